@@ -1,0 +1,44 @@
+# Each target sets up what it needs. The virtual environment is made once, in .venv.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo serve test test-fast lint openapi bench clean
+
+demo: $(VENV)/.base ## run the main job on an example
+	$(BIN)/cow simulate examples/ball-and-mug/image.jpg \
+	  "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?" \
+	  --frames events --out demo
+
+serve: $(VENV)/.base ## start the server on 127.0.0.1:8000
+	$(BIN)/cow serve
+
+test: $(VENV)/.test ## all tests, slow ones included
+	$(BIN)/python -m pytest
+
+test-fast: $(VENV)/.test ## the tests that take seconds
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: $(VENV)/.test ## style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+openapi: $(VENV)/.base ## write openapi.yaml from the app
+	$(BIN)/cow openapi > openapi.yaml
+
+bench: $(VENV)/.base ## the figures of the README
+	$(BIN)/python benchmarks/scenes.py examples
+	$(BIN)/python benchmarks/latency.py
+
+clean: ## remove what the other targets made
+	rm -rf $(VENV) demo dist build
+
+$(VENV)/.base: pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --editable .
+	touch $@
+
+$(VENV)/.test: pyproject.toml tests/constraints.txt $(VENV)/.base
+	$(BIN)/python -m pip install --quiet --editable ".[test]" --constraint tests/constraints.txt
+	touch $@

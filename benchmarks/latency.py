@@ -1,0 +1,119 @@
+"""Measures what a caller waits for, on this machine: command line start, server start, requests, memory.
+
+    python benchmarks/latency.py [--runs N] [--image FILE --question TEXT] [--json FILE]
+
+A real server runs in its own process with an empty data folder. Times are medians in milliseconds; a run of each kind
+is made first and not counted. Peak memory is the largest resident set of the server process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLE = ROOT / "examples" / "ball-and-mug"
+
+
+def timed(run: Callable[[], object], runs: int) -> dict[str, float]:
+    """Median, least and most milliseconds of `runs` calls after one that is not counted."""
+    run()
+    times: list[float] = []
+    for _ in range(runs):
+        started = time.perf_counter()
+        run()
+        times.append(1000 * (time.perf_counter() - started))
+    return {
+        "p50_ms": round(statistics.median(times), 1),
+        "min_ms": round(min(times), 1),
+        "max_ms": round(max(times), 1),
+    }
+
+
+def cow(*arguments: str) -> list[str]:
+    """The command line of this interpreter's environment."""
+    return [sys.executable, "-m", "cow_service.cli", *arguments]
+
+
+def start_server(data: Path) -> tuple[subprocess.Popen[str], str, float]:
+    """The server process, its address, and the milliseconds until it was ready."""
+    started = time.perf_counter()
+    environment = os.environ | {"COW_DATA_DIR": str(data)}
+    process = subprocess.Popen(cow("serve", "--port", "0"), env=environment, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    address = ""
+    for line in process.stderr:
+        if "running on" in line:
+            address = line.split("running on ")[1].split()[0]
+            break
+    while httpx.get(address + "/readyz").status_code != 200:
+        time.sleep(0.01)
+    return process, address, 1000 * (time.perf_counter() - started)
+
+
+def peak_memory_mb(pid: int) -> float:
+    """Largest resident set of a process so far, MB."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1000
+
+
+def measure(image: Path, question: str, runs: int) -> dict[str, Any]:
+    """All figures."""
+    figures: dict[str, Any] = {"cores": os.cpu_count(), "image": image.name, "runs": runs}
+    figures["cow --help"] = timed(lambda: subprocess.run(cow("--help"), check=True, capture_output=True), min(runs, 7))
+    with tempfile.TemporaryDirectory() as data:
+        starts: list[float] = []
+        for _ in range(3):
+            process, address, ready = start_server(Path(data))
+            starts.append(ready)
+            process.terminate()
+            process.wait()
+        figures["server ready"] = {"p50_ms": round(statistics.median(starts), 1)}
+        process, address, _ = start_server(Path(data))
+        try:
+            encoded = "data:image/jpeg;base64," + base64.b64encode(image.read_bytes()).decode()
+            with httpx.Client(base_url=address, timeout=60) as client:
+                for name, video in (
+                    ("POST /simulate, 3 frames", False),
+                    ("POST /simulate, 3 frames and 81-frame mp4", True),
+                ):
+                    body = {"image": encoded, "question": question, "video": video}
+                    figures[name] = timed(
+                        lambda body=body: client.post("/simulate", json=body).raise_for_status(), runs
+                    )
+            figures["peak memory, MB"] = round(peak_memory_mb(process.pid), 1)
+        finally:
+            process.terminate()
+            process.wait()
+    return figures
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--runs", type=int, default=15)
+    parser.add_argument("--image", type=Path, default=EXAMPLE / "image.jpg")
+    parser.add_argument("--question", default=json.loads((EXAMPLE / "meta.json").read_text())["question"])
+    parser.add_argument("--json", type=Path, default=None, help="write the figures here")
+    arguments = parser.parse_args()
+    figures = measure(arguments.image, arguments.question, arguments.runs)
+    print(json.dumps(figures, indent=2))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

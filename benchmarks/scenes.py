@@ -1,0 +1,279 @@
+"""Measures the default backends against scenes with known truth.
+
+    python benchmarks/scenes.py DIR [--json FILE]
+
+DIR holds one folder per scene with image.jpg, clean.jpg and meta.json; `examples/` is such a folder. Per scene: box IoU,
+direction error (degrees), path error (% of the image's width: mean distance of the true centres, up to the first
+contact, to the computed path), centre error (px: where the mover is found in rendered frames against its trajectory),
+background error (grey levels: the largest difference to the input away from mover, hole and drawing), arrow error (grey
+levels: mean difference to clean.jpg where the arrow stood), and whether the encounters give the true answer.
+Scenes whose direction is an orientation must be refused; they are then run again with the true direction given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from cow_service.errors import CannotReadDirection, CowError
+from cow_service.records import Simulation
+from cow_service.requests import SimulateRequest
+from cow_service.service import Service
+from cow_service.settings import Settings
+from cow_service.vision.scene import Scene, iou
+
+DRAWN = 40  # grey levels between image and clean image where something was drawn
+AWAY = 15  # px around mover, hole and drawing that may differ
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one scene gave; None where a figure does not apply."""
+
+    scene: str
+    task: str
+    outcome: str
+    iou: float | None = None
+    direction_error: float | None = None
+    path_error: float | None = None
+    centre_error: float | None = None
+    background_error: float | None = None
+    arrow_error: float | None = None
+    encounter: str | None = None
+    truth: str | None = None
+    agrees: bool | None = None
+    seconds: float | None = None
+
+
+def measure(service: Service, folder: Path) -> Row:
+    """Runs one scene by image and question alone, as a caller would, and holds the result against the truth."""
+    meta = json.loads((folder / "meta.json").read_text())
+    image = service.keep_image((folder / "image.jpg").read_bytes())
+    body: dict[str, Any] = {
+        "image": {"artifact": image.sha256},
+        "question": meta["question"],
+        "frames": {"indices": [0, 8, 16, 24, 40], "max_side": None},
+    }
+    needs_orientation = meta["motion"] == "linear" and not meta["arrow"]
+    outcome = "ok"
+    try:
+        simulation = service.simulate(SimulateRequest.model_validate(body))
+    except CowError as error:
+        outcome = error.code
+        if not (needs_orientation and isinstance(error, CannotReadDirection)):
+            return Row(folder.name, meta["task"], outcome, truth=meta["answer"])
+        body["motion"] = {"direction": meta["direction"]}
+        simulation = service.simulate(SimulateRequest.model_validate(body))
+    expected_refusal = needs_orientation and outcome == "ok"
+    return _row(service, folder, meta, simulation, "not refused" if expected_refusal else outcome)
+
+
+def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simulation, outcome: str) -> Row:
+    pixels, clean = (cv2.imread(str(folder / name))[..., ::-1] for name in ("image.jpg", "clean.jpg"))
+    frames = [_frame(service, frame.sha256) for frame in simulation.frames]
+    centre, background, arrow = _frame_errors(simulation, frames, Scene(np.ascontiguousarray(pixels)), clean)
+    kinds = [
+        encounter.kind
+        for encounter in simulation.trajectory.encounters
+        if iou(encounter.bbox, tuple(meta["boxes"][meta["target"]][0])) > 0.4
+    ]
+    occlusion = "occluded" in meta["question"]
+    yes = bool(kinds) and (any(kind != "occluded-by" for kind in kinds) if occlusion else "touches" in kinds)
+    direction = simulation.motion.direction
+    return Row(
+        scene=folder.name,
+        task=meta["task"],
+        outcome=outcome,
+        iou=iou(simulation.grounding.bbox, tuple(meta["bbox"])),
+        direction_error=None if direction is None else _angle(direction, meta["direction"]),
+        path_error=_path_error(simulation, meta),
+        centre_error=centre,
+        background_error=background,
+        arrow_error=arrow,
+        encounter=", ".join(kinds) or "-",
+        truth=meta["answer"],
+        agrees=yes == (meta["answer"] == "A"),
+        seconds=sum(simulation.timings.values()),
+    )
+
+
+def _frame(service: Service, sha256: str) -> NDArray[np.uint8]:
+    encoded = np.frombuffer(service.artifacts.read(sha256), np.uint8)
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1], np.uint8)
+
+
+def _frame_errors(
+    simulation: Simulation, frames: list[NDArray[np.uint8]], scene: Scene, clean: NDArray[np.uint8]
+) -> tuple[float | None, float, float | None]:
+    """Largest centre error (px), background error and arrow error (grey levels) over the frames."""
+    bbox, start = simulation.grounding.bbox, np.array(simulation.grounding.point)
+    mover = scene.silhouette(bbox)
+    drawn = np.abs(scene.image.astype(int) - clean).max(axis=2) > DRAWN
+    kernel = np.ones((2 * AWAY + 1, 2 * AWAY + 1), np.uint8)
+    still = cv2.dilate((mover | drawn | scene.cues).astype(np.uint8), kernel)
+    centres: list[float] = []
+    backgrounds: list[float] = []
+    arrows: list[float] = []
+    for frame, pixels in zip(simulation.frames, frames, strict=True):
+        point = np.array(simulation.trajectory.points[frame.index])
+        shift = np.array([[1, 0, point[0] - start[0]], [0, 1, point[1] - start[1]]], np.float64)
+        here = cv2.warpAffine(mover.astype(np.uint8), shift, mover.shape[::-1])
+        changed = cv2.dilate(here, kernel) | still
+        backgrounds.append(float(np.abs(pixels.astype(int) - scene.image)[changed == 0].max(initial=0)))
+        hole = here | mover.astype(np.uint8)
+        free = drawn & (cv2.dilate(hole, np.ones((11, 11), np.uint8)) == 0) if frame.index else drawn
+        if free.sum() > 0.5 * drawn.sum() > 0:
+            arrows.append(float(np.abs(pixels.astype(int) - clean)[free].mean()))
+        found = _locate(scene, mover, pixels, point - start)
+        if found is not None and simulation.trajectory.visible[frame.index]:
+            centres.append(found)
+    return max(centres, default=None), max(backgrounds), max(arrows, default=None)
+
+
+def _locate(
+    scene: Scene, mover: NDArray[np.bool_], pixels: NDArray[np.uint8], shift: NDArray[np.float64]
+) -> float | None:
+    """Distance (px) between where the mover is best found in a frame and where it should be; None where it is hidden."""
+    rows, columns = np.nonzero(mover.any(axis=1))[0], np.nonzero(mover.any(axis=0))[0]
+    window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    template, mask = scene.clean[window], np.repeat(mover[window][..., None], 3, axis=2).astype(np.float32)
+    reach = 8
+    x, y = round(columns[0] + shift[0]) - reach, round(rows[0] + shift[1]) - reach
+    height, width = template.shape[:2]
+    if x < 0 or y < 0 or x + width + 2 * reach > pixels.shape[1] or y + height + 2 * reach > pixels.shape[0]:
+        return None
+    search = pixels[y : y + height + 2 * reach, x : x + width + 2 * reach]
+    error = cv2.matchTemplate(np.ascontiguousarray(search), template, cv2.TM_SQDIFF, mask=mask) / mask.sum()
+    best = np.unravel_index(int(error.argmin()), error.shape)
+    if error[best] > 400:  # more than 20 grey levels off: something stands in front
+        return None
+    offset = np.array([best[1], best[0]]) - reach - (shift - np.round(shift))
+    return float(np.hypot(*offset))
+
+
+def _path_error(simulation: Simulation, meta: dict[str, Any]) -> float:
+    last = min(meta["hits"].values(), default=len(meta["track"]) - 1)
+    true = np.array(meta["track"][: last + 1])
+    path = np.array(simulation.trajectory.points)
+    fine = np.stack(
+        [np.interp(np.linspace(0, len(path) - 1, 4000), np.arange(len(path)), path[:, i]) for i in (0, 1)], 1
+    )
+    gaps = np.linalg.norm(true[:, None] - fine[None], axis=2).min(axis=1)
+    return float(100 * gaps.mean() / simulation.image.width)
+
+
+def _angle(a: tuple[float, float], b: list[float]) -> float:
+    return float(abs(np.degrees(np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))))
+
+
+def show(rows: list[Row]) -> dict[str, Any]:
+    """Prints the table and returns its summary."""
+    table = Table(box=None, pad_edge=False)
+    columns = (
+        "scene",
+        "task",
+        "outcome",
+        "IoU",
+        "dir °",
+        "path %",
+        "centre px",
+        "bg",
+        "arrow",
+        "encounters",
+        "truth",
+        "s",
+    )
+    for name in columns:
+        table.add_column(name, no_wrap=True)
+    for row in rows:
+        numbers = [_text(v) for v in (row.iou, row.direction_error, row.path_error, row.centre_error)]
+        errors = [_text(v, 1) for v in (row.background_error, row.arrow_error)]
+        verdict = "" if row.agrees is None else (" ✓" if row.agrees else " ✗")
+        table.add_row(
+            row.scene,
+            row.task,
+            row.outcome,
+            *numbers,
+            *errors,
+            (row.encounter or "-") + verdict,
+            row.truth,
+            _text(row.seconds),
+        )
+    Console(width=150).print(table)
+    summary = summarise(rows)
+    for name, value in summary.items():
+        print(f"{name}: {value}")
+    return summary
+
+
+def summarise(rows: list[Row]) -> dict[str, Any]:
+    """Medians, worst cases and shares over all scenes."""
+    ious = [row.iou for row in rows if row.iou is not None]
+    read = [row.direction_error for row in rows if row.direction_error is not None and row.outcome == "ok"]
+    judged = [row.agrees for row in rows if row.agrees is not None and row.task in ("collision", "occlusion")]
+    judged_all = [row.agrees for row in rows if row.agrees is not None]
+    return {
+        "scenes": len(rows),
+        "refused": sum(row.outcome not in ("ok", "not refused") for row in rows),
+        "box IoU, least": round(min(ious, default=0.0), 3),
+        "box IoU, median": round(statistics.median(ious), 3) if ious else None,
+        "direction error, median (degrees)": round(statistics.median(read), 2) if read else None,
+        "direction error, worst (degrees)": round(max(read), 2) if read else None,
+        "centre error, worst (px)": _worst(rows, "centre_error"),
+        "background error, worst (grey levels)": _worst(rows, "background_error"),
+        "arrow error, worst (grey levels)": _worst(rows, "arrow_error"),
+        "path error, median (% of width)": round(
+            statistics.median(r.path_error for r in rows if r.path_error is not None), 2
+        ),
+        "encounters agree, collision and occlusion": f"{sum(judged)} of {len(judged)}",
+        "encounters agree, all tasks": f"{sum(judged_all)} of {len(judged_all)}",
+    }
+
+
+def _worst(rows: list[Row], name: str) -> float | None:
+    values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
+    return round(max(values), 2) if values else None
+
+
+def _text(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--json", type=Path, default=None, help="write rows and summary here")
+    arguments = parser.parse_args()
+    folders = sorted(path.parent for path in arguments.folder.glob("*/meta.json"))
+    if not folders:
+        print(
+            f"No scenes in {arguments.folder}: it needs folders with image.jpg, clean.jpg and meta.json.",
+            file=sys.stderr,
+        )
+        return 2
+    with tempfile.TemporaryDirectory() as data:
+        service = Service(Settings(data_dir=Path(data)))
+        rows = [measure(service, folder) for folder in folders]
+    summary = show(rows)
+    if arguments.json is not None:
+        arguments.json.write_text(
+            json.dumps({"summary": summary, "scenes": [asdict(row) for row in rows]}, indent=2) + "\n"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

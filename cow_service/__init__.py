@@ -1,0 +1,3 @@
+"""COW: a service that lets a multimodal LLM look before it answers."""
+
+__version__ = "0.1.0"

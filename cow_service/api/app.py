@@ -1,0 +1,51 @@
+"""The HTTP application: routes, problems and limits around one service."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from cow_service import __version__
+from cow_service.api.artifacts import artifact_routes
+from cow_service.api.health import health_routes
+from cow_service.api.limits import BodyLimit
+from cow_service.api.problems import Problem, install_problem_handlers
+from cow_service.api.simulate import simulate_routes
+from cow_service.requests import SimulateRequest
+from cow_service.service import Service
+
+SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out."
+DROPPED = ("HTTPValidationError", "ValidationError")  # the framework's error shapes, which no operation returns
+
+
+def create_app(service: Service) -> FastAPI:
+    """The application for a service. It holds no state of its own."""
+    app = FastAPI(title="COW", version=__version__, summary=SUMMARY, docs_url="/docs", redoc_url=None)
+    app.add_middleware(BodyLimit, megabytes=service.settings.max_body_mb)
+    install_problem_handlers(app)
+    for router in (simulate_routes(service), artifact_routes(service), health_routes(service)):
+        app.include_router(router)
+    app.openapi = lambda: _openapi(app)
+    return app
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """The contract: the framework's document, with the bodies and errors that are read and written by hand."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        for model in (Problem, SimulateRequest):
+            schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(schema.pop("$defs", {}))
+            schemas[model.__name__] = schema
+        for operations in document["paths"].values():
+            for operation in operations.values():
+                if "HTTPValidationError" in str(operation["responses"].get("422")):
+                    del operation["responses"]["422"]
+        for name in DROPPED:
+            schemas.pop(name, None)
+        document["components"]["schemas"] = dict(sorted(schemas.items()))
+        app.openapi_schema = document
+    return app.openapi_schema

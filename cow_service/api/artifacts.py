@@ -1,0 +1,49 @@
+"""`GET /artifacts/{sha256}`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path
+from fastapi.responses import FileResponse, Response
+from starlette.requests import Request
+
+from cow_service import errors
+from cow_service.api.problems import documented
+from cow_service.service import Service
+
+FOREVER = "public, max-age=31536000, immutable"
+
+
+def artifact_routes(service: Service) -> APIRouter:
+    """The operation, bound to a service. Bytes never change under their digest, so caches may keep them."""
+    router = APIRouter()
+
+    @router.api_route(
+        "/artifacts/{sha256}",
+        methods=["GET", "HEAD"],
+        operation_id="artifact",
+        tags=["artifacts"],
+        summary="Bytes by their SHA-256",
+        response_class=Response,
+        responses={
+            200: {"description": "The bytes.", "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}},
+            206: {"description": "The ranges asked for."},
+            304: {"description": "The caller has them."},
+            416: {"description": "The range lies outside."},
+            **documented(errors.ArtifactNotFound, errors.StorageUnavailable),
+        },
+    )
+    def artifact(
+        sha256: Annotated[str, Path(description="64 lower-case hexadecimal digits.")], request: Request
+    ) -> Response:
+        """Images, frames and videos that the service keeps. The ETag is the digest."""
+        stored = service.artifacts.get(sha256)
+        etag = f'"{sha256}"'
+        headers = {"ETag": etag, "Cache-Control": FOREVER, "X-Content-Type-Options": "nosniff"}
+        known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
+        if etag in known or "*" in known:
+            return Response(status_code=304, headers=headers)
+        return FileResponse(stored.path, media_type=stored.artifact.media_type, headers=headers)
+
+    return router

@@ -1,0 +1,52 @@
+"""`POST /simulate`."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from anyio import CapacityLimiter, to_thread
+from fastapi import APIRouter, Request
+
+from cow_service import errors
+from cow_service.api.intake import BODY, read_simulate_request
+from cow_service.api.problems import documented
+from cow_service.records import Simulation
+from cow_service.service import Service
+
+FAILURES = (
+    errors.MalformedBody,
+    errors.InvalidRequest,
+    errors.ArtifactNotFound,
+    errors.BodyTooLarge,
+    errors.BodyTypeUnsupported,
+    errors.ImageTooLarge,
+    errors.ImageUnreadable,
+    errors.ImageTypeUnsupported,
+    errors.ImageUrlNotAllowed,
+    errors.CannotGround,
+    errors.CannotReadDirection,
+    errors.ReaderUnavailable,
+    errors.GeneratorUnavailable,
+    errors.StorageUnavailable,
+)
+
+
+def simulate_routes(service: Service) -> APIRouter:
+    """The operation, bound to a service. Computation runs in threads, at most `COW_CONCURRENCY` at a time."""
+    router = APIRouter()
+    limiter = CapacityLimiter(service.settings.concurrency)
+
+    @router.post(
+        "/simulate",
+        operation_id="simulate",
+        tags=["simulation"],
+        summary="Imagine the future of an image",
+        responses=documented(*FAILURES),
+        openapi_extra={"requestBody": BODY},
+    )
+    async def simulate(request: Request) -> Simulation:
+        """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once."""
+        asked = await read_simulate_request(request, service)
+        return await to_thread.run_sync(partial(service.simulate, asked), limiter=limiter)
+
+    return router

@@ -1,0 +1,184 @@
+"""Frames, masks and clips as files, named by the SHA-256 of their bytes.
+
+The layout is `<folder>/<first two digits>/<digest>.<extension>`; the extension keeps the media type.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import re
+import shutil
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+from uuid import uuid4
+
+from cow_service.errors import ArtifactNotFound, StorageUnavailable
+from cow_service.records import Artifact
+
+MEDIA_TYPES = {
+    "image/png": "png",
+    "image/jpeg": "jpg",
+    "image/webp": "webp",
+    "video/mp4": "mp4",
+    "application/json": "json",
+}
+
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_SHOWN_CHARACTERS = 80
+
+
+@dataclass(frozen=True)
+class StoredArtifact:
+    """An artifact and where its bytes are on this machine. The path never leaves the server."""
+
+    artifact: Artifact
+    path: Path
+
+
+class ArtifactStore:
+    """Content-addressed files under one folder, made when first needed. Safe to share between threads.
+
+    Every method raises `StorageUnavailable` where the folder cannot be read or written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._settling = threading.Lock()
+
+    def put(self, data: bytes, media_type: str) -> Artifact:
+        """Keep the bytes. Bytes that are there already stay as they are, their first media type too.
+
+        Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
+        """
+        extension = _extension(media_type)
+        sha256 = hashlib.sha256(data).hexdigest()
+        with _storage_errors():
+            known = self._find(sha256)
+            if known is not None:
+                return known.artifact
+            target = self._target(sha256, extension)
+            with _temporary_beside(target) as temporary:
+                with temporary.open("xb") as file:
+                    file.write(data)
+                    _sync(file)
+                return self._settle(temporary, target, sha256)
+
+    def put_file(self, path: Path, media_type: str) -> Artifact:
+        """Move a finished file in, hashing it in chunks; afterwards `path` is gone.
+
+        Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
+        """
+        extension = _extension(media_type)
+        with _storage_errors():
+            with path.open("rb+") as file:
+                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+                _sync(file)
+            target = self._target(sha256, extension)
+            with _temporary_beside(target) as temporary:
+                _move(path, temporary)
+                return self._settle(temporary, target, sha256)
+
+    def get(self, sha256: str) -> StoredArtifact:
+        """Find an artifact. Raises `ArtifactNotFound` if there is none, or if it is not a digest at all."""
+        if _DIGEST.fullmatch(sha256) is None:
+            # Decided without the disk: what is no digest must never become a part of a path.
+            raise ArtifactNotFound(
+                f"No artifact is named {sha256[:_SHOWN_CHARACTERS]!r}: give its SHA-256, 64 lower-case hex digits."
+            )
+        with _storage_errors():
+            stored = self._find(sha256)
+        if stored is None:
+            raise ArtifactNotFound(f"No artifact has the SHA-256 {sha256}: run the simulation that made it again.")
+        return stored
+
+    def read(self, sha256: str) -> bytes:
+        """The bytes of an artifact. Raises as `get` does."""
+        path = self.get(sha256).path
+        with _storage_errors():
+            return path.read_bytes()
+
+    def check(self) -> None:
+        """Write, sync and remove a small file. Raises `StorageUnavailable` if that fails."""
+        with _storage_errors(), _temporary_beside(self._folder / "check") as temporary, temporary.open("xb") as file:
+            file.write(b"\0")
+            _sync(file)
+
+    def _target(self, sha256: str, extension: str) -> Path:
+        return self._folder / sha256[:2] / f"{sha256}.{extension}"
+
+    def _find(self, sha256: str) -> StoredArtifact | None:
+        for media_type, extension in MEDIA_TYPES.items():
+            path = self._target(sha256, extension)
+            try:
+                size = path.stat().st_size
+            except FileNotFoundError:
+                continue
+            url = f"/artifacts/{sha256}"
+            return StoredArtifact(Artifact(sha256=sha256, url=url, media_type=media_type, size=size), path)
+        return None
+
+    def _settle(self, temporary: Path, target: Path, sha256: str) -> Artifact:
+        # Two threads may bring the same bytes under two media types: the first one in decides.
+        with self._settling:
+            stored = self._find(sha256)
+            if stored is None:
+                temporary.replace(target)
+                stored = self._find(sha256)
+        if stored is None:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        return stored.artifact
+
+
+def _extension(media_type: str) -> str:
+    if media_type not in MEDIA_TYPES:
+        raise ValueError(f"The media type {media_type!r} is not kept: use one of {', '.join(MEDIA_TYPES)}.")
+    return MEDIA_TYPES[media_type]
+
+
+@contextmanager
+def _temporary_beside(target: Path) -> Generator[Path]:
+    """A name for a file that does not exist yet, on the target's own disk so that it can be renamed to it."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.parent / f".{uuid4().hex}.part"
+    try:
+        yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _move(source: Path, destination: Path) -> None:
+    try:
+        source.replace(destination)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        with source.open("rb") as reader, destination.open("xb") as writer:
+            shutil.copyfileobj(reader, writer)
+            _sync(writer)
+        source.unlink()
+
+
+def _sync(file: BinaryIO) -> None:
+    file.flush()
+    os.fsync(file.fileno())
+
+
+@contextmanager
+def _storage_errors() -> Generator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise StorageUnavailable("The disk of the data folder is full: free some space and try again.") from error
+        # The reason alone: the text of an OSError holds the path.
+        reason = os.strerror(error.errno) if error.errno else type(error).__name__
+        raise StorageUnavailable(
+            f"The data folder cannot be used ({reason}): make it a folder that the server may read and write."
+        ) from error

@@ -1,0 +1,189 @@
+"""The command line. Heavy imports stand inside the commands, so that `cow --help` is quick."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cow_service import __version__
+from cow_service.errors import CowError
+
+if TYPE_CHECKING:
+    from cow_service.service import Service
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Look before you answer: imagine the future of an image.",
+)
+
+
+class Policy(StrEnum):
+    """Which frames to keep as pictures."""
+
+    initial = "initial"
+    uniform = "uniform"
+    events = "events"
+
+
+class Kind(StrEnum):
+    """Kinds of motion."""
+
+    linear = "linear"
+    projectile = "projectile"
+    fall = "fall"
+    static = "static"
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cow {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Look before you answer: imagine the future of an image."""
+
+
+@app.command()
+def simulate(
+    image: Annotated[Path, typer.Argument(help="PNG, JPEG or WebP.", exists=True, dir_okay=False, readable=True)],
+    question: Annotated[
+        str, typer.Argument(help='For example "If the red ball moves to the left, will it hit the vase?"')
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the results.", show_default="./<image>-cow")
+    ] = None,
+    point: Annotated[str | None, typer.Option(help="X,Y of a point on the object that moves, px.")] = None,
+    box: Annotated[str | None, typer.Option(help="X0,Y0,X1,Y1 of the object that moves, px.")] = None,
+    name: Annotated[
+        str | None, typer.Option("--object", help="What the object is called, with --point or --box.")
+    ] = None,
+    direction: Annotated[str | None, typer.Option(help="DX,DY of the motion, px, x right, y down.")] = None,
+    kind: Annotated[
+        Kind, typer.Option(help="Kind of motion, with --direction (or alone for fall and static).")
+    ] = Kind.linear,
+    speed: Annotated[float | None, typer.Option(help="px/s, with --direction.", show_default="0.26 widths/s")] = None,
+    reader: Annotated[str | None, typer.Option(help="Who looks at the image.", show_default="COW_READER")] = None,
+    generator: Annotated[str | None, typer.Option(help="Who makes the frames.", show_default="COW_GENERATOR")] = None,
+    num_frames: Annotated[int, typer.Option(help="Frames of the clip.")] = 81,
+    fps: Annotated[float, typer.Option(help="Frames per second.")] = 16,
+    seed: Annotated[int, typer.Option(help="For generators that draw random numbers.")] = 0,
+    video: Annotated[bool, typer.Option(help="Make the mp4.")] = True,
+    frames: Annotated[Policy, typer.Option(help="Which frames to keep as pictures.")] = Policy.initial,
+    count: Annotated[int, typer.Option(help="How many of them.")] = 3,
+    max_side: Annotated[int, typer.Option(help="Their longest side, px; 0 for the clip's own size.")] = 512,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the simulation as JSON, and nothing else.")] = False,
+) -> None:
+    """Imagine one image's future: frames, video, overlay and simulation.json in a folder."""
+    with _errors_told():
+        from cow_service.console import build_request, run_simulation  # noqa: PLC0415
+
+        request = build_request(
+            question=question,
+            point=point,
+            box=box,
+            name=name,
+            direction=direction,
+            kind=kind.value,
+            speed=speed,
+            reader=reader,
+            generator=generator,
+            num_frames=num_frames,
+            fps=fps,
+            seed=seed,
+            video=video,
+            frames={"policy": frames.value, "count": count, "max_side": max_side or None},
+        )
+        run_simulation(_service(), image, request, out or Path(f"{image.stem}-cow"), as_json=as_json)
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.", show_default="COW_HOST, 127.0.0.1")] = None,
+    port: Annotated[
+        int | None, typer.Option(help="Port to listen on; 0 takes a free one.", show_default="COW_PORT, 8000")
+    ] = None,
+) -> None:
+    """Start the server."""
+    with _errors_told():
+        service = _service(host=host, port=port)
+        import uvicorn  # noqa: PLC0415
+
+        from cow_service.api.app import create_app  # noqa: PLC0415
+
+        uvicorn.run(create_app(service), host=service.settings.host, port=service.settings.port, log_level="info")
+
+
+@app.command()
+def models(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+    """List readers and generators, and whether each is ready."""
+    with _errors_told():
+        from cow_service.console import print_models  # noqa: PLC0415
+
+        print_models(_service().models(), as_json=as_json)
+
+
+@app.command()
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+    """Say what is installed, what is missing for which backend, and the line that installs it."""
+    with _errors_told():
+        from cow_service.doctor import examine, print_report  # noqa: PLC0415
+
+        report = examine(_service())
+        print_report(report, as_json=as_json)
+        if not report.healthy:
+            raise typer.Exit(1)
+
+
+@app.command(hidden=True)
+def openapi() -> None:
+    """Print the HTTP contract as YAML; `make openapi` keeps openapi.yaml with it."""
+    with _errors_told():
+        import yaml  # noqa: PLC0415
+
+        from cow_service.api.app import create_app  # noqa: PLC0415
+
+        document = create_app(_service()).openapi()
+        typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
+
+
+def _service(host: str | None = None, port: int | None = None) -> Service:
+    from cow_service.service import Service  # noqa: PLC0415
+    from cow_service.settings import load_settings  # noqa: PLC0415
+
+    return Service(load_settings(host=host, port=port))
+
+
+@contextmanager
+def _errors_told() -> Iterator[None]:
+    """Errors as a few plain lines on standard error, and exit code 1; 2 for bad settings."""
+    from cow_service.settings import SettingsError  # noqa: PLC0415
+
+    try:
+        yield
+    except CowError as error:
+        typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
+        typer.echo(error.detail, err=True)
+        for field in error.errors:
+            typer.echo(f"  {field.pointer}: {field.detail}", err=True)
+        raise typer.Exit(1) from error
+    except SettingsError as error:
+        typer.secho(str(error), fg="red", err=True)
+        raise typer.Exit(2) from error
+
+
+if __name__ == "__main__":
+    sys.exit(app())

@@ -1,0 +1,152 @@
+"""What the command line does and shows: requests from options, results into a folder, tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Table
+
+from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
+from cow_service.records import BackendInfo, Models, Simulation
+from cow_service.requests import SimulateRequest, Stage
+from cow_service.service import Service
+
+STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation")
+
+
+def build_request(
+    *,
+    point: str | None,
+    box: str | None,
+    name: str | None,
+    direction: str | None,
+    kind: str,
+    speed: float | None,
+    **rest: Any,
+) -> dict[str, Any]:
+    """The request's body without its image. Raises `InvalidRequest` naming the option that cannot be read."""
+    body = dict(rest)
+    if point is not None or box is not None:
+        body["grounding"] = {
+            "object": name,
+            "point": None if point is None else _numbers("--point", point, 2),
+            "bbox": None if box is None else _numbers("--box", box, 4),
+        }
+    elif name is not None:
+        raise InvalidRequest("--object goes with --point or --box; without them the question names the object.")
+    if direction is not None or kind in ("fall", "static"):
+        body["motion"] = {
+            "direction": None if direction is None else _numbers("--direction", direction, 2),
+            "kind": kind,
+            "speed": speed,
+        }
+    elif kind != "linear" or speed is not None:
+        raise InvalidRequest("--kind and --speed go with --direction; without it the motion is read from the question.")
+    return body
+
+
+def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Path, *, as_json: bool) -> None:
+    """Simulates with a progress line per stage, writes the results into a folder, and says where they are."""
+    console = Console(stderr=as_json, quiet=as_json)
+    artifact = service.keep_image(_read(image))
+    try:
+        request = SimulateRequest.model_validate({"image": {"artifact": artifact.sha256}, **body})
+    except ValidationError as error:
+        told = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
+        raise InvalidRequest(told) from error
+    columns = TextColumn("{task.description:<11}"), BarColumn(bar_width=10), TextColumn("{task.fields[said]}")
+    with Progress(*columns, console=console) as bars:
+        tasks = {stage: bars.add_task(stage, total=1.0, start=False, said="") for stage in STAGES}
+
+        def show(stage: Stage, done: float) -> None:
+            task: TaskID = tasks[stage]
+            if done == 0:
+                bars.start_task(task)
+            bars.update(task, completed=done)
+
+        simulation = service.simulate(request, show)
+        for stage, said in _told(simulation).items():
+            bars.update(tasks[stage], said=f"{simulation.timings[stage]:5.2f} s  {said}")
+    written = save(service, simulation, out)
+    if as_json:
+        print(simulation.model_dump_json(indent=2))
+        return
+    for warning in simulation.warnings:
+        console.print(f"[yellow]warning[/]: {warning}", highlight=False)
+    console.print(f"Wrote to [bold]{out}[/]: {', '.join(written)}", highlight=False)
+
+
+def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
+    """Writes frames, video, overlay and simulation.json into a folder; returns their names."""
+    files = {f"frame_{frame.index:03d}.png": frame.sha256 for frame in simulation.frames}
+    files["overlay.png"] = simulation.overlay.sha256
+    if simulation.video is not None:
+        files["video.mp4"] = simulation.video.sha256
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, sha256 in files.items():
+            (out / name).write_bytes(service.artifacts.read(sha256))
+        (out / "simulation.json").write_text(simulation.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise StorageUnavailable(
+            f"The results cannot be written to '{out}': {error.strerror}. Choose another --out."
+        ) from error
+    return [*files, "simulation.json"]
+
+
+def print_models(models: Models, *, as_json: bool) -> None:
+    """A table of backends, or their JSON."""
+    if as_json:
+        print(models.model_dump_json(indent=2))
+        return
+    table = Table(box=None, pad_edge=False)
+    for heading in ("door", "name", "ready", "what it is"):
+        table.add_column(heading)
+    for door, backends in (("reader", models.readers), ("generator", models.generators)):
+        for backend in backends:
+            table.add_row(
+                door, backend.name + (" (default)" if backend.default else ""), _readiness(backend), backend.summary
+            )
+    Console().print(table)
+
+
+def _readiness(backend: BackendInfo) -> str:
+    return "[green]yes[/]" if backend.ready else f"[yellow]needs {', '.join(backend.missing)}[/]"
+
+
+def _told(simulation: Simulation) -> dict[Stage, str]:
+    """One line per stage of what came out of it."""
+    grounding, motion, trajectory = simulation.grounding, simulation.motion, simulation.trajectory
+    x, y = grounding.point
+    way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"
+    met = ", ".join(f"{e.kind} {e.object} at {e.first_frame / trajectory.fps:.1f} s" for e in trajectory.encounters)
+    video = f", {simulation.video.num_frames}-frame video" if simulation.video else ""
+    return {
+        "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
+        "motion": f"{motion.kind}{way}, {motion.speed:.0f} px/s, from {motion.cue}",
+        "trajectory": met or "meets nothing",
+        "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
+    }
+
+
+def _numbers(option: str, text: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.replace(" ", "").split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise InvalidRequest(
+            f"{option} takes {count} numbers with commas between, such as {','.join(['10'] * count)}; got '{text}'."
+        )
+    return values
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise CowError(f"'{path}' cannot be read: {error.strerror}.") from error

@@ -1,0 +1,155 @@
+"""Every error that a caller can meet.
+
+    CowError
+    ├── InvalidRequest             invalid-request          422
+    │   └── MalformedBody          malformed-body           400
+    ├── NotFound                   not-found                404
+    ├── MethodNotAllowed           method-not-allowed       405
+    ├── ArtifactNotFound           artifact-not-found       404
+    ├── BodyTooLarge               body-too-large           413
+    ├── BodyTypeUnsupported        body-type-unsupported    415
+    ├── ImageTooLarge              image-too-large          413
+    ├── ImageUnreadable            image-unreadable         422
+    ├── ImageTypeUnsupported       image-type-unsupported   415
+    ├── ImageUrlNotAllowed         image-url-not-allowed    422
+    ├── CannotGround               cannot-ground            422
+    ├── CannotReadDirection        cannot-read-direction    422
+    ├── ReaderUnavailable          reader-unavailable       503
+    ├── GeneratorUnavailable       generator-unavailable    503
+    ├── StorageUnavailable         storage-unavailable      503
+    └── InternalError              internal-error           500
+
+An error's docstring is its title on the wire. Its message says what was wrong, with the value, and what to do about it;
+it never holds a path, a trace or a secret.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class FieldError:
+    """One invalid field of a request: a JSON Pointer (RFC 6901) and what is wrong there."""
+
+    pointer: str
+    detail: str
+
+
+class CowError(Exception):
+    """Something went wrong."""
+
+    code: str = "internal-error"
+    status: int = 500
+
+    def __init__(self, detail: str, *, errors: tuple[FieldError, ...] = ()) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.errors = errors
+
+    @property
+    def title(self) -> str:
+        """The kind of error in one sentence, the same for every occurrence."""
+        return (type(self).__doc__ or "").strip()
+
+
+class InvalidRequest(CowError):
+    """The request is not valid."""
+
+    code, status = "invalid-request", 422
+
+
+class MalformedBody(InvalidRequest):
+    """The body could not be read."""
+
+    code, status = "malformed-body", 400
+
+
+class NotFound(CowError):
+    """There is nothing here."""
+
+    code, status = "not-found", 404
+
+
+class MethodNotAllowed(CowError):
+    """This address does not take that method."""
+
+    code, status = "method-not-allowed", 405
+
+
+class ArtifactNotFound(CowError):
+    """No artifact has that digest."""
+
+    code, status = "artifact-not-found", 404
+
+
+class BodyTooLarge(CowError):
+    """The body is larger than the server takes."""
+
+    code, status = "body-too-large", 413
+
+
+class BodyTypeUnsupported(CowError):
+    """The body has a media type that the server does not take."""
+
+    code, status = "body-type-unsupported", 415
+
+
+class ImageTooLarge(CowError):
+    """The image has more pixels than the server takes."""
+
+    code, status = "image-too-large", 413
+
+
+class ImageUnreadable(CowError):
+    """The image could not be decoded."""
+
+    code, status = "image-unreadable", 422
+
+
+class ImageTypeUnsupported(CowError):
+    """The image is not PNG, JPEG or WebP."""
+
+    code, status = "image-type-unsupported", 415
+
+
+class ImageUrlNotAllowed(CowError):
+    """Images by URL are not allowed here."""
+
+    code, status = "image-url-not-allowed", 422
+
+
+class CannotGround(CowError):
+    """The object that moves could not be found."""
+
+    code, status = "cannot-ground", 422
+
+
+class CannotReadDirection(CowError):
+    """The direction of the motion could not be read."""
+
+    code, status = "cannot-read-direction", 422
+
+
+class ReaderUnavailable(CowError):
+    """The reader cannot run on this server."""
+
+    code, status = "reader-unavailable", 503
+
+
+class GeneratorUnavailable(CowError):
+    """The generator cannot run on this server."""
+
+    code, status = "generator-unavailable", 503
+
+
+class StorageUnavailable(CowError):
+    """The data folder cannot be written or read."""
+
+    code, status = "storage-unavailable", 503
+
+
+class InternalError(CowError):
+    """The server met an error of its own."""
+
+    code, status = "internal-error", 500

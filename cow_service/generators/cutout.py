@@ -1,0 +1,168 @@
+"""The CPU compositor: the mover is cut out and drawn along its trajectory over the filled-in background."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from cow_service import __version__
+from cow_service.generators.base import Shot
+from cow_service.images import fit_within
+from cow_service.physics.encounters import box_at, stands_nearer
+from cow_service.records import BBox, GeneratorInfo
+from cow_service.vision.fill import draw_in, fill_hole
+from cow_service.vision.obstacles import Obstacle, obstacles_of
+
+MAX_SIDE = 1280  # px: longer images give a clip of this size
+EDGE_SIGMA = 0.8  # px of softness at the cut
+HOLE_GROWTH = 0.03  # of the object's size: its rim is mixed with the background and must go too
+
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+
+
+class CutoutOptions(BaseModel):
+    """What `generator_options` may hold for the cutout generator."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    clean_cues: bool = Field(default=True, description="Take drawn arrows and boxes out of the frames.")
+
+
+@dataclass(frozen=True)
+class _Layers:
+    """What is composed, at the clip's size."""
+
+    background: Image  # [h, w, 3] with the mover taken out
+    sprite: Floats  # [a, b, 4] the mover, colours times alpha, then alpha 0..1
+    origin: tuple[float, float]  # x, y of the sprite's top left corner at the first frame, px
+    occluders: tuple[tuple[BBox, Floats], ...]  # boxes (px of the image) and alphas [h, w] of other objects
+    factor: float  # clip px per image px
+
+
+class CutoutGenerator:
+    """Milliseconds per frame, no weights. It moves a picture: it does not turn, light or break things."""
+
+    options_model = CutoutOptions
+
+    def describe(self, shot: Shot) -> GeneratorInfo:
+        """The same image, trajectory and version give the same frames; the seed changes nothing."""
+        return GeneratorInfo(name="cutout", revision=__version__, seed=shot.seed, options=shot.options.model_dump())
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """The image's own size, up to 1280 px on the longer side."""
+        factor = min(1.0, MAX_SIDE / max(width, height))
+        return max(1, round(width * factor)), max(1, round(height * factor))
+
+    def render(self, shot: Shot, wanted: Sequence[int]) -> Iterator[Image]:
+        """The wanted frames, RGB [h, w, 3]; only where the mover is are they composed anew."""
+        layers = _layers(shot)
+        start = np.array(shot.grounding.point)
+        airborne = shot.motion.kind in ("projectile", "fall")
+        for index in wanted:
+            point, scale = np.array(shot.trajectory.points[index]), shot.trajectory.scale[index]
+            box = box_at(shot.grounding.bbox, start, point, scale)
+            in_front = [alpha for other, alpha in layers.occluders if not stands_nearer(box, other, airborne=airborne)]
+            yield _compose(layers, start, point, scale, in_front)
+
+
+def create() -> CutoutGenerator:
+    """Factory for the registry."""
+    return CutoutGenerator()
+
+
+def _layers(shot: Shot) -> _Layers:
+    scene, options = shot.scene, shot.options
+    clean = not isinstance(options, CutoutOptions) or options.clean_cues
+    image = fit_within(scene.clean if clean else scene.image, MAX_SIDE)
+    size = image.shape[1], image.shape[0]
+    factor = image.shape[1] / scene.width
+    mover = _resized(scene.silhouette(shot.grounding.bbox), size)
+    obstacles = obstacles_of(scene, shot.grounding.bbox, shot.grounding.others)
+    others = np.zeros(mover.shape, bool)
+    for obstacle in obstacles:
+        others |= _resized(obstacle.mask, size)
+    growth = 2 * max(2, round(HOLE_GROWTH * float(np.sqrt(mover.sum())))) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (growth, growth))
+    hole = cv2.dilate(mover.astype(np.uint8), kernel) > 0
+    if clean:  # what continued a cue next to the mover has the mover's colour in it
+        hole |= _resized(scene.cues, size) & (cv2.dilate(hole.astype(np.uint8), kernel, iterations=3) > 0)
+    hole &= ~(others & ~mover)
+    sprite, origin = _sprite(image, mover)
+    occluders = tuple(
+        (obstacle.bbox, _soft(_resized(obstacle.mask, size) & ~mover)) for obstacle in _near(shot, obstacles)
+    )
+    return _Layers(fill_hole(image, hole, others & ~mover), sprite, origin, occluders, factor)
+
+
+def _near(shot: Shot, obstacles: Sequence[Obstacle]) -> list[Obstacle]:
+    """The objects whose box the mover's box crosses at some frame: no other can hide it."""
+    start, bbox = np.array(shot.grounding.point), shot.grounding.bbox
+    boxes = [
+        box_at(bbox, start, np.array(point), scale)
+        for point, scale in zip(shot.trajectory.points, shot.trajectory.scale, strict=True)
+    ]
+    return [
+        other
+        for other in obstacles
+        if any(
+            b[0] < other.bbox[2] and other.bbox[0] < b[2] and b[1] < other.bbox[3] and other.bbox[1] < b[3]
+            for b in boxes
+        )
+    ]
+
+
+def _sprite(image: Image, mover: Mask) -> tuple[Floats, tuple[float, float]]:
+    """The mover with a soft edge, and where its corner lies. Colours at the edge are the mover's own, not mixed ones."""
+    rows, columns = np.nonzero(mover.any(axis=1))[0], np.nonzero(mover.any(axis=0))[0]
+    pad = 4
+    top, left = int(rows[0]) - pad, int(columns[0]) - pad
+    bottom, right = int(rows[-1]) + 1 + pad, int(columns[-1]) + 1 + pad
+    inside = slice(max(0, top), min(mover.shape[0], bottom)), slice(max(0, left), min(mover.shape[1], right))
+    mask, colours = mover[inside], image[inside].astype(np.float32)
+    alpha = _soft(mask)
+    core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
+    own = draw_in(colours, core) if core.any() else colours
+    blended = np.where((core | ~mask)[..., None], np.where(core[..., None], colours, own), 0.5 * colours + 0.5 * own)
+    sprite = np.dstack([blended * alpha[..., None], alpha]).astype(np.float32)
+    return sprite, (float(inside[1].start), float(inside[0].start))
+
+
+def _compose(
+    layers: _Layers, start: NDArray[np.float64], point: NDArray[np.float64], scale: float, in_front: list[Floats]
+) -> Image:
+    """One frame: the sprite's corner moves with the object, to a fraction of a pixel."""
+    height, width = layers.background.shape[:2]
+    corner = layers.factor * point + scale * (np.array(layers.origin) - layers.factor * start)
+    reach = np.array(layers.sprite.shape[1::-1]) * scale
+    x0, y0 = (int(v) for v in np.floor(np.maximum(corner - 1, 0)))
+    x1, y1 = (int(v) for v in np.ceil(np.minimum(corner + reach + 1, [width, height])))
+    frame = layers.background.copy()
+    if x1 <= x0 or y1 <= y0:
+        return frame
+    shift = corner - [x0, y0] + 0.5 * scale - 0.5  # pixel centres, not corners, are what warpAffine maps
+    transform = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]], np.float64)
+    moved = cv2.warpAffine(layers.sprite, transform, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR)
+    for alpha in in_front:
+        moved *= 1 - alpha[y0:y1, x0:x1, None]
+    window = frame[y0:y1, x0:x1]
+    mixed = window * (1 - moved[..., 3:]) + moved[..., :3]
+    frame[y0:y1, x0:x1] = np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
+    return frame
+
+
+def _soft(mask: Mask) -> Floats:
+    """Alpha 0..1 of a mask: half at its outline."""
+    return np.asarray(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), EDGE_SIGMA), np.float32)
+
+
+def _resized(mask: Mask, size: tuple[int, int]) -> Mask:
+    if (mask.shape[1], mask.shape[0]) == size:
+        return mask
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5

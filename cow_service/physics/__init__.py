@@ -1,0 +1,1 @@
+"""How things move: pure computation on records and arrays, no images read, no I/O."""

@@ -1,0 +1,1 @@
+"""Readers: who looks at the image and says what moves, and how."""

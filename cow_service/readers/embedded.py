@@ -1,0 +1,186 @@
+"""The reader that needs no weights: rules for the question, classical vision for the image. It refuses rather than guess."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from cow_service import __version__
+from cow_service.errors import CannotGround, CannotReadDirection
+from cow_service.physics.camera import depth_motion
+from cow_service.readers.base import GroundingReading, MotionReading
+from cow_service.readers.matching import best_matches, describe, inside_drawn_box, match_one
+from cow_service.readers.phrases import ObjectPhrase
+from cow_service.readers.sentences import Question, parse
+from cow_service.records import BBox, Grounding, LocatedObject, ReaderInfo, Vector
+from cow_service.vision.arrows import Arrow
+from cow_service.vision.regions import Region
+from cow_service.vision.scene import SAME_OBJECT, Scene, iou
+
+REACH = 1.5  # sizes of the mover: an arrow that starts or ends further away is not its own
+RIVAL = 0.6  # a second arrow nearer than the first divided by this makes the choice unsure
+
+GIVE_PLACE = "Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the request."
+GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y down."
+
+
+class EmbeddedReader:
+    """Colour and noun of the mover, words and arrows for its direction. Nothing is kept between calls."""
+
+    source = "embedded"
+
+    @property
+    def info(self) -> ReaderInfo:
+        """Rules change with the version alone."""
+        return ReaderInfo(name="embedded", revision=__version__)
+
+    def ground(self, scene: Scene, question: str) -> GroundingReading:
+        """The region that fits the mover's words; `CannotGround` where none or several do."""
+        asked = parse(question)
+        if asked.mover is None:
+            raise CannotGround(
+                'No moving object was found in the words of the question. Ask like "If the red ball moves to the left, '
+                f'will it hit the vase?". {GIVE_PLACE}'
+            )
+        bbox = self._mover(scene, asked, asked.mover)
+        return GroundingReading(asked.mover.text, bbox, _others(scene, asked, bbox))
+
+    def read_motion(self, scene: Scene, question: str, grounding: Grounding) -> MotionReading:
+        """Kind and direction from the words, and from the arrow where the words speak of one."""
+        asked = parse(question)
+        words = asked.motion
+        kind = words.kind or "linear"
+        if kind == "static":
+            return MotionReading("static", None, "text")
+        if kind == "fall":
+            return MotionReading("fall", None, "gravity")
+        if words.arrow is not None:
+            arrow = _arrow_of(scene, grounding)
+            sign = 1.0 if words.arrow == "along" else -1.0
+            return MotionReading(kind, _scaled(arrow.direction, sign), "arrow", along_arrow=sign > 0)
+        if words.direction is not None:
+            return MotionReading(kind, words.direction, "text", depth=words.depth)
+        if words.depth:
+            direction, depth = depth_motion(words.depth)
+            return MotionReading(kind, direction, "text", depth=depth)
+        if words.towards is not None:
+            return MotionReading(kind, _towards(scene, asked, words.towards, grounding), "text")
+        if words.forward is not None:
+            raise CannotReadDirection(
+                f"The question says that the {grounding.object} moves {'forward' if words.forward else 'backward'}. Which way "
+                f"an object faces is beyond the embedded reader: it reads drawn arrows and words like left or up. {GIVE_DIRECTION}"
+            )
+        own = _arrows_near(scene, grounding)
+        if len(own) != 1:
+            raise CannotReadDirection(
+                f"The question names no direction (left, right, up, down, towards, away, along the arrow), and the image shows "
+                f"{len(own) or 'no'} arrow{'s' if len(own) > 1 else ''} at the {grounding.object}. {GIVE_DIRECTION}"
+            )
+        note = "The question names no direction; the arrow drawn at the object was followed."
+        return MotionReading(kind, own[0].direction, "arrow", along_arrow=True, warnings=(note,))
+
+    def _mover(self, scene: Scene, asked: Question, phrase: ObjectPhrase) -> BBox:
+        if phrase.inside_box:
+            return inside_drawn_box(scene, phrase, GIVE_PLACE)
+        if not scene.regions:
+            raise CannotGround(
+                f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to tell "
+                f"its objects apart. {GIVE_PLACE}"
+            )
+        fitting = best_matches(scene.regions, phrase, asked.others)
+        if len(fitting) > 1 and (asked.motion.arrow is not None or phrase.colour is None):
+            fitting = _at_arrow(scene, fitting) or fitting
+        if len(fitting) == 1:
+            return fitting[0].bbox
+        seen = describe(scene.regions)
+        if not fitting:
+            raise CannotGround(f"Looked for '{phrase.text}' and found nothing that fits. Seen: {seen}. {GIVE_PLACE}")
+        raise CannotGround(
+            f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. Seen in all: {seen}. {GIVE_PLACE}"
+        )
+
+
+def create() -> EmbeddedReader:
+    """Factory for the registry."""
+    return EmbeddedReader()
+
+
+def _others(scene: Scene, asked: Question, mover: BBox) -> tuple[LocatedObject, ...]:
+    """The other things that the question names, where exactly one region fits; the rest stay unnamed."""
+    rest = [region for region in scene.regions if iou(region.bbox, mover) < SAME_OBJECT]
+    found: list[LocatedObject] = []
+    for phrase in asked.others:
+        region = match_one(rest, phrase)
+        if region is not None and all(region.bbox != other.bbox for other in found):
+            found.append(LocatedObject(object=phrase.text, bbox=region.bbox))
+    return tuple(found)
+
+
+def _gap(arrow: Arrow, bbox: BBox) -> float:
+    """Distance (px) from a box to the nearer end of an arrow."""
+    return min(
+        math.hypot(max(bbox[0] - x, 0, x - bbox[2]), max(bbox[1] - y, 0, y - bbox[3]))
+        for x, y in (arrow.tail, arrow.tip)
+    )
+
+
+def _arrows_near(scene: Scene, grounding: Grounding) -> list[Arrow]:
+    """Arrows that start or end close to the mover, nearest first."""
+    x0, y0, x1, y1 = grounding.bbox
+    near = [arrow for arrow in scene.arrows if _gap(arrow, grounding.bbox) <= REACH * max(x1 - x0, y1 - y0)]
+    return sorted(near, key=lambda arrow: _gap(arrow, grounding.bbox))
+
+
+def _arrow_of(scene: Scene, grounding: Grounding) -> Arrow:
+    """The mover's arrow: the only one, or the one clearly nearest to it."""
+    arrows = sorted(scene.arrows, key=lambda arrow: _gap(arrow, grounding.bbox))
+    if not arrows:
+        raise CannotReadDirection(
+            "The question speaks of an arrow, but no drawn arrow was found: looked for one flat colour with a straight shaft and "
+            f"a head. {GIVE_DIRECTION}"
+        )
+    if len(arrows) > 1 and _gap(arrows[0], grounding.bbox) > RIVAL * _gap(arrows[1], grounding.bbox):
+        places = "; ".join(
+            f"from ({a.tail[0]:.0f}, {a.tail[1]:.0f}) to ({a.tip[0]:.0f}, {a.tip[1]:.0f})" for a in arrows
+        )
+        raise CannotReadDirection(
+            f"The question speaks of one arrow, but {len(arrows)} were found, and none is clearly that of the {grounding.object}: "
+            f"{places}. {GIVE_DIRECTION}"
+        )
+    return arrows[0]
+
+
+def _at_arrow(scene: Scene, regions: Sequence[Region]) -> list[Region]:
+    """Of several regions the one at which the only arrow starts, if it is clearly that one."""
+    if len(scene.arrows) != 1:
+        return []
+    arrow = scene.arrows[0]
+
+    def gap(region: Region) -> float:
+        x0, y0, x1, y1 = region.bbox
+        x, y = arrow.tail
+        return math.hypot(max(x0 - x, 0, x - x1), max(y0 - y, 0, y - y1)) / max(x1 - x0, y1 - y0)
+
+    ranked = sorted(regions, key=gap)
+    first, second = gap(ranked[0]), gap(ranked[1])
+    return [ranked[0]] if first <= REACH and (first < RIVAL * second or (first == 0 and second > 0)) else []
+
+
+def _towards(scene: Scene, asked: Question, phrase: ObjectPhrase, grounding: Grounding) -> Vector:
+    """From the mover to the thing that it moves towards."""
+    goal = next((other for other in grounding.others if other.object == phrase.text), None)
+    bbox = goal.bbox if goal is not None else None
+    if bbox is None:
+        region = match_one([r for r in scene.regions if iou(r.bbox, grounding.bbox) < SAME_OBJECT], phrase)
+        bbox = None if region is None else region.bbox
+    if bbox is None:
+        raise CannotReadDirection(
+            f"The {grounding.object} moves towards '{phrase.text}', which was not found. Seen: {describe(scene.regions)}. "
+            f"{GIVE_DIRECTION}"
+        )
+    x, y = grounding.point
+    return (bbox[0] + bbox[2]) / 2 - x, (bbox[1] + bbox[3]) / 2 - y
+
+
+def _scaled(vector: Vector, factor: float) -> Vector:
+    return factor * vector[0], factor * vector[1]

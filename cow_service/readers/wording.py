@@ -1,0 +1,50 @@
+"""Says a motion in words: the sentence that goes to a video generator as its prompt."""
+
+from __future__ import annotations
+
+import math
+
+from cow_service.readers.prompts import load_prompt
+from cow_service.records import MotionKind, Vector
+
+MAX_OBJECT = 200  # characters
+ALONG_AXIS = 0.95  # sine of the angle out of the image plane from which only the depth is worth a word
+IN_PLANE = 0.3  # and up to which it is not
+
+# 16 sectors of 22.5 degrees, from the right, turning upwards.
+_QUARTERS = (
+    ("to the right", "up"),
+    ("up", "to the left"),
+    ("to the left", "down"),
+    ("down", "to the right"),
+)
+_DETERMINERS = ("the ", "a ", "an ", "this ", "that ")
+
+
+def direction_words(direction: Vector | None, depth: float) -> str:
+    """A direction as a short phrase, such as "to the right and slightly up"; empty where there is none.
+
+    `direction` is in image pixels, x right, y down, of any length; `depth` as in `Motion`.
+    """
+    flat = _flat_words(direction)
+    away = "away from the camera" if depth > 0 else "towards the camera"
+    if not flat or abs(depth) >= ALONG_AXIS:
+        return away if abs(depth) > IN_PLANE else flat
+    return f"{flat} and {away}" if abs(depth) > IN_PLANE else flat
+
+
+def _flat_words(direction: Vector | None) -> str:
+    if direction is None or math.hypot(*direction) == 0 or not all(map(math.isfinite, direction)):
+        return ""
+    sector = round(math.atan2(-direction[1], direction[0]) / (math.pi / 8)) % 16
+    main, side = _QUARTERS[sector // 4]
+    return (main, f"{main} and slightly {side}", f"{main} and {side}", f"{side} and slightly {main}")[sector % 4]
+
+
+def motion_sentence(object: str, kind: MotionKind, direction: Vector | None, depth: float) -> str:
+    """The motion in one line: a declarative sentence and a remark that the camera stays still."""
+    name = " ".join(object.split())[:MAX_OBJECT].rstrip()
+    determiner = next((word for word in _DETERMINERS if name.lower().startswith(word)), "")
+    words = direction_words(direction, depth)
+    text = load_prompt("motion-sentence").render(object=name[len(determiner) :], kind=kind, words=words)
+    return " ".join(text.split())

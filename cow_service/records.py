@@ -1,0 +1,223 @@
+"""The nouns of the service: frozen records that cross every wall, the SDK and the wire alike.
+
+Coordinates are pixels of the upright input image, x right, y down, (0, 0) the image's top left corner.
+Times are seconds from the first frame. Records hold no pixels and do no I/O: bytes are named by their SHA-256.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Point = tuple[float, float]
+BBox = tuple[float, float, float, float]
+Vector = tuple[float, float]
+State = tuple[float, float, float, float, float, float]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+Source = Literal["mllm", "embedded", "request"]
+MotionKind = Literal["linear", "projectile", "fall", "static"]
+Cue = Literal["arrow", "orientation", "text", "gravity", "request"]
+EncounterKind = Literal["touches", "occludes", "occluded-by"]
+FramePolicy = Literal["initial", "uniform", "events"]
+
+
+class Record(BaseModel):
+    """A frozen record; unknown fields are an error, so that a misspelt one is never ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Artifact(Record):
+    """Bytes kept by the service. It names them; it does not hold them."""
+
+    sha256: Sha256
+    url: str = Field(description="Path of the bytes on the server that made them.")
+    media_type: str
+    size: int = Field(ge=0, description="Bytes.")
+
+
+class ImageInfo(Record):
+    """The input image, upright. `sha256` is that of the bytes as they were sent."""
+
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
+    sha256: Sha256
+
+
+class LocatedObject(Record):
+    """Something in the image, in words and with its box."""
+
+    object: str
+    bbox: BBox = Field(description="[x0, y0, x1, y1], px.")
+
+
+class Grounding(Record):
+    """Stage 1: which object moves, and where it is. It does not say how it moves."""
+
+    object: str = Field(description="Words that single it out.")
+    point: Point = Field(description="[x, y], px: the centre of the box.")
+    bbox: BBox = Field(description="[x0, y0, x1, y1], px.")
+    mask: Artifact | None = Field(default=None, description="PNG of the image's size, white where the object is.")
+    others: tuple[LocatedObject, ...] = Field(
+        default=(), description="Other things that the question names, where they were found."
+    )
+    source: Source
+
+
+class MetresPerPixel(Record):
+    """The scale of the scene at the object, and where it came from."""
+
+    value: float = Field(gt=0, description="Metres per pixel at the object's depth.")
+    source: Literal["default", "reference", "request"]
+    note: str = Field(default="", description="What it was taken from, in words.")
+
+
+class Motion(Record):
+    """Stage 2: how the object moves. It does not say where it gets to."""
+
+    kind: MotionKind
+    direction: Vector | None = Field(description="Unit vector in the image, px; null for a fall or a static object.")
+    depth: float = Field(
+        default=0.0,
+        ge=-1,
+        le=1,
+        description="Sine of the angle out of the image plane: positive away from the camera, negative towards it.",
+    )
+    cue: Cue
+    along_arrow: bool | None = Field(default=None, description="Along or against it, where the cue is an arrow.")
+    speed: float = Field(ge=0, description="px/s at the depth of the first frame.")
+    gravity: Vector = Field(default=(0.0, 0.0), description="px/s^2.")
+    metres_per_pixel: MetresPerPixel
+    sentence: str = Field(description="The motion in one declarative sentence: the generator's prompt.")
+    source: Source
+
+
+class Encounter(Record):
+    """The mover's silhouette meets another object on its way. Computed from the image alone: a hypothesis."""
+
+    object: str
+    bbox: BBox = Field(description="[x0, y0, x1, y1], px, of the other object.")
+    first_frame: int = Field(ge=0, description="The first clip frame of the encounter.")
+    kind: EncounterKind
+
+
+class TrajectoryUnits(Record):
+    """Units of `Trajectory.states`."""
+
+    position: Literal["m"] = "m"
+    velocity: Literal["m/s"] = "m/s"
+    frame: Literal["camera: x right, y down, z depth"] = "camera: x right, y down, z depth"
+
+
+class Trajectory(Record):
+    """Stage 3: where the object's centre is in every frame of the clip, and what it meets."""
+
+    fps: float = Field(gt=0, description="Frames per second of the clip.")
+    states: tuple[State, ...] = Field(description="[x, y, z, vx, vy, vz] per frame: the 6-D state of the object.")
+    units: TrajectoryUnits = TrajectoryUnits()
+    points: tuple[Point, ...] = Field(description="[x, y] per frame, px.")
+    visible: tuple[bool, ...] = Field(description="Per frame: the point is inside the image.")
+    scale: tuple[float, ...] = Field(description="Per frame: apparent size, 1 at the first frame.")
+    tracks: tuple[tuple[Point, ...], ...] = Field(
+        description="Several points inside the object's mask, each [x, y] per frame, px."
+    )
+    anchors: tuple[Point, ...] = Field(description="Static points that hold the camera still, px.")
+    encounters: tuple[Encounter, ...] = ()
+
+
+class Frame(Record):
+    """One picture of the clip."""
+
+    index: int = Field(ge=0, description="Which frame of the clip.")
+    time: float = Field(ge=0, description="Seconds.")
+    url: str
+    sha256: Sha256
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
+
+
+class Video(Record):
+    """The clip as H.264 in MP4."""
+
+    url: str
+    sha256: Sha256
+    fps: float = Field(gt=0)
+    num_frames: int = Field(gt=0)
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
+
+
+class Clip(Record):
+    """Stage 4: the frames that were asked for and, where wanted, the whole clip as video."""
+
+    fps: float = Field(gt=0)
+    num_frames: int = Field(gt=0)
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
+    frames: tuple[Frame, ...]
+    video: Video | None = None
+
+
+class ReaderInfo(Record):
+    """Who read the image, and what would have to be the same to read it so again."""
+
+    name: str
+    model: str | None = None
+    revision: str | None = None
+    stages: tuple[Literal["grounding", "motion"], ...] = Field(
+        default=(), description="The stages it was asked for; the others came with the request."
+    )
+
+
+class GeneratorInfo(Record):
+    """Who made the frames, and what would have to be the same to make them again."""
+
+    name: str
+    model: str | None = None
+    revision: str | None = None
+    seed: int
+    steps: int | None = Field(default=None, description="Sampling steps; null where there are none.")
+    options: dict[str, bool | int | float | str] = Field(default_factory=dict)
+
+
+class Simulation(Record):
+    """The whole way from image and question to frames: what `POST /simulate` returns."""
+
+    id: str
+    status: Literal["succeeded"] = "succeeded"
+    created_at: str = Field(description="RFC 3339, UTC.")
+    question: str
+    image: ImageInfo
+    grounding: Grounding
+    motion: Motion
+    trajectory: Trajectory
+    frames: tuple[Frame, ...] = Field(description="The frames chosen for reasoning.")
+    video: Video | None = Field(description="Null where the request said `video: false`.")
+    overlay: Artifact = Field(description="The input with box, point, arrow and path drawn.")
+    generator: GeneratorInfo
+    reader: ReaderInfo
+    timings: dict[str, float] = Field(description="Seconds per stage.")
+    warnings: tuple[str, ...] = ()
+
+
+class BackendInfo(Record):
+    """A reader or generator: what it is, what it needs, whether it is ready."""
+
+    name: str
+    default: bool = Field(description="Used where a request names none.")
+    ready: bool
+    summary: str
+    licence: str | None = None
+    weights: str | None = Field(default=None, description="Repository of its weights; null where it has none.")
+    missing: tuple[str, ...] = Field(default=(), description="Python modules that are not installed.")
+    install: str | None = Field(default=None, description="The command that installs them.")
+    defaults: dict[str, bool | int | float | str] = Field(default_factory=dict)
+
+
+class Models(Record):
+    """What `GET /models` returns."""
+
+    readers: tuple[BackendInfo, ...]
+    generators: tuple[BackendInfo, ...]

@@ -1,0 +1,154 @@
+"""What a caller may ask: the body of `POST /simulate`. Checked once, here; inside, these values are trusted."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from cow_service.records import BBox, FramePolicy, MotionKind, Point, Record, Sha256, Vector
+
+MAX_FRAMES = 481
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class ImageArtifact(Record):
+    """An image that the service already keeps."""
+
+    artifact: Sha256
+
+
+class ImageUrl(Record):
+    """An image to be fetched; off unless the server allows it."""
+
+    url: str = Field(max_length=4096)
+
+
+ImageRef = (
+    Annotated[str, Field(description="data:image/png;base64,... (PNG, JPEG or WebP)", pattern=r"^data:")]
+    | ImageArtifact
+    | ImageUrl
+)
+
+
+class GroundingRequest(Record):
+    """Skips stage 1: the object's box, or a point on it, from which the box is cut."""
+
+    object: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    bbox: tuple[Finite, Finite, Finite, Finite] | None = Field(default=None, description="[x0, y0, x1, y1], px.")
+    point: tuple[Finite, Finite] | None = Field(default=None, description="[x, y], px.")
+
+    @model_validator(mode="after")
+    def _one_place(self) -> GroundingRequest:
+        if (self.bbox is None) == (self.point is None):
+            raise ValueError("give either `bbox` or `point`")
+        return self
+
+    @field_validator("bbox")
+    @classmethod
+    def _has_area(cls, bbox: BBox | None) -> BBox | None:
+        if bbox is not None and (bbox[2] - bbox[0] < 2 or bbox[3] - bbox[1] < 2):
+            raise ValueError(f"[x0, y0, x1, y1] must span at least 2 px each way, got {list(bbox)}")
+        return bbox
+
+
+class MotionRequest(Record):
+    """Skips stage 2: how the object moves."""
+
+    kind: MotionKind = "linear"
+    direction: tuple[Finite, Finite] | None = Field(
+        default=None,
+        description="[dx, dy] in the image, any length but zero; not needed for a fall or a static object.",
+    )
+    depth: float = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
+    speed: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False)] | None = Field(
+        default=None, description="px/s; by default 0.26 image widths per second."
+    )
+    metres_per_pixel: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = Field(
+        default=None, description="By default the image is taken to be 3 m wide at the object."
+    )
+
+    @model_validator(mode="after")
+    def _goes_somewhere(self) -> MotionRequest:
+        if self.kind in ("linear", "projectile") and self.direction is None:
+            raise ValueError(f"a {self.kind} motion needs a `direction` [dx, dy]")
+        return self
+
+    @field_validator("direction")
+    @classmethod
+    def _has_length(cls, direction: Vector | None) -> Vector | None:
+        if direction is not None and not 1e-9 < math.hypot(*direction) < 1e12:
+            raise ValueError(f"[dx, dy] must have a length, got {list(direction)}")
+        return direction
+
+
+class TrajectoryRequest(Record):
+    """Skips stage 3: where the object's centre is, at `fps`. After the last point it stays there."""
+
+    points: tuple[tuple[Finite, Finite], ...] = Field(min_length=2, max_length=4096, description="[[x, y], ...], px.")
+    fps: float = Field(default=16, gt=0, le=240)
+
+    @field_validator("points")
+    @classmethod
+    def _near_the_image(cls, points: tuple[Point, ...]) -> tuple[Point, ...]:
+        far = next((point for point in points if max(abs(point[0]), abs(point[1])) > 1e6), None)
+        if far is not None:
+            raise ValueError(f"points lie at most 1,000,000 px from the image, got {list(far)}")
+        return points
+
+
+class FramesRequest(Record):
+    """Which frames of the clip to return as pictures, and how large."""
+
+    policy: FramePolicy = Field(
+        default="initial",
+        description="initial: frames 1, 3, 5, ...; uniform: evenly over the clip; events: at encounters and on the way.",
+    )
+    count: int = Field(default=3, ge=1, le=64)
+    indices: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
+        default=None, min_length=1, max_length=MAX_FRAMES, description="Exactly these frames; overrides the policy."
+    )
+    max_side: Annotated[int, Field(ge=16, le=8192)] | None = Field(
+        default=512, description="Longest side of the pictures, px; null for the clip's own size."
+    )
+
+
+class SimulateRequest(Record):
+    """One image and one what-if question; everything else has a default."""
+
+    image: ImageRef
+    question: str = Field(min_length=1, max_length=4000)
+    options: tuple[Annotated[str, Field(max_length=400)], ...] | None = Field(
+        default=None, max_length=26, description="Answer options; for `/answer`, ignored here."
+    )
+    grounding: GroundingRequest | None = None
+    motion: MotionRequest | None = None
+    trajectory: TrajectoryRequest | None = None
+    reader: str | None = Field(default=None, description="By default the server's.")
+    generator: str | None = Field(default=None, description="By default the server's.")
+    num_frames: int = Field(default=81, ge=2, le=MAX_FRAMES)
+    fps: float = Field(default=16, ge=1, le=60)
+    seed: int = Field(default=0, ge=0, le=2**32 - 1)
+    video: bool = Field(default=True, description="Whether to make the mp4 of the whole clip.")
+    frames: FramesRequest = FramesRequest()
+    generator_options: dict[str, Any] = Field(default_factory=dict, description="As the generator defines them.")
+
+    @field_validator("question")
+    @classmethod
+    def _says_something(cls, question: str) -> str:
+        if not question.strip():
+            raise ValueError("the question is empty")
+        return question
+
+    @model_validator(mode="after")
+    def _frames_exist(self) -> SimulateRequest:
+        for index in self.frames.indices or ():
+            if index >= self.num_frames:
+                raise ValueError(
+                    f"`frames.indices` names frame {index}, but the clip has frames 0 to {self.num_frames - 1}"
+                )
+        return self
+
+
+Stage = Literal["grounding", "motion", "trajectory", "generation"]

@@ -1,0 +1,121 @@
+"""The composition root: settings in, a service that simulates out. Nothing else chooses a backend."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+
+from cow_service.artifacts import ArtifactStore
+from cow_service.errors import (
+    CowError,
+    FieldError,
+    GeneratorUnavailable,
+    ImageUrlNotAllowed,
+    InvalidRequest,
+    ReaderUnavailable,
+)
+from cow_service.generators.base import Generator
+from cow_service.images import DecodedImage, decode
+from cow_service.manifests import load_manifests
+from cow_service.pipeline import Backends, Progress, simulate
+from cow_service.plugins import Registry
+from cow_service.readers.base import Reader
+from cow_service.records import Artifact, BackendInfo, Models, Simulation
+from cow_service.requests import ImageArtifact, ImageRef, ImageUrl, SimulateRequest
+from cow_service.settings import Settings
+
+_DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)
+
+
+def _ignore(stage: str, done: float) -> None:
+    """Nobody listens."""
+
+
+class Service:
+    """Everything a server or a command line needs, made once. Safe to use from several threads."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.artifacts = ArtifactStore(settings.data_dir / "artifacts")
+        self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable)
+        self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable)
+
+    def keep_image(self, data: bytes) -> Artifact:
+        """Checks an image (PNG, JPEG or WebP) and keeps its bytes as sent. Raises the image errors of `images.decode`."""
+        image = decode(data, max_megapixels=self.settings.max_image_megapixels)
+        return self.artifacts.put(data, image.media_type)
+
+    def simulate(self, request: SimulateRequest, progress: Progress = _ignore) -> Simulation:
+        """One simulation, start to end. Raises any `CowError` of its stages."""
+        backends = Backends(
+            reader_name=self._known("reader", request.reader or self.settings.reader, self.readers),
+            reader=lambda: self.readers.get(request.reader or self.settings.reader),
+            generator=self.generators.get(
+                self._known("generator", request.generator or self.settings.generator, self.generators)
+            ),
+            artifacts=self.artifacts,
+        )
+        return simulate(request, self._image(request.image), backends, progress)
+
+    def models(self) -> Models:
+        """Readers and generators, what each needs, and whether it is ready."""
+        return Models(
+            readers=tuple(self._describe("reader", name) for name in self.readers.names()),
+            generators=tuple(self._describe("generator", name) for name in self.generators.names()),
+        )
+
+    def check(self) -> None:
+        """Raises the `CowError` that would keep the default request from succeeding."""
+        self.artifacts.check()
+        self.readers.get(self._known("reader", self.settings.reader, self.readers))
+        self.generators.get(self._known("generator", self.settings.generator, self.generators))
+
+    def _image(self, ref: ImageRef) -> DecodedImage:
+        if isinstance(ref, ImageUrl):
+            raise ImageUrlNotAllowed("This server fetches no images. Send the image as a data URL or as a file part.")
+        if isinstance(ref, ImageArtifact):
+            return decode(self.artifacts.read(ref.artifact), max_megapixels=self.settings.max_image_megapixels)
+        data = decode_data_url(ref)
+        image = decode(data, max_megapixels=self.settings.max_image_megapixels)
+        self.artifacts.put(data, image.media_type)
+        return image
+
+    def _known(self, door: str, name: str, registry: Registry[Reader] | Registry[Generator]) -> str:
+        if name not in registry.names():
+            detail = f"There is no {door} '{name}'. There are: {', '.join(registry.names()) or 'none'}."
+            raise InvalidRequest(detail, errors=(FieldError(f"/{door}", detail),))
+        return name
+
+    def _describe(self, door: str, name: str) -> BackendInfo:
+        manifest = load_manifests().get(name)
+        default = name == (self.settings.reader if door == "reader" else self.settings.generator)
+        if manifest is None:
+            return BackendInfo(name=name, default=default, ready=True, summary="No manifest.")
+        missing = manifest.missing_modules()
+        return BackendInfo(
+            name=name,
+            default=default,
+            ready=not missing,
+            summary=manifest.summary,
+            licence=manifest.licence,
+            weights=manifest.weights,
+            missing=missing,
+            install=manifest.install_line() if missing else None,
+            defaults=manifest.defaults,
+        )
+
+
+def decode_data_url(url: str) -> bytes:
+    """The bytes of a base64 data URL. Raises `InvalidRequest` pointing at `/image`."""
+    head = _DATA_URL.match(url[:256])
+    if head is None or head["base64"] is None:
+        raise _bad_image("`image` must be a data URL with base64: data:image/png;base64,...")
+    try:
+        return base64.b64decode(url[head.end() :], validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise _bad_image(f"The base64 of `image` cannot be decoded: {error}.") from error
+
+
+def _bad_image(detail: str) -> CowError:
+    return InvalidRequest(detail, errors=(FieldError("/image", detail),))

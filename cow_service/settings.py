@@ -1,0 +1,47 @@
+"""Settings of the service, from the environment: each `COW_` plus the field's name in capitals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from platformdirs import user_data_path
+from pydantic import Field, ValidationError
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class SettingsError(Exception):
+    """A setting has a value that cannot be used. The message names each one and what it takes."""
+
+
+class Settings(BaseSettings):
+    """What a server or a command line run may be told."""
+
+    model_config = SettingsConfigDict(env_prefix="COW_", frozen=True, extra="ignore")
+
+    data_dir: Path = Field(
+        default_factory=lambda: user_data_path("cow", appauthor=False),
+        description="Folder for artifacts; made if missing.",
+    )
+    host: str = Field(default="127.0.0.1", description="Address the server listens on.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port the server listens on; 0 takes a free one.")
+    reader: str = Field(default="embedded", description="Reader where a request names none.")
+    generator: str = Field(default="cutout", description="Generator where a request names none.")
+    max_image_megapixels: float = Field(
+        default=25, gt=0, le=500, allow_inf_nan=False, description="Largest image taken, in millions of pixels."
+    )
+    max_body_mb: float = Field(
+        default=32, gt=0, le=4096, allow_inf_nan=False, description="Largest request body taken, in MB (10^6 bytes)."
+    )
+    concurrency: int = Field(default=2, ge=1, le=256, description="Simulations computed at the same time; others wait.")
+
+
+def load_settings(**overrides: Any) -> Settings:
+    """Settings from the environment, with overrides that are not None. Raises `SettingsError` for a bad value."""
+    try:
+        return Settings(**{name: value for name, value in overrides.items() if value is not None})
+    except ValidationError as error:
+        told = "; ".join(
+            f"COW_{str(item['loc'][0]).upper()}={item['input']!r}: {item['msg']}" for item in error.errors()
+        )
+        raise SettingsError(f"Bad settings: {told}.") from error

@@ -1,0 +1,65 @@
+"""Stage 1: which object moves, and where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.errors import FieldError, InvalidRequest
+from cow_service.readers.base import Reader
+from cow_service.records import Artifact, BBox, Grounding, Point
+from cow_service.requests import GroundingRequest
+from cow_service.vision.scene import Scene
+
+DEFAULT_NAME = "object"
+
+
+def ground(
+    scene: Scene,
+    question: str,
+    given: GroundingRequest | None,
+    reader: Callable[[], Reader],
+    keep_mask: Callable[[NDArray[np.bool_]], Artifact],
+) -> Grounding:
+    """The mover, from the request where it says so, else from the reader. Its mask [H, W] is kept as an artifact.
+
+    Raises `InvalidRequest` for a place outside the image, and what the reader raises.
+    """
+    if given is not None:
+        bbox = _bbox_given(scene, given)
+        name, others, source = given.object or DEFAULT_NAME, (), "request"
+    else:
+        reading = reader().ground(scene, question)
+        bbox, name, others, source = reading.bbox, reading.object, reading.others, reader().source
+    return Grounding(
+        object=name,
+        point=_centre(bbox),
+        bbox=bbox,
+        mask=keep_mask(scene.silhouette(bbox)),
+        others=others,
+        source=source,
+    )
+
+
+def _bbox_given(scene: Scene, given: GroundingRequest) -> BBox:
+    if given.point is not None:
+        x, y = given.point
+        if not (0 <= x < scene.width and 0 <= y < scene.height):
+            raise _outside("/grounding/point", list(given.point), scene)
+        return scene.bbox_at(given.point)
+    x0, y0, x1, y1 = given.bbox or (0.0, 0.0, 0.0, 0.0)
+    clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
+    if clipped[2] - clipped[0] < 2 or clipped[3] - clipped[1] < 2:
+        raise _outside("/grounding/bbox", [x0, y0, x1, y1], scene)
+    return clipped
+
+
+def _outside(pointer: str, value: list[float], scene: Scene) -> InvalidRequest:
+    detail = f"{value} lies outside the upright image of {scene.width} x {scene.height} px."
+    return InvalidRequest(f"{detail} Give pixels, x right and y down.", errors=(FieldError(pointer, detail),))
+
+
+def _centre(bbox: BBox) -> Point:
+    return (bbox[0] + bbox[2]) / 2, (bbox[1] + bbox[3]) / 2

@@ -1,0 +1,124 @@
+"""Frames to an MP4 file that every browser plays. This is the seam to FFmpeg."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterable
+from contextlib import ExitStack
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import OutputContainer
+from av.error import FFmpegError
+from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from cow_service.errors import CowError, InternalError, StorageUnavailable
+
+CRF_DEFAULT = 18  # x264's constant rate factor, 0 (lossless) to 51; 18 looks lossless
+_PRESET = "veryfast"
+_THREADS = 2
+_MAX_DENOMINATOR = 1001  # of the frame rate: 30000/1001 is broadcast's 29.97
+_BT709 = 1  # code point of its matrix, primaries and transfer alike (ITU-T H.273)
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def write_mp4(
+    frames: Iterable[NDArray[np.uint8]],
+    path: Path,
+    *,
+    fps: float,
+    width: int,
+    height: int,
+    crf: int = CRF_DEFAULT,
+) -> int:
+    """Write frames, each [height, width, 3] RGB, as H.264 (High, 4:2:0, BT.709) and return how many there were.
+
+    Frames are taken one at a time, and frame i is shown at exactly i / fps seconds. The index stands before the
+    pictures, so that a browser can start before it has all. H.264 4:2:0 needs even sides: an odd one is padded by
+    repeating its last row or column.
+
+    Raises `ValueError` for no frames, a frame of another shape, or a rate or size that is not positive;
+    `StorageUnavailable` if the disk is full; `InternalError` if FFmpeg fails otherwise. What `frames` raises passes
+    through. After an error no file is left.
+    """
+    rate = _rate(fps)
+    if width < 1 or height < 1:
+        raise ValueError(f"The video is {width} x {height} px: both sides must be at least 1 px.")
+    with ExitStack() as on_error:
+        on_error.callback(path.unlink, missing_ok=True)
+        try:
+            with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+                stream = _add_stream(container, rate, width, height, crf)
+                count = _encode(frames, container, stream, (height, width, 3))
+        except FFmpegError as error:
+            raise _translated(error) from error
+        if count == 0:
+            raise ValueError("There are no frames: a video needs at least one.")
+        on_error.pop_all()
+    return count
+
+
+def _rate(fps: float) -> Fraction:
+    if not 0 < fps < float("inf"):
+        raise ValueError(f"fps is {fps}: give a positive number of frames per second.")
+    rate = Fraction(fps).limit_denominator(_MAX_DENOMINATOR)
+    if rate == 0:
+        raise ValueError(f"fps is {fps}: give at least {1 / _MAX_DENOMINATOR:.4f} frames per second.")
+    return rate
+
+
+def _add_stream(container: OutputContainer, rate: Fraction, width: int, height: int, crf: int) -> VideoStream:
+    options = {"crf": str(crf), "preset": _PRESET, "profile": "high"}
+    stream = container.add_stream("libx264", rate=rate, options=options)
+    context = stream.codec_context
+    context.width, context.height = width + width % 2, height + height % 2
+    context.pix_fmt = "yuv420p"
+    context.time_base = 1 / rate
+    # Without these tags players guess the matrix from the height of the video, and colours shift.
+    context.colorspace = context.color_primaries = context.color_trc = _BT709
+    context.color_range = ColorRange.MPEG
+    context.thread_count = _THREADS
+    # Slices, the default, would cost compression.
+    context.thread_type = "FRAME"
+    return stream
+
+
+def _encode(
+    frames: Iterable[NDArray[np.uint8]], container: OutputContainer, stream: VideoStream, shape: tuple[int, int, int]
+) -> int:
+    # One for all frames: to prepare it takes longer than to convert a frame.
+    reformatter = VideoReformatter()
+    count = 0
+    for pixels in frames:
+        if pixels.shape != shape or pixels.dtype != np.uint8:
+            raise ValueError(f"Frame {count} is {pixels.shape} of {pixels.dtype}: it must be {shape} of uint8.")
+        frame = _to_yuv(pixels, reformatter)
+        frame.pts, frame.time_base = count, stream.codec_context.time_base
+        container.mux(stream.encode(frame))
+        count += 1
+    if count:
+        container.mux(stream.encode(None))
+    return count
+
+
+def _to_yuv(pixels: NDArray[np.uint8], reformatter: VideoReformatter) -> av.VideoFrame:
+    height, width = pixels.shape[:2]
+    even = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge") if height % 2 or width % 2 else pixels
+    return reformatter.reformat(
+        av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24"),
+        format="yuv420p",
+        dst_colorspace=Colorspace.ITU709,
+        dst_color_range=ColorRange.MPEG,
+        interpolation=Interpolation.AREA,
+    )
+
+
+def _translated(error: FFmpegError) -> CowError:
+    # The number and its name alone: the text of the error holds the path.
+    if error.errno in _FULL:
+        return StorageUnavailable("The disk is full, the video could not be written: free some space and try again.")
+    return InternalError(f"The video could not be encoded (FFmpeg: {error.strerror}).")

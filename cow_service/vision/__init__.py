@@ -1,0 +1,1 @@
+"""Classical vision: what can be measured in an image without a model."""

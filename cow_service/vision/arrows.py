@@ -1,0 +1,200 @@
+"""Finds arrows drawn over an image: one flat colour, a straight shaft, a head that is open or filled.
+
+The image is read as it is; nothing is learnt. A candidate is a connected patch of one colour; it is an arrow when its
+width along its own axis is that of a shaft followed by a head that tapers to a tip, and when an ideal arrow of those
+measures covers the patch. Objects of a scene (bottles, cones, pencils) fail one of the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask, full_size
+
+MIN_FIT = 0.73  # intersection over union with the ideal arrow
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """A drawn arrow, in pixels of the image it was found in. It says where the drawing points, not what moves."""
+
+    tail: tuple[float, float]
+    tip: tuple[float, float]
+    thickness: float
+    head_width: float
+    colour: tuple[int, int, int]  # RGB
+    filled: bool
+    mask: NDArray[np.bool_]  # [H, W]: the drawing with its outline and its fringe
+    fit: float  # intersection over union with the ideal arrow, 0..1
+
+    @property
+    def direction(self) -> tuple[float, float]:
+        """Unit vector from tail to tip."""
+        dx, dy = self.tip[0] - self.tail[0], self.tip[1] - self.tail[1]
+        length = float(np.hypot(dx, dy))
+        return dx / length, dy / length
+
+    @property
+    def length(self) -> float:
+        """Pixels from tail to tip."""
+        return float(np.hypot(self.tip[0] - self.tail[0], self.tip[1] - self.tail[1]))
+
+
+@dataclass(frozen=True)
+class _Shape:
+    tail: NDArray[np.float64]
+    tip: NDArray[np.float64]
+    thickness: float
+    head_width: float
+    head_length: float
+    filled: bool
+    fit: float
+
+
+def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[Arrow, ...]:
+    """Drawn arrows among the strokes of an image whose full size is [height, width]; overlapping findings are one."""
+    found = [(shape, stroke) for stroke in strokes if (shape := fit_arrow(stroke.patch)) is not None]
+    found.sort(key=lambda item: -item[0].fit * np.linalg.norm(item[0].tip - item[0].tail) ** 0.25)
+    arrows: list[Arrow] = []
+    taken = np.zeros(image.pixels.shape[:2], bool)
+    for shape, stroke in found:
+        h, w = stroke.patch.shape
+        if (taken[stroke.y : stroke.y + h, stroke.x : stroke.x + w] & stroke.patch).sum() > 0.2 * stroke.patch.sum():
+            continue
+        mask = drawing_mask(image.pixels, stroke)
+        taken |= mask
+        offset = np.array([stroke.x, stroke.y])
+        tail, tip = ((point + offset + 0.5) / image.scale - 0.5 for point in (shape.tail, shape.tip))
+        arrows.append(
+            Arrow(
+                tail=(float(tail[0]), float(tail[1])),
+                tip=(float(tip[0]), float(tip[1])),
+                thickness=shape.thickness / image.scale,
+                head_width=shape.head_width / image.scale,
+                colour=stroke.colour,
+                filled=shape.filled,
+                mask=full_size(mask, size),
+                fit=shape.fit,
+            )
+        )
+    return tuple(arrows)
+
+
+def fit_arrow(patch: NDArray[np.bool_]) -> _Shape | None:
+    """The arrow that a patch [h, w] is, or None. Coordinates are those of the patch."""
+    ys, xs = np.nonzero(patch)
+    points = np.stack([xs, ys], axis=1).astype(np.float64)
+    centre = points.mean(axis=0)
+    _, vectors = np.linalg.eigh(np.cov((points - centre).T))
+    best: _Shape | None = None
+    hull = cv2.convexHull(points.astype(np.float32))[:, 0]
+    gaps = hull[:, None] - hull[None]
+    i, j = np.unravel_index(int((gaps**2).sum(axis=2).argmax()), (len(hull), len(hull)))
+    diameter = (hull[i] - hull[j]).astype(np.float64)
+    for axis in (vectors[:, 1], diameter / np.linalg.norm(diameter)):
+        for sign in (1.0, -1.0):
+            shape = _measure(points, centre, sign * axis, patch)
+            if shape is not None and (best is None or shape.fit > best.fit):
+                best = shape
+    return best if best is not None and best.fit >= MIN_FIT else None
+
+
+def _measure(
+    points: NDArray[np.float64], centre: NDArray[np.float64], axis: NDArray[np.float64], patch: NDArray[np.bool_]
+) -> _Shape | None:
+    """Reads shaft and head off the width profile along `axis` (tail to tip); the axis is refined on the shaft."""
+    for _ in range(3):
+        normal = np.array([-axis[1], axis[0]])
+        along, across = (points - centre) @ axis, (points - centre) @ normal
+        start, end = along.min(), along.max()
+        length = end - start
+        if length < MIN_LENGTH:
+            return None
+        bins = np.clip((along - start).astype(int), 0, int(length))
+        n = int(length) + 1
+        high, low = np.full(n, -1e9), np.full(n, 1e9)
+        np.maximum.at(high, bins, across)
+        np.minimum.at(low, bins, across)
+        filled_bins = high > -1e8
+        if filled_bins.mean() < 0.95:
+            return None
+        extent = np.where(filled_bins, high - low + 1, np.nan)
+        shaft_end = int(0.45 * n)
+        thickness = float(np.nanmedian(extent[max(1, n // 12) : shaft_end]))
+        peak = int(np.nanargmax(extent))
+        head_width = float(extent[peak])
+        if peak < 0.4 * n or head_width < max(1.8 * thickness, thickness + 4):
+            return None
+        wide = np.nonzero(extent[:peak] > thickness + max(2.0, 0.35 * thickness))[0]
+        wide = wide[wide > 0.3 * n]
+        neck = int(wide.min()) if len(wide) else peak
+        shaft = (bins > n // 20) & (bins < max(neck - 1, n // 3))
+        if shaft.sum() < 12:
+            return None
+        vx, vy, x0, y0 = (
+            float(v) for v in cv2.fitLine(points[shaft].astype(np.float32), cv2.DIST_L2, 0, 0.01, 0.01).ravel()
+        )
+        line = np.array([vx, vy]) if vx * axis[0] + vy * axis[1] > 0 else -np.array([vx, vy])
+        axis, centre = line, np.array([x0, y0])
+    head = extent[peak:]
+    shaft_extent = extent[max(1, n // 20) : max(neck - 1, n // 3)]
+    steady = np.nanmean(np.abs(shaft_extent - thickness) <= max(1.6, 0.3 * thickness))
+    head_length = n - 1 - peak
+    middle = (high[peak] + low[peak]) / 2
+    if (
+        steady < 0.75
+        or len(shaft_extent) < 0.25 * n
+        or head_length < 0.35 * (head_width - thickness) / 2
+        or head_length > 0.7 * n
+        or head_length > 2.5 * head_width
+        or abs(middle) > 0.22 * head_width + 1
+        or float(np.nanmean(np.diff(head) <= 1.5)) < 0.9
+        or head[-1] > 0.45 * head_width + thickness
+    ):
+        return None
+    tail, tip = centre + axis * start, centre + axis * end
+    fits = {filled: _overlap(patch, tail, tip, thickness, head_width, head_length, filled) for filled in (True, False)}
+    filled = fits[True] >= fits[False]
+    return _Shape(tail, tip, thickness, head_width, float(head_length), filled, fits[filled])
+
+
+def _overlap(
+    patch: NDArray[np.bool_],
+    tail: NDArray[np.float64],
+    tip: NDArray[np.float64],
+    thickness: float,
+    head_width: float,
+    head_length: float,
+    filled: bool,
+) -> float:
+    """Intersection over union of the patch and the ideal arrow of these measures."""
+    axis = (tip - tail) / np.linalg.norm(tip - tail)
+    normal = np.array([-axis[1], axis[0]])
+    pad = int(thickness) + 3
+    ideal = np.zeros((patch.shape[0] + 2 * pad, patch.shape[1] + 2 * pad), np.uint8)
+    half = head_width / 2 if filled else max(0.0, (head_width - thickness) / 2)
+    base = tip - axis * head_length
+    barbs = [base + normal * half, base - normal * half]
+
+    def fixed(points: list[NDArray[np.float64]]) -> NDArray[np.int32]:
+        return np.round((np.array(points) + pad) * 16).astype(np.int32)
+
+    w = max(0.5, thickness / 2 - 0.25)
+    shaft_end = base if filled else tip - axis * thickness / 2
+    body = [tail + normal * w, shaft_end + normal * w, shaft_end - normal * w, tail - normal * w]
+    cv2.fillPoly(ideal, [fixed(body)], 1, cv2.LINE_8, 4)
+    if filled:
+        cv2.fillPoly(ideal, [fixed([barbs[0], tip, barbs[1]])], 1, cv2.LINE_8, 4)
+    else:
+        line = max(1, round(thickness))
+        for barb in barbs:
+            start, end = fixed([barb, tip - axis * thickness / 2])
+            cv2.line(ideal, start.tolist(), end.tolist(), 1, line, cv2.LINE_8, 4)
+    real = np.pad(patch, pad)
+    drawn = ideal.astype(bool)
+    return float((real & drawn).sum() / max(1, (real | drawn).sum()))

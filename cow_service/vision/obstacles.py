@@ -1,0 +1,47 @@
+"""The other objects of a scene: what the mover can meet, pass in front of, or be hidden by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.records import BBox, LocatedObject
+from cow_service.vision.scene import SAME_OBJECT, Scene, iou
+
+OWN_SHARE = 0.2  # of the mover's area: something smaller that clings to it is its shadow or a part of it
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Another object of the image."""
+
+    name: str
+    bbox: BBox
+    mask: Mask  # [H, W]
+
+
+def obstacles_of(scene: Scene, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
+    """Everything but the mover: first what the question names, by that name, then what else was seen, by its colour."""
+    body = scene.silhouette(mover)
+    near = cv2.dilate(body.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    obstacles = [
+        Obstacle(other.object, other.bbox, scene.silhouette(other.bbox))
+        for other in named
+        if iou(other.bbox, mover) < SAME_OBJECT
+    ]
+    for region in scene.regions:
+        area = int(region.mask.sum())
+        if iou(region.bbox, mover) >= SAME_OBJECT or (region.mask & body).sum() > 0.5 * area:
+            continue
+        if area < OWN_SHARE * body.sum() and (region.mask & near).any():
+            continue
+        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT for other in obstacles):
+            continue
+        obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask))
+    return tuple(obstacles)

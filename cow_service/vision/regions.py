@@ -1,0 +1,240 @@
+"""Finds the objects of an uncluttered image: coloured, white or black things on a floor, a table or a wall.
+
+What differs from its wide surroundings in colour, stands out brighter, or is nearly black, is part of an object; a patch
+fenced in by edges below a bright top is the shaded side of a white one. Shadows are darker and keep the hue: left out.
+Where the surroundings themselves vary too much (most photographs), nothing is reported instead of something wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.vision.colours import name_of
+
+WORKING_SIDE = 512  # px: images are searched at this size
+CHROMA_STEP = 9.0  # Lab units from the surroundings
+BRIGHT_STEP, BRIGHT_REACH = 5.0, 1.6  # Lab lightness above the surroundings: a top, and another lit face
+FENCES = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median edge: the larger makes an edge
+SHARP_SHARE = 0.65  # of an outline that must lie on edges
+BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
+MIN_AREA = 0.0004  # of the image
+MAX_AREA = 0.25
+CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
+SPLIT_HUE = 36.0  # degrees: another colour, hence another object
+MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
+
+_DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+
+Mask = NDArray[np.bool_]
+Channel = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Region:
+    """One object of the image as seen, without a noun: where it is and what colour. Not what moves."""
+
+    bbox: tuple[float, float, float, float]  # x0, y0, x1, y1, px of the image
+    mask: Mask  # [H, W] of the image
+    colour: str
+    roundness: float  # 0..1: how much of its ellipse it fills, times the ratio of the ellipse's axes
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Centre of the box, px."""
+        return (self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2
+
+
+@dataclass(frozen=True)
+class _View:
+    """The image at the working size, against its surroundings."""
+
+    lab: NDArray[np.float32]  # [h, w, 3] CIE Lab
+    chroma_gap: Channel  # distance from the surroundings in the a*b* plane
+    bright: Channel  # lightness above the surroundings
+    around: Channel  # lightness of the surroundings
+    edges: Channel  # Lab gradient per px
+    fence: float  # gradient from which the outline of an object may lie on it
+
+    def crop(self, window: tuple[slice, slice]) -> _View:
+        """The same measurements for a part of the image."""
+        layers = (self.lab, self.chroma_gap, self.bright, self.around, self.edges)
+        return _View(*(layer[window] for layer in layers), self.fence)
+
+
+def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
+    """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
+    height, width = image.shape[:2]
+    scale = min(1.0, WORKING_SIDE / max(height, width))
+    small = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    view = _view(small)
+    core = _core(view)
+    if core.mean() > CLUTTER:
+        return ()
+    solid = (core | _white_sides(view, core)).astype(np.uint8)
+    solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    regions: list[Region] = []
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
+    for i in range(1, count):
+        if not MIN_AREA * solid.size <= stats[i][4] <= MAX_AREA * solid.size or _is_background(stats[i], solid.shape):
+            continue
+        window = _window(stats[i], solid.shape)
+        near = view.crop(window)
+        for part in _parts(near, labels[window] == i):
+            if _is_sharp(near, part, view.fence):
+                whole = np.zeros(solid.shape, np.float32)
+                whole[window] = part
+                regions.append(_region(near.lab[part], whole, (height, width)))
+    return tuple(sorted(regions, key=lambda region: -int(region.mask.sum())))
+
+
+def _view(small: NDArray[np.uint8]) -> _View:
+    """Measures every pixel against a median over half the image around it."""
+    smooth = cv2.bilateralFilter(small, 5, 25, 5)
+    lab = cv2.cvtColor(smooth.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    coarse = cv2.resize(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    side = int(0.5 * min(coarse.shape[:2])) | 1
+    pad = side // 2
+    padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)
+    median = cv2.medianBlur(padded, side)[pad : pad + coarse.shape[0], pad : pad + coarse.shape[1]]
+    around = cv2.resize(median, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    around_l = around[..., 0] / np.float32(2.55)
+    gap = np.hypot(lab[..., 1] - (around[..., 1] - 128), lab[..., 2] - (around[..., 2] - 128))
+    blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
+    dx, dy = cv2.Sobel(blurred, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(blurred, cv2.CV_32F, 0, 1) / 8
+    edges = np.sqrt((dx * dx + dy * dy).sum(axis=2))
+    fence = max(FENCES[1][0], FENCES[1][1] * float(np.median(edges)))
+    return _View(lab, gap, lab[..., 0] - around_l, around_l, edges, fence)
+
+
+def _window(stats: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of a component with a little around it."""
+    x, y, w, h = (int(v) for v in stats[:4])
+    return slice(max(0, y - 6), min(shape[0], y + h + 6)), slice(max(0, x - 6), min(shape[1], x + w + 6))
+
+
+def _core(view: _View) -> Mask:
+    """Pixels that are surely of an object: another hue, clearly brighter, or nearly black."""
+    black = (view.lab[..., 0] < BLACK_SHARE * view.around).astype(np.uint8)
+    solid_black = cv2.morphologyEx(black, cv2.MORPH_OPEN, _DISC) > 0  # a contact shadow is a thin strip
+    return (view.chroma_gap > CHROMA_STEP) | (view.bright > BRIGHT_STEP) | solid_black
+
+
+def _white_sides(view: _View, core: Mask) -> Mask:
+    """Patches fenced in by edges at a bright neutral top: the other faces of something white, lit or in shade."""
+    neutral = (np.hypot(view.lab[..., 1], view.lab[..., 2]) < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
+    white = (core & (view.bright > BRIGHT_STEP) & neutral).astype(np.uint8)
+    _, top_labels, top_stats, _ = cv2.connectedComponentsWithStats(white, connectivity=8)
+    sides = _lit_fronts(view, white > 0, top_labels, top_stats)
+    height, width = core.shape
+    kernel = np.ones((3, 3), np.uint8)
+    for floor, factor in FENCES:
+        fence = max(floor, factor * float(np.median(view.edges)))
+        edges = cv2.morphologyEx((view.edges > fence).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
+        for i in range(1, count):
+            x, y, w, h, area = (int(v) for v in stats[i])
+            if area < 12 or area > 0.03 * core.size or x == 0 or y == 0 or x + w == width or y + h == height:
+                continue
+            near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
+            patch = (labels[near] == i).astype(np.uint8)
+            lit = float(np.median(view.bright[near][patch > 0])) > BRIGHT_REACH
+            touched = np.unique(top_labels[near][cv2.dilate(patch, kernel, iterations=4) > 0])
+            for top in touched[touched > 0]:
+                tx, ty, tw, _, top_area = (int(v) for v in top_stats[top])
+                overlap = min(x + w, tx + tw + 3) - max(x, tx - 3)
+                hangs = overlap > 0.7 * w and y >= ty
+                if top_area >= 20 and area < 12 * top_area and (lit or hangs):
+                    sides[near] |= cv2.dilate(patch, kernel, iterations=2) > 0
+    return sides
+
+
+def _lit_fronts(view: _View, white: Mask, labels: NDArray[np.int32], stats: NDArray[np.int32]) -> Mask:
+    """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide."""
+    lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | white
+    fronts = np.zeros(white.shape, bool)
+    for top, (x, y, w, h, area) in enumerate(stats.tolist()):
+        if top == 0 or area < 20 or not 0.2 * w < h < 0.8 * w:
+            continue
+        window = slice(y, y + h + w), slice(x, x + w)
+        _, blobs = cv2.connectedComponents(lit[window].astype(np.uint8), connectivity=4)
+        joined = np.unique(blobs[labels[window] == top])
+        fronts[window] |= np.isin(blobs, joined[joined > 0])
+    return fronts
+
+
+def _is_sharp(view: _View, part: Mask, fence: float) -> bool:
+    """Whether the outline of a part lies on edges, as an object's does and a patch of light does not."""
+    outline = part & ~cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    nearby = cv2.dilate(view.edges, np.ones((5, 5), np.uint8))
+    return float(np.mean(nearby[outline] > fence)) > SHARP_SHARE
+
+
+def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
+    """Whether a component is a strip of wall or floor: it runs along much of an edge of the image, or spans it."""
+    x, y, w, h, area = (int(v) for v in stats)
+    height, width = shape[:2]
+    on_side = x == 0 or x + w == width
+    on_top, on_bottom = y == 0, y + h == height
+    spans = w > 0.5 * width or h > 0.75 * height
+    sliver = (on_top or on_side) and (area < 0.45 * w * h or min(w, h) < 0.12 * max(w, h))
+    return spans or sliver or (on_side and (on_top or on_bottom))
+
+
+def _parts(view: _View, component: Mask) -> list[Mask]:
+    """Splits a component where two colours meet; wheels, necks and lights stay with what they sit on."""
+    area = int(component.sum())
+    lab = view.lab
+    chroma = np.hypot(lab[..., 1], lab[..., 2])
+    hue = np.degrees(np.arctan2(lab[..., 2], lab[..., 1]))
+    coloured = component & (view.chroma_gap > CHROMA_STEP) & (chroma > CHROMA_STEP)
+    seeds: list[Mask] = []
+    rest = coloured.copy()
+    while rest.sum() > 0.12 * area and len(seeds) < 6:
+        values = hue[rest]
+        histogram, _ = np.histogram(values % 360, bins=36, range=(0, 360), weights=chroma[rest])
+        wrapped = histogram + np.roll(histogram, 1) + np.roll(histogram, -1)
+        middle = 10 * int(wrapped.argmax()) + 5
+        alike = rest & (np.abs((hue - middle + 180) % 360 - 180) < SPLIT_HUE)
+        seeds.extend(_blobs(alike, 0.12 * area))
+        rest &= ~alike
+    neutral = component & ~coloured
+    bright = neutral & (view.bright > -12) & (lab[..., 0] > 40)
+    black = neutral & (lab[..., 0] < BLACK_SHARE * view.around)
+    seeds.extend(_blobs(bright, 0.30 * area))
+    seeds.extend(_blobs(black, 0.35 * area))
+    if len(seeds) <= 1:
+        return [component]
+    distances = np.stack([cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds])
+    owner = distances.argmin(axis=0)
+    return [component & (owner == i) for i in range(len(seeds))]
+
+
+def _blobs(mask: Mask, least: float) -> list[Mask]:
+    """Connected blobs of at least so many pixels."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    return [labels == i for i in range(1, count) if stats[i][4] >= max(least, 12)]
+
+
+def _region(lab: NDArray[np.float32], part: Channel, size: tuple[int, int]) -> Region:
+    """A part [h, w] at the working size, with the Lab colours [N, 3] of its pixels, as a region of the image."""
+    height, width = size
+    soft = cv2.GaussianBlur(part, (0, 0), MASK_SIGMA)
+    mask = (soft if part.shape == size else cv2.resize(soft, (width, height), interpolation=cv2.INTER_LINEAR)) > 0.5
+    ys, xs = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
+    bbox = (float(xs[0]), float(ys[0]), float(xs[-1] + 1), float(ys[-1] + 1))
+    chroma = np.hypot(lab[:, 1], lab[:, 2])
+    told = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
+    colour = name_of(*(float(v) for v in np.median(told, axis=0)))
+    return Region(bbox, mask, colour, _roundness(mask))
+
+
+def _roundness(mask: Mask) -> float:
+    """1 for a disc. A square has about 0.8, a bottle less than 0.5."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = max(contours, key=cv2.contourArea)
+    _, radius = cv2.minEnclosingCircle(outline)
+    return float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))

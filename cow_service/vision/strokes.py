@@ -1,0 +1,167 @@
+"""Finds what was drawn over an image: patches of one flat colour with sharp ends, narrow somewhere.
+
+Arrows and boxes are told apart from these by their shape, in `arrows.py` and `boxes.py`. Nothing here knows a shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+WORKING_SIDE = 896  # px: longer images are searched at this size
+THIN = 41  # px: side of the median window; narrower structures stand out from it
+STANDS_OUT = 28  # grey levels from that median, in any channel
+TOLERANCES = (26, 52)  # grey levels around a flat colour: strict first, then with the fringes that JPEG leaves
+FLAT = 14  # grey levels: median distance of a drawing's pixels from its colour
+SHARP = 56  # grey levels between a drawing and what lies beside it
+SHARP_SHARE = 0.85  # of what lies beside it
+MIN_LENGTH = 18.0  # px at the working size
+MAX_COLOURS = 36  # flat colours tried per thin structure
+
+_SQUARE = np.ones((3, 3), np.uint8)
+
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A connected patch of one flat colour, at the working size. It may be an arrow, a box, a letter, or nothing."""
+
+    x: int
+    y: int
+    patch: Mask  # [h, w], its top left corner at (x, y)
+    colour: tuple[int, int, int]  # RGB
+
+
+@dataclass(frozen=True)
+class WorkingImage:
+    """An RGB image [h, w, 3] at the working size, and the factor that brought it there."""
+
+    pixels: Image
+    scale: float
+
+
+def working_image(image: Image) -> WorkingImage:
+    """The image, scaled down where it is longer than the working size."""
+    scale = min(1.0, WORKING_SIDE / max(image.shape[:2]))
+    small = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return WorkingImage(small, scale)
+
+
+def find_strokes(image: Image) -> Iterator[Stroke]:
+    """Candidates in an RGB image [h, w, 3] of working size. The same drawing can come twice, a little different."""
+    for (bx, by, bw, bh), thin in _patches(_thin_structures(image), most=1.0):
+        window = image[by : by + bh, bx : bx + bw]
+        for colour in _flat_colours(window[thin]):
+            for tolerance in TOLERANCES:
+                low, high = np.clip(colour - tolerance, 0, 255), np.clip(colour + tolerance, 0, 255)
+                same = cv2.inRange(window, low, high)
+                same[~thin] = 0
+                for (x, y, _, _), patch in _patches(same, most=0.30):
+                    stroke = Stroke(bx + x, by + y, patch, (int(colour[0]), int(colour[1]), int(colour[2])))
+                    if _is_drawn(image, stroke):
+                        yield stroke
+
+
+def drawing_mask(image: Image, stroke: Stroke) -> Mask:
+    """Mask [h, w] of the stroke with the outline around it, if it has one, and the fringe that compression leaves."""
+    mask = np.zeros(image.shape[:2], np.uint8)
+    h, w = stroke.patch.shape
+    mask[stroke.y : stroke.y + h, stroke.x : stroke.x + w] = stroke.patch
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+    reach, grown = 4, cv2.dilate(mask, kernel)
+    for ring_index in range(1, 6):
+        wider = cv2.dilate(grown, kernel)
+        ring = image[(wider > 0) & (grown == 0)].astype(np.float32)
+        if len(ring) and np.median(np.abs(ring - np.median(ring, axis=0)).max(axis=1)) < 14 and _is_ink(ring):
+            reach = ring_index + 5
+        grown = wider
+    return cv2.dilate(mask, kernel, iterations=reach).astype(bool)
+
+
+def _is_ink(ring: NDArray[np.float32]) -> bool:
+    """Whether a ring of pixels [N, 3] has the white or black of an outline."""
+    colour = np.median(ring, axis=0)
+    return bool(colour.min() > 225 or colour.max() < 30)
+
+
+def full_size(mask: Mask, size: tuple[int, int]) -> Mask:
+    """A mask of working size at the image's full size [height, width]."""
+    if mask.shape == size:
+        return mask
+    return cv2.resize(mask.astype(np.uint8), (size[1], size[0]), interpolation=cv2.INTER_NEAREST).astype(bool)
+
+
+def _thin_structures(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """255 where something narrow stands out from what is around it, and a little beyond."""
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    around = cv2.medianBlur(half, THIN // 2 | 1)
+    thin = (cv2.absdiff(half, around).max(axis=2) > STANDS_OUT).astype(np.uint8) * 255
+    thin = cv2.dilate(thin, np.ones((3, 3), np.uint8))
+    return cv2.resize(thin, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
+
+
+def _is_drawn(image: Image, stroke: Stroke) -> bool:
+    """Whether the patch is flat inside and ends sharply all around, as paint does and shading does not."""
+    x, y, (h, w) = stroke.x, stroke.y, stroke.patch.shape
+    inner = image[y : y + h, x : x + w][stroke.patch].astype(np.int16)
+    flat = (np.abs(inner - np.array(stroke.colour, np.int16)) <= FLAT).all(axis=1)
+    if 2 * np.count_nonzero(flat) < len(flat):
+        return False
+    pad = 4
+    x0, y0, x1, y1 = (
+        max(0, x - pad),
+        max(0, y - pad),
+        min(image.shape[1], x + w + pad),
+        min(image.shape[0], y + h + pad),
+    )
+    inside = np.zeros((y1 - y0, x1 - x0), np.uint8)
+    inside[y - y0 : y - y0 + h, x - x0 : x - x0 + w] = stroke.patch
+    near = cv2.dilate(inside, _SQUARE, iterations=2)
+    ring = cv2.dilate(near, _SQUARE) > near
+    beyond = image[y0:y1, x0:x1][ring].astype(np.int16)
+    sharp = (np.abs(beyond - np.array(stroke.colour, np.int16)) > SHARP).any(axis=1)
+    return np.count_nonzero(sharp) > SHARP_SHARE * len(sharp)
+
+
+def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
+    """Colours [3] that many of the pixels [N, 3] share: a drawing has one, a shaded object spreads over many."""
+    if len(pixels) < 40:
+        return []
+    step = 16
+    bins = np.zeros((18, 18, 18), np.float32)
+    index = pixels.astype(np.int64) // step + 1
+    np.add.at(bins, (index[:, 0], index[:, 1], index[:, 2]), 1.0)
+    smooth = bins.copy()
+    for axis in range(3):
+        smooth = smooth + 0.5 * (np.roll(smooth, 1, axis) + np.roll(smooth, -1, axis))
+    colours: list[NDArray[np.int64]] = []
+    for _ in range(MAX_COLOURS):
+        peak = np.unravel_index(int(smooth.argmax()), smooth.shape)
+        if smooth[peak] < 30:
+            break
+        near = pixels[np.abs(index - np.array(peak)).max(axis=1) <= 1]
+        colour = np.median(near, axis=0).astype(np.int64)
+        if (np.abs(near - colour).max(axis=1) <= FLAT).sum() >= 24:
+            colours.append(colour)
+        r, g, b = (slice(max(0, int(p) - 1), int(p) + 2) for p in peak)
+        smooth[r, g, b] = 0
+    return colours
+
+
+def _patches(same: Image, most: float) -> list[tuple[tuple[int, int, int, int], Mask]]:
+    """Connected patches (box [x, y, w, h] and mask [h, w]) long enough for an arrow; `most` bounds area / diagonal^2."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(same, connectivity=8)
+    patches: list[tuple[tuple[int, int, int, int], Mask]] = []
+    for i in range(1, count):
+        x, y, w, h, area = (int(v) for v in stats[i])
+        diagonal = float(np.hypot(w, h))
+        if area < 40 or diagonal < MIN_LENGTH or area > most * diagonal * diagonal:
+            continue
+        patches.append(((x, y, w, h), labels[y : y + h, x : x + w] == i))
+    return patches

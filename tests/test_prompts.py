@@ -1,0 +1,148 @@
+"""Prompt files, and the sentence that says a motion."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jinja2.exceptions import SecurityError
+
+from cow_service.readers.prompts import load_prompt, parse_prompt
+from cow_service.readers.wording import direction_words, motion_sentence
+from cow_service.records import MotionKind, Vector
+from cow_service.resources import prompt_names
+
+HEAD = "---\nstage: motion\nversion: 1\ninputs: [name]\noutput: text\n---\n"
+
+
+@pytest.mark.parametrize("name", prompt_names())
+def test_every_shipped_prompt_loads(name: str) -> None:
+    prompt = load_prompt(name)
+    assert prompt.name == name
+    assert prompt.version >= 1
+    assert prompt.body
+    assert load_prompt(name) is prompt
+
+
+def test_fields() -> None:
+    prompt = load_prompt("motion-sentence")
+    assert (prompt.stage, prompt.version, prompt.output) == ("motion", 1, "text")
+    assert prompt.inputs == ("object", "kind", "words")
+
+
+def test_unknown_prompt_names_those_that_exist() -> None:
+    with pytest.raises(LookupError, match="motion-sentence"):
+        load_prompt("no-such-prompt")
+
+
+@pytest.mark.parametrize(
+    ("inputs", "named"),
+    [
+        ({}, "missing: name"),
+        ({"name": "x", "colour": "red"}, "not declared: colour"),
+        ({"nme": "x"}, "missing: name; not declared: nme"),
+    ],
+)
+def test_inputs_are_checked(inputs: dict[str, str], named: str) -> None:
+    with pytest.raises(TypeError, match=named):
+        parse_prompt("p", HEAD + "Hello {{ name }}").render(**inputs)
+
+
+def test_values_are_data() -> None:
+    prompt = parse_prompt("p", HEAD + "Hello {{ name }}")
+    value = "{{ 7 * 7 }} {% if %} <b> & {# no #}"
+    assert prompt.render(name=value) == f"Hello {value}"
+
+
+def test_blocks_leave_no_blank_lines() -> None:
+    assert parse_prompt("p", HEAD + "a\n{% if name %}\nb\n{% endif %}\nc").render(name=1) == "a\nb\nc"
+
+
+def test_body_is_sandboxed() -> None:
+    with pytest.raises(SecurityError):
+        parse_prompt("p", HEAD + "{{ name.__class__.__mro__ }}").render(name="x")
+    with pytest.raises(SecurityError):
+        parse_prompt("p", HEAD + "{{ name.append(1) }}").render(name=[])
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("Hello", "front matter"),
+        ("---\nstage: x\n", "front matter"),
+        ("---\nstage: x\n---\nHello", "exactly these fields"),
+        ("---\n- a\n---\nHello", "exactly these fields"),
+        (HEAD.replace("version: 1", "version: one"), "version must be of type int"),
+        (HEAD.replace("version: 1", "version: true"), "version must be of type int"),
+        (HEAD.replace("[name]", "name"), "inputs must be of type list"),
+        (HEAD + "Hello {{ nme }}", "does not declare: nme"),
+    ],
+)
+def test_malformed_prompts(text: str, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        parse_prompt("p", text)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "words"),
+    [
+        (0, "to the right"),
+        (22.5, "to the right and slightly up"),
+        (45, "to the right and up"),
+        (67.5, "up and slightly to the right"),
+        (90, "up"),
+        (112.5, "up and slightly to the left"),
+        (135, "up and to the left"),
+        (180, "to the left"),
+        (202.5, "to the left and slightly down"),
+        (-90, "down"),
+        (-45, "down and to the right"),
+        (-11, "to the right"),
+    ],
+)
+def test_direction_words(degrees: float, words: str) -> None:
+    angle = math.radians(degrees)
+    assert direction_words((math.cos(angle), -math.sin(angle)), 0.0) == words
+
+
+@pytest.mark.parametrize(
+    ("direction", "depth", "words"),
+    [
+        (None, 0.0, ""),
+        ((0.0, 0.0), 0.0, ""),
+        ((math.nan, 1.0), 0.0, ""),
+        (None, -1.0, "towards the camera"),
+        (None, 0.7, "away from the camera"),
+        ((1.0, 0.0), 1.0, "away from the camera"),
+        ((1.0, 0.0), -0.7, "to the right and towards the camera"),
+        ((9.0, 0.0), 0.1, "to the right"),
+    ],
+)
+def test_direction_words_with_depth(direction: Vector | None, depth: float, words: str) -> None:
+    assert direction_words(direction, depth) == words
+
+
+@pytest.mark.parametrize(
+    ("kind", "direction", "words"),
+    [
+        ("linear", (1.0, 0.0), "moves straight to the right at a constant speed"),
+        ("linear", None, "moves in a straight line at a constant speed"),
+        ("projectile", (0.0, -1.0), "is thrown up and flies on a curved path, pulled down by gravity"),
+        ("fall", None, "falls straight down, faster and faster, pulled down by gravity"),
+        ("static", None, "stays where it is and does not move"),
+    ],
+)
+def test_motion_sentence(kind: MotionKind, direction: Vector | None, words: str) -> None:
+    sentence = motion_sentence("the orange\n ball", kind, direction, 0.0)
+    assert sentence == f"The orange ball {words}. The camera stays still."
+
+
+@settings(deadline=None)
+@given(st.text(), st.sampled_from(["linear", "projectile", "fall", "static"]))
+def test_motion_sentence_is_one_line_of_bounded_length(name: str, kind: MotionKind) -> None:
+    sentence = motion_sentence(name, kind, (1.0, 0.0), 0.0)
+    assert len(sentence.splitlines()) == 1
+    assert len(sentence) < 350
+    assert sentence.endswith("The camera stays still.")

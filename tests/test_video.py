@@ -1,0 +1,221 @@
+"""Video: what was written is decoded again, as a browser would."""
+
+from __future__ import annotations
+
+import struct
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
+
+from cow_service.errors import InternalError, StorageUnavailable
+from cow_service.video import write_mp4
+
+
+def scene(index: int, width: int = 96, height: int = 64) -> np.ndarray:
+    pixels = np.zeros((height, width, 3), np.uint8)
+    pixels[..., 0] = np.linspace(20, 230, width, dtype=np.uint8)
+    pixels[..., 1] = np.linspace(30, 200, height, dtype=np.uint8)[:, None]
+    pixels[..., 2] = 90
+    left = 2 * index
+    pixels[20:36, left : left + 16] = [240, 200, 20]
+    return pixels
+
+
+def read_mp4(path: Path) -> tuple[list[np.ndarray], Fraction]:
+    reformatter = VideoReformatter()
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frames = [
+            reformatter.reformat(
+                frame, format="rgb24", src_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.JPEG
+            ).to_ndarray()
+            for frame in container.decode(stream)
+        ]
+        return frames, stream.average_rate
+
+
+def boxes(data: bytes) -> list[bytes]:
+    names, at = [], 0
+    while at < len(data):
+        size, name = struct.unpack_from(">I4s", data, at)
+        names.append(name)
+        at += size
+    return names
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return tmp_path / "clip.part"
+
+
+def test_what_is_written_is_what_is_shown(path):
+    written = [scene(i) for i in range(33)]
+    assert write_mp4(iter(written), path, fps=16, width=96, height=64) == 33
+    shown, rate = read_mp4(path)
+    assert len(shown) == 33
+    assert rate == 16
+    errors = [np.abs(a.astype(int) - b).mean() for a, b in zip(written, shown, strict=True)]
+    assert max(errors) < 3
+
+
+def test_the_stream_is_one_that_browsers_play(path):
+    write_mp4((scene(i) for i in range(20)), path, fps=16, width=96, height=64)
+    with av.open(str(path)) as container:
+        assert "mp4" in container.format.name
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        assert context.name == "h264"
+        assert context.profile == "High"
+        assert context.pix_fmt == "yuv420p"
+        assert (stream.width, stream.height, stream.frames) == (96, 64, 20)
+        bt709 = 1  # ITU-T H.273
+        assert (context.colorspace, context.color_primaries, context.color_trc) == (bt709, bt709, bt709)
+        assert context.color_range == ColorRange.MPEG
+    names = boxes(path.read_bytes())
+    assert names.index(b"moov") < names.index(b"mdat")
+
+
+@pytest.mark.parametrize(
+    ("fps", "rate"),
+    [(16, Fraction(16)), (7.5, Fraction(15, 2)), (29.97, Fraction(2997, 100)), (30000 / 1001, Fraction(30000, 1001))],
+)
+def test_every_frame_stands_at_its_exact_time(path, fps, rate):
+    write_mp4((scene(i) for i in range(40)), path, fps=fps, width=96, height=64)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        times = [frame.pts * frame.time_base for frame in container.decode(stream)]
+        assert times == [i / rate for i in range(40)]
+        assert stream.average_rate == rate
+        assert stream.duration * stream.time_base == 40 / rate
+
+
+@pytest.mark.parametrize("colour", [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (0, 0, 0), (30, 140, 200)])
+def test_flat_colours_come_back(path, colour):
+    frame = np.full((64, 64, 3), colour, np.uint8)
+    write_mp4([frame] * 3, path, fps=8, width=64, height=64)
+    shown, _ = read_mp4(path)
+    assert np.abs(shown[1].astype(int) - colour).max() <= 4
+
+
+@pytest.mark.parametrize("size", [(97, 64), (96, 65), (33, 35), (1, 1)])
+def test_odd_sides_are_padded_with_their_last_row_or_column(path, size):
+    width, height = size
+    frame = scene(3, width, height) if width > 1 else np.full((1, 1, 3), 120, np.uint8)
+    assert write_mp4([frame] * 4, path, fps=16, width=width, height=height) == 4
+    shown, _ = read_mp4(path)
+    padded = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    assert shown[0].shape == padded.shape
+    assert np.abs(shown[0].astype(int) - padded).mean() < 6
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_very_short_clips(path, count):
+    assert write_mp4([scene(0)] * count, path, fps=16, width=96, height=64) == count
+    assert len(read_mp4(path)[0]) == count
+
+
+def test_views_that_are_not_contiguous(path):
+    mirrored = scene(0)[:, ::-1]
+    write_mp4([mirrored] * 2, path, fps=16, width=96, height=64)
+    assert np.abs(read_mp4(path)[0][0].astype(int) - mirrored).mean() < 3
+
+
+def test_frames_are_taken_one_at_a_time(path):
+    alive = []
+
+    class Watched(np.ndarray):
+        def __del__(self):
+            alive.pop()
+
+    most = 0
+
+    def frames():
+        nonlocal most
+        for i in range(30):
+            frame = scene(i).copy().view(Watched)
+            alive.append(i)
+            most = max(most, len(alive))
+            yield frame
+            del frame
+
+    write_mp4(frames(), path, fps=16, width=96, height=64)
+    assert most <= 2
+
+
+def test_a_higher_crf_makes_a_smaller_file(path, tmp_path):
+    rng = np.random.default_rng(0)
+    noisy = [rng.integers(0, 256, (64, 96, 3), np.uint8) for _ in range(8)]
+    coarse = tmp_path / "coarse.mp4"
+    write_mp4(noisy, path, fps=16, width=96, height=64)
+    write_mp4(noisy, coarse, fps=16, width=96, height=64, crf=40)
+    assert coarse.stat().st_size < path.stat().st_size / 2
+
+
+@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf"), 1e-9])
+def test_a_rate_that_is_not_positive(path, fps):
+    with pytest.raises(ValueError, match="fps is"):
+        write_mp4([scene(0)], path, fps=fps, width=96, height=64)
+    assert not path.exists()
+
+
+def test_a_size_that_is_not_positive(path):
+    with pytest.raises(ValueError, match="0 x 64"):
+        write_mp4([], path, fps=16, width=0, height=64)
+
+
+def test_no_frames(path):
+    with pytest.raises(ValueError, match="no frames"):
+        write_mp4([], path, fps=16, width=96, height=64)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("second", [scene(1, 94), scene(1)[..., :2], scene(1).astype(np.float32)])
+def test_a_frame_of_another_shape(path, second):
+    with pytest.raises(ValueError, match=r"Frame 1 is .* must be \(64, 96, 3\) of uint8"):
+        write_mp4([scene(0), second], path, fps=16, width=96, height=64)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("after", [0, 1, 60])
+def test_what_the_frames_raise_passes_through(path, after):
+    class Stop(Exception):
+        pass
+
+    def frames():
+        yield from (scene(i % 40) for i in range(after))
+        raise Stop
+
+    with pytest.raises(Stop):
+        write_mp4(frames(), path, fps=16, width=96, height=64)
+    assert not path.exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk(path):
+    # By a link, since what is left after an error is removed.
+    path.symlink_to("/dev/full")
+    noise = np.random.default_rng(0).integers(0, 256, (50, 128, 128, 3), np.uint8)
+    with pytest.raises(StorageUnavailable, match="disk is full") as caught:
+        write_mp4(noise, path, fps=16, width=128, height=128)
+    assert "/" not in caught.value.detail
+    assert isinstance(caught.value.__cause__, av.error.FFmpegError)
+    assert Path("/dev/full").exists()
+    assert not path.is_symlink()
+
+
+def test_an_encoder_that_fails_otherwise(tmp_path):
+    with pytest.raises(InternalError, match="could not be encoded") as caught:
+        write_mp4([scene(0)], tmp_path / "absent" / "clip.mp4", fps=16, width=96, height=64)
+    assert str(tmp_path) not in caught.value.detail
+
+
+def test_a_size_that_the_encoder_refuses(path):
+    frame = np.zeros((2, 40_000, 3), np.uint8)
+    with pytest.raises(InternalError) as caught:
+        write_mp4([frame], path, fps=16, width=40_000, height=2)
+    assert str(path) not in caught.value.detail
+    assert not path.exists()
