@@ -22,7 +22,7 @@ test-fast: $(VENV)/.test ## the tests that take seconds
 lint: $(VENV)/.test ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 openapi: $(VENV)/.base ## write openapi.yaml from the app
 	$(BIN)/cow openapi > openapi.yaml

@@ -102,7 +102,7 @@ def measure(image: Path, question: str, runs: int) -> dict[str, Any]:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("--runs", type=int, default=15)
     parser.add_argument("--image", type=Path, default=EXAMPLE / "image.jpg")
     parser.add_argument("--question", default=json.loads((EXAMPLE / "meta.json").read_text())["question"])

@@ -2,8 +2,8 @@
 
     python benchmarks/scenes.py DIR [--json FILE]
 
-DIR holds one folder per scene with image.jpg, clean.jpg and meta.json; `examples/` is such a folder. Per scene: box IoU,
-direction error (degrees), path error (% of the image's width: mean distance of the true centres, up to the first
+DIR holds one folder per scene with image.jpg, clean.jpg and meta.json; `examples/` is such a folder. Per scene: box
+IoU, direction error (degrees), path error (% of the image's width: mean distance of the true centres, up to the first
 contact, to the computed path), centre error (px: where the mover is found in rendered frames against its trajectory),
 background error (grey levels: the largest difference to the input away from mover, hole and drawing), arrow error (grey
 levels: mean difference to clean.jpg where the arrow stood), and whether the encounters give the true answer.
@@ -81,8 +81,8 @@ def measure(service: Service, folder: Path) -> Row:
 
 
 def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simulation, outcome: str) -> Row:
-    pixels, clean = (cv2.imread(str(folder / name))[..., ::-1] for name in ("image.jpg", "clean.jpg"))
-    frames = [_frame(service, frame.sha256) for frame in simulation.frames]
+    pixels, clean = (_pixels((folder / name).read_bytes()) for name in ("image.jpg", "clean.jpg"))
+    frames = [_pixels(service.artifacts.read(frame.sha256)) for frame in simulation.frames]
     centre, background, arrow = _frame_errors(simulation, frames, Scene(np.ascontiguousarray(pixels)), clean)
     kinds = [
         encounter.kind
@@ -109,9 +109,12 @@ def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simul
     )
 
 
-def _frame(service: Service, sha256: str) -> NDArray[np.uint8]:
-    encoded = np.frombuffer(service.artifacts.read(sha256), np.uint8)
-    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1], np.uint8)
+def _pixels(encoded: bytes) -> NDArray[np.uint8]:
+    """RGB [h, w, 3] of an encoded image."""
+    pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise ValueError("not an image that OpenCV reads")
+    return np.asarray(pixels[..., ::-1], np.uint8)
 
 
 def _frame_errors(
@@ -122,17 +125,17 @@ def _frame_errors(
     mover = scene.silhouette(bbox)
     drawn = np.abs(scene.image.astype(int) - clean).max(axis=2) > DRAWN
     kernel = np.ones((2 * AWAY + 1, 2 * AWAY + 1), np.uint8)
-    still = cv2.dilate((mover | drawn | scene.cues).astype(np.uint8), kernel)
+    still = cv2.dilate((mover | drawn | scene.cues).astype(np.uint8), kernel) > 0
     centres: list[float] = []
     backgrounds: list[float] = []
     arrows: list[float] = []
     for frame, pixels in zip(simulation.frames, frames, strict=True):
         point = np.array(simulation.trajectory.points[frame.index])
         shift = np.array([[1, 0, point[0] - start[0]], [0, 1, point[1] - start[1]]], np.float64)
-        here = cv2.warpAffine(mover.astype(np.uint8), shift, mover.shape[::-1])
-        changed = cv2.dilate(here, kernel) | still
-        backgrounds.append(float(np.abs(pixels.astype(int) - scene.image)[changed == 0].max(initial=0)))
-        hole = here | mover.astype(np.uint8)
+        here = cv2.warpAffine(mover.astype(np.uint8), shift, mover.shape[::-1]) > 0
+        changed = (cv2.dilate(here.astype(np.uint8), kernel) > 0) | still
+        backgrounds.append(float(np.abs(pixels.astype(int) - scene.image)[~changed].max(initial=0)))
+        hole = (here | mover).astype(np.uint8)
         free = drawn & (cv2.dilate(hole, np.ones((11, 11), np.uint8)) == 0) if frame.index else drawn
         if free.sum() > 0.5 * drawn.sum() > 0:
             arrows.append(float(np.abs(pixels.astype(int) - clean)[free].mean()))
@@ -145,7 +148,7 @@ def _frame_errors(
 def _locate(
     scene: Scene, mover: NDArray[np.bool_], pixels: NDArray[np.uint8], shift: NDArray[np.float64]
 ) -> float | None:
-    """Distance (px) between where the mover is best found in a frame and where it should be; None where it is hidden."""
+    """Distance (px) between where the mover is best found in a frame and where it should be; None where hidden."""
     rows, columns = np.nonzero(mover.any(axis=1))[0], np.nonzero(mover.any(axis=0))[0]
     window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     template, mask = scene.clean[window], np.repeat(mover[window][..., None], 3, axis=2).astype(np.float32)
@@ -253,7 +256,7 @@ def _text(value: float | None, digits: int = 2) -> str:
 
 def main() -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--json", type=Path, default=None, help="write rows and summary here")
     arguments = parser.parse_args()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -59,9 +59,14 @@ def main(
 
 @app.command()
 def simulate(
-    image: Annotated[Path, typer.Argument(help="PNG, JPEG or WebP.", exists=True, dir_okay=False, readable=True)],
+    image: Annotated[
+        Path, typer.Argument(metavar="IMAGE", help="PNG, JPEG or WebP.", exists=True, dir_okay=False, readable=True)
+    ],
     question: Annotated[
-        str, typer.Argument(help='For example "If the red ball moves to the left, will it hit the vase?"')
+        str,
+        typer.Argument(
+            metavar="QUESTION", help='For example "If the red ball moves to the left, will it hit the vase?"'
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the results.", show_default="./<image>-cow")
@@ -168,7 +173,7 @@ def _service(host: str | None = None, port: int | None = None) -> Service:
 
 
 @contextmanager
-def _errors_told() -> Iterator[None]:
+def _errors_told() -> Generator[None]:
     """Errors as a few plain lines on standard error, and exit code 1; 2 for bad settings."""
     from cow_service.settings import SettingsError  # noqa: PLC0415
 

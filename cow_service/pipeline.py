@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import collections.abc
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -53,7 +54,7 @@ class _Clock:
     timings: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def stage(self, name: Stage) -> Iterator[Callable[[float], None]]:
+    def stage(self, name: Stage) -> collections.abc.Generator[Callable[[float], None]]:
         """Times a stage and reports its start, its progress and its end."""
         started = time.perf_counter()
         self.progress(name, 0.0)
@@ -67,7 +68,7 @@ def simulate(
 ) -> Simulation:
     """Imagines the future of an image. `progress` hears each stage's name with 0 at its start and 1 at its end.
 
-    Raises the errors of the stages: `InvalidRequest`, `CannotGround`, `CannotReadDirection`, `GeneratorUnavailable`, ...
+    Raises the errors of its stages: `InvalidRequest`, `CannotGround`, `CannotReadDirection`, `GeneratorUnavailable`...
     """
     options = read_options(backends.generator, request.generator_options)
     scene = Scene(image.pixels)

@@ -103,7 +103,8 @@ class FramesRequest(Record):
 
     policy: FramePolicy = Field(
         default="initial",
-        description="initial: frames 1, 3, 5, ...; uniform: evenly over the clip; events: at encounters and on the way.",
+        description="initial: frames 1, 3, 5, ...; uniform: evenly over the clip; "
+        "events: at encounters and on the way.",
     )
     count: int = Field(default=3, ge=1, le=64)
     indices: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(

@@ -42,7 +42,7 @@ class Service:
         self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable)
 
     def keep_image(self, data: bytes) -> Artifact:
-        """Checks an image (PNG, JPEG or WebP) and keeps its bytes as sent. Raises the image errors of `images.decode`."""
+        """Checks an image (PNG, JPEG or WebP) and keeps its bytes as sent. Raises the errors of `images.decode`."""
         image = decode(data, max_megapixels=self.settings.max_image_megapixels)
         return self.artifacts.put(data, image.media_type)
 

@@ -19,9 +19,9 @@ def artifact_routes(service: Service) -> APIRouter:
     """The operation, bound to a service. Bytes never change under their digest, so caches may keep them."""
     router = APIRouter()
 
-    @router.api_route(
+    @router.head("/artifacts/{sha256}", include_in_schema=False)
+    @router.get(
         "/artifacts/{sha256}",
-        methods=["GET", "HEAD"],
         operation_id="artifact",
         tags=["artifacts"],
         summary="Bytes by their SHA-256",

@@ -8,14 +8,12 @@ from typing import Any
 from fastapi import Request
 from pydantic import ValidationError
 from starlette.datastructures import UploadFile
-from starlette.formparsers import MultiPartException
+from starlette.exceptions import HTTPException
 
 from cow_service.api.problems import invalid
 from cow_service.errors import BodyTypeUnsupported, FieldError, InvalidRequest, MalformedBody
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
-
-MAX_DEPTH_CHARACTERS = 200  # of an unreadable body, quoted back
 
 BODY = {
     "required": True,
@@ -57,9 +55,10 @@ async def _read_form(request: Request, service: Service) -> dict[str, Any]:
     """The multipart form as the JSON body that it stands for; its image is kept as an artifact."""
     try:
         form = await request.form(max_files=1, max_fields=8)
-    except (MultiPartException, ValueError) as error:
-        raise MalformedBody(f"The multipart body could not be read: {error}. Send an `image` file part.") from error
-    async with form:
+    except (HTTPException, ValueError) as error:  # starlette turns its own parser errors into HTTP ones
+        told = error.detail if isinstance(error, HTTPException) else error
+        raise MalformedBody(f"The multipart body could not be read: {told} Send an `image` file part.") from error
+    try:
         given = _parse(_text(form, "request") or "{}", "The form field `request`")
         image = form.get("image")
         unknown = sorted(set(form.keys()) - {"image", "question", "request"})
@@ -76,6 +75,8 @@ async def _read_form(request: Request, service: Service) -> dict[str, Any]:
             detail = "`image` must be a file part with a file name."
             raise InvalidRequest(detail, errors=(FieldError("/image", detail),))
         return given
+    finally:
+        await form.close()
 
 
 def _text(form: Any, name: str) -> str | None:

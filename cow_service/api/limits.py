@@ -39,5 +39,6 @@ class BodyLimit:
 
     def _error(self) -> BodyTooLarge:
         return BodyTooLarge(
-            f"The body is larger than {self.megabytes:g} MB. Send a smaller image, or raise COW_MAX_BODY_MB on the server."
+            f"The body is larger than {self.megabytes:g} MB. Send a smaller image, or raise COW_MAX_BODY_MB on the "
+            "server."
         )

@@ -12,9 +12,17 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field, ValidationError
 from starlette.exceptions import HTTPException
 
-from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, MethodNotAllowed, NotFound
+from cow_service.errors import (
+    CowError,
+    FieldError,
+    InternalError,
+    InvalidRequest,
+    MalformedBody,
+    MethodNotAllowed,
+    NotFound,
+)
 
-TYPE_PREFIX = "https://cow-service.dev/problems/"
+TYPE_PREFIX = "urn:cow:problem:"  # a name, not an address: README.md explains every code
 MEDIA_TYPE = "application/problem+json"
 
 log = logging.getLogger("cow_service")
@@ -106,9 +114,9 @@ def _translated(error: HTTPException, request: Request) -> CowError:
         return NotFound(f"Nothing is served at {request.url.path}. GET /openapi.json lists what is.")
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
         return MethodNotAllowed(f"{request.url.path} does not take {request.method}.")
-    translated = CowError(str(error.detail))
-    translated.status = error.status_code
-    return translated
+    if HTTPStatus.BAD_REQUEST <= error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
+        return MalformedBody(f"{error.detail}.")
+    return InternalError(f"{error.detail}.")
 
 
 def _location(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:

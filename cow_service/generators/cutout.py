@@ -119,7 +119,7 @@ def _near(shot: Shot, obstacles: Sequence[Obstacle]) -> list[Obstacle]:
 
 
 def _sprite(image: Image, mover: Mask) -> tuple[Floats, tuple[float, float]]:
-    """The mover with a soft edge, and where its corner lies. Colours at the edge are the mover's own, not mixed ones."""
+    """The mover with a soft edge, and where its corner lies. Colours at the edge are the mover's own, not mixed."""
     rows, columns = np.nonzero(mover.any(axis=1))[0], np.nonzero(mover.any(axis=0))[0]
     pad = 4
     top, left = int(rows[0]) - pad, int(columns[0]) - pad

@@ -53,5 +53,5 @@ class Camera:
 
 
 def depth_motion(sense: float) -> tuple[tuple[float, float], float]:
-    """Image direction and `Motion.depth` of something on the floor moving straight away (+1) or towards (-1) the camera."""
+    """Image direction and `Motion.depth` of what moves on the floor straight away (+1) or towards (-1) the camera."""
     return (0.0, -1.0 if sense > 0 else 1.0), math.copysign(math.cos(PITCH), sense)

@@ -1,4 +1,4 @@
-"""The reader that needs no weights: rules for the question, classical vision for the image. It refuses rather than guess."""
+"""The reader that needs no weights: rules for the question, classical vision for the image. It refuses, not guesses."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import GroundingReading, MotionReading
 from cow_service.readers.matching import best_matches, describe, inside_drawn_box, match_one
+from cow_service.readers.motion_words import MotionWords
 from cow_service.readers.phrases import ObjectPhrase
 from cow_service.readers.sentences import Question, parse
 from cow_service.records import BBox, Grounding, LocatedObject, ReaderInfo, Vector
@@ -37,9 +38,9 @@ class EmbeddedReader:
     def ground(self, scene: Scene, question: str) -> GroundingReading:
         """The region that fits the mover's words; `CannotGround` where none or several do."""
         asked = parse(question)
-        if asked.mover is None:
+        if asked.mover is None or not _speaks_of_motion(asked.motion):
             raise CannotGround(
-                'No moving object was found in the words of the question. Ask like "If the red ball moves to the left, '
+                'The question does not say in words what moves. Ask like "If the red ball moves to the left, '
                 f'will it hit the vase?". {GIVE_PLACE}'
             )
         bbox = self._mover(scene, asked, asked.mover)
@@ -50,10 +51,8 @@ class EmbeddedReader:
         asked = parse(question)
         words = asked.motion
         kind = words.kind or "linear"
-        if kind == "static":
-            return MotionReading("static", None, "text")
-        if kind == "fall":
-            return MotionReading("fall", None, "gravity")
+        if kind in ("static", "fall"):  # neither has a direction
+            return MotionReading(kind, None, "text" if kind == "static" else "gravity")
         if words.arrow is not None:
             arrow = _arrow_of(scene, grounding)
             sign = 1.0 if words.arrow == "along" else -1.0
@@ -67,14 +66,16 @@ class EmbeddedReader:
             return MotionReading(kind, _towards(scene, asked, words.towards, grounding), "text")
         if words.forward is not None:
             raise CannotReadDirection(
-                f"The question says that the {grounding.object} moves {'forward' if words.forward else 'backward'}. Which way "
-                f"an object faces is beyond the embedded reader: it reads drawn arrows and words like left or up. {GIVE_DIRECTION}"
+                f"The question says that the {grounding.object} moves {'forward' if words.forward else 'backward'}. "
+                "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
+                f"up. {GIVE_DIRECTION}"
             )
         own = _arrows_near(scene, grounding)
         if len(own) != 1:
             raise CannotReadDirection(
-                f"The question names no direction (left, right, up, down, towards, away, along the arrow), and the image shows "
-                f"{len(own) or 'no'} arrow{'s' if len(own) > 1 else ''} at the {grounding.object}. {GIVE_DIRECTION}"
+                "The question names no direction (left, right, up, down, towards, away, along the arrow), and the "
+                f"image shows {len(own) or 'no'} arrow{'s' if len(own) > 1 else ''} at the {grounding.object}. "
+                f"{GIVE_DIRECTION}"
             )
         note = "The question names no direction; the arrow drawn at the object was followed."
         return MotionReading(kind, own[0].direction, "arrow", along_arrow=True, warnings=(note,))
@@ -84,8 +85,8 @@ class EmbeddedReader:
             return inside_drawn_box(scene, phrase, GIVE_PLACE)
         if not scene.regions:
             raise CannotGround(
-                f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to tell "
-                f"its objects apart. {GIVE_PLACE}"
+                f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to "
+                f"tell its objects apart. {GIVE_PLACE}"
             )
         fitting = best_matches(scene.regions, phrase, asked.others)
         if len(fitting) > 1 and (asked.motion.arrow is not None or phrase.colour is None):
@@ -96,13 +97,20 @@ class EmbeddedReader:
         if not fitting:
             raise CannotGround(f"Looked for '{phrase.text}' and found nothing that fits. Seen: {seen}. {GIVE_PLACE}")
         raise CannotGround(
-            f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. Seen in all: {seen}. {GIVE_PLACE}"
+            f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. "
+            f"Seen in all: {seen}. {GIVE_PLACE}"
         )
 
 
 def create() -> EmbeddedReader:
     """Factory for the registry."""
     return EmbeddedReader()
+
+
+def _speaks_of_motion(words: MotionWords) -> bool:
+    """Whether the question says at all that something moves."""
+    told = (words.kind, words.arrow, words.direction, words.forward, words.towards)
+    return bool(words.verb or words.depth) or any(part is not None for part in told)
 
 
 def _others(scene: Scene, asked: Question, mover: BBox) -> tuple[LocatedObject, ...]:
@@ -136,16 +144,16 @@ def _arrow_of(scene: Scene, grounding: Grounding) -> Arrow:
     arrows = sorted(scene.arrows, key=lambda arrow: _gap(arrow, grounding.bbox))
     if not arrows:
         raise CannotReadDirection(
-            "The question speaks of an arrow, but no drawn arrow was found: looked for one flat colour with a straight shaft and "
-            f"a head. {GIVE_DIRECTION}"
+            "The question speaks of an arrow, but no drawn arrow was found: looked for one flat colour with a straight "
+            f"shaft and a head. {GIVE_DIRECTION}"
         )
     if len(arrows) > 1 and _gap(arrows[0], grounding.bbox) > RIVAL * _gap(arrows[1], grounding.bbox):
         places = "; ".join(
             f"from ({a.tail[0]:.0f}, {a.tail[1]:.0f}) to ({a.tip[0]:.0f}, {a.tip[1]:.0f})" for a in arrows
         )
         raise CannotReadDirection(
-            f"The question speaks of one arrow, but {len(arrows)} were found, and none is clearly that of the {grounding.object}: "
-            f"{places}. {GIVE_DIRECTION}"
+            f"The question speaks of one arrow, but {len(arrows)} were found, and none is clearly that of the "
+            f"{grounding.object}: {places}. {GIVE_DIRECTION}"
         )
     return arrows[0]
 
@@ -175,8 +183,8 @@ def _towards(scene: Scene, asked: Question, phrase: ObjectPhrase, grounding: Gro
         bbox = None if region is None else region.bbox
     if bbox is None:
         raise CannotReadDirection(
-            f"The {grounding.object} moves towards '{phrase.text}', which was not found. Seen: {describe(scene.regions)}. "
-            f"{GIVE_DIRECTION}"
+            f"The {grounding.object} moves towards '{phrase.text}', which was not found. "
+            f"Seen: {describe(scene.regions)}. {GIVE_DIRECTION}"
         )
     x, y = grounding.point
     return (bbox[0] + bbox[2]) / 2 - x, (bbox[1] + bbox[3]) / 2 - y

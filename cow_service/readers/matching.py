@@ -24,8 +24,9 @@ def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequen
         best = max(scores, default=0.0)
         fitting = [region for region, score in zip(fitting, scores, strict=True) if score == best > 0]
         if best < 1:
+            # Only a neighbouring colour: then nobody else may claim it, and the shape must speak for it.
             claimed = {other.colour for other in others}
-            fitting = [region for region in fitting if region.colour not in claimed]
+            fitting = [r for r in fitting if r.colour not in claimed and _looks_like(r, phrase)]
     else:
         claimed = {other.colour for other in others if other.colour is not None}
         fitting = [region for region in fitting if region.colour not in claimed]
@@ -67,6 +68,9 @@ def _by_shape(regions: list[Region], phrase: ObjectPhrase) -> list[Region]:
     """Where several fit and the noun names something round, the round ones; where it does not, the others."""
     if len(regions) < 2 or phrase.noun is None:
         return regions
-    is_ball = phrase.head in ROUND_NOUNS
-    shaped = [region for region in regions if (region.roundness >= ROUND) == is_ball]
-    return shaped or regions
+    return [region for region in regions if _looks_like(region, phrase)] or regions
+
+
+def _looks_like(region: Region, phrase: ObjectPhrase) -> bool:
+    """Whether a region is round where the noun names something round, and is not where it does not."""
+    return (region.roundness >= ROUND) == (phrase.head in ROUND_NOUNS)

@@ -56,6 +56,22 @@ class _Shape:
     fit: float
 
 
+@dataclass(frozen=True)
+class _Profile:
+    """The width of a patch along an axis from tail to tip, and the axis that its shaft then has."""
+
+    extent: NDArray[np.float64]  # [n] px: the width at every px along the axis; NaN where nothing lies
+    start: float  # px along the axis, from the centre that the points were measured from
+    end: float
+    thickness: float
+    head_width: float
+    peak: int  # where along the axis it is widest
+    neck: int  # where the head begins
+    middle: float  # px beside the axis: the middle of the head
+    axis: NDArray[np.float64]  # unit vector along the shaft
+    centre: NDArray[np.float64]  # a point on it
+
+
 def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[Arrow, ...]:
     """Drawn arrows among the strokes of an image whose full size is [height, width]; overlapping findings are one."""
     found = [(shape, stroke) for stroke in strokes if (shape := fit_arrow(stroke.patch)) is not None]
@@ -108,59 +124,78 @@ def _measure(
     points: NDArray[np.float64], centre: NDArray[np.float64], axis: NDArray[np.float64], patch: NDArray[np.bool_]
 ) -> _Shape | None:
     """Reads shaft and head off the width profile along `axis` (tail to tip); the axis is refined on the shaft."""
-    for _ in range(3):
-        normal = np.array([-axis[1], axis[0]])
-        along, across = (points - centre) @ axis, (points - centre) @ normal
-        start, end = along.min(), along.max()
-        length = end - start
-        if length < MIN_LENGTH:
-            return None
-        bins = np.clip((along - start).astype(int), 0, int(length))
-        n = int(length) + 1
-        high, low = np.full(n, -1e9), np.full(n, 1e9)
-        np.maximum.at(high, bins, across)
-        np.minimum.at(low, bins, across)
-        filled_bins = high > -1e8
-        if filled_bins.mean() < 0.95:
-            return None
-        extent = np.where(filled_bins, high - low + 1, np.nan)
-        shaft_end = int(0.45 * n)
-        thickness = float(np.nanmedian(extent[max(1, n // 12) : shaft_end]))
-        peak = int(np.nanargmax(extent))
-        head_width = float(extent[peak])
-        if peak < 0.4 * n or head_width < max(1.8 * thickness, thickness + 4):
-            return None
-        wide = np.nonzero(extent[:peak] > thickness + max(2.0, 0.35 * thickness))[0]
-        wide = wide[wide > 0.3 * n]
-        neck = int(wide.min()) if len(wide) else peak
-        shaft = (bins > n // 20) & (bins < max(neck - 1, n // 3))
-        if shaft.sum() < 12:
-            return None
-        vx, vy, x0, y0 = (
-            float(v) for v in cv2.fitLine(points[shaft].astype(np.float32), cv2.DIST_L2, 0, 0.01, 0.01).ravel()
-        )
-        line = np.array([vx, vy]) if vx * axis[0] + vy * axis[1] > 0 else -np.array([vx, vy])
-        axis, centre = line, np.array([x0, y0])
+    profile = _profile(points, centre, axis)
+    for _ in range(2):
+        if profile is not None:
+            profile = _profile(points, profile.centre, profile.axis)
+    if profile is None or not _is_arrow_like(profile):
+        return None
+    tail, tip = profile.centre + profile.axis * profile.start, profile.centre + profile.axis * profile.end
+    thickness, head_width = profile.thickness, profile.head_width
+    head_length = len(profile.extent) - 1 - profile.peak
+    fits = {filled: _overlap(patch, tail, tip, thickness, head_width, head_length, filled) for filled in (True, False)}
+    filled = fits[True] >= fits[False]
+    return _Shape(tail, tip, thickness, head_width, float(head_length), filled, fits[filled])
+
+
+def _profile(points: NDArray[np.float64], centre: NDArray[np.float64], axis: NDArray[np.float64]) -> _Profile | None:
+    """The widths of a patch's points [N, 2] along an axis, or None where they are no shaft followed by a wider head."""
+    normal = np.array([-axis[1], axis[0]])
+    along, across = (points - centre) @ axis, (points - centre) @ normal
+    start, end = float(along.min()), float(along.max())
+    length = end - start
+    if length < MIN_LENGTH:
+        return None
+    bins = np.clip((along - start).astype(int), 0, int(length))
+    n = int(length) + 1
+    high, low = np.full(n, -1e9), np.full(n, 1e9)
+    np.maximum.at(high, bins, across)
+    np.minimum.at(low, bins, across)
+    filled_bins = high > -1e8
+    if filled_bins.mean() < 0.95:
+        return None
+    extent = np.where(filled_bins, high - low + 1, np.nan)
+    shaft_end = int(0.45 * n)
+    thickness = float(np.nanmedian(extent[max(1, n // 12) : shaft_end]))
+    peak = int(np.nanargmax(extent))
+    head_width = float(extent[peak])
+    if peak < 0.4 * n or head_width < max(1.8 * thickness, thickness + 4):
+        return None
+    wide = np.nonzero(extent[:peak] > thickness + max(2.0, 0.35 * thickness))[0]
+    wide = wide[wide > 0.3 * n]
+    neck = int(wide.min()) if len(wide) else peak
+    shaft = (bins > n // 20) & (bins < max(neck - 1, n // 3))
+    if shaft.sum() < 12:
+        return None
+    vx, vy, x0, y0 = (
+        float(v) for v in cv2.fitLine(points[shaft].astype(np.float32), cv2.DIST_L2, 0, 0.01, 0.01).ravel()
+    )
+    line = np.array([vx, vy]) if vx * axis[0] + vy * axis[1] > 0 else -np.array([vx, vy])
+    middle = float(high[peak] + low[peak]) / 2
+    origin = np.array([x0, y0])
+    along = (points - origin) @ line
+    start, end = float(along.min()), float(along.max())
+    return _Profile(extent, start, end, thickness, head_width, peak, neck, middle, line, origin)
+
+
+def _is_arrow_like(profile: _Profile) -> bool:
+    """Whether the shaft keeps its width, and the head is symmetric, of plausible length and tapers to a tip."""
+    extent, thickness, head_width, peak = profile.extent, profile.thickness, profile.head_width, profile.peak
+    n = len(extent)
     head = extent[peak:]
-    shaft_extent = extent[max(1, n // 20) : max(neck - 1, n // 3)]
-    steady = np.nanmean(np.abs(shaft_extent - thickness) <= max(1.6, 0.3 * thickness))
+    shaft_extent = extent[max(1, n // 20) : max(profile.neck - 1, n // 3)]
+    steady = float(np.nanmean(np.abs(shaft_extent - thickness) <= max(1.6, 0.3 * thickness)))
     head_length = n - 1 - peak
-    middle = (high[peak] + low[peak]) / 2
-    if (
+    return not (
         steady < 0.75
         or len(shaft_extent) < 0.25 * n
         or head_length < 0.35 * (head_width - thickness) / 2
         or head_length > 0.7 * n
         or head_length > 2.5 * head_width
-        or abs(middle) > 0.22 * head_width + 1
+        or abs(profile.middle) > 0.22 * head_width + 1
         or float(np.nanmean(np.diff(head) <= 1.5)) < 0.9
         or head[-1] > 0.45 * head_width + thickness
-    ):
-        return None
-    tail, tip = centre + axis * start, centre + axis * end
-    fits = {filled: _overlap(patch, tail, tip, thickness, head_width, head_length, filled) for filled in (True, False)}
-    filled = fits[True] >= fits[False]
-    return _Shape(tail, tip, thickness, head_width, float(head_length), filled, fits[filled])
+    )
 
 
 def _overlap(

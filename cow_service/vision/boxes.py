@@ -48,7 +48,7 @@ def _line_width(patch: NDArray[np.bool_]) -> int | None:
     if min(h, w) < MIN_SIDE:
         return None
     sides = (patch[:, w // 2], patch[:, w // 2][::-1], patch[h // 2], patch[h // 2][::-1])
-    widths = [int(np.argmin(side)) if side[0] else 0 for side in sides]
+    widths = [_first_run(side) for side in sides]
     line = int(np.median(widths))
     if not 1 <= line <= 0.2 * min(h, w):
         return None
@@ -60,3 +60,9 @@ def _line_width(patch: NDArray[np.bool_]) -> int | None:
     if patch[frame].sum() < ON_OUTLINE * patch.sum() or rim.mean() < COVERED:
         return None
     return line
+
+
+def _first_run(side: NDArray[np.bool_]) -> int:
+    """How many pixels inwards the line ends, where it begins within a fringe of 2 px; else 0."""
+    start = int(np.argmax(side))
+    return start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0

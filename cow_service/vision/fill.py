@@ -86,7 +86,7 @@ def _is_varied(source: NDArray[np.float32], inside: Mask, known: Mask) -> bool:
 
 
 def _contact_shadow(source: NDArray[np.float32], inside: Mask, known: Mask) -> Mask:
-    """Known pixels at the rim of the hole that are much darker than most: the object's own shadow, no shading to draw in."""
+    """Known pixels at the hole's rim that are much darker than most: the object's own shadow, no shading to draw in."""
     reach = 2 * max(3, int(0.15 * np.sqrt(inside.sum()))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     rim = (cv2.dilate(inside.astype(np.uint8), kernel) > 0) & known
@@ -101,7 +101,7 @@ def draw_in(source: NDArray[np.float32], known: Mask) -> NDArray[np.float32]:
     weight = known.astype(np.float32)
     levels = [(source * weight[..., None], weight)]
     while min(levels[-1][1].shape) > 1 and not (levels[-1][1] > 0).all():
-        colours, weights = (cv2.pyrDown(layer) for layer in levels[-1])
+        colours, weights = (np.asarray(cv2.pyrDown(layer), np.float32) for layer in levels[-1])
         levels.append((colours, weights))
     colours, weights = levels[-1]
     value = colours / np.maximum(weights, 1e-6)[..., None]
@@ -111,7 +111,7 @@ def draw_in(source: NDArray[np.float32], known: Mask) -> NDArray[np.float32]:
         value = np.where(trust > 1e-3, colours / np.maximum(weights, 1e-3)[..., None], 0) * trust + coarse * (1 - trust)
     for _ in range(2):
         value = np.where(known[..., None], source, cv2.GaussianBlur(value, (0, 0), 2.0))
-    return value
+    return np.asarray(value, np.float32)
 
 
 def _texture(image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, slice]) -> NDArray[np.float32]:

@@ -35,7 +35,7 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
     columns = slice(max(0, int(x0 - pad)), min(width, int(np.ceil(x1 + pad))))
     crop = image[rows, columns]
     scale = min(1.0, WORKING_SIDE / max(crop.shape[:2]))
-    small = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else crop
+    small = _scaled(crop, scale)
     h, w = small.shape[:2]
     box = np.array([x0 - columns.start, y0 - rows.start, x1 - columns.start, y1 - rows.start]) * scale
     if guess is None:
@@ -44,7 +44,7 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
             cut = _grabcut(small, _labels_from_box(h, w, box, LARGE_CORE))
     else:
         near = cv2.resize(guess[rows, columns].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA)
-        cut = _grabcut(small, _labels_from_guess(near))
+        cut = _grabcut(small, _labels_from_guess(np.asarray(near, np.uint8)))
     if guess is not None:  # a guess may have missed a highlight: its box is not the object's
         grow = GROW * float(np.sqrt((box[2] - box[0]) * (box[3] - box[1])))
         box = box + grow * np.array([-1, -1, 1, 1])
@@ -89,7 +89,7 @@ def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[
     columns = slice(max(0, int(point[0] - outer)), min(width, int(point[0] + outer) + 1))
     crop = image[rows, columns]
     scale = min(1.0, POINT_WORKING_SIDE / max(crop.shape[:2]))
-    small = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else crop
+    small = _scaled(crop, scale)
     h, w = small.shape[:2]
     x, y, r = (point[0] - columns.start) * scale, (point[1] - rows.start) * scale, half * scale
     box = _inside((x - r, y - r, x + r, y + r), w, h)
@@ -111,6 +111,13 @@ def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[
     mask = np.zeros((height, width), bool)
     mask[rows, columns] = soft > 0.5
     return on_edge - 0.6 * cramped, mask if mask.any() else None
+
+
+def _scaled(crop: Image, scale: float) -> Image:
+    """A crop made smaller; one that need not be is left as it is."""
+    if scale >= 1:
+        return crop
+    return np.asarray(cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _inside(bbox: BBox, width: int, height: int) -> BBox:
@@ -163,7 +170,8 @@ def _grabcut(image: Image, labels: NDArray[np.uint8]) -> Mask:
     if sure & foreground and sure & background:
         light = np.clip(255 * (image / 255.0) ** GAMMA, 0, 255).astype(np.uint8)
         cv2.setRNGSeed(0)  # its clustering draws random numbers: the same image must give the same mask
-        cv2.grabCut(light, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), ITERATIONS, cv2.GC_INIT_WITH_MASK)
+        no_box, models = (0, 0, 0, 0), (np.zeros((1, 65)), np.zeros((1, 65)))  # labels say it all
+        cv2.grabCut(light, labels, no_box, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)
     return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 

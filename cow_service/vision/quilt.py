@@ -27,7 +27,8 @@ def quilt(source: Floats, unknown: Mask, forbidden: Mask, shading: Floats) -> Fl
     height, width = unknown.shape
     scale = min(1.0, COARSE_SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    coarse = cv2.resize(np.where(unknown[..., None], shading, source), size, interpolation=cv2.INTER_AREA)
+    guess = np.where(unknown[..., None], shading, source)
+    coarse = np.asarray(cv2.resize(guess, size, interpolation=cv2.INTER_AREA), np.float32)
     todo = cv2.resize(unknown.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
     barred = cv2.resize((unknown | forbidden).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
     result, weight = np.zeros_like(source), np.zeros(unknown.shape, np.float32)

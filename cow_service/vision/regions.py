@@ -1,8 +1,9 @@
 """Finds the objects of an uncluttered image: coloured, white or black things on a floor, a table or a wall.
 
-What differs from its wide surroundings in colour, stands out brighter, or is nearly black, is part of an object; a patch
-fenced in by edges below a bright top is the shaded side of a white one. Shadows are darker and keep the hue: left out.
-Where the surroundings themselves vary too much (most photographs), nothing is reported instead of something wrong.
+What differs from its wide surroundings in colour, stands out brighter, or is nearly black, is part of an object; a
+patch fenced in by edges below a bright top is the shaded side of a white one. Shadows are darker and keep the hue:
+left out. Where the surroundings themselves vary too much (most photographs), nothing is reported instead of something
+wrong.
 """
 
 from __future__ import annotations
@@ -61,8 +62,10 @@ class _View:
 
     def crop(self, window: tuple[slice, slice]) -> _View:
         """The same measurements for a part of the image."""
-        layers = (self.lab, self.chroma_gap, self.bright, self.around, self.edges)
-        return _View(*(layer[window] for layer in layers), self.fence)
+        gap, bright, around, edges = (
+            layer[window] for layer in (self.chroma_gap, self.bright, self.around, self.edges)
+        )
+        return _View(self.lab[window], gap, bright, around, edges, self.fence)
 
 
 def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
@@ -70,7 +73,7 @@ def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
     small = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    view = _view(small)
+    view = _view(np.asarray(small, np.uint8))
     core = _core(view)
     if core.mean() > CLUTTER:
         return ()
@@ -94,14 +97,14 @@ def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
 def _view(small: NDArray[np.uint8]) -> _View:
     """Measures every pixel against a median over half the image around it."""
     smooth = cv2.bilateralFilter(small, 5, 25, 5)
-    lab = cv2.cvtColor(smooth.astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
+    lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
     coarse = cv2.resize(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     side = int(0.5 * min(coarse.shape[:2])) | 1
     pad = side // 2
     padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)
     median = cv2.medianBlur(padded, side)[pad : pad + coarse.shape[0], pad : pad + coarse.shape[1]]
     around = cv2.resize(median, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR).astype(np.float32)
-    around_l = around[..., 0] / np.float32(2.55)
+    around_l: Channel = np.divide(around[..., 0], 2.55, dtype=np.float32)
     gap = np.hypot(lab[..., 1] - (around[..., 1] - 128), lab[..., 2] - (around[..., 2] - 128))
     blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
     dx, dy = cv2.Sobel(blurred, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(blurred, cv2.CV_32F, 0, 1) / 8
@@ -128,7 +131,7 @@ def _white_sides(view: _View, core: Mask) -> Mask:
     neutral = (np.hypot(view.lab[..., 1], view.lab[..., 2]) < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
     white = (core & (view.bright > BRIGHT_STEP) & neutral).astype(np.uint8)
     _, top_labels, top_stats, _ = cv2.connectedComponentsWithStats(white, connectivity=8)
-    sides = _lit_fronts(view, white > 0, top_labels, top_stats)
+    sides = _lit_fronts(view, white > 0, np.asarray(top_labels, np.int32), np.asarray(top_stats, np.int32))
     height, width = core.shape
     kernel = np.ones((3, 3), np.uint8)
     for floor, factor in FENCES:

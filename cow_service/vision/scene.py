@@ -87,7 +87,7 @@ class Scene:
             return self._masks[bbox]
 
     def bbox_at(self, point: tuple[float, float]) -> BBox:
-        """Tight box [x0, y0, x1, y1] of the object at a point [x, y]; the smallest region there, else a cut around it."""
+        """Tight box [x0, y0, x1, y1] of the object at a point [x, y]: the smallest region there, or a cut around it."""
         x = min(self.width - 1, max(0, int(point[0])))
         y = min(self.height - 1, max(0, int(point[1])))
         with self._lock:

@@ -49,8 +49,10 @@ class WorkingImage:
 def working_image(image: Image) -> WorkingImage:
     """The image, scaled down where it is longer than the working size."""
     scale = min(1.0, WORKING_SIDE / max(image.shape[:2]))
-    small = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return WorkingImage(small, scale)
+    if scale == 1.0:
+        return WorkingImage(image, scale)
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return WorkingImage(np.asarray(small, np.uint8), scale)
 
 
 def find_strokes(image: Image) -> Iterator[Stroke]:
@@ -60,7 +62,7 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
         for colour in _flat_colours(window[thin]):
             for tolerance in TOLERANCES:
                 low, high = np.clip(colour - tolerance, 0, 255), np.clip(colour + tolerance, 0, 255)
-                same = cv2.inRange(window, low, high)
+                same = np.asarray(cv2.inRange(window, low, high), np.uint8)
                 same[~thin] = 0
                 for (x, y, _, _), patch in _patches(same, most=0.30):
                     stroke = Stroke(bx + x, by + y, patch, (int(colour[0]), int(colour[1]), int(colour[2])))
@@ -103,7 +105,8 @@ def _thin_structures(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     around = cv2.medianBlur(half, THIN // 2 | 1)
     thin = (cv2.absdiff(half, around).max(axis=2) > STANDS_OUT).astype(np.uint8) * 255
     thin = cv2.dilate(thin, np.ones((3, 3), np.uint8))
-    return cv2.resize(thin, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
+    thin = cv2.resize(thin, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(thin, np.uint8)
 
 
 def _is_drawn(image: Image, stroke: Stroke) -> bool:
@@ -111,7 +114,7 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
     x, y, (h, w) = stroke.x, stroke.y, stroke.patch.shape
     inner = image[y : y + h, x : x + w][stroke.patch].astype(np.int16)
     flat = (np.abs(inner - np.array(stroke.colour, np.int16)) <= FLAT).all(axis=1)
-    if 2 * np.count_nonzero(flat) < len(flat):
+    if 2 * np.count_nonzero(flat) < len(inner):
         return False
     pad = 4
     x0, y0, x1, y1 = (
@@ -126,7 +129,7 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
     ring = cv2.dilate(near, _SQUARE) > near
     beyond = image[y0:y1, x0:x1][ring].astype(np.int16)
     sharp = (np.abs(beyond - np.array(stroke.colour, np.int16)) > SHARP).any(axis=1)
-    return np.count_nonzero(sharp) > SHARP_SHARE * len(sharp)
+    return bool(np.count_nonzero(sharp) > SHARP_SHARE * len(beyond))
 
 
 def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
@@ -155,7 +158,7 @@ def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
 
 
 def _patches(same: Image, most: float) -> list[tuple[tuple[int, int, int, int], Mask]]:
-    """Connected patches (box [x, y, w, h] and mask [h, w]) long enough for an arrow; `most` bounds area / diagonal^2."""
+    """Connected patches (box [x, y, w, h], mask [h, w]) long enough for an arrow; `most` bounds area / diagonal^2."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(same, connectivity=8)
     patches: list[tuple[tuple[int, int, int, int], Mask]] = []
     for i in range(1, count):

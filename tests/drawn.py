@@ -1,0 +1,107 @@
+"""Draws arrows, boxes and simple scenes for tests, with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+
+def floor(width: int = 640, height: int = 400, grey: int = 150, seed: int = 0) -> Image:
+    """A plain floor with a little texture and a soft gradient, RGB."""
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.normal(0, 6, (height, width)).astype(np.float32), (0, 0), 1.2)
+    ramp = np.linspace(-10, 10, width, dtype=np.float32)[None]
+    value = np.clip(grey + noise + ramp, 0, 255)
+    return np.repeat(value[..., None], 3, axis=2).astype(np.uint8)
+
+
+def ball(image: Image, centre: tuple[float, float], radius: float, rgb: tuple[int, int, int]) -> Image:
+    """A shaded ball."""
+    ys, xs = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    dx, dy = (xs - centre[0]) / radius, (ys - centre[1]) / radius
+    inside = dx * dx + dy * dy <= 1
+    light = np.clip(1.05 - 0.35 * (dx + dy + 1) / 2, 0.5, 1.1)[..., None]
+    shaded = np.clip(np.array(rgb) * light, 0, 255)
+    return np.where(inside[..., None], shaded, image).astype(np.uint8)
+
+
+def block(image: Image, bbox: tuple[int, int, int, int], rgb: tuple[int, int, int]) -> Image:
+    """A cube seen from the front: a lit top and a darker face."""
+    x0, y0, x1, y1 = bbox
+    edge = y0 + (y1 - y0) // 4
+    result = image.copy()
+    result[y0:edge, x0:x1] = np.clip(np.array(rgb) * 1.1, 0, 255)
+    result[edge:y1, x0:x1] = np.clip(np.array(rgb) * 0.8, 0, 255)
+    return result
+
+
+@dataclass(frozen=True)
+class DrawnArrow:
+    tail: tuple[float, float]
+    angle: float  # radians
+    length: float
+    thickness: int
+    rgb: tuple[int, int, int]
+    style: str  # open, filled or outlined
+
+    @property
+    def direction(self) -> tuple[float, float]:
+        return float(np.cos(self.angle)), float(np.sin(self.angle))
+
+    @property
+    def tip(self) -> tuple[float, float]:
+        dx, dy = self.direction
+        return self.tail[0] + dx * self.length, self.tail[1] + dy * self.length
+
+    def on(self, image: Image) -> Image:
+        """The image with the arrow drawn over it."""
+        result = np.ascontiguousarray(image).copy()
+        if self.style == "outlined":
+            self._paint(result, (255, 255, 255), 4)
+        self._paint(result, self.rgb, 0)
+        return result
+
+    def _paint(self, image: Image, rgb: tuple[int, int, int], grow: int) -> None:
+        along = np.array(self.direction)
+        across = np.array([-along[1], along[0]])
+        tail, tip = np.array(self.tail), np.array(self.tip)
+        head = max(3.2 * self.thickness, 14.0)
+        if self.style == "open":
+            cv2.arrowedLine(
+                image, _whole(tail), _whole(tip), rgb, self.thickness, cv2.LINE_AA, tipLength=head / self.length
+            )
+            return
+        base = tip - along * head
+        cv2.line(image, _whole(tail), _whole(base), rgb, self.thickness + grow, cv2.LINE_AA)
+        corners = np.array([tip, base + across * head * 0.56, base - across * head * 0.56]).round().astype(np.int32)
+        if grow:
+            cv2.polylines(image, [corners], True, rgb, grow, cv2.LINE_AA)
+        cv2.fillPoly(image, [corners], rgb, cv2.LINE_AA)
+
+
+def jpeg(image: Image, quality: int = 90) -> Image:
+    """The image after JPEG compression."""
+    return np.ascontiguousarray(cv2.imdecode(encoded(image, ".jpg", quality), cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def png_bytes(image: Image) -> bytes:
+    return encoded(image, ".png").tobytes()
+
+
+def encoded(image: Image, extension: str, quality: int = 90) -> Image:
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, quality] if extension == ".jpg" else []
+    return cv2.imencode(extension, np.ascontiguousarray(image[..., ::-1]), parameters)[1]
+
+
+def angle_between(a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Degrees."""
+    return float(abs(np.degrees(np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))))
+
+
+def _whole(point: NDArray[np.float64]) -> tuple[int, int]:
+    return round(float(point[0])), round(float(point[1]))

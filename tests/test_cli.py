@@ -1,0 +1,145 @@
+"""The command line, run as a person would run it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from drawn import ball, block, floor, png_bytes
+from PIL import Image
+
+from cow_service import __version__
+from cow_service.records import Models, Simulation
+
+QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
+
+
+@pytest.fixture
+def picture(tmp_path: Path) -> Path:
+    path = tmp_path / "toys.png"
+    path.write_bytes(
+        png_bytes(block(ball(floor(), (150, 200), 40, (210, 20, 20)), (430, 160, 510, 250), (50, 80, 200)))
+    )
+    return path
+
+
+def cow(tmp_path: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    plain = {"COW_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    return subprocess.run(
+        [sys.executable, "-m", "cow_service.cli", *arguments],
+        env=os.environ | plain | environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_simulate_writes_frames_video_overlay_and_record(tmp_path: Path, picture: Path) -> None:
+    result = cow(
+        tmp_path, "simulate", str(picture), QUESTION, "--num-frames", "41", "--frames", "uniform", "--out", "out"
+    )
+    assert result.returncode == 0, result.stderr
+    out = tmp_path / "out"
+    names = {"frame_000.png", "frame_020.png", "frame_040.png", "overlay.png", "simulation.json", "video.mp4"}
+    assert {path.name for path in out.iterdir()} == names
+    simulation = Simulation.model_validate_json((out / "simulation.json").read_text())
+    assert simulation.grounding.object == "red ball"
+    with Image.open(out / "frame_020.png") as frame:
+        assert frame.size == (512, 320)
+    for told in ("grounding", "red ball at (150, 200)", "linear (+1.00, +0.00)", "touches blue cube", "41-frame video"):
+        assert told in result.stdout
+    assert not result.stderr
+
+
+def test_json_and_overrides(tmp_path: Path, picture: Path) -> None:
+    result = cow(
+        tmp_path, "simulate", str(picture), "?", "--point", "150,200", "--object", "it", "--direction", "0,-1",
+        "--speed", "50", "--no-video", "--max-side", "0", "--count", "1", "--json",
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    simulation = Simulation.model_validate_json(result.stdout)
+    assert simulation.grounding.object == "it"
+    assert simulation.motion.speed == 50
+    assert simulation.video is None
+    assert [(f.index, f.width) for f in simulation.frames] == [(1, 640)]
+    assert (tmp_path / "toys-cow" / "frame_001.png").is_file()
+
+
+def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
+    result = cow(
+        tmp_path, "simulate", str(picture), "?", "--box", "105,155,195,245", "--kind", "fall", "--json", "--no-video"
+    )
+    assert result.returncode == 0, result.stderr
+    assert Simulation.model_validate_json(result.stdout).motion.kind == "fall"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (["If the pink car moves left, what?"], 1, "cannot-ground: The object that moves could not be found."),
+        ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers with commas between"),
+        ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),
+        ([QUESTION, "--kind", "projectile"], 1, "go with --direction"),
+        ([QUESTION, "--object", "x"], 1, "goes with --point or --box"),
+        ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: cutout."),
+        ([QUESTION, "--num-frames", "1"], 1, "num_frames"),
+        ([QUESTION, "--frames", "best"], 2, "'best'"),
+        ([], 2, "QUESTION"),
+    ],
+)
+def test_errors_are_told_in_words(tmp_path: Path, picture: Path, arguments: list[str], code: int, told: str) -> None:
+    result = cow(tmp_path, "simulate", str(picture), *arguments)
+    assert result.returncode == code
+    assert told in " ".join(result.stderr.split())
+    assert "Traceback" not in result.stderr
+
+
+def test_files_that_are_missing_or_no_images(tmp_path: Path) -> None:
+    assert cow(tmp_path, "simulate", "nowhere.png", QUESTION).returncode == 2
+    (tmp_path / "text.png").write_text("hello")
+    result = cow(tmp_path, "simulate", "text.png", QUESTION)
+    assert result.returncode == 1
+    assert "image-type-unsupported" in result.stderr
+
+
+def test_bad_settings_are_named(tmp_path: Path) -> None:
+    result = cow(tmp_path, "models", COW_MAX_IMAGE_MEGAPIXELS="many", COW_PORT="99999")
+    assert result.returncode == 2
+    assert "COW_MAX_IMAGE_MEGAPIXELS='many'" in result.stderr
+    assert "COW_PORT='99999'" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_models_and_doctor(tmp_path: Path) -> None:
+    assert "cutout (default)" in cow(tmp_path, "models").stdout
+    models = Models.model_validate_json(cow(tmp_path, "models", "--json").stdout)
+    assert [m.name for m in models.generators] == ["cutout"]
+    result = cow(tmp_path, "doctor")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "The default request can be served." in result.stdout
+    report = json.loads(cow(tmp_path, "doctor", "--json").stdout)
+    assert report["cow"] == __version__
+    assert report["packages"]["fastapi"]
+    assert report["problem"] is None
+
+
+def test_the_doctor_finds_what_is_wrong(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    result = cow(tmp_path, "doctor", COW_DATA_DIR=str(tmp_path / "file"))
+    assert result.returncode == 1
+    assert "storage-unavailable" in result.stdout
+    result = cow(tmp_path, "doctor", COW_GENERATOR="dream")
+    assert result.returncode == 1
+    assert "dream" in result.stdout
+
+
+def test_version_and_help(tmp_path: Path) -> None:
+    assert cow(tmp_path, "--version").stdout.strip() == f"cow {__version__}"
+    shown = cow(tmp_path, "--help").stdout
+    for command in ("simulate", "serve", "models", "doctor"):
+        assert command in shown

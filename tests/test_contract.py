@@ -1,0 +1,133 @@
+"""openapi.yaml is what the app serves, every code and setting is documented, and errors have one shape."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+import yaml
+from conftest import ROOT
+from fastapi import FastAPI
+
+from cow_service import errors
+from cow_service.api.app import create_app
+from cow_service.api.problems import problem_of
+from cow_service.errors import CowError, FieldError
+from cow_service.plugins import Registry
+from cow_service.service import Service
+from cow_service.settings import Settings
+
+README = (ROOT / "README.md").read_text()
+CLASSES = [c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, CowError) and c is not CowError]
+
+
+def get(app: FastAPI, path: str) -> httpx.Response:
+    """One request to the app itself; an error that nobody handled is answered, not raised."""
+
+    async def ask() -> httpx.Response:
+        transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow") as client:
+            return await client.get(path)
+
+    return asyncio.run(ask())
+
+
+@pytest.fixture
+def document(service: Service) -> dict:
+    return create_app(service).openapi()
+
+
+def test_openapi_yaml_is_what_the_app_serves(service: Service, document: dict) -> None:
+    assert yaml.safe_load((ROOT / "openapi.yaml").read_text()) == document, "run `make openapi`"
+    assert get(create_app(service), "/openapi.json").json() == document
+
+
+def test_every_reference_leads_somewhere(document: dict) -> None:
+    names = set(re.findall(r"#/components/schemas/(\w+)", str(document)))
+    assert names <= set(document["components"]["schemas"])
+    assert {"SimulateRequest", "Simulation", "Problem"} <= names
+
+
+def test_every_error_has_its_own_code_and_is_documented() -> None:
+    codes = [cls.code for cls in CLASSES]
+    assert len(set(codes)) == len(codes)
+    for cls in CLASSES:
+        assert f"`{cls.code}`" in README, f"{cls.code} is not in the README"
+        assert cls.code in (errors.__doc__ or "")
+        assert 400 <= cls.status < 600
+
+
+def test_every_code_of_simulate_is_in_the_contract(document: dict) -> None:
+    responses = document["paths"]["/simulate"]["post"]["responses"]
+    told = " ".join(response["description"] for response in responses.values())
+    for cls in CLASSES:
+        if cls.code not in ("not-found", "method-not-allowed", "internal-error"):
+            assert f"`{cls.code}`" in told
+            assert str(cls.status) in responses
+
+
+def test_one_error_shape() -> None:
+    problem = problem_of(errors.InvalidRequest("x is 7; give 8.", errors=(FieldError("/x", "7"),)))
+    assert problem.model_dump() == {
+        "type": "urn:cow:problem:invalid-request",
+        "title": "The request is not valid.",
+        "status": 422,
+        "detail": "x is 7; give 8.",
+        "errors": [{"pointer": "/x", "detail": "7"}],
+    }
+
+
+def test_every_setting_is_in_the_readme() -> None:
+    for name, field in Settings.model_fields.items():
+        assert f"`COW_{name.upper()}`" in README
+        assert field.description
+
+
+def test_every_command_and_option_is_in_the_readme() -> None:
+    from typer.main import get_command
+
+    from cow_service.cli import app
+
+    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
+        if not command.hidden:
+            assert f"cow {name}" in README
+            for parameter in command.params:
+                for option in parameter.opts:
+                    if option.startswith("--"):
+                        assert option in README, f"cow {name} {option}"
+
+
+def test_an_unforeseen_error_is_a_problem_without_a_trace(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise RuntimeError("secret /home/path")
+
+    monkeypatch.setattr(service, "check", fail)
+    response = get(create_app(service), "/readyz")
+    assert response.status_code == 500
+    assert response.headers["content-type"] == "application/problem+json"
+    assert "secret" not in response.text
+
+
+def test_an_unready_service_says_why(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    response = get(create_app(Service(Settings(data_dir=tmp_path / "file"))), "/readyz")
+    assert response.status_code == 503
+    assert response.json()["type"].endswith("storage-unavailable")
+    assert response.headers["retry-after"]
+    assert str(tmp_path) not in response.text
+
+
+def test_a_backend_that_cannot_be_imported_is_unavailable() -> None:
+    from importlib.metadata import EntryPoint
+
+    registry: Registry = Registry("none", errors.GeneratorUnavailable)
+    registry.__dict__["_points"] = {"far": EntryPoint("far", "no_such_package.far:create", "none")}
+    with pytest.raises(errors.GeneratorUnavailable, match="no_such_package"):
+        registry.get("far")
+    with pytest.raises(KeyError):
+        registry.get("near")
+    assert registry.names() == ("far",)

@@ -1,0 +1,142 @@
+"""The embedded reader on drawn scenes: what it finds, and what it refuses and how it says so."""
+
+from __future__ import annotations
+
+import cv2
+import pytest
+from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
+
+from cow_service.errors import CannotGround, CannotReadDirection
+from cow_service.physics.camera import depth_motion
+from cow_service.readers.embedded import EmbeddedReader
+from cow_service.records import Grounding
+from cow_service.vision.scene import Scene, iou
+
+RED, BLUE, GREEN, ORANGE = (200, 30, 30), (50, 80, 200), (50, 150, 50), (235, 130, 40)
+reader = EmbeddedReader()
+
+
+def drawn(arrow: bool = True, against: bool = False) -> Scene:
+    """A red ball left, a blue block right; an arrow from the ball to the right, or to the left."""
+    image = block(ball(floor(), (150, 200), 40, RED), (430, 150, 520, 250), BLUE)
+    if arrow:
+        image = DrawnArrow((200, 200), 3.0 if against else 0.2, 110, 5, (30, 160, 30), "filled").on(image)
+    return Scene(jpeg(image))
+
+
+def read(scene: Scene, question: str):
+    reading = reader.ground(scene, question)
+    box = reading.bbox
+    point = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+    grounding = Grounding(object=reading.object, point=point, bbox=box, others=reading.others, source="embedded")
+    return grounding, reader.read_motion(scene, question, grounding)
+
+
+def test_colour_and_arrow() -> None:
+    grounding, motion = read(drawn(), "If the red ball moves in the direction of the arrow, will it hit the blue cube?")
+    assert grounding.object == "red ball"
+    assert iou(grounding.bbox, (110, 160, 190, 240)) > 0.8
+    assert [other.object for other in grounding.others] == ["blue cube"]
+    assert iou(grounding.others[0].bbox, (430, 150, 520, 250)) > 0.8
+    assert (motion.kind, motion.cue, motion.along_arrow) == ("linear", "arrow", True)
+    assert motion.direction is not None
+    assert angle_between(motion.direction, DrawnArrow((0, 0), 0.2, 1, 1, RED, "").direction) < 2
+
+
+def test_against_the_arrow() -> None:
+    _, motion = read(
+        drawn(against=True), "If the red ball rolls opposite to the direction of the arrow, will it hit the cube?"
+    )
+    assert motion.along_arrow is False
+    assert motion.direction is not None
+    assert motion.direction[0] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("words", "direction"),
+    [
+        ("moves to the left", (-1, 0)),
+        ("rolls to the right", (1, 0)),
+        ("moves up", (0, -1)),
+        ("slides downwards", (0, 1)),
+        ("moves towards the blue cube", (1, 0)),
+    ],
+)
+def test_directions_in_words(words: str, direction: tuple[float, float]) -> None:
+    _, motion = read(drawn(arrow=False), f"If the red ball {words}, will it hit the blue cube?")
+    assert motion.direction is not None
+    assert angle_between(motion.direction, direction) < 2
+    assert motion.cue == "text"
+
+
+@pytest.mark.parametrize(("words", "sense"), [("towards the camera", -1.0), ("away from the camera", 1.0)])
+def test_towards_and_away_from_the_camera(words: str, sense: float) -> None:
+    _, motion = read(drawn(arrow=False), f"If the red ball moves {words}, will it hit the blue cube?")
+    assert (motion.direction, motion.depth) == depth_motion(sense)
+
+
+def test_falls_throws_and_rests() -> None:
+    assert read(drawn(False), "If the red ball falls freely, will it land on the cube?")[1].kind == "fall"
+    assert read(drawn(False), "If the red ball is thrown to the right, will it hit the cube?")[1].kind == "projectile"
+    assert read(drawn(False), "If the red ball stays still, will it hit the cube?")[1].kind == "static"
+
+
+def test_the_only_ball_needs_no_colour() -> None:
+    grounding, _ = read(drawn(False), "If the ball moves left, what happens?")
+    assert iou(grounding.bbox, (110, 160, 190, 240)) > 0.8
+
+
+def test_of_two_balls_the_one_at_the_arrow_moves() -> None:
+    image = ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED)
+    scene = Scene(jpeg(DrawnArrow((500, 200), 0.0, 90, 5, (20, 60, 200), "open").on(image)))
+    grounding, _ = read(scene, "If the ball moves in the direction of the arrow, where does it go?")
+    assert grounding.point[0] > 400
+
+
+def test_the_object_inside_the_box() -> None:
+    image = ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, GREEN)
+    cv2.rectangle(image, (395, 145), (505, 255), (230, 200, 20), 3)
+    grounding, _ = read(Scene(jpeg(image)), "If the object inside the yellow box moves left, will it hit the red ball?")
+    assert grounding.point[0] > 400
+
+
+def test_an_arrow_not_spoken_of_is_followed_aloud() -> None:
+    _, motion = read(drawn(), "If the red ball is thrown, will it hit the blue cube?")
+    assert motion.cue == "arrow"
+    assert motion.warnings
+
+
+def refusal(error, scene: Scene, question: str) -> str:
+    with pytest.raises(error) as caught:
+        read(scene, question)
+    return caught.value.detail
+
+
+def test_refusals_say_what_was_looked_for_what_was_seen_and_what_to_give() -> None:
+    told = refusal(CannotGround, drawn(), "If the purple ball moves left, will it hit the cube?")
+    assert "'purple ball'" in told
+    assert "red at (1" in told
+    assert "grounding.point" in told
+    told = refusal(CannotGround, drawn(), "Is this nice?")
+    assert "does not say in words what moves" in told
+    twins = Scene(jpeg(ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED)))
+    assert "found 2 that fit" in refusal(CannotGround, twins, "If the red ball moves left, what happens?")
+    told = refusal(CannotReadDirection, drawn(False), "If the red ball moves along the arrow, will it hit the cube?")
+    assert "no drawn arrow was found" in told
+    assert "motion.direction" in told
+    told = refusal(CannotReadDirection, drawn(False), "If the red ball moves, will it hit the cube?")
+    assert "names no direction" in told
+    told = refusal(CannotReadDirection, drawn(False), "If the red ball moves forward, will it hit the cube?")
+    assert "faces is beyond the embedded reader" in told
+    told = refusal(CannotReadDirection, drawn(False), "If the red ball moves towards the green vase, will it hit it?")
+    assert "'green vase'" in told
+    told = refusal(CannotGround, drawn(False), "If the object inside the box moves left, what happens?")
+    assert "no box" in told
+
+
+def test_two_arrows_that_could_both_be_meant_are_refused() -> None:
+    scene = ball(floor(), (300, 200), 40, ORANGE)
+    for start, angle in (((355, 200), 0.0), ((245, 200), 3.1)):
+        scene = DrawnArrow(start, angle, 100, 5, (20, 60, 200), "filled").on(scene)
+    told = refusal(CannotReadDirection, Scene(jpeg(scene)), "If the orange ball moves along the arrow, what happens?")
+    assert "2 were found" in told

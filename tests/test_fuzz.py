@@ -1,0 +1,53 @@
+"""Random requests made from the contract itself: whatever is sent, the answer is one that the contract names."""
+
+from __future__ import annotations
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, given, settings
+from schemathesis import GenerationMode
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+
+from cow_service.api.app import create_app
+from cow_service.service import Service
+from cow_service.settings import Settings
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
+CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
+
+
+@pytest.fixture(scope="module")
+def contract(tmp_path_factory: pytest.TempPathFactory):
+    service = Service(Settings(data_dir=tmp_path_factory.mktemp("data")))
+    return schemathesis.openapi.from_asgi("/openapi.json", create_app(service))
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "mode"),
+    [
+        ("POST", "/simulate", GenerationMode.POSITIVE),
+        ("POST", "/simulate", GenerationMode.NEGATIVE),
+        ("GET", "/artifacts/{sha256}", GenerationMode.POSITIVE),
+        ("GET", "/models", GenerationMode.POSITIVE),
+        ("GET", "/livez", GenerationMode.POSITIVE),
+        ("GET", "/readyz", GenerationMode.POSITIVE),
+    ],
+)
+def test_every_answer_is_in_the_contract(contract, method: str, path: str, mode: GenerationMode) -> None:
+    operation = contract[path][method]
+
+    @given(case=operation.as_strategy(generation_mode=mode))
+    @settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))
+    def check(case) -> None:
+        case.call_and_validate(checks=CHECKS)
+
+    check()
+
+
+def test_the_contract_has_no_other_operations(contract) -> None:
+    assert set(contract) == {"/simulate", "/artifacts/{sha256}", "/models", "/livez", "/readyz"}

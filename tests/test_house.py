@@ -1,0 +1,124 @@
+"""The rules of the house: who may import whom, what stays light, how long a file may be."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "cow_service"
+MAX_LINES = 400
+
+# Every room stands on a floor and imports only from floors below it; inside a room only circles are forbidden.
+FLOORS: dict[str, int] = {
+    "__init__": 1,
+    "records": 1,
+    "requests": 2,
+    "errors": 1,
+    "settings": 1,
+    "resources": 1,
+    "images": 2,
+    "video": 2,
+    "drawing": 2,
+    "artifacts": 2,
+    "manifests": 2,
+    "plugins": 2,
+    "vision": 3,
+    "physics": 4,
+    "readers": 5,
+    "generators": 5,
+    "stages": 6,
+    "pipeline": 7,
+    "service": 8,
+    "api": 9,
+    "console": 9,
+    "doctor": 9,
+    "cli": 10,
+}
+HEAVY = ("torch", "transformers", "diffusers", "accelerate")
+
+
+def modules() -> dict[str, Path]:
+    names = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        names[".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)] = path
+    return names
+
+
+def imports(path: Path) -> set[str]:
+    """Names inside the package that a file imports, lazily or for types only included."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("cow_service"):
+            module = node.module.removeprefix("cow_service").lstrip(".")
+            found |= {module} if module else {alias.name for alias in node.names} - {"__version__"}
+        if isinstance(node, ast.Import):
+            names = {alias.name for alias in node.names}
+            found |= {name.removeprefix("cow_service.") for name in names if name.startswith("cow_service.")}
+    return found
+
+
+def test_every_room_has_a_floor() -> None:
+    assert {name.split(".")[0] for name in modules()} <= set(FLOORS)
+
+
+@pytest.mark.parametrize("name", sorted(modules()))
+def test_imports_come_from_floors_below(name: str) -> None:
+    room = name.split(".", maxsplit=1)[0]
+    for imported in imports(modules()[name]):
+        other = imported.split(".")[0]
+        assert other == room or FLOORS[other] < FLOORS[room], f"{name} (floor {FLOORS[room]}) imports {imported}"
+
+
+def test_no_circles() -> None:
+    graph = {name: {i for i in imports(path) if i in modules()} for name, path in modules().items()}
+    done: set[str] = set()
+
+    def visit(name: str, way: tuple[str, ...]) -> None:
+        assert name not in way, f"circle: {' -> '.join((*way, name))}"
+        if name not in done:
+            for other in graph[name]:
+                visit(other, (*way, name))
+            done.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+def test_stages_and_pipeline_know_no_implementation() -> None:
+    for name, path in modules().items():
+        if name.startswith("stages.") or name == "pipeline":
+            backends = {i for i in imports(path) if i.startswith(("readers.", "generators."))}
+            assert backends <= {"readers.base", "readers.wording", "generators.base"}, name
+
+
+@pytest.mark.parametrize("name", sorted(modules()))
+def test_files_stay_small(name: str) -> None:
+    assert len(modules()[name].read_text().splitlines()) <= MAX_LINES
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import cow_service",
+        "import cow_service.cli",
+        "from cow_service.api.app import create_app; from cow_service.service import Service; "
+        "from cow_service.settings import Settings; s = Service(Settings(data_dir='unused')); create_app(s); s.models()",
+    ],
+)
+def test_nothing_heavy_is_imported(statement: str) -> None:
+    assert imported_by(statement, HEAVY) == []
+
+
+def test_help_imports_no_server_and_no_vision() -> None:
+    assert imported_by("import cow_service.cli", ("fastapi", "uvicorn", "cv2", "numpy", "av")) == []
+
+
+def imported_by(statement: str, suspects: tuple[str, ...]) -> list[str]:
+    code = f"import sys; {statement}; print(*[m for m in {suspects} if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return result.stdout.split()

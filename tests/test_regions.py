@@ -1,0 +1,120 @@
+"""Objects are found by colour and edges, named by colour, and cut out."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from conftest import all_scenes, example
+from drawn import ball, block, floor, jpeg
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cow_service.vision.colours import NEIGHBOURS, agreement, name_of
+from cow_service.vision.masks import bbox_of, mask_from_bbox, mask_from_point
+from cow_service.vision.obstacles import obstacles_of
+from cow_service.vision.regions import find_regions
+from cow_service.vision.scene import Scene, iou
+
+RGB = {
+    "red": (200, 30, 30),
+    "orange": (235, 130, 40),
+    "yellow": (225, 200, 50),
+    "green": (50, 150, 50),
+    "cyan": (60, 180, 190),
+    "blue": (50, 80, 200),
+    "purple": (120, 60, 170),
+    "pink": (225, 130, 165),
+    "white": (240, 240, 240),
+    "black": (18, 18, 18),
+}
+
+
+@pytest.mark.parametrize("colour", sorted(RGB))
+def test_a_ball_of_any_colour_is_found_and_named(colour: str) -> None:
+    regions = find_regions(jpeg(ball(floor(), (300, 180), 45, RGB[colour])))
+    assert [region.colour for region in regions] == [colour]
+    assert iou(regions[0].bbox, (255, 135, 345, 225)) > 0.8
+    assert regions[0].roundness > 0.75
+
+
+def test_touching_objects_of_two_colours_are_two() -> None:
+    image = block(block(floor(), (200, 150, 280, 250), RGB["blue"]), (280, 140, 360, 250), RGB["orange"])
+    regions = find_regions(jpeg(image))
+    assert sorted(region.colour for region in regions) == ["blue", "orange"]
+    assert all(region.roundness < 0.76 for region in regions)
+
+
+def test_a_shadow_is_no_object() -> None:
+    image = floor().astype(np.float32)
+    shade = cv2.GaussianBlur(
+        cv2.ellipse(np.zeros(image.shape[:2], np.float32), (300, 200), (50, 18), 0, 0, 360, 1, -1), (0, 0), 3
+    )
+    darker = (image * (1 - 0.3 * shade[..., None])).astype(np.uint8)
+    assert find_regions(darker) == ()
+
+
+def test_a_cluttered_image_gives_nothing() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    assert find_regions(cv2.resize(noise, (640, 480), interpolation=cv2.INTER_NEAREST)) == ()
+
+
+@pytest.mark.parametrize("folder", all_scenes(), ids=lambda path: path.name)
+def test_objects_of_rendered_scenes(folder) -> None:
+    scene = example(folder.name) if folder.parent.name == "examples" else type(example("x"))(folder)
+    regions = find_regions(scene.pixels("clean.jpg"))
+    for name, boxes in scene.meta["boxes"].items():
+        x0, y0, x1, y1 = boxes[0]
+        seen = (max(0, x0), max(0, y0), min(832, x1), min(480, y1))
+        best = max(regions, key=lambda region: iou(region.bbox, seen))
+        assert iou(best.bbox, seen) > 0.6, name
+        assert name.startswith(best.colour), name
+
+
+@given(st.floats(0, 100), st.floats(-120, 120), st.floats(-120, 120))
+def test_every_colour_has_a_name(lightness: float, a: float, b: float) -> None:
+    assert name_of(lightness, a, b) in {name for pair in NEIGHBOURS for name in pair}
+
+
+def test_agreement_of_names() -> None:
+    assert agreement("red", "red") == 1
+    assert agreement("orange", "red") == agreement("red", "orange") == 0.5
+    assert agreement("red", "blue") == 0
+
+
+@pytest.mark.parametrize("name", ["ball-and-mug", "bottle-passes-cylinder", "thrown-ball", "car-forward"])
+def test_masks_are_cut_from_a_box_and_from_a_point(name: str) -> None:
+    scene = example(name)
+    image, truth = scene.pixels("clean.jpg"), scene.mask(scene.meta["object"])
+    for mask in (mask_from_bbox(image, tuple(scene.meta["bbox"])), mask_from_point(image, tuple(scene.meta["point"]))):
+        assert (mask & truth).sum() / (mask | truth).sum() > 0.75
+    again = mask_from_bbox(image, tuple(scene.meta["bbox"]))
+    assert (again == mask_from_bbox(image, tuple(scene.meta["bbox"]))).all()
+
+
+@given(
+    st.tuples(st.floats(-50, 250), st.floats(-50, 200)),
+    st.tuples(st.floats(2, 300), st.floats(2, 300)),
+)
+def test_any_box_gives_a_mask(corner: tuple[float, float], size: tuple[float, float]) -> None:
+    image = ball(floor(200, 150), (100, 75), 30, RGB["red"])
+    mask = mask_from_bbox(image, (corner[0], corner[1], corner[0] + size[0], corner[1] + size[1]))
+    assert mask.shape == (150, 200)
+    assert mask.any()
+    assert bbox_of(mask)[2] <= 200
+
+
+def test_obstacles_are_named_by_the_question_first() -> None:
+    from cow_service.records import LocatedObject
+
+    image = ball(
+        block(ball(floor(), (120, 200), 40, RGB["red"]), (280, 150, 360, 250), RGB["blue"]),
+        (500, 200),
+        35,
+        RGB["green"],
+    )
+    scene = Scene(jpeg(image))
+    mover = next(region.bbox for region in scene.regions if region.colour == "red")
+    cube = next(region.bbox for region in scene.regions if region.colour == "blue")
+    obstacles = obstacles_of(scene, mover, (LocatedObject(object="big blue cube", bbox=cube),))
+    assert sorted(obstacle.name for obstacle in obstacles) == ["big blue cube", "green object"]

@@ -1,0 +1,210 @@
+"""Each stage on its own: defaults, overrides, and what each refuses."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from drawn import ball, floor
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cow_service.errors import InvalidRequest
+from cow_service.readers.base import MotionReading
+from cow_service.records import Artifact, Encounter, Grounding, Motion, Trajectory
+from cow_service.requests import FramesRequest, GroundingRequest, MotionRequest, SimulateRequest, TrajectoryRequest
+from cow_service.stages.generation import choose_frames
+from cow_service.stages.grounding import ground
+from cow_service.stages.motion import read_motion
+from cow_service.stages.trajectory import compute_trajectory
+from cow_service.vision.scene import Scene
+
+RED = (200, 30, 30)
+
+
+def no_reader():
+    raise AssertionError("the request said it all: no reader may be made")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(ball(floor(640, 400), (200, 200), 40, RED))
+
+
+def grounded(scene: Scene, **given) -> Grounding:
+    artifact = Artifact(sha256="0" * 64, url="/artifacts/0", media_type="image/png", size=1)
+    return ground(scene, "?", GroundingRequest(**given), no_reader, lambda mask: artifact)
+
+
+def moved(scene: Scene, path: TrajectoryRequest | None = None, **given) -> Motion:
+    request = MotionRequest(**given) if given else None
+    return read_motion(scene, "?", grounded(scene, point=(200, 200)), request, path, no_reader)[0]
+
+
+def rolled(scene: Scene, motion: Motion, path: TrajectoryRequest | None = None, frames=81, fps=16.0) -> Trajectory:
+    return compute_trajectory(scene, grounded(scene, point=(200, 200)), motion, (), path, frames, fps)
+
+
+def test_a_point_grounds_the_object_under_it(scene: Scene) -> None:
+    grounding = grounded(scene, point=(220, 190))
+    assert grounding.bbox == pytest.approx((160, 160, 240, 240), abs=4)
+    assert grounding.point == pytest.approx((200, 200), abs=3)
+    assert (grounding.object, grounding.source) == ("object", "request")
+
+
+def test_a_box_is_taken_as_it_is_and_clipped_to_the_image(scene: Scene) -> None:
+    assert grounded(scene, bbox=(150, 150, 250, 250), object="ball").bbox == (150, 150, 250, 250)
+    assert grounded(scene, bbox=(-50, 150, 250, 250)).bbox == (0, 150, 250, 250)
+
+
+@pytest.mark.parametrize("given", [{"point": (640, 10)}, {"point": (-1, 10)}, {"bbox": (700, 10, 800, 90)}])
+def test_a_place_outside_the_image_is_refused(scene: Scene, given) -> None:
+    with pytest.raises(InvalidRequest, match="outside the upright image of 640 x 400") as caught:
+        grounded(scene, **given)
+    assert caught.value.errors[0].pointer == f"/grounding/{next(iter(given))}"
+
+
+def test_defaults_of_speed_scale_and_gravity(scene: Scene) -> None:
+    linear = moved(scene, direction=(3, 4))
+    assert linear.direction == pytest.approx((0.6, 0.8))
+    assert linear.speed == pytest.approx(0.26 * 640)
+    assert linear.gravity == (0, 0)
+    thrown = moved(scene, direction=(1, 0), kind="projectile")
+    assert thrown.metres_per_pixel.value == pytest.approx(3 / 640)
+    assert thrown.metres_per_pixel.source == "default"
+    assert "3 m wide" in thrown.metres_per_pixel.note
+    assert thrown.gravity == pytest.approx((0, 9.81 * 640 / 3))
+    fall = moved(scene, kind="fall", metres_per_pixel=0.01)
+    assert (fall.direction, fall.speed) == (None, 0)
+    assert fall.gravity == pytest.approx((0, 981))
+    assert fall.metres_per_pixel.source == "request"
+
+
+def test_static_stays(scene: Scene) -> None:
+    trajectory = rolled(scene, moved(scene, kind="static"))
+    assert len(set(trajectory.points)) == 1
+
+
+def test_linear_points_move_by_speed_over_fps(scene: Scene) -> None:
+    trajectory = rolled(scene, moved(scene, direction=(1, 0), speed=160))
+    points = np.array(trajectory.points)
+    assert np.allclose(np.diff(points, axis=0), [10, 0])
+    assert len(trajectory.states) == len(trajectory.visible) == len(trajectory.scale) == 81
+    outside = points[:, 0] >= 640
+    assert (np.array(trajectory.visible) == ~outside).all()
+    metres = 3 / 640
+    assert trajectory.states[0][3:] == pytest.approx((160 * metres, 0, 0))
+    assert trajectory.states[0][2] == pytest.approx(640 * metres)
+
+
+def test_a_fall_follows_gravity(scene: Scene) -> None:
+    trajectory = rolled(scene, moved(scene, kind="fall"), fps=16)
+    start, later = trajectory.points[0], trajectory.points[8]
+    assert later[0] == pytest.approx(start[0])
+    assert later[1] - start[1] == pytest.approx(0.5 * 9.81 * (640 / 3) * 0.25)
+
+
+def test_tracks_follow_the_object_and_grow_with_it(scene: Scene) -> None:
+    trajectory = rolled(scene, moved(scene, direction=(0, 1), depth=-0.8, speed=60), frames=33)
+    assert trajectory.scale[-1] > trajectory.scale[0] == 1
+    centre, track = np.array(trajectory.points), np.array(trajectory.tracks[1])
+    spread = np.linalg.norm(track - centre, axis=1)
+    assert np.allclose(spread / spread[0], trajectory.scale)
+
+
+def test_anchors_keep_off_object_and_path(scene: Scene) -> None:
+    trajectory = rolled(scene, moved(scene, direction=(1, 0)))
+    assert len(trajectory.anchors) == 8
+    assert all(abs(y - 200) > 40 for x, y in trajectory.anchors if x > 160)
+
+
+def test_a_given_path_is_followed_and_held(scene: Scene) -> None:
+    path = TrajectoryRequest(points=((200, 200), (300, 200), (300, 300)), fps=2)
+    motion = moved(scene, path=path)
+    assert motion.kind == "linear"
+    assert motion.direction == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
+    assert motion.speed == pytest.approx(200)
+    trajectory = rolled(scene, motion, path, frames=33, fps=16)
+    assert trajectory.points[0] == pytest.approx((200, 200))
+    assert trajectory.points[4] == pytest.approx((250, 200))
+    assert trajectory.points[8] == pytest.approx((300, 200))
+    assert trajectory.points[16] == pytest.approx((300, 300))
+    assert trajectory.points[32] == pytest.approx((300, 300))
+    assert trajectory.states[32][3:] == (0, 0, 0)
+    assert trajectory.states[12][4] > 0
+
+
+def test_a_path_that_returns_has_a_first_direction_and_one_that_stays_is_static(scene: Scene) -> None:
+    assert moved(scene, path=TrajectoryRequest(points=((0, 0), (0, 9), (0, 0)))).direction == (0, 1)
+    assert moved(scene, path=TrajectoryRequest(points=((5, 5), (5, 5)))).kind == "static"
+
+
+def plain(frames: int, encounters: tuple[int, ...] = (), seen: int | None = None) -> Trajectory:
+    visible = tuple(i < (frames if seen is None else seen) for i in range(frames))
+    met = tuple(Encounter(object="o", bbox=(0, 0, 1, 1), first_frame=i, kind="touches") for i in encounters)
+    zero = ((0.0, 0.0),) * frames
+    return Trajectory(
+        fps=16, states=((0.0,) * 6,) * frames, points=zero, visible=visible, scale=(1.0,) * frames, tracks=(zero,),
+        anchors=(), encounters=met,
+    )  # fmt: skip
+
+
+def test_frame_policies() -> None:
+    assert choose_frames(FramesRequest(), plain(81)) == (1, 3, 5)
+    assert choose_frames(FramesRequest(policy="uniform"), plain(81)) == (0, 40, 80)
+    assert choose_frames(FramesRequest(policy="uniform", count=1), plain(81)) == (80,)
+    assert choose_frames(FramesRequest(policy="events"), plain(81, (12, 30, 50))) == (12, 30, 50)
+    assert 12 in choose_frames(FramesRequest(policy="events"), plain(81, (12,), seen=40))
+    assert max(choose_frames(FramesRequest(policy="events"), plain(81, seen=40))) == 39
+    assert choose_frames(FramesRequest(indices=(7, 3, 3)), plain(81)) == (3, 7)
+
+
+@given(
+    st.sampled_from(["initial", "uniform", "events"]),
+    st.integers(1, 64),
+    st.integers(2, 100),
+    st.lists(st.integers(0, 99), max_size=5),
+    st.integers(0, 100),
+)
+def test_any_policy_gives_as_many_frames_as_there_are(policy, count, frames, events, seen) -> None:
+    trajectory = plain(frames, tuple(e for e in events if e < frames), seen)
+    chosen = choose_frames(FramesRequest(policy=policy, count=count), trajectory)
+    assert len(chosen) == min(count, frames)
+    assert list(chosen) == sorted(set(chosen))
+    assert chosen[0] >= 0
+    assert chosen[-1] < frames
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        ({"grounding": {"object": "ball"}}, "either `bbox` or `point`"),
+        ({"grounding": {"bbox": [0, 0, 9, 9], "point": [1, 1]}}, "either `bbox` or `point`"),
+        ({"grounding": {"bbox": [10, 10, 10, 90]}}, "span at least 2 px"),
+        ({"motion": {"direction": [0, 0]}}, "must have a length"),
+        ({"motion": {"kind": "projectile"}}, "needs a `direction`"),
+        ({"trajectory": {"points": [[1, 1]]}}, "at least 2"),
+        ({"trajectory": {"points": [[1, 1], [1e9, 0]]}}, "1,000,000 px"),
+        ({"frames": {"indices": [81]}}, "frames 0 to 80"),
+        ({"question": "   "}, "empty"),
+        ({"num_frames": 1}, "greater than or equal to 2"),
+        ({"sede": 3}, "Extra inputs"),
+    ],
+)
+def test_requests_that_cannot_be_meant(body, told) -> None:
+    with pytest.raises(ValueError, match=told):
+        SimulateRequest.model_validate({"image": "data:,", "question": "?", **body})
+
+
+def test_a_reader_is_asked_where_the_request_is_silent(scene: Scene) -> None:
+    class OneReader:
+        source = "embedded"
+
+        def read_motion(self, scene, question, grounding):
+            return MotionReading("linear", (0.0, -2.0), "text", warnings=("careful",))
+
+    motion, warnings = read_motion(scene, "?", grounded(scene, point=(200, 200)), None, None, OneReader)
+    assert motion.direction == (0, -1)
+    assert motion.source == "embedded"
+    assert warnings == ("careful",)
