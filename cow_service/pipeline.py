@@ -97,7 +97,7 @@ def simulate(
         trajectory = compute_trajectory(
             scene, grounding, motion, obstacles, request.trajectory, request.num_frames, request.fps
         )
-    shot = Shot(scene, grounding, motion, trajectory, request.seed, options)
+    shot = Shot(scene, grounding, motion, trajectory, obstacles, request.seed, options)
     with clock.stage("generation") as progressed:
         clip = generate(shot, backends.generator, request.frames, request.video, backends.artifacts, progressed)
         overlay = keep(draw_overlay(scene.image, grounding, motion, trajectory))

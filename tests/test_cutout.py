@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drawn import DrawnArrow, ball, block, floor
@@ -35,7 +37,7 @@ def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion)
     moving, _ = read_motion(scene, "?", grounding, MotionRequest(**motion), None, no_reader)
     obstacles = obstacles_of(scene, grounding.bbox)
     trajectory = compute_trajectory(scene, grounding, moving, obstacles, None, frames, fps)
-    return Shot(scene, grounding, moving, trajectory, 0, CutoutOptions(clean_cues=clean))
+    return Shot(scene, grounding, moving, trajectory, obstacles, 0, CutoutOptions(clean_cues=clean))
 
 
 def frame_of(filmed: Shot, index: int) -> np.ndarray:
@@ -65,9 +67,7 @@ def test_fractions_of_a_pixel_move_the_mover(dx: float, dy: float) -> None:
     filmed = shot(ball(floor(320, 300), CENTRE, RADIUS, RED), frames=2, fps=1, direction=(1, 0), speed=0)
     start = filmed.trajectory.points[0]
     moved = filmed.trajectory.model_copy(update={"points": (start, (start[0] + dx, start[1] + dy))})
-    first, second = generator.render(
-        Shot(filmed.scene, filmed.grounding, filmed.motion, moved, 0, filmed.options), [0, 1]
-    )
+    first, second = generator.render(replace(filmed, trajectory=moved), [0, 1])
 
     def balance(frame) -> np.ndarray:
         weight = np.clip(frame[..., 0].astype(float) - frame[..., 1] - 40, 0, None)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from cow_service.records import GeneratorInfo, Grounding, Motion, Trajectory
+from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
 
 
@@ -22,6 +23,7 @@ class Shot:
     grounding: Grounding
     motion: Motion
     trajectory: Trajectory
+    obstacles: tuple[Obstacle, ...]  # the other objects of the scene
     seed: int
     options: BaseModel  # an instance of the generator's own `options_model`
 

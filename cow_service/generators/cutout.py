@@ -16,7 +16,7 @@ from cow_service.images import fit_within
 from cow_service.physics.encounters import box_at, stands_nearer
 from cow_service.records import BBox, GeneratorInfo
 from cow_service.vision.fill import draw_in, fill_hole
-from cow_service.vision.obstacles import Obstacle, obstacles_of
+from cow_service.vision.obstacles import Obstacle
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
 EDGE_SIGMA = 0.8  # px of softness at the cut
@@ -84,9 +84,8 @@ def _layers(shot: Shot) -> _Layers:
     size = image.shape[1], image.shape[0]
     factor = image.shape[1] / scene.width
     mover = _resized(scene.silhouette(shot.grounding.bbox), size)
-    obstacles = obstacles_of(scene, shot.grounding.bbox, shot.grounding.others)
     others = np.zeros(mover.shape, bool)
-    for obstacle in obstacles:
+    for obstacle in shot.obstacles:
         others |= _resized(obstacle.mask, size)
     growth = 2 * max(2, round(HOLE_GROWTH * float(np.sqrt(mover.sum())))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (growth, growth))
@@ -95,13 +94,11 @@ def _layers(shot: Shot) -> _Layers:
         hole |= _resized(scene.cues, size) & (cv2.dilate(hole.astype(np.uint8), kernel, iterations=3) > 0)
     hole &= ~(others & ~mover)
     sprite, origin = _sprite(image, mover)
-    occluders = tuple(
-        (obstacle.bbox, _soft(_resized(obstacle.mask, size) & ~mover)) for obstacle in _near(shot, obstacles)
-    )
+    occluders = tuple((obstacle.bbox, _soft(_resized(obstacle.mask, size) & ~mover)) for obstacle in _near(shot))
     return _Layers(fill_hole(image, hole, others & ~mover), sprite, origin, occluders, factor)
 
 
-def _near(shot: Shot, obstacles: Sequence[Obstacle]) -> list[Obstacle]:
+def _near(shot: Shot) -> list[Obstacle]:
     """The objects whose box the mover's box crosses at some frame: no other can hide it."""
     start, bbox = np.array(shot.grounding.point), shot.grounding.bbox
     boxes = [
@@ -110,7 +107,7 @@ def _near(shot: Shot, obstacles: Sequence[Obstacle]) -> list[Obstacle]:
     ]
     return [
         other
-        for other in obstacles
+        for other in shot.obstacles
         if any(
             b[0] < other.bbox[2] and other.bbox[0] < b[2] and b[1] < other.bbox[3] and other.bbox[1] < b[3]
             for b in boxes
