@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
 from cow_service.records import BackendInfo, Models, Simulation
@@ -58,7 +58,11 @@ def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Pat
     except ValidationError as error:
         told = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
         raise InvalidRequest(told) from error
-    columns = TextColumn("{task.description:<11}"), BarColumn(bar_width=10), TextColumn("{task.fields[said]}")
+    columns = (
+        TextColumn("{task.description}", table_column=Column(width=10, no_wrap=True)),
+        BarColumn(bar_width=6),
+        TextColumn("{task.fields[said]}", table_column=Column(overflow="fold")),
+    )
     with Progress(*columns, console=console) as bars:
         tasks = {stage: bars.add_task(stage, total=1.0, start=False, said="") for stage in STAGES}
 

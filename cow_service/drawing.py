@@ -21,12 +21,12 @@ def draw_overlay(image: Image, grounding: Grounding, motion: Motion, trajectory:
     unit = max(1.0, max(canvas.shape[:2]) / 640)
     thin = max(1, round(unit))
     for encounter in trajectory.encounters:
-        colour = ENCOUNTERS[encounter.kind]
-        _rectangle(canvas, encounter.bbox, colour, thin)
-        time = encounter.first_frame / trajectory.fps
-        _label(canvas, f"{encounter.kind} {encounter.object} {time:.1f} s", encounter.bbox, colour, unit, below=True)
+        _rectangle(canvas, encounter.bbox, ENCOUNTERS[encounter.kind], thin)
     _draw_path(canvas, trajectory, thin)
     _rectangle(canvas, grounding.bbox, BOX, 2 * thin)
+    for encounter in trajectory.encounters:
+        told = f"{encounter.kind} {encounter.object} {encounter.first_frame / trajectory.fps:.1f} s"
+        _label(canvas, told, encounter.bbox, ENCOUNTERS[encounter.kind], unit, below=True)
     _label(canvas, grounding.object, grounding.bbox, BOX, unit, below=False)
     if motion.direction is not None:
         start = np.array(grounding.point)

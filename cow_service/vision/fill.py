@@ -12,7 +12,9 @@ INPAINT_RADIUS = 4  # px
 MARGIN = 8  # px around a drawing that the fill may look at
 TEXTURE_SIGMA = 3.0  # px: finer detail than this is texture, coarser is shading
 VARIED = 18.0  # grey levels of standard deviation around a hole
+RIM, RIM_LEAST = 0.04, 3.0  # of the hole's size, px: next to it the fill fades out, and nothing is learnt
 SHADOW_STEP = 14.0  # grey levels
+LEAST_WEIGHT = 1e-3  # of a pyramid cell known: with less, the coarser level says more
 FADE = 0.14  # of the hole's size: how far out its shadow is taken away
 FADE_MOST = 0.011  # of the image's longer side: and no further
 SHIFTS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))  # in sizes of the hole
@@ -60,19 +62,20 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
     if not known.any():
         return image
     source = image[crop].astype(np.float32)
+    away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
+    rim = max(RIM_LEAST, RIM * size)
     shadow = _contact_shadow(source, inside, known)
-    shading = draw_in(source, known & ~shadow)
-    if _is_varied(source, inside, known & ~shadow):
-        filled = quilt(source, inside, ~known | shadow, shading)
+    trusted = known & ~shadow & (away > rim)
+    if not trusted.any():
+        trusted = known
+    shading = draw_in(source, trusted)
+    if _is_varied(source, inside, trusted):
+        filled = quilt(source, inside | (away <= rim), ~trusted, shading)
     else:
         filled = shading + _texture(image, hole, avoid, crop)
-    share = inside.astype(np.float32)
-    if shadow.any():
-        fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
-        gone = 1 - cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5) / fade
-        share = np.where(cv2.dilate(shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, np.clip(gone, 0, 1), share)
-        share = np.where(known, np.minimum(share, gone), share)
-    share = np.clip(share, 0, 1)[..., None].astype(np.float32)
+    fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
+    reach = np.where(cv2.dilate(shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, max(fade, rim), rim)
+    share = np.where(inside, 1.0, np.where(known, np.clip(1 - away / reach, 0, 1), 0.0))[..., None].astype(np.float32)
     result = image.copy()
     result[crop] = np.clip(filled * share + source * (1 - share) + 0.5, 0, 255).astype(np.uint8)
     return result
@@ -100,15 +103,17 @@ def draw_in(source: NDArray[np.float32], known: Mask) -> NDArray[np.float32]:
     """Unknown pixels of [h, w, 3] from known ones: averages down a pyramid, then back up (push-pull)."""
     weight = known.astype(np.float32)
     levels = [(source * weight[..., None], weight)]
-    while min(levels[-1][1].shape) > 1 and not (levels[-1][1] > 0).all():
+    while min(levels[-1][1].shape) > 1 and not (levels[-1][1] > LEAST_WEIGHT).all():
         colours, weights = (np.asarray(cv2.pyrDown(layer), np.float32) for layer in levels[-1])
         levels.append((colours, weights))
     colours, weights = levels[-1]
-    value = colours / np.maximum(weights, 1e-6)[..., None]
+    value = colours / np.maximum(weights, LEAST_WEIGHT)[..., None]
     for colours, weights in reversed(levels[:-1]):
         coarse = cv2.resize(value, (weights.shape[1], weights.shape[0]), interpolation=cv2.INTER_LINEAR)
         trust = np.minimum(weights, 1)[..., None]
-        value = np.where(trust > 1e-3, colours / np.maximum(weights, 1e-3)[..., None], 0) * trust + coarse * (1 - trust)
+        value = np.where(
+            trust > LEAST_WEIGHT, colours / np.maximum(weights, LEAST_WEIGHT)[..., None], 0
+        ) * trust + coarse * (1 - trust)
     for _ in range(2):
         value = np.where(known[..., None], source, cv2.GaussianBlur(value, (0, 0), 2.0))
     return np.asarray(value, np.float32)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.vision.colours import name_of
+from cow_service.vision.discs import as_disc
 
 WORKING_SIDE = 512  # px: images are searched at this size
 CHROMA_STEP = 9.0  # Lab units from the surroundings
@@ -41,7 +42,8 @@ class Region:
     bbox: tuple[float, float, float, float]  # x0, y0, x1, y1, px of the image
     mask: Mask  # [H, W] of the image
     colour: str
-    roundness: float  # 0..1: how much of its ellipse it fills, times the ratio of the ellipse's axes
+    roundness: float  # 0..1: how much of the smallest circle around it the region fills
+    is_disc: bool  # its outline was measured as a circle: the mask is exact, no cut can better it
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -87,10 +89,11 @@ def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
         window = _window(stats[i], solid.shape)
         near = view.crop(window)
         for part in _parts(near, labels[window] == i):
-            if _is_sharp(near, part, view.fence):
+            disc = as_disc(part, near.edges, view.fence)
+            if disc is not None or _is_sharp(near, part, view.fence):
                 whole = np.zeros(solid.shape, np.float32)
-                whole[window] = part
-                regions.append(_region(near.lab[part], whole, (height, width)))
+                whole[window] = part if disc is None else disc
+                regions.append(_region(near.lab[part], whole, (height, width), disc is not None))
     return tuple(sorted(regions, key=lambda region: -int(region.mask.sum())))
 
 
@@ -116,7 +119,8 @@ def _view(small: NDArray[np.uint8]) -> _View:
 def _window(stats: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of a component with a little around it."""
     x, y, w, h = (int(v) for v in stats[:4])
-    return slice(max(0, y - 6), min(shape[0], y + h + 6)), slice(max(0, x - 6), min(shape[1], x + w + 6))
+    pad = 6 + max(w, h) // 3  # a ball may have lost as much to a highlight
+    return slice(max(0, y - pad), min(shape[0], y + h + pad)), slice(max(0, x - pad), min(shape[1], x + w + pad))
 
 
 def _core(view: _View) -> Mask:
@@ -222,7 +226,7 @@ def _blobs(mask: Mask, least: float) -> list[Mask]:
     return [labels == i for i in range(1, count) if stats[i][4] >= max(least, 12)]
 
 
-def _region(lab: NDArray[np.float32], part: Channel, size: tuple[int, int]) -> Region:
+def _region(lab: NDArray[np.float32], part: Channel, size: tuple[int, int], is_disc: bool) -> Region:
     """A part [h, w] at the working size, with the Lab colours [N, 3] of its pixels, as a region of the image."""
     height, width = size
     soft = cv2.GaussianBlur(part, (0, 0), MASK_SIGMA)
@@ -232,7 +236,7 @@ def _region(lab: NDArray[np.float32], part: Channel, size: tuple[int, int]) -> R
     chroma = np.hypot(lab[:, 1], lab[:, 2])
     told = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
     colour = name_of(*(float(v) for v in np.median(told, axis=0)))
-    return Region(bbox, mask, colour, _roundness(mask))
+    return Region(bbox, mask, colour, _roundness(mask), is_disc)
 
 
 def _roundness(mask: Mask) -> float:

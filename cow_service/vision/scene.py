@@ -83,7 +83,9 @@ class Scene:
         with self._lock:
             if bbox not in self._masks:
                 region = self.region_of(bbox)
-                self._masks[bbox] = mask_from_bbox(self.clean, bbox, None if region is None else region.mask)
+                known = region is not None and region.is_disc
+                guess = None if region is None else region.mask
+                self._masks[bbox] = guess if known and guess is not None else mask_from_bbox(self.clean, bbox, guess)
             return self._masks[bbox]
 
     def bbox_at(self, point: tuple[float, float]) -> BBox:

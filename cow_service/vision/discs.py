@@ -1,0 +1,72 @@
+"""Completes balls: a region most of whose outline lies on one circle, all of which lies on edges, is that disc.
+
+Colour alone loses a ball's highlight and wins its contact shadow; the circle does neither.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+TRIES = 120  # circles through three points of the outline
+NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
+ON_CIRCLE = 0.55  # share of the outline
+ON_EDGES = 0.8  # share of the circle
+SAMPLES = 72  # points tried on the circle
+LEAST_RADIUS = 5.0  # px
+
+Mask = NDArray[np.bool_]
+
+
+def as_disc(part: Mask, edges: NDArray[np.float32], fence: float) -> Mask | None:
+    """The disc [h, w] that a part is, or None. `edges` [h, w] are gradients; above `fence` they count as edges."""
+    contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = np.asarray(max(contours, key=len)[:, 0], np.float64)
+    if len(outline) < 20:
+        return None
+    circle = _best_circle(outline)
+    if circle is None:
+        return None
+    x, y, radius = circle
+    height, width = part.shape
+    angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)
+    columns, rows = np.round(x + radius * np.cos(angles)).astype(int), np.round(y + radius * np.sin(angles)).astype(int)
+    seen = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    strong = cv2.dilate((edges > fence).astype(np.uint8), np.ones((3, 3), np.uint8))
+    if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < ON_EDGES:
+        return None
+    ys, xs = np.mgrid[:height, :width]
+    disc = np.hypot(xs - x, ys - y) <= radius + 0.5
+    return disc if (disc & part).sum() > 0.6 * disc.sum() else None
+
+
+def _best_circle(outline: NDArray[np.float64]) -> tuple[float, float, float] | None:
+    """Centre and radius (px) of the circle on which most points [N, 2] lie, refined on those; None where too few do."""
+    rng = np.random.default_rng(0)  # the same outline must give the same circle
+    circles = _circles_through(outline[rng.integers(0, len(outline), (TRIES, 3))])
+    reach = float(np.ptp(outline, axis=0).max())
+    circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] >= LEAST_RADIUS) & (circles[:, 2] <= reach)]
+    if not len(circles):
+        return None
+    gaps = np.linalg.norm(outline[None] - circles[:, None, :2], axis=2) - circles[:, 2:]
+    close = np.abs(gaps) < NEAR
+    best = int(close.sum(axis=1).argmax())
+    if close[best].mean() < ON_CIRCLE:
+        return None
+    chosen = outline[close[best]]
+    terms = np.column_stack([2 * chosen, np.ones(len(chosen))])  # x^2 + y^2 = 2ax + 2by + c, least squares
+    a, b, c = np.linalg.lstsq(terms, (chosen**2).sum(axis=1), rcond=None)[0]
+    return float(a), float(b), float(np.sqrt(max(c + a * a + b * b, 0.0)))
+
+
+def _circles_through(triples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Circles [T, 3] (x, y, radius) through triples of points [T, 3, 2]; not finite where they lie on a line."""
+    a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
+    ab, ac = b - a, c - a
+    doubled = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    ab2, ac2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = (ac[:, 1] * ab2 - ab[:, 1] * ac2) / doubled
+        y = (ab[:, 0] * ac2 - ac[:, 0] * ab2) / doubled
+    return np.column_stack([a[:, 0] + x, a[:, 1] + y, np.hypot(x, y)])

@@ -1,0 +1,72 @@
+"""Holes and drawings are filled from what is around them, and nothing else is touched."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drawn import ball, floor
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cow_service.vision.discs import as_disc
+from cow_service.vision.fill import draw_in, erase_drawing, fill_hole
+
+
+@given(
+    st.integers(8, 300),
+    st.integers(8, 300),
+    st.tuples(st.floats(0, 0.9), st.floats(0, 0.9), st.floats(0.05, 1), st.floats(0.05, 1)),
+)
+def test_a_plain_surface_stays_plain_whatever_is_unknown(width: int, height: int, block) -> None:
+    known = np.ones((height, width), bool)
+    y, x = int(block[0] * height), int(block[1] * width)
+    known[y : y + max(1, int(block[2] * height)), x : x + max(1, int(block[3] * width))] = False
+    if not known.any():
+        return
+    source = np.where(known[..., None], 140.0, 0.0).repeat(3, axis=2).astype(np.float32)
+    assert np.abs(draw_in(source, known) - 140).max() < 1
+
+
+@pytest.mark.parametrize("radius", [8, 30, 80])
+def test_a_hole_in_a_floor_is_floor(radius: int) -> None:
+    plain = floor()
+    ys, xs = np.mgrid[:400, :640]
+    hole = np.hypot(xs - 300, ys - 200) < radius
+    filled = fill_hole(ball(plain, (300, 200), radius - 2, (20, 20, 20)), hole)
+    assert np.abs(filled[hole].astype(int) - plain[hole]).mean() < 9
+    far = np.hypot(xs - 300, ys - 200) > radius + 15
+    assert (filled[far] == plain[far]).all()
+
+
+def test_what_is_to_be_avoided_does_not_bleed_in() -> None:
+    image = ball(floor(), (360, 200), 30, (220, 20, 20))
+    ys, xs = np.mgrid[:400, :640]
+    hole, avoid = np.hypot(xs - 300, ys - 200) < 28, np.hypot(xs - 360, ys - 200) < 33
+    filled = fill_hole(image, hole, avoid)[hole].astype(int)
+    assert (filled[:, 0] - filled[:, 1]).max() < 12
+
+
+def test_nothing_to_fill_is_no_work() -> None:
+    image = floor()
+    nothing = np.zeros(image.shape[:2], bool)
+    assert fill_hole(image, nothing) is image
+    assert erase_drawing(image, nothing) is image
+    everything = ~nothing
+    assert (fill_hole(image, everything) == image).all()
+
+
+def _edges(disc: np.ndarray) -> np.ndarray:
+    rows, columns = np.gradient(disc.astype(np.float32))
+    return np.hypot(rows, columns) * 10
+
+
+def test_a_bitten_ball_is_completed_and_a_square_is_not() -> None:
+    ys, xs = np.mgrid[:120, :120]
+    disc = np.hypot(xs - 60, ys - 60) < 35
+    bitten = disc & ~(np.hypot(xs - 60, ys - 22) < 15)
+    whole = as_disc(bitten, _edges(disc), 1.0)
+    assert whole is not None
+    assert (whole & disc).sum() / (whole | disc).sum() > 0.95
+    assert as_disc(bitten, np.zeros((120, 120), np.float32), 1.0) is None
+    square = (np.abs(xs - 60) < 30) & (np.abs(ys - 60) < 30)
+    assert as_disc(square, _edges(square), 1.0) is None
