@@ -51,7 +51,8 @@ def start_server(data: Path) -> tuple[subprocess.Popen[str], str, float]:
     """The server process, its address, and the milliseconds until it was ready."""
     started = time.perf_counter()
     environment = os.environ | {"COW_DATA_DIR": str(data)}
-    process = subprocess.Popen(cow("serve", "--port", "0"), env=environment, stderr=subprocess.PIPE, text=True)
+    command = cow("serve", "--port", "0")
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     address = ""
     for line in process.stderr:

@@ -2,8 +2,8 @@
 
     python benchmarks/scenes.py DIR [--json FILE]
 
-DIR holds one folder per scene with image.jpg, clean.jpg and meta.json; `examples/` is such a folder. Per scene: box
-IoU, direction error (degrees), path error (% of the image's width: mean distance of the true centres, up to the first
+DIR holds one folder per scene with image.jpg, clean.jpg, ids.png and meta.json, as `examples/` does. Per scene: box
+IoU, IoU, direction error (degrees), path error (% of the image's width: mean distance of the true centres, up to the first
 contact, to the computed path), centre error (px: where the mover is found in rendered frames against its trajectory),
 background error (grey levels: the largest difference to the input away from mover, hole and drawing), arrow error (grey
 levels: mean difference to clean.jpg where the arrow stood), and whether the encounters give the true answer.
@@ -28,14 +28,19 @@ from rich.console import Console
 from rich.table import Table
 
 from cow_service.errors import CannotReadDirection, CowError
-from cow_service.records import Simulation
+from cow_service.physics.encounters import box_at
+from cow_service.records import BBox, Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.vision.scene import Scene, iou
 
 DRAWN = 40  # grey levels between image and clean image where something was drawn
-AWAY = 15  # px around mover, hole and drawing that may differ
+AWAY = 15  # px around the true mover, its hole and the drawing that may differ
+LOST = 900  # squared grey levels: the best match is no match
+INDICES = (0, 2, 4, 8, 12, 16, 24, 32, 40, 60, 80)
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -60,11 +65,11 @@ class Row:
 def measure(service: Service, folder: Path) -> Row:
     """Runs one scene by image and question alone, as a caller would, and holds the result against the truth."""
     meta = json.loads((folder / "meta.json").read_text())
-    image = service.keep_image((folder / "image.jpg").read_bytes())
+    image, _ = service.keep_image((folder / "image.jpg").read_bytes())
     body: dict[str, Any] = {
         "image": {"artifact": image.sha256},
         "question": meta["question"],
-        "frames": {"indices": [0, 8, 16, 24, 40], "max_side": None},
+        "frames": {"indices": INDICES, "max_side": None},
     }
     needs_orientation = meta["motion"] == "linear" and not meta["arrow"]
     outcome = "ok"
@@ -83,7 +88,12 @@ def measure(service: Service, folder: Path) -> Row:
 def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simulation, outcome: str) -> Row:
     pixels, clean = (_pixels((folder / name).read_bytes()) for name in ("image.jpg", "clean.jpg"))
     frames = [_pixels(service.artifacts.read(frame.sha256)) for frame in simulation.frames]
-    centre, background, arrow = _frame_errors(simulation, frames, Scene(np.ascontiguousarray(pixels)), clean)
+    ids = cv2.imread(str(folder / "ids.png"), cv2.IMREAD_UNCHANGED)
+    truth = np.asarray(ids == meta["id_of"][meta["object"]])
+    others = [tuple(boxes[0]) for name, boxes in meta["boxes"].items() if name != meta["object"]]
+    centre, background, arrow = _frame_errors(
+        simulation, frames, Scene(np.ascontiguousarray(pixels)), clean, truth, others
+    )
     kinds = [
         encounter.kind
         for encounter in simulation.trajectory.encounters
@@ -118,37 +128,52 @@ def _pixels(encoded: bytes) -> NDArray[np.uint8]:
 
 
 def _frame_errors(
-    simulation: Simulation, frames: list[NDArray[np.uint8]], scene: Scene, clean: NDArray[np.uint8]
+    simulation: Simulation,
+    frames: list[NDArray[np.uint8]],
+    scene: Scene,
+    clean: NDArray[np.uint8],
+    truth: Mask,
+    others: list[BBox],
 ) -> tuple[float | None, float, float | None]:
-    """Largest centre error (px), background error and arrow error (grey levels) over the frames."""
-    bbox, start = simulation.grounding.bbox, np.array(simulation.grounding.point)
-    mover = scene.silhouette(bbox)
+    """Largest centre error (px), background error and arrow error (grey levels) over the frames.
+
+    `truth` [H, W] is the true mask of the mover, `others` the boxes of the other objects: where the mover meets one it
+    may be hidden, and is not looked for. What was drawn is where the image differs from the clean one.
+    """
+    start = np.array(simulation.grounding.point)
     drawn = np.abs(scene.image.astype(int) - clean).max(axis=2) > DRAWN
     kernel = np.ones((2 * AWAY + 1, 2 * AWAY + 1), np.uint8)
-    still = cv2.dilate((mover | drawn | scene.cues).astype(np.uint8), kernel) > 0
+    still = np.asarray(cv2.dilate((truth | drawn).astype(np.uint8), kernel), np.uint8)
     centres: list[float] = []
     backgrounds: list[float] = []
     arrows: list[float] = []
     for frame, pixels in zip(simulation.frames, frames, strict=True):
-        point = np.array(simulation.trajectory.points[frame.index])
-        shift = np.array([[1, 0, point[0] - start[0]], [0, 1, point[1] - start[1]]], np.float64)
-        here = cv2.warpAffine(mover.astype(np.uint8), shift, mover.shape[::-1]) > 0
-        changed = (cv2.dilate(here.astype(np.uint8), kernel) > 0) | still
-        backgrounds.append(float(np.abs(pixels.astype(int) - scene.image)[~changed].max(initial=0)))
-        hole = (here | mover).astype(np.uint8)
+        shift = np.array(simulation.trajectory.points[frame.index]) - start
+        move = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float64)
+        here = np.asarray(cv2.warpAffine(truth.astype(np.uint8), move, (truth.shape[1], truth.shape[0])), np.uint8)
+        changed = np.asarray(cv2.dilate(here, kernel), np.uint8) | still
+        backgrounds.append(float(np.abs(pixels.astype(int) - scene.image)[changed == 0].max(initial=0)))
+        hole = here | truth.astype(np.uint8)
         free = drawn & (cv2.dilate(hole, np.ones((11, 11), np.uint8)) == 0) if frame.index else drawn
         if free.sum() > 0.5 * drawn.sum() > 0:
             arrows.append(float(np.abs(pixels.astype(int) - clean)[free].mean()))
-        found = _locate(scene, mover, pixels, point - start)
-        if found is not None and simulation.trajectory.visible[frame.index]:
-            centres.append(found)
+        beside = box_at(simulation.grounding.bbox, start, start + shift, 1.0)
+        if simulation.trajectory.visible[frame.index] and not any(_meet(beside, other) for other in others):
+            found = _locate(scene, truth, pixels, shift)
+            if found is not None:
+                centres.append(found)
     return max(centres, default=None), max(backgrounds), max(arrows, default=None)
 
 
-def _locate(
-    scene: Scene, mover: NDArray[np.bool_], pixels: NDArray[np.uint8], shift: NDArray[np.float64]
-) -> float | None:
-    """Distance (px) between where the mover is best found in a frame and where it should be; None where hidden."""
+def _meet(a: BBox, b: BBox) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _locate(scene: Scene, mover: Mask, pixels: NDArray[np.uint8], shift: NDArray[np.float64]) -> float | None:
+    """Distance (px) from where the mover should be to where it is best found in a frame; None next to the border.
+
+    A mover that is not found at all counts as far off.
+    """
     rows, columns = np.nonzero(mover.any(axis=1))[0], np.nonzero(mover.any(axis=0))[0]
     window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     template, mask = scene.clean[window], np.repeat(mover[window][..., None], 3, axis=2).astype(np.float32)
@@ -160,8 +185,8 @@ def _locate(
     search = pixels[y : y + height + 2 * reach, x : x + width + 2 * reach]
     error = cv2.matchTemplate(np.ascontiguousarray(search), template, cv2.TM_SQDIFF, mask=mask) / mask.sum()
     best = np.unravel_index(int(error.argmin()), error.shape)
-    if error[best] > 400:  # more than 20 grey levels off: something stands in front
-        return None
+    if error[best] > LOST:
+        return float(reach)
     offset = np.array([best[1], best[0]]) - reach - (shift - np.round(shift))
     return float(np.hypot(*offset))
 
@@ -263,7 +288,7 @@ def main() -> int:
     folders = sorted(path.parent for path in arguments.folder.glob("*/meta.json"))
     if not folders:
         print(
-            f"No scenes in {arguments.folder}: it needs folders with image.jpg, clean.jpg and meta.json.",
+            f"No scenes in {arguments.folder}: it needs folders with image.jpg, clean.jpg, ids.png and meta.json.",
             file=sys.stderr,
         )
         return 2

@@ -104,6 +104,17 @@ class ArtifactStore:
         with _storage_errors():
             return path.read_bytes()
 
+    @contextmanager
+    def scratch(self) -> Generator[Path]:
+        """A path on the data folder's disk for a file in the making; removed afterwards unless `put_file` took it."""
+        with _storage_errors():
+            self._folder.mkdir(parents=True, exist_ok=True)
+        path = self._folder / f".{uuid4().hex}.part"
+        try:
+            yield path
+        finally:
+            path.unlink(missing_ok=True)
+
     def check(self) -> None:
         """Write, sync and remove a small file. Raises `StorageUnavailable` if that fails."""
         with _storage_errors(), _temporary_beside(self._folder / "check") as temporary, temporary.open("xb") as file:

@@ -14,6 +14,11 @@ import typer
 from cow_service import __version__
 from cow_service.errors import CowError
 
+HINTS = {  # how the command line says what an error's remedy asks for
+    "cannot-ground": "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME).",
+    "cannot-read-direction": "Here: --direction DX,DY.",
+}
+
 if TYPE_CHECKING:
     from cow_service.service import Service
 
@@ -125,6 +130,7 @@ def serve(
     """Start the server."""
     with _errors_told():
         service = _service(host=host, port=port)
+        service.check()  # what cannot serve the default request should not start
         import uvicorn  # noqa: PLC0415
 
         from cow_service.api.app import create_app  # noqa: PLC0415
@@ -182,6 +188,8 @@ def _errors_told() -> Generator[None]:
     except CowError as error:
         typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
         typer.echo(error.detail, err=True)
+        if error.code in HINTS:
+            typer.echo(HINTS[error.code], err=True)
         for field in error.errors:
             typer.echo(f"  {field.pointer}: {field.detail}", err=True)
         raise typer.Exit(1) from error

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
-from rich.table import Column, Table
+from rich.table import Table
 
-from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
+from cow_service.errors import CowError, InvalidRequest
 from cow_service.records import BackendInfo, Models, Simulation
 from cow_service.requests import SimulateRequest, Stage
 from cow_service.service import Service
-
-STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation")
 
 
 def build_request(
@@ -50,38 +50,35 @@ def build_request(
 
 
 def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Path, *, as_json: bool) -> None:
-    """Simulates with a progress line per stage, writes the results into a folder, and says where they are."""
-    console = Console(stderr=as_json, quiet=as_json)
-    artifact = service.keep_image(_read(image))
+    """Simulates, showing each stage as it runs, writes the results into a folder, and says what came out."""
+    console = Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)
+    with _writable(out):
+        out.mkdir(parents=True, exist_ok=True)
+    artifact, decoded = service.keep_image(_read(image))
     try:
         request = SimulateRequest.model_validate({"image": {"artifact": artifact.sha256}, **body})
     except ValidationError as error:
         told = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
         raise InvalidRequest(told) from error
-    columns = (
-        TextColumn("{task.description}", table_column=Column(width=10, no_wrap=True)),
-        BarColumn(bar_width=6),
-        TextColumn("{task.fields[said]}", table_column=Column(overflow="fold")),
-    )
-    with Progress(*columns, console=console) as bars:
-        tasks = {stage: bars.add_task(stage, total=1.0, start=False, said="") for stage in STAGES}
+    columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
+    with Progress(*columns, console=console, transient=True) as bars:
+        tasks: dict[Stage, TaskID] = {}
 
         def show(stage: Stage, done: float) -> None:
-            task: TaskID = tasks[stage]
-            if done == 0:
-                bars.start_task(task)
-            bars.update(task, completed=done)
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=1.0)
+            bars.update(tasks[stage], completed=done)
 
-        simulation = service.simulate(request, show)
-        for stage, said in _told(simulation).items():
-            bars.update(tasks[stage], said=f"{simulation.timings[stage]:5.2f} s  {said}")
+        simulation = service.simulate(request, show, decoded)
     written = save(service, simulation, out)
     if as_json:
         print(simulation.model_dump_json(indent=2))
         return
+    for stage, said in _told(simulation).items():
+        console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {said}")
     for warning in simulation.warnings:
-        console.print(f"[yellow]warning[/]: {warning}", highlight=False)
-    console.print(f"Wrote to [bold]{out}[/]: {', '.join(written)}", highlight=False)
+        console.print(f"[yellow]warning[/]: {warning}")
+    console.print(f"Wrote to [bold]{out}[/]: {', '.join(written)}")
 
 
 def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
@@ -90,16 +87,20 @@ def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
     files["overlay.png"] = simulation.overlay.sha256
     if simulation.video is not None:
         files["video.mp4"] = simulation.video.sha256
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with _writable(out):
         for name, sha256 in files.items():
             (out / name).write_bytes(service.artifacts.read(sha256))
         (out / "simulation.json").write_text(simulation.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise StorageUnavailable(
-            f"The results cannot be written to '{out}': {error.strerror}. Choose another --out."
-        ) from error
     return [*files, "simulation.json"]
+
+
+@contextmanager
+def _writable(out: Path) -> Generator[None]:
+    """Says which folder could not be written, where one could not."""
+    try:
+        yield
+    except OSError as error:
+        raise CowError(f"'{out}' cannot be written: {error.strerror}. Choose another folder with --out.") from error
 
 
 def print_models(models: Models, *, as_json: bool) -> None:
@@ -119,6 +120,8 @@ def print_models(models: Models, *, as_json: bool) -> None:
 
 
 def _readiness(backend: BackendInfo) -> str:
+    if backend.ready is None:
+        return "unknown"
     return "[green]yes[/]" if backend.ready else f"[yellow]needs {', '.join(backend.missing)}[/]"
 
 
@@ -127,12 +130,15 @@ def _told(simulation: Simulation) -> dict[Stage, str]:
     grounding, motion, trajectory = simulation.grounding, simulation.motion, simulation.trajectory
     x, y = grounding.point
     way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"
+    if motion.depth:
+        way += " and towards the camera" if motion.depth < 0 else " and away from the camera"
     met = ", ".join(f"{e.kind} {e.object} at {e.first_frame / trajectory.fps:.1f} s" for e in trajectory.encounters)
+    computed = not any("encounters were not computed" in warning for warning in simulation.warnings)
     video = f", {simulation.video.num_frames}-frame video" if simulation.video else ""
     return {
         "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
         "motion": f"{motion.kind}{way}, {motion.speed:.0f} px/s, from {motion.cue}",
-        "trajectory": met or "meets nothing",
+        "trajectory": met or ("meets nothing" if computed else "encounters were not computed"),
         "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
     }
 

@@ -81,7 +81,7 @@ def print_report(report: Report, *, as_json: bool) -> None:
     for heading in ("backend", "ready", "missing", "install with"):
         table.add_column(heading)
     for backend in report.backends:
-        ready = "[green]yes[/]" if backend.ready else "[yellow]no[/]"
+        ready = {True: "[green]yes[/]", False: "[yellow]no[/]", None: "unknown"}[backend.ready]
         table.add_row(backend.name, ready, ", ".join(backend.missing) or "-", backend.install or "-")
     console.print(table)
     installed = ", ".join(f"{name} {found}" for name, found in report.packages.items() if found)

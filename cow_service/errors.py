@@ -6,6 +6,7 @@
     ├── NotFound                   not-found                404
     ├── MethodNotAllowed           method-not-allowed       405
     ├── ArtifactNotFound           artifact-not-found       404
+    ├── RangeNotSatisfiable        range-not-satisfiable    416
     ├── BodyTooLarge               body-too-large           413
     ├── BodyTypeUnsupported        body-type-unsupported    415
     ├── ImageTooLarge              image-too-large          413
@@ -36,16 +37,24 @@ class FieldError:
     detail: str
 
 
+def pointer_part(part: int | str) -> str:
+    """One step of a JSON Pointer, escaped (RFC 6901)."""
+    return str(part).replace("~", "~0").replace("/", "~1")
+
+
 class CowError(Exception):
     """Something went wrong."""
 
     code: str = "internal-error"
     status: int = 500
 
-    def __init__(self, detail: str, *, errors: tuple[FieldError, ...] = ()) -> None:
+    def __init__(
+        self, detail: str, *, errors: tuple[FieldError, ...] = (), headers: dict[str, str] | None = None
+    ) -> None:
         super().__init__(detail)
         self.detail = detail
         self.errors = errors
+        self.headers = headers or {}  # of the HTTP response, where the error calls for some
 
     @property
     def title(self) -> str:
@@ -81,6 +90,12 @@ class ArtifactNotFound(CowError):
     """No artifact has that digest."""
 
     code, status = "artifact-not-found", 404
+
+
+class RangeNotSatisfiable(CowError):
+    """The range lies outside the artifact."""
+
+    code, status = "range-not-satisfiable", 416
 
 
 class BodyTooLarge(CowError):

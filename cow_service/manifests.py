@@ -29,9 +29,9 @@ class Manifest(Record):
         """Modules that are not installed. Nothing is imported to find out."""
         return tuple(module for module in self.modules if find_spec(module) is None)
 
-    def install_line(self) -> str | None:
-        """The command that installs what this backend needs beyond the base install."""
-        return f'pip install "cow-service[{self.extra}]"' if self.extra else None
+    def install_line(self) -> str:
+        """The command that installs what this backend needs."""
+        return f'pip install "cow-service[{self.extra}]"' if self.extra else "pip install --force-reinstall cow-service"
 
 
 @cache

@@ -21,10 +21,11 @@ from cow_service.images import DecodedImage, encode_png
 from cow_service.readers.base import Reader
 from cow_service.records import Artifact, ReaderInfo, Simulation
 from cow_service.requests import GroundingRequest, SimulateRequest, Stage
+from cow_service.stages.doubts import doubts
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
-from cow_service.stages.options import read_options
+from cow_service.stages.options import check_frames, read_options
 from cow_service.stages.trajectory import compute_trajectory
 from cow_service.vision.obstacles import obstacles_of
 from cow_service.vision.scene import Scene
@@ -71,6 +72,7 @@ def simulate(
     Raises the errors of its stages: `InvalidRequest`, `CannotGround`, `CannotReadDirection`, `GeneratorUnavailable`...
     """
     options = read_options(backends.generator, request.generator_options)
+    check_frames(request)
     scene = Scene(image.pixels)
     clock = _Clock(progress)
     used: list[Stage] = []
@@ -87,7 +89,7 @@ def simulate(
         return backends.artifacts.put(encode_png(pixels), "image/png")
 
     with clock.stage("grounding"):
-        grounding = ground(scene, request.question, _place(request), reader_for("grounding"), keep)
+        grounding, unsure = ground(scene, request.question, _place(request), reader_for("grounding"), keep)
     with clock.stage("motion"):
         motion, warnings = read_motion(
             scene, request.question, grounding, request.motion, request.trajectory, reader_for("motion")
@@ -115,7 +117,7 @@ def simulate(
         generator=backends.generator.describe(shot),
         reader=_reader_info(backends, used),
         timings=clock.timings,
-        warnings=(*warnings, *_doubts(scene, obstacles_found=bool(obstacles))),
+        warnings=(*unsure, *warnings, *doubts(scene, request, grounding, obstacles)),
     )
 
 
@@ -132,13 +134,3 @@ def _reader_info(backends: Backends, used: list[Stage]) -> ReaderInfo:
     if not stages:
         return ReaderInfo(name=backends.reader_name)
     return backends.reader().info.model_copy(update={"stages": stages})
-
-
-def _doubts(scene: Scene, *, obstacles_found: bool) -> tuple[str, ...]:
-    """What a caller should know before trusting the encounters."""
-    if not scene.regions and not obstacles_found:
-        return (
-            "The surroundings could not be separated into objects, so encounters were not computed: "
-            "an empty list does not mean that nothing is hit.",
-        )
-    return ()

@@ -207,7 +207,8 @@ class BackendInfo(Record):
 
     name: str
     default: bool = Field(description="Used where a request names none.")
-    ready: bool
+    ready: bool | None = Field(description="Null where nothing is known of it before it is used.")
+    needs: tuple[str, ...] = Field(default=(), description="Python modules that it uses.")
     summary: str
     licence: str | None = None
     weights: str | None = Field(default=None, description="Repository of its weights; null where it has none.")

@@ -25,11 +25,7 @@ class ImageUrl(Record):
     url: str = Field(max_length=4096)
 
 
-ImageRef = (
-    Annotated[str, Field(description="data:image/png;base64,... (PNG, JPEG or WebP)", pattern=r"^data:")]
-    | ImageArtifact
-    | ImageUrl
-)
+ImageRef = Annotated[str, Field(description="data:image/png;base64,... (PNG, JPEG or WebP)")] | ImageArtifact | ImageUrl
 
 
 class GroundingRequest(Record):
@@ -65,7 +61,7 @@ class MotionRequest(Record):
     speed: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False)] | None = Field(
         default=None, description="px/s; by default 0.26 image widths per second."
     )
-    metres_per_pixel: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = Field(
+    metres_per_pixel: Annotated[float, Field(ge=1e-6, le=1000, allow_inf_nan=False)] | None = Field(
         default=None, description="By default the image is taken to be 3 m wide at the object."
     )
 
@@ -73,6 +69,10 @@ class MotionRequest(Record):
     def _goes_somewhere(self) -> MotionRequest:
         if self.kind in ("linear", "projectile") and self.direction is None:
             raise ValueError(f"a {self.kind} motion needs a `direction` [dx, dy]")
+        if self.kind in ("fall", "static") and (self.direction is not None or self.speed is not None or self.depth):
+            raise ValueError(
+                f"a {self.kind} motion takes no `direction`, `speed` or `depth`; a throw is a `projectile`"
+            )
         return self
 
     @field_validator("direction")
@@ -141,15 +141,6 @@ class SimulateRequest(Record):
         if not question.strip():
             raise ValueError("the question is empty")
         return question
-
-    @model_validator(mode="after")
-    def _frames_exist(self) -> SimulateRequest:
-        for index in self.frames.indices or ():
-            if index >= self.num_frames:
-                raise ValueError(
-                    f"`frames.indices` names frame {index}, but the clip has frames 0 to {self.num_frames - 1}"
-                )
-        return self
 
 
 Stage = Literal["grounding", "motion", "trajectory", "generation"]

@@ -23,7 +23,7 @@ from cow_service.plugins import Registry
 from cow_service.readers.base import Reader
 from cow_service.records import Artifact, BackendInfo, Models, Simulation
 from cow_service.requests import ImageArtifact, ImageRef, ImageUrl, SimulateRequest
-from cow_service.settings import Settings
+from cow_service.settings import Settings, SettingsError
 
 _DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)
 
@@ -40,14 +40,25 @@ class Service:
         self.artifacts = ArtifactStore(settings.data_dir / "artifacts")
         self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable)
         self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable)
+        for setting, name, names in (
+            ("COW_READER", settings.reader, self.readers.names()),
+            ("COW_GENERATOR", settings.generator, self.generators.names()),
+        ):
+            if name not in names:
+                raise SettingsError(f"Bad settings: {setting}={name!r}: there are only {', '.join(names) or 'none'}.")
 
-    def keep_image(self, data: bytes) -> Artifact:
-        """Checks an image (PNG, JPEG or WebP) and keeps its bytes as sent. Raises the errors of `images.decode`."""
+    def keep_image(self, data: bytes) -> tuple[Artifact, DecodedImage]:
+        """Decodes an image (PNG, JPEG or WebP) and keeps its bytes as sent. Raises the errors of `images.decode`."""
         image = decode(data, max_megapixels=self.settings.max_image_megapixels)
-        return self.artifacts.put(data, image.media_type)
+        return self.artifacts.put(data, image.media_type), image
 
-    def simulate(self, request: SimulateRequest, progress: Progress = _ignore) -> Simulation:
-        """One simulation, start to end. Raises any `CowError` of its stages."""
+    def simulate(
+        self, request: SimulateRequest, progress: Progress = _ignore, image: DecodedImage | None = None
+    ) -> Simulation:
+        """One simulation, start to end; `image` is that of the request where it was decoded before.
+
+        Raises any `CowError` of its stages.
+        """
         backends = Backends(
             reader_name=self._known("reader", request.reader or self.settings.reader, self.readers),
             reader=lambda: self.readers.get(request.reader or self.settings.reader),
@@ -56,7 +67,7 @@ class Service:
             ),
             artifacts=self.artifacts,
         )
-        return simulate(request, self._image(request.image), backends, progress)
+        return simulate(request, image or self._image(request.image), backends, progress)
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
@@ -68,18 +79,15 @@ class Service:
     def check(self) -> None:
         """Raises the `CowError` that would keep the default request from succeeding."""
         self.artifacts.check()
-        self.readers.get(self._known("reader", self.settings.reader, self.readers))
-        self.generators.get(self._known("generator", self.settings.generator, self.generators))
+        self.readers.get(self.settings.reader)
+        self.generators.get(self.settings.generator)
 
     def _image(self, ref: ImageRef) -> DecodedImage:
-        if isinstance(ref, ImageUrl):
+        if isinstance(ref, ImageUrl) or (isinstance(ref, str) and ref[:8].lower().startswith(("http://", "https://"))):
             raise ImageUrlNotAllowed("This server fetches no images. Send the image as a data URL or as a file part.")
         if isinstance(ref, ImageArtifact):
             return decode(self.artifacts.read(ref.artifact), max_megapixels=self.settings.max_image_megapixels)
-        data = decode_data_url(ref)
-        image = decode(data, max_megapixels=self.settings.max_image_megapixels)
-        self.artifacts.put(data, image.media_type)
-        return image
+        return self.keep_image(decode_data_url(ref))[1]
 
     def _known(self, door: str, name: str, registry: Registry[Reader] | Registry[Generator]) -> str:
         if name not in registry.names():
@@ -91,12 +99,13 @@ class Service:
         manifest = load_manifests().get(name)
         default = name == (self.settings.reader if door == "reader" else self.settings.generator)
         if manifest is None:
-            return BackendInfo(name=name, default=default, ready=True, summary="No manifest.")
+            return BackendInfo(name=name, default=default, ready=None, summary="Registered by another package.")
         missing = manifest.missing_modules()
         return BackendInfo(
             name=name,
             default=default,
             ready=not missing,
+            needs=manifest.modules,
             summary=manifest.summary,
             licence=manifest.licence,
             weights=manifest.weights,

@@ -82,6 +82,7 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
     ("arguments", "code", "told"),
     [
         (["If the pink car moves left, what?"], 1, "cannot-ground: The object that moves could not be found."),
+        (["If the red ball moves forward, what?"], 1, "Here: --direction DX,DY."),
         ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers with commas between"),
         ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),
         ([QUESTION, "--kind", "projectile"], 1, "go with --direction"),
@@ -133,9 +134,23 @@ def test_the_doctor_finds_what_is_wrong(tmp_path: Path) -> None:
     result = cow(tmp_path, "doctor", COW_DATA_DIR=str(tmp_path / "file"))
     assert result.returncode == 1
     assert "storage-unavailable" in result.stdout
-    result = cow(tmp_path, "doctor", COW_GENERATOR="dream")
+    result = cow(tmp_path, "serve", COW_DATA_DIR=str(tmp_path / "file"))
     assert result.returncode == 1
-    assert "dream" in result.stdout
+    assert "storage-unavailable" in result.stderr
+
+
+def test_a_default_backend_that_is_not_there_stops_the_start(tmp_path: Path) -> None:
+    result = cow(tmp_path, "serve", COW_GENERATOR="dream")
+    assert result.returncode == 2
+    assert "COW_GENERATOR='dream': there are only cutout" in result.stderr
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path, picture: Path) -> None:
+    (tmp_path / "file").write_text("")
+    result = cow(tmp_path, "simulate", str(picture), QUESTION, "--out", "file")
+    assert result.returncode == 1
+    assert "--out" in result.stderr
+    assert "grounding" not in result.stdout
 
 
 def test_version_and_help(tmp_path: Path) -> None:

@@ -33,7 +33,8 @@ def no_reader():
 
 def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion) -> Shot:
     scene = Scene(image)
-    grounding: Grounding = ground(scene, "?", GroundingRequest(point=CENTRE), no_reader, lambda mask: ARTIFACT)
+    grounding: Grounding
+    grounding, _ = ground(scene, "?", GroundingRequest(point=CENTRE), no_reader, lambda mask: ARTIFACT)
     moving, _ = read_motion(scene, "?", grounding, MotionRequest(**motion), None, no_reader)
     obstacles = obstacles_of(scene, grounding.bbox)
     trajectory = compute_trajectory(scene, grounding, moving, obstacles, None, frames, fps)
@@ -120,6 +121,30 @@ def test_coming_closer_it_grows() -> None:
     sizes = [redness(frame).sum() for frame in generator.render(filmed, (0, 8, 16))]
     assert sizes[0] < sizes[1] < sizes[2]
     assert sizes[2] / sizes[0] == pytest.approx(filmed.trajectory.scale[16] ** 2, rel=0.15)
+
+
+def test_past_the_camera_it_is_gone() -> None:
+    image = ball(floor(320, 240), CENTRE, 20, RED)
+    filmed = shot(image, frames=81, direction=(0, 1), depth=-1, speed=400)
+    assert filmed.trajectory.visible[-1] is False
+    assert not redness(frame_of(filmed, 80)).any()
+
+
+def test_edges_are_soft() -> None:
+    filmed = shot(ball(floor(), CENTRE, RADIUS, RED), frames=3, direction=(0, -1), speed=0)
+    frame = frame_of(filmed, 1).astype(int)
+    row = frame[200, 110:130, 0] - frame[200, 110:130, 1]
+    assert ((row > 3) & (row < 0.9 * row.max())).sum() >= 2
+
+
+def test_a_varied_background_is_continued_not_smeared() -> None:
+    rng = np.random.default_rng(0)
+    tiles = rng.integers(40, 220, (50, 80, 1)).astype(np.uint8).repeat(8, axis=0).repeat(8, axis=1).repeat(3, axis=2)
+    filmed = shot(ball(tiles, CENTRE, RADIUS, RED), frames=33, direction=(1, 0), speed=500)
+    frame = frame_of(filmed, 32).astype(int)
+    hole = frame[175:225, 135:185, 1]
+    assert hole.std() > 25
+    assert not redness(frame[160:240, 120:200]).any()
 
 
 def test_out_of_the_image_only_the_background_is_left() -> None:

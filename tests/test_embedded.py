@@ -134,6 +134,42 @@ def test_refusals_say_what_was_looked_for_what_was_seen_and_what_to_give() -> No
     assert "no box" in told
 
 
+MUGS = block(
+    block(ball(floor(), (150, 120), 35, (225, 200, 50)), (260, 230, 330, 330), (235, 235, 235)),
+    (450, 150, 520, 250),
+    BLUE,
+)
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        "If the green ball moves right, will it hit the mug?",
+        "If the mug moves to the left, will it hit the ball?",
+        "If the mugs move left, do they hit the ball?",
+        "If the leftmost object moves right, what happens?",
+        "If the wind blows from the left, where does the yellow ball go?",
+        "If the table is tilted to the right, where does the ball roll?",
+        "If the yelow bal moves oposite to the arrow, will it hit the mug?",
+        "If the yellow ball moves to the left of the blue mug, will it touch it?",
+        "If the yellow ball comes from the left, will it hit the blue mug?",
+        "If the yellow ball moves north-east, what happens?",
+        "If the yellow ball does not move to the left but to the right, will it hit the mug?",
+    ],
+)
+def test_what_was_not_understood_is_never_guessed(question: str) -> None:
+    scene = Scene(jpeg(DrawnArrow((110, 110), 3.0, 80, 4, (220, 20, 20), "filled").on(MUGS)))
+    with pytest.raises((CannotGround, CannotReadDirection)):
+        read(scene, question)
+
+
+def test_an_arrow_at_something_else_is_not_the_movers() -> None:
+    image = ball(ball(floor(), (120, 80), 35, RED), (200, 300), 40, BLUE)
+    scene = Scene(jpeg(DrawnArrow((205, 300), 0.0, 120, 5, (30, 160, 30), "filled").on(image)))
+    told = refusal(CannotReadDirection, scene, "If the red ball moves along the arrow, will it hit the blue ball?")
+    assert "stands elsewhere" in told
+
+
 def test_two_arrows_that_could_both_be_meant_are_refused() -> None:
     scene = ball(floor(), (300, 200), 40, ORANGE)
     for start, angle in (((355, 200), 0.0), ((245, 200), 3.1)):

@@ -53,9 +53,12 @@ def imports(path: Path) -> set[str]:
     """Names inside the package that a file imports, lazily or for types only included."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("cow_service"):
-            module = node.module.removeprefix("cow_service").lstrip(".")
-            found |= {module} if module else {alias.name for alias in node.names} - {"__version__"}
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name} imports relatively, which this test does not follow"
+            if node.module == "cow_service" or (node.module or "").startswith("cow_service."):
+                room = (node.module or "").removeprefix("cow_service").lstrip(".")
+                names = {f"{room}.{alias.name}".lstrip(".") for alias in node.names}
+                found |= {name for name in names if name in modules()} or ({room} if room else set())
         if isinstance(node, ast.Import):
             names = {alias.name for alias in node.names}
             found |= {name.removeprefix("cow_service.") for name in names if name.startswith("cow_service.")}

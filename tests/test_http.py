@@ -78,7 +78,9 @@ def test_multipart_is_the_same_request(http: httpx.Client) -> None:
         ({**BODY, "frames": {"count": 0, "policy": "best"}}, {"/frames/count", "/frames/policy"}),
         ({**BODY, "grounding": {"point": [9999, 1]}}, {"/grounding/point"}),
         ({**BODY, "reader": "nobody"}, {"/reader"}),
-        ({**BODY, "image": "http://example.org"}, {"/image"}),
+        ({**BODY, "motion": {"kind": "fall", "direction": [1, 0]}}, {"/motion"}),
+        ({**BODY, "motion": {"kind": "fall", "metres_per_pixel": 1e-300}}, {"/motion/metres_per_pixel"}),
+        ({**BODY, "image": "example.org"}, {"/image"}),
         ({**BODY, "image": 7}, {"/image"}),
         ({**BODY, "image": "data:image/png;base64,!!"}, {"/image"}),
     ],
@@ -93,7 +95,7 @@ def raw(body: bytes | str, media_type: str = "application/json") -> dict:
     return {"content": body, "headers": {"content-type": media_type}}
 
 
-@pytest.mark.parametrize("body", ["", "{", "[]", "7", '{"num_frames": NaN}', b"\xff\xfe", "[" * 50_000])
+@pytest.mark.parametrize("body", ["", "{", "[]", "7", b"\xff\xfe", "[" * 50_000, '{"question": "\\ud800"}'])
 def test_what_is_no_json_object_is_malformed(http: httpx.Client, body) -> None:
     problem(http.post("/simulate", **raw(body)), 400, "malformed-body")
 
@@ -108,6 +110,10 @@ def test_other_media_types_and_bad_forms(http: httpx.Client) -> None:
     problem(response, 422, "invalid-request")
     assert pointers(response) == {"/seed"}
     problem(http.post("/simulate", data={"question": "?", "request": "{"}, files=image), 400, "malformed-body")
+    again = {"question": "?", "request": json.dumps({"question": "other"})}
+    response = http.post("/simulate", data=again, files=image)
+    problem(response, 422, "invalid-request")
+    assert pointers(response) == {"/question"}
     response = http.post("/simulate", data={"image": "a"}, files={"question": ("q", b"?")})
     problem(response, 422, "invalid-request")
 
@@ -123,7 +129,8 @@ def test_images_that_cannot_be_used(http: httpx.Client) -> None:
     huge[29:33] = zlib.crc32(huge[12:29]).to_bytes(4, "big")
     told = problem(send(bytes(huge)), 413, "image-too-large")
     assert "100000" in told["detail"].replace(",", "")
-    problem(http.post("/simulate", json={**BODY, "image": {"url": "http://x"}}), 422, "image-url-not-allowed")
+    for image in ({"url": "http://x"}, "http://x"):
+        problem(http.post("/simulate", json={**BODY, "image": image}), 422, "image-url-not-allowed")
     problem(http.post("/simulate", json={**BODY, "image": {"artifact": "0" * 64}}), 404, "artifact-not-found")
 
 
@@ -162,6 +169,7 @@ def test_addresses_and_methods_that_are_not_there(http: httpx.Client) -> None:
     problem(http.get("/artifacts/" + "0" * 64), 404, "artifact-not-found")
     problem(http.get("/artifacts/..%2f..%2fetc%2fpasswd"), 404, "not-found")
     problem(http.get("/artifacts/ABC"), 404, "artifact-not-found")
+    problem(http.get("/livez/"), 404, "not-found")
 
 
 def test_artifacts_are_cached_forever_and_served_in_parts(http: httpx.Client) -> None:
@@ -175,7 +183,12 @@ def test_artifacts_are_cached_forever_and_served_in_parts(http: httpx.Client) ->
     assert http.get(url, headers={"if-none-match": '"other"'}).status_code == 200
     part = http.get(url, headers={"range": "bytes=10-19"})
     assert (part.status_code, part.content) == (206, whole.content[10:20])
-    assert http.get(url, headers={"range": "bytes=999999999-"}).status_code == 416
+    outside = http.get(url, headers={"range": "bytes=999999999-"})
+    problem(outside, 416, "range-not-satisfiable")
+    assert outside.headers["content-range"] == f"bytes */{len(whole.content)}"
+    for ignored in ("bytes=abc", "foo=0-1", "bytes=5-2", "bytes=" + ",".join(f"{i}-{i}" for i in range(500))):
+        assert http.get(url, headers={"range": ignored}).content == whole.content
+    assert http.get(url, headers={"range": "bytes=-5"}).content == whole.content[-5:]
     head = http.head(url)
     assert (head.status_code, head.content) == (200, b"")
     assert int(head.headers["content-length"]) == len(whole.content)
@@ -187,7 +200,7 @@ def test_probes_and_models(http: httpx.Client) -> None:
     models = Models.model_validate(http.get("/models").json())
     assert [(m.name, m.default, m.ready) for m in models.readers] == [("embedded", True, True)]
     assert [(m.name, m.default, m.ready) for m in models.generators] == [("cutout", True, True)]
-    assert models.generators[0].defaults["num_frames"] == 81
+    assert models.generators[0].needs == ("cv2", "numpy", "av")
 
 
 def test_a_caller_that_hangs_up_leaves_the_server_well(server, http: httpx.Client) -> None:

@@ -10,14 +10,15 @@ import cv2
 import numpy as np
 import pytest
 from conftest import Example, all_scenes
-from drawn import angle_between, ball, block, floor, png_bytes
+from drawn import DrawnArrow, angle_between, ball, block, floor, png_bytes
 from PIL import Image
 
 from cow_service.errors import ArtifactNotFound, CannotReadDirection, ImageUrlNotAllowed, InvalidRequest
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service, decode_data_url
-from cow_service.vision.scene import iou
+from cow_service.vision.regions import MAX_REGIONS
+from cow_service.vision.scene import Scene, iou
 
 RED, BLUE = (210, 20, 20), (50, 80, 200)
 DRAWN = png_bytes(block(ball(floor(), (150, 200), 40, RED), (430, 160, 510, 250), BLUE))
@@ -25,7 +26,7 @@ QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 
 
 def run(service: Service, image: bytes = DRAWN, question: str = QUESTION, progress=None, **body) -> Simulation:
-    artifact = service.keep_image(image)
+    artifact, _ = service.keep_image(image)
     request = SimulateRequest.model_validate({"image": {"artifact": artifact.sha256}, "question": question, **body})
     return service.simulate(request, progress) if progress else service.simulate(request)
 
@@ -140,6 +141,35 @@ def test_overrides_skip_their_readers(service: Service) -> None:
     assert simulation.trajectory.points[16] == pytest.approx((150, 100))
 
 
+def test_doubts_are_told(service: Service) -> None:
+    motion, path = {"direction": [1, 0]}, {"points": [[300, 300], [310, 300]]}
+    place = {"grounding": {"point": [150, 200]}}
+
+    def told(**body) -> str:
+        return " ".join(run(service, video=False, num_frames=5, **body).warnings)
+
+    assert "Both `motion` and `trajectory`" in told(motion=motion, trajectory=path)
+    assert "from the object's centre" in told(trajectory=path, **place)
+    assert "speed" in told(motion={"kind": "projectile", **motion})
+    assert "'green vase', which was not found" in told(
+        question="If the red ball moves left, will it hit the green vase?"
+    )
+    arrow = DrawnArrow((300, 330), 0.0, 120, 6, (30, 160, 30), "filled").on(block(floor(), (80, 100, 200, 220), RED))
+    assert "an arrow at (" in told(image=png_bytes(arrow), question="?", motion=motion, grounding={"point": [140, 160]})
+    assert told() == ""
+
+
+def test_many_objects_stay_affordable(service: Service) -> None:
+    image = floor(1600, 1200)
+    for y in range(60, 1200, 120):
+        for x in range(60, 1600, 120):
+            cv2.circle(image, (x, y), 30, BLUE, -1)
+    place = {"grounding": {"bbox": [30, 30, 90, 90]}, "motion": {"direction": [1, 0]}}
+    simulation = run(service, png_bytes(image), "?", **place, video=False)
+    assert len(Scene(image).regions) == MAX_REGIONS
+    assert len(simulation.frames) == 3
+
+
 def test_the_same_request_gives_the_same_bytes(service: Service) -> None:
     first, second = (run(service, num_frames=9) for _ in range(2))
     assert [f.sha256 for f in first.frames] == [f.sha256 for f in second.frames]
@@ -159,7 +189,7 @@ def test_a_cluttered_image_says_that_it_knows_no_surroundings(service: Service) 
     assert "encounters were not computed" in simulation.warnings[0]
 
 
-@pytest.mark.parametrize("size", [(8, 8), (9, 31), (40, 500), (500, 40)])
+@pytest.mark.parametrize("size", [(8, 8), (9, 31), (40, 500), (500, 40), (8, 4000), (4000, 8)])
 def test_small_and_long_images(service: Service, size: tuple[int, int]) -> None:
     image = np.full((size[1], size[0], 3), 128, np.uint8)
     place = {"grounding": {"bbox": [2, 2, 6, 6]}, "motion": {"direction": [1, 1]}}
@@ -174,6 +204,8 @@ def test_small_and_long_images(service: Service, size: tuple[int, int]) -> None:
         ({"reader": "nobody"}, "/reader"),
         ({"generator": "nobody"}, "/generator"),
         ({"generator_options": {"clean_cue": True}}, "/generator_options/clean_cue"),
+        ({"frames": {"indices": [3, 81]}}, "/frames/indices/1"),
+        ({"generator_options": {"a/b": 1}}, "/generator_options/a~1b"),
         ({"generator_options": {"clean_cues": "perhaps"}}, "/generator_options/clean_cues"),
     ],
 )
@@ -191,7 +223,9 @@ def test_images_come_as_data_urls_or_artifacts_only(service: Service) -> None:
         ask({"url": "https://example.org/a.png"})
     with pytest.raises(ArtifactNotFound):
         ask({"artifact": "f" * 64})
-    for bad in ("data:image/png,abc", "data:image/png;base64,***", "data:"):
+    with pytest.raises(ImageUrlNotAllowed):
+        ask("https://example.org/a.png")
+    for bad in ("ftp://x", "data:image/png,abc", "data:image/png;base64,***", "data:"):
         with pytest.raises(InvalidRequest) as caught:
             ask(bad)
         assert caught.value.errors[0].pointer == "/image"

@@ -18,6 +18,8 @@ from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import compute_trajectory
+from cow_service.vision.cuttings import cutting_of
+from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
 
 RED = (200, 30, 30)
@@ -34,7 +36,7 @@ def scene() -> Scene:
 
 def grounded(scene: Scene, **given) -> Grounding:
     artifact = Artifact(sha256="0" * 64, url="/artifacts/0", media_type="image/png", size=1)
-    return ground(scene, "?", GroundingRequest(**given), no_reader, lambda mask: artifact)
+    return ground(scene, "?", GroundingRequest(**given), no_reader, lambda mask: artifact)[0]
 
 
 def moved(scene: Scene, path: TrajectoryRequest | None = None, **given) -> Motion:
@@ -119,6 +121,25 @@ def test_anchors_keep_off_object_and_path(scene: Scene) -> None:
     assert all(abs(y - 200) > 40 for x, y in trajectory.anchors if x > 160)
 
 
+def test_anchors_keep_off_where_they_would_else_stand(scene: Scene) -> None:
+    free = rolled(scene, moved(scene, kind="static")).anchors
+    x, y = next(anchor for anchor in free if math.dist(anchor, (200, 200)) > 120)
+    here = np.zeros((400, 640), bool)
+    here[int(y) - 15 : int(y) + 15, int(x) - 15 : int(x) + 15] = True
+    obstacle = Obstacle("vase", (x - 15, y - 15, x + 15, y + 15), cutting_of(here))
+    grounding = grounded(scene, point=(200, 200))
+    kept = compute_trajectory(scene, grounding, moved(scene, kind="static"), (obstacle,), None, 5, 16).anchors
+    assert (x, y) not in kept
+    assert all(not here[int(b), int(a)] for a, b in kept)
+    away = rolled(scene, moved(scene, direction=(x - 200, y - 200), speed=300)).anchors
+    assert (x, y) not in away
+
+
+def test_the_sentence_says_what_the_record_says(scene: Scene) -> None:
+    assert "towards the camera" in moved(scene, direction=(0, 1), depth=-0.9).sentence
+    assert "camera." not in moved(scene, kind="fall").sentence.split("The camera")[0]
+
+
 def test_a_given_path_is_followed_and_held(scene: Scene) -> None:
     path = TrajectoryRequest(points=((200, 200), (300, 200), (300, 300)), fps=2)
     motion = moved(scene, path=path)
@@ -186,7 +207,7 @@ def test_any_policy_gives_as_many_frames_as_there_are(policy, count, frames, eve
         ({"motion": {"kind": "projectile"}}, "needs a `direction`"),
         ({"trajectory": {"points": [[1, 1]]}}, "at least 2"),
         ({"trajectory": {"points": [[1, 1], [1e9, 0]]}}, "1,000,000 px"),
-        ({"frames": {"indices": [81]}}, "frames 0 to 80"),
+        ({"motion": {"kind": "fall", "direction": [1, 0]}}, "takes no `direction`"),
         ({"question": "   "}, "empty"),
         ({"num_frames": 1}, "greater than or equal to 2"),
         ({"sede": 3}, "Extra inputs"),

@@ -22,7 +22,9 @@ DROPPED = ("HTTPValidationError", "ValidationError")  # the framework's error sh
 
 def create_app(service: Service) -> FastAPI:
     """The application for a service. It holds no state of its own."""
-    app = FastAPI(title="COW", version=__version__, summary=SUMMARY, docs_url="/docs", redoc_url=None)
+    app = FastAPI(
+        title="COW", version=__version__, summary=SUMMARY, docs_url=None, redoc_url=None, redirect_slashes=False
+    )
     app.add_middleware(BodyLimit, megabytes=service.settings.max_body_mb)
     install_problem_handlers(app)
     for router in (simulate_routes(service), artifact_routes(service), health_routes(service)):

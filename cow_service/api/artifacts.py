@@ -10,6 +10,7 @@ from starlette.requests import Request
 
 from cow_service import errors
 from cow_service.api.problems import documented
+from cow_service.api.ranges import is_honoured
 from cow_service.service import Service
 
 FOREVER = "public, max-age=31536000, immutable"
@@ -28,10 +29,12 @@ def artifact_routes(service: Service) -> APIRouter:
         response_class=Response,
         responses={
             200: {"description": "The bytes.", "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}},
-            206: {"description": "The ranges asked for."},
+            206: {
+                "description": "The ranges asked for.",
+                "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}},
+            },
             304: {"description": "The caller has them."},
-            416: {"description": "The range lies outside."},
-            **documented(errors.ArtifactNotFound, errors.StorageUnavailable),
+            **documented(errors.ArtifactNotFound, errors.RangeNotSatisfiable, errors.StorageUnavailable),
         },
     )
     def artifact(
@@ -44,6 +47,10 @@ def artifact_routes(service: Service) -> APIRouter:
         known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
         if etag in known or "*" in known:
             return Response(status_code=304, headers=headers)
+        asked = request.headers.get("range")
+        if asked is not None and not is_honoured(asked, stored.artifact.size):
+            # The response reads the header itself: what is to be ignored must not reach it.
+            request.scope["headers"] = [pair for pair in request.scope["headers"] if pair[0] != b"range"]
         return FileResponse(stored.path, media_type=stored.artifact.media_type, headers=headers)
 
     return router

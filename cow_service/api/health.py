@@ -33,9 +33,7 @@ def health_routes(service: Service) -> APIRouter:
         operation_id="readyz",
         tags=["health"],
         summary="The default request can be served",
-        responses=documented(
-            errors.StorageUnavailable, errors.ReaderUnavailable, errors.GeneratorUnavailable, errors.InvalidRequest
-        ),
+        responses=documented(errors.StorageUnavailable, errors.ReaderUnavailable, errors.GeneratorUnavailable),
     )
     def readyz() -> Health:
         """Checks that the data folder can be written and that the default reader and generator load."""

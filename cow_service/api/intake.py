@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from typing import Any
 
 from fastapi import Request
 from pydantic import ValidationError
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 
 from cow_service.api.problems import invalid
 from cow_service.errors import BodyTypeUnsupported, FieldError, InvalidRequest, MalformedBody
+from cow_service.images import DecodedImage
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 
@@ -22,10 +24,11 @@ BODY = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
-                "required": ["image", "question"],
+                "required": ["image"],
+                "additionalProperties": False,
                 "properties": {
                     "image": {"type": "string", "format": "binary", "description": "PNG, JPEG or WebP."},
-                    "question": {"type": "string"},
+                    "question": {"type": "string", "description": "Here, or in `request`."},
                     "request": {"type": "string", "description": "The rest of `SimulateRequest` as JSON."},
                 },
             }
@@ -34,52 +37,79 @@ BODY = {
 }
 
 
-async def read_simulate_request(request: Request, service: Service) -> SimulateRequest:
-    """The request's record. Raises `BodyTypeUnsupported`, `MalformedBody`, `InvalidRequest` or an image error."""
+@dataclass(frozen=True)
+class Posted:
+    """A body as it came: JSON, or the parts of a form. Nothing of it has been checked or decoded."""
+
+    json: bytes | None = None
+    request: str = "{}"  # the form field that holds the rest as JSON
+    question: str | None = None
+    image: bytes | None = None
+
+
+async def receive(request: Request) -> Posted:
+    """Takes the body in. Raises `BodyTypeUnsupported`, `BodyTooLarge`, and for a form also `MalformedBody`."""
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "multipart/form-data":
-        given = await _read_form(request, service)
-    elif media_type == "application/json" or media_type.endswith("+json"):
-        given = _parse(await request.body(), "The body")
-    else:
-        raise BodyTypeUnsupported(
-            f"The body has the media type '{media_type or 'none'}'. Send application/json or multipart/form-data."
-        )
+        return await _receive_form(request)
+    if media_type == "application/json" or media_type.endswith("+json"):
+        return Posted(json=await request.body())
+    raise BodyTypeUnsupported(
+        f"The body has the media type '{media_type or 'none'}'. Send application/json or multipart/form-data."
+    )
+
+
+def check(posted: Posted, service: Service) -> tuple[SimulateRequest, DecodedImage | None]:
+    """The checked request, and the image of a form, kept and decoded. This computes: not for the event loop."""
     try:
-        return SimulateRequest.model_validate_json(json.dumps(given))
+        if posted.json is not None:
+            return SimulateRequest.model_validate_json(posted.json), None
+        given = _object(posted.request)
+        twice = [name for name in ("image", "question") if name in given and getattr(posted, name) is not None]
+        if twice:
+            detail = "stands in the form and in its field `request`; give it once"
+            raise InvalidRequest(
+                f"{' and '.join(f'`{name}`' for name in twice)} {detail}.",
+                errors=tuple(FieldError(f"/{name}", detail) for name in twice),
+            )
+        if posted.question is not None:
+            given["question"] = posted.question
+        image = None
+        if posted.image is not None:
+            artifact, image = service.keep_image(posted.image)
+            given["image"] = {"artifact": artifact.sha256}
+        return SimulateRequest.model_validate(given), image
     except ValidationError as error:
         raise invalid(error) from error
 
 
-async def _read_form(request: Request, service: Service) -> dict[str, Any]:
-    """The multipart form as the JSON body that it stands for; its image is kept as an artifact."""
+async def _receive_form(request: Request) -> Posted:
     try:
-        form = await request.form(max_files=1, max_fields=8)
+        form = await request.form(max_files=3, max_fields=8)
     except (HTTPException, ValueError) as error:  # starlette turns its own parser errors into HTTP ones
         told = error.detail if isinstance(error, HTTPException) else error
         raise MalformedBody(f"The multipart body could not be read: {told} Send an `image` file part.") from error
     try:
-        given = _parse(_text(form, "request") or "{}", "The form field `request`")
-        image = form.get("image")
         unknown = sorted(set(form.keys()) - {"image", "question", "request"})
         if unknown:
             raise InvalidRequest(
                 f"The form has fields that nothing reads: {', '.join(unknown)}. Put them into `request` as JSON.",
                 errors=tuple(FieldError(f"/{name}", "not a form field") for name in unknown),
             )
-        if "question" in form:
-            given["question"] = _text(form, "question")
-        if isinstance(image, UploadFile):
-            given["image"] = {"artifact": service.keep_image(await image.read()).sha256}
-        elif image is not None:
+        image = form.get("image")
+        if image is not None and not isinstance(image, UploadFile):
             detail = "`image` must be a file part with a file name."
             raise InvalidRequest(detail, errors=(FieldError("/image", detail),))
-        return given
+        return Posted(
+            request=_text(form, "request") or "{}",
+            question=_text(form, "question"),
+            image=None if image is None else await image.read(),
+        )
     finally:
         await form.close()
 
 
-def _text(form: Any, name: str) -> str | None:
+def _text(form: FormData, name: str) -> str | None:
     value = form.get(name)
     if isinstance(value, UploadFile):
         detail = f"`{name}` must be a plain field, not a file."
@@ -87,16 +117,12 @@ def _text(form: Any, name: str) -> str | None:
     return value
 
 
-def _parse(text: str | bytes, what: str) -> dict[str, Any]:
-    """A JSON object. NaN and Infinity are not JSON and are refused."""
+def _object(text: str) -> dict[str, Any]:
+    """The JSON object of the form field `request`."""
     try:
-        value = json.loads(text, parse_constant=_refuse)
+        value = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise MalformedBody(f"{what} is not JSON: {error}.") from error
+        raise MalformedBody(f"The form field `request` is not JSON: {error}.") from error
     if not isinstance(value, dict):
-        raise MalformedBody(f"{what} must be a JSON object, got {type(value).__name__}.")
+        raise MalformedBody(f"The form field `request` must be a JSON object, got {type(value).__name__}.")
     return value
-
-
-def _refuse(name: str) -> None:
-    raise ValueError(f"{name} is not a JSON number")

@@ -8,9 +8,10 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, Field, ValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from cow_service.errors import (
     CowError,
@@ -20,6 +21,7 @@ from cow_service.errors import (
     MalformedBody,
     MethodNotAllowed,
     NotFound,
+    pointer_part,
 )
 
 TYPE_PREFIX = "urn:cow:problem:"  # a name, not an address: README.md explains every code
@@ -56,8 +58,10 @@ def problem_of(error: CowError) -> Problem:
 def invalid(error: ValidationError | RequestValidationError) -> InvalidRequest:
     """A pydantic error as ours, with a JSON Pointer per field."""
     fields: dict[str, FieldError] = {}
+    if any(item["type"] in ("json_invalid", "model_type") and not item["loc"] for item in error.errors()):
+        return MalformedBody(f"The body is no JSON object: {error.errors()[0]['msg']}.")
     for item in error.errors():
-        pointer = "".join("/" + _escaped(part) for part in _location(item["loc"]))
+        pointer = "".join("/" + pointer_part(part) for part in _location(item["loc"]))
         fields.setdefault(pointer, FieldError(pointer, str(item["msg"]).removeprefix("Value error, ")))
     told = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in list(fields.values())[:5])
     return InvalidRequest(f"{told}. See /openapi.json for what the request may hold.", errors=tuple(fields.values()))
@@ -65,9 +69,9 @@ def invalid(error: ValidationError | RequestValidationError) -> InvalidRequest:
 
 def respond(error: CowError) -> JSONResponse:
     """The HTTP response for an error."""
-    headers = {"Retry-After": "5"} if error.status == HTTPStatus.SERVICE_UNAVAILABLE else None
+    headers = {"Retry-After": "5"} if error.status == HTTPStatus.SERVICE_UNAVAILABLE else {}
     body = problem_of(error).model_dump(mode="json")
-    return JSONResponse(body, error.status, headers=headers, media_type=MEDIA_TYPE)
+    return JSONResponse(body, error.status, headers=headers | error.headers, media_type=MEDIA_TYPE)
 
 
 def install_problem_handlers(app: FastAPI) -> None:
@@ -91,6 +95,11 @@ def install_problem_handlers(app: FastAPI) -> None:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
         return respond(InternalError("The server met an error that it did not foresee; its log has the trace."))
 
+    async def gone(request: Request, _: Exception) -> Response:
+        log.info("%s %s: the caller left before its body was in", request.method, request.url.path)
+        return Response(status_code=HTTPStatus.BAD_REQUEST)
+
+    app.add_exception_handler(ClientDisconnect, gone)
     app.add_exception_handler(CowError, cow_error)
     app.add_exception_handler(HTTPException, framework_error)
     app.add_exception_handler(RequestValidationError, validation_error)
@@ -127,7 +136,3 @@ def _location(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
 
 
 _UNION_BRANCHES = frozenset({"ImageArtifact", "ImageUrl", "str"})
-
-
-def _escaped(part: int | str) -> str:
-    return str(part).replace("~", "~0").replace("/", "~1")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request
 
 from cow_service import errors
-from cow_service.api.intake import BODY, read_simulate_request
+from cow_service.api.intake import BODY, Posted, check, receive
 from cow_service.api.problems import documented
 from cow_service.records import Simulation
 from cow_service.service import Service
@@ -36,6 +34,10 @@ def simulate_routes(service: Service) -> APIRouter:
     router = APIRouter()
     limiter = CapacityLimiter(service.settings.concurrency)
 
+    def run(posted: Posted) -> Simulation:
+        asked, image = check(posted, service)
+        return service.simulate(asked, image=image)
+
     @router.post(
         "/simulate",
         operation_id="simulate",
@@ -46,7 +48,7 @@ def simulate_routes(service: Service) -> APIRouter:
     )
     async def simulate(request: Request) -> Simulation:
         """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once."""
-        asked = await read_simulate_request(request, service)
-        return await to_thread.run_sync(partial(service.simulate, asked), limiter=limiter)
+        posted = await receive(request)
+        return await to_thread.run_sync(run, posted, limiter=limiter)
 
     return router

@@ -13,10 +13,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from cow_service import __version__
 from cow_service.generators.base import Shot
 from cow_service.images import fit_within
+from cow_service.physics.camera import has_passed
 from cow_service.physics.encounters import box_at, stands_nearer
 from cow_service.records import BBox, GeneratorInfo
-from cow_service.vision.fill import draw_in, fill_hole
+from cow_service.vision.fill import crop_of, draw_in, fill_hole
 from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.sizes import resized_mask
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
 EDGE_SIGMA = 0.8  # px of softness at the cut
@@ -65,7 +67,12 @@ class CutoutGenerator:
         layers = _layers(shot)
         start = np.array(shot.grounding.point)
         airborne = shot.motion.kind in ("projectile", "fall")
+        depths = np.array([state[2] for state in shot.trajectory.states])
+        gone = has_passed(depths, depths[0])
         for index in wanted:
+            if gone[index]:  # behind the camera
+                yield layers.background.copy()
+                continue
             point, scale = np.array(shot.trajectory.points[index]), shot.trajectory.scale[index]
             box = box_at(shot.grounding.bbox, start, point, scale)
             in_front = [alpha for other, alpha in layers.occluders if not stands_nearer(box, other, airborne=airborne)]
@@ -83,18 +90,18 @@ def _layers(shot: Shot) -> _Layers:
     image = fit_within(scene.clean if clean else scene.image, MAX_SIDE)
     size = image.shape[1], image.shape[0]
     factor = image.shape[1] / scene.width
-    mover = _resized(scene.silhouette(shot.grounding.bbox), size)
+    mover = resized_mask(scene.silhouette(shot.grounding.bbox), size)
     others = np.zeros(mover.shape, bool)
     for obstacle in shot.obstacles:
-        others |= _resized(obstacle.mask, size)
+        others |= obstacle.cutting.at(size)
     growth = 2 * max(2, round(HOLE_GROWTH * float(np.sqrt(mover.sum())))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (growth, growth))
     hole = cv2.dilate(mover.astype(np.uint8), kernel) > 0
     if clean:  # what continued a cue next to the mover has the mover's colour in it
-        hole |= _resized(scene.cues, size) & (cv2.dilate(hole.astype(np.uint8), kernel, iterations=3) > 0)
+        hole |= resized_mask(scene.cues, size) & (cv2.dilate(hole.astype(np.uint8), kernel, iterations=3) > 0)
     hole &= ~(others & ~mover)
     sprite, origin = _sprite(image, mover)
-    occluders = tuple((obstacle.bbox, _soft(_resized(obstacle.mask, size) & ~mover)) for obstacle in _near(shot))
+    occluders = tuple((obstacle.bbox, _soft(obstacle.cutting.at(size) & ~mover)) for obstacle in _near(shot))
     return _Layers(fill_hole(image, hole, others & ~mover), sprite, origin, occluders, factor)
 
 
@@ -117,11 +124,7 @@ def _near(shot: Shot) -> list[Obstacle]:
 
 def _sprite(image: Image, mover: Mask) -> tuple[Floats, tuple[float, float]]:
     """The mover with a soft edge, and where its corner lies. Colours at the edge are the mover's own, not mixed."""
-    rows, columns = np.nonzero(mover.any(axis=1))[0], np.nonzero(mover.any(axis=0))[0]
-    pad = 4
-    top, left = int(rows[0]) - pad, int(columns[0]) - pad
-    bottom, right = int(rows[-1]) + 1 + pad, int(columns[-1]) + 1 + pad
-    inside = slice(max(0, top), min(mover.shape[0], bottom)), slice(max(0, left), min(mover.shape[1], right))
+    inside = crop_of(mover, 4) or (slice(0, 1), slice(0, 1))
     mask, colours = mover[inside], image[inside].astype(np.float32)
     alpha = _soft(mask)
     core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
@@ -157,9 +160,3 @@ def _compose(
 def _soft(mask: Mask) -> Floats:
     """Alpha 0..1 of a mask: half at its outline."""
     return np.asarray(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), EDGE_SIGMA), np.float32)
-
-
-def _resized(mask: Mask, size: tuple[int, int]) -> Mask:
-    if (mask.shape[1], mask.shape[0]) == size:
-        return mask
-    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5

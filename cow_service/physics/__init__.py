@@ -1,1 +1,1 @@
-"""How things move: pure computation on records and arrays, no images read, no I/O."""
+"""How things move: pure computation on records and arrays, no pixels read, no I/O."""

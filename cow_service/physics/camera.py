@@ -49,7 +49,12 @@ class Camera:
 
     def has_passed(self, positions: Floats) -> NDArray[np.bool_]:
         """Which of the positions [F, 3] lie at or behind the camera."""
-        return positions[:, 2] <= NEAREST * self.depth
+        return has_passed(positions[:, 2], self.depth)
+
+
+def has_passed(depths: Floats, first: float) -> NDArray[np.bool_]:
+    """Which of the depths [F] of an object are so small, against its first one, that the camera has been passed."""
+    return depths <= NEAREST * first
 
 
 def depth_motion(sense: float) -> tuple[tuple[float, float], float]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cow_service.physics.camera import PITCH
 from cow_service.records import BBox, Encounter, EncounterKind
 from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.sizes import resized_mask
 
 WORKING_SIDE = 320  # px: masks are swept at this size
 LEAST_OVERLAP = 0.03  # of the smaller silhouette: less is a graze that nobody would call an encounter
@@ -44,10 +45,10 @@ def find_encounters(sweep: Sweep, obstacles: Sequence[Obstacle]) -> tuple[Encoun
     height, width = sweep.mask.shape
     factor = min(1.0, WORKING_SIDE / max(height, width))
     size = max(1, round(width * factor)), max(1, round(height * factor))
-    mover = _shrunk(sweep.mask, size)
+    mover = resized_mask(sweep.mask, size)
     found: list[Encounter] = []
     for obstacle in obstacles:
-        other = _shrunk(obstacle.mask, size)
+        other = obstacle.cutting.at(size)
         seen: set[EncounterKind] = set()
         for frame, (point, scale, visible) in enumerate(zip(sweep.points, sweep.scale, sweep.visible, strict=True)):
             if not visible or not _boxes_meet(sweep, point, scale, obstacle.bbox):
@@ -68,9 +69,12 @@ def swept_mask(sweep: Sweep) -> Mask:
     height, width = sweep.mask.shape
     factor = min(1.0, WORKING_SIDE / max(height, width))
     size = max(1, round(width * factor)), max(1, round(height * factor))
-    mover = _shrunk(sweep.mask, size)
+    mover = resized_mask(sweep.mask, size)
     swept = np.zeros(mover.shape, np.uint8)
+    whole = (0.0, 0.0, float(width), float(height))
     for point, scale in zip(sweep.points, sweep.scale, strict=True):
+        if not _boxes_meet(sweep, point, scale, whole):
+            continue
         swept |= _moved(mover, sweep.start * factor, point * factor, scale)
     return cv2.resize(swept, (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
@@ -127,7 +131,3 @@ def _moved(mover: Mask, start: Floats, point: Floats, scale: float) -> NDArray[n
     transform = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]], np.float64)
     size = mover.shape[1], mover.shape[0]
     return np.asarray(cv2.warpAffine(mover.astype(np.uint8), transform, size, flags=cv2.INTER_NEAREST), np.uint8)
-
-
-def _shrunk(mask: Mask, size: tuple[int, int]) -> Mask:
-    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5

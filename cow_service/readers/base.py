@@ -26,6 +26,7 @@ class GroundingReading:
     object: str
     bbox: BBox  # px of the upright image
     others: tuple[LocatedObject, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

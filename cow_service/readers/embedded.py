@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import re
 
 from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
+from cow_service.readers.arrow_choice import arrow_of, arrows_near, at_arrow
 from cow_service.readers.base import GroundingReading, MotionReading
-from cow_service.readers.matching import best_matches, describe, inside_drawn_box, match_one
+from cow_service.readers.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.motion_words import MotionWords
 from cow_service.readers.phrases import ObjectPhrase
 from cow_service.readers.sentences import Question, parse
 from cow_service.records import BBox, Grounding, LocatedObject, ReaderInfo, Vector
-from cow_service.vision.arrows import Arrow
-from cow_service.vision.regions import Region
 from cow_service.vision.scene import SAME_OBJECT, Scene, iou
 
-REACH = 1.5  # sizes of the mover: an arrow that starts or ends further away is not its own
-RIVAL = 0.6  # a second arrow nearer than the first divided by this makes the choice unsure
+# Words that say which way, wherever they stand: where they were not understood, no arrow may stand in for them.
+_DIRECTIONS = re.compile(
+    r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
+    r"|clockwise|counterclockwise|towards?|away|diagonal(ly)?|degrees?|sideways|back|backwards?|forwards?|other way)\b",
+    re.IGNORECASE,
+)
 
 GIVE_PLACE = "Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the request."
 GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y down."
@@ -44,17 +46,25 @@ class EmbeddedReader:
                 f'will it hit the vase?". {GIVE_PLACE}'
             )
         bbox = self._mover(scene, asked, asked.mover)
-        return GroundingReading(asked.mover.text, bbox, _others(scene, asked, bbox))
+        others = _others(scene, asked, bbox)
+        found = {other.object for other in others}
+        missing = [phrase.text for phrase in asked.others if phrase.text not in found]
+        return GroundingReading(asked.mover.text, bbox, others, tuple(_not_found(scene, text) for text in missing))
 
     def read_motion(self, scene: Scene, question: str, grounding: Grounding) -> MotionReading:
         """Kind and direction from the words, and from the arrow where the words speak of one."""
         asked = parse(question)
         words = asked.motion
         kind = words.kind or "linear"
+        if kind == "static" and _DIRECTIONS.search(question):
+            raise CannotReadDirection(
+                f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
+                f"which is meant was not understood. {GIVE_DIRECTION}"
+            )
         if kind in ("static", "fall"):  # neither has a direction
             return MotionReading(kind, None, "text" if kind == "static" else "gravity")
         if words.arrow is not None:
-            arrow = _arrow_of(scene, grounding)
+            arrow = arrow_of(scene, grounding, GIVE_DIRECTION)
             sign = 1.0 if words.arrow == "along" else -1.0
             return MotionReading(kind, _scaled(arrow.direction, sign), "arrow", along_arrow=sign > 0)
         if words.direction is not None:
@@ -70,7 +80,12 @@ class EmbeddedReader:
                 "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
                 f"up. {GIVE_DIRECTION}"
             )
-        own = _arrows_near(scene, grounding)
+        own = arrows_near(scene, grounding.bbox)
+        if own and _DIRECTIONS.search(question):
+            raise CannotReadDirection(
+                "The question has words of direction that could not be read as the motion's, so the drawn arrow was "
+                f"not followed either. {GIVE_DIRECTION}"
+            )
         if len(own) != 1:
             raise CannotReadDirection(
                 "The question names no direction (left, right, up, down, towards, away, along the arrow), and the "
@@ -89,11 +104,16 @@ class EmbeddedReader:
                 f"tell its objects apart. {GIVE_PLACE}"
             )
         fitting = best_matches(scene.regions, phrase, asked.others)
-        if len(fitting) > 1 and (asked.motion.arrow is not None or phrase.colour is None):
-            fitting = _at_arrow(scene, fitting) or fitting
+        if len(fitting) > 1 and "arrow" in asked.text.lower():
+            fitting = at_arrow(scene, fitting) or fitting
+        seen = describe(scene.regions)
+        if len(fitting) == 1 and phrase.colour is None and not is_known(phrase) and len(scene.regions) > 1:
+            raise CannotGround(
+                f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
+                f"Seen: {seen}. {GIVE_PLACE}"
+            )
         if len(fitting) == 1:
             return fitting[0].bbox
-        seen = describe(scene.regions)
         if not fitting:
             raise CannotGround(f"Looked for '{phrase.text}' and found nothing that fits. Seen: {seen}. {GIVE_PLACE}")
         raise CannotGround(
@@ -105,6 +125,13 @@ class EmbeddedReader:
 def create() -> EmbeddedReader:
     """Factory for the registry."""
     return EmbeddedReader()
+
+
+def _not_found(scene: Scene, text: str) -> str:
+    return (
+        f"The question names '{text}', which was not found, or not for certain, so no encounter is told of it by that "
+        f"name. Seen: {describe(scene.regions)}."
+    )
 
 
 def _speaks_of_motion(words: MotionWords) -> bool:
@@ -122,56 +149,6 @@ def _others(scene: Scene, asked: Question, mover: BBox) -> tuple[LocatedObject, 
         if region is not None and all(region.bbox != other.bbox for other in found):
             found.append(LocatedObject(object=phrase.text, bbox=region.bbox))
     return tuple(found)
-
-
-def _gap(arrow: Arrow, bbox: BBox) -> float:
-    """Distance (px) from a box to the nearer end of an arrow."""
-    return min(
-        math.hypot(max(bbox[0] - x, 0, x - bbox[2]), max(bbox[1] - y, 0, y - bbox[3]))
-        for x, y in (arrow.tail, arrow.tip)
-    )
-
-
-def _arrows_near(scene: Scene, grounding: Grounding) -> list[Arrow]:
-    """Arrows that start or end close to the mover, nearest first."""
-    x0, y0, x1, y1 = grounding.bbox
-    near = [arrow for arrow in scene.arrows if _gap(arrow, grounding.bbox) <= REACH * max(x1 - x0, y1 - y0)]
-    return sorted(near, key=lambda arrow: _gap(arrow, grounding.bbox))
-
-
-def _arrow_of(scene: Scene, grounding: Grounding) -> Arrow:
-    """The mover's arrow: the only one, or the one clearly nearest to it."""
-    arrows = sorted(scene.arrows, key=lambda arrow: _gap(arrow, grounding.bbox))
-    if not arrows:
-        raise CannotReadDirection(
-            "The question speaks of an arrow, but no drawn arrow was found: looked for one flat colour with a straight "
-            f"shaft and a head. {GIVE_DIRECTION}"
-        )
-    if len(arrows) > 1 and _gap(arrows[0], grounding.bbox) > RIVAL * _gap(arrows[1], grounding.bbox):
-        places = "; ".join(
-            f"from ({a.tail[0]:.0f}, {a.tail[1]:.0f}) to ({a.tip[0]:.0f}, {a.tip[1]:.0f})" for a in arrows
-        )
-        raise CannotReadDirection(
-            f"The question speaks of one arrow, but {len(arrows)} were found, and none is clearly that of the "
-            f"{grounding.object}: {places}. {GIVE_DIRECTION}"
-        )
-    return arrows[0]
-
-
-def _at_arrow(scene: Scene, regions: Sequence[Region]) -> list[Region]:
-    """Of several regions the one at which the only arrow starts, if it is clearly that one."""
-    if len(scene.arrows) != 1:
-        return []
-    arrow = scene.arrows[0]
-
-    def gap(region: Region) -> float:
-        x0, y0, x1, y1 = region.bbox
-        x, y = arrow.tail
-        return math.hypot(max(x0 - x, 0, x - x1), max(y0 - y, 0, y - y1)) / max(x1 - x0, y1 - y0)
-
-    ranked = sorted(regions, key=gap)
-    first, second = gap(ranked[0]), gap(ranked[1])
-    return [ranked[0]] if first <= REACH and (first < RIVAL * second or (first == 0 and second > 0)) else []
 
 
 def _towards(scene: Scene, asked: Question, phrase: ObjectPhrase, grounding: Grounding) -> Vector:

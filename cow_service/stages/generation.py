@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,8 +94,7 @@ def _keep(pixels: Image, index: int, fps: float, max_side: int | None, artifacts
 
 
 def _keep_video(frames: Iterator[Image], fps: float, size: tuple[int, int], artifacts: ArtifactStore) -> Video:
-    with tempfile.TemporaryDirectory(prefix="cow-clip-") as folder:
-        path = Path(folder) / "clip.mp4"
+    with artifacts.scratch() as path:
         count = write_mp4(frames, path, fps=fps, width=size[0], height=size[1])
         artifact = artifacts.put_file(path, "video/mp4")
     even = (size[0] + size[0] % 2, size[1] + size[1] % 2)

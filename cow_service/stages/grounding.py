@@ -22,18 +22,20 @@ def ground(
     given: GroundingRequest | None,
     reader: Callable[[], Reader],
     keep_mask: Callable[[NDArray[np.bool_]], Artifact],
-) -> Grounding:
-    """The mover, from the request where it says so, else from the reader. Its mask [H, W] is kept as an artifact.
+) -> tuple[Grounding, tuple[str, ...]]:
+    """The mover, from the request where it says so, else from the reader; and warnings. Its mask [H, W] is kept.
 
     Raises `InvalidRequest` for a place outside the image, and what the reader raises.
     """
     if given is not None:
         bbox = _bbox_given(scene, given)
         name, others, source = given.object or DEFAULT_NAME, (), "request"
+        warnings = _guessed(scene, given, bbox)
     else:
         reading = reader().ground(scene, question)
         bbox, name, others, source = reading.bbox, reading.object, reading.others, reader().source
-    return Grounding(
+        warnings = reading.warnings
+    grounding = Grounding(
         object=name,
         point=_centre(bbox),
         bbox=bbox,
@@ -41,6 +43,15 @@ def ground(
         others=others,
         source=source,
     )
+    return grounding, warnings
+
+
+def _guessed(scene: Scene, given: GroundingRequest, bbox: BBox) -> tuple[str, ...]:
+    """A doubt about an outline that was drawn around a point in a cluttered place."""
+    if given.point is None or scene.region_of(bbox) is not None:
+        return ()
+    box = ", ".join(f"{value:.0f}" for value in bbox)
+    return (f"The object around the point was guessed to be [{box}]; `grounding.bbox` says it for certain.",)
 
 
 def _bbox_given(scene: Scene, given: GroundingRequest) -> BBox:

@@ -39,7 +39,8 @@ def read_motion(
     else:
         reading = reader().read_motion(scene, question, grounding)
         source = reader().source
-    return _complete(scene, grounding, reading, speed, source), reading.warnings
+    motion = _complete(scene, grounding, reading, speed, source)
+    return motion, (*reading.warnings, *_assumed(motion, speed))
 
 
 def _complete(
@@ -53,17 +54,27 @@ def _complete(
     )
     moves = reading.kind in MOVING
     direction = _unit(reading.direction) if moves and reading.direction is not None else None
+    depth = reading.depth if moves else 0.0
     return Motion(
         kind=reading.kind,
         direction=direction,
-        depth=reading.depth if moves else 0.0,
+        depth=depth,
         cue=reading.cue,
         along_arrow=reading.along_arrow,
         speed=(DEFAULT_SPEED * scene.width if speed is None else speed) if moves else 0.0,
         gravity=(0.0, GRAVITY / scale.value) if reading.kind in FALLING else (0.0, 0.0),
         metres_per_pixel=scale,
-        sentence=motion_sentence(grounding.object, reading.kind, direction, reading.depth),
+        sentence=motion_sentence(grounding.object, reading.kind, direction, depth),
         source=source,
+    )
+
+
+def _assumed(motion: Motion, speed: float | None) -> tuple[str, ...]:
+    """A doubt about a throw, whose reach hangs on a speed that nobody gave."""
+    if motion.kind != "projectile" or speed is not None:
+        return ()
+    return (
+        f"How far a throw reaches depends on its speed: {motion.speed:.0f} px/s was assumed; `motion.speed` sets it.",
     )
 
 

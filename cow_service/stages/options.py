@@ -1,4 +1,4 @@
-"""Checks `generator_options` against what the chosen generator takes, before any work is done."""
+"""Checks, before any work is done, what only the chosen generator or several fields together can tell."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from cow_service.errors import FieldError, InvalidRequest
+from cow_service.errors import FieldError, InvalidRequest, pointer_part
 from cow_service.generators.base import Generator
+from cow_service.requests import SimulateRequest
 
 
 def read_options(generator: Generator, given: dict[str, Any]) -> BaseModel:
@@ -17,9 +18,23 @@ def read_options(generator: Generator, given: dict[str, Any]) -> BaseModel:
     except ValidationError as error:
         known = ", ".join(sorted(generator.options_model.model_fields)) or "none"
         fields = tuple(
-            FieldError("/generator_options/" + "/".join(str(part) for part in item["loc"]), item["msg"])
+            FieldError("/generator_options/" + "/".join(pointer_part(part) for part in item["loc"]), item["msg"])
             for item in error.errors()
         )
         raise InvalidRequest(
             f"`generator_options` are not valid for this generator. It takes: {known}.", errors=fields
         ) from error
+
+
+def check_frames(request: SimulateRequest) -> None:
+    """Raises `InvalidRequest` where the request asks for frames that its clip does not have."""
+    last = request.num_frames - 1
+    errors = tuple(
+        FieldError(f"/frames/indices/{place}", f"the clip has frames 0 to {last}, got {index}")
+        for place, index in enumerate(request.frames.indices or ())
+        if index > last
+    )
+    if errors:
+        raise InvalidRequest(
+            f"`frames.indices` names frames that the clip does not have: it has 0 to {last}.", errors=errors
+        )

@@ -45,7 +45,7 @@ def compute_trajectory(
     sweep = Sweep(mask, grounding.bbox, np.array(grounding.point), points, scale, visible, airborne)
     movable = swept_mask(sweep)
     for obstacle in obstacles:
-        movable |= obstacle.mask
+        obstacle.cutting.add_to(movable)
     centre = np.array(grounding.point)
     starts = points_inside(mask, grounding.point)
     tracks = [points + scale[:, None] * (np.array(start) - centre) for start in starts]

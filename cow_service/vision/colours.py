@@ -22,23 +22,7 @@ HUES = (
     (360.0, "pink"),
 )
 
-NEIGHBOURS = frozenset(
-    frozenset(pair)
-    for pair in (
-        ("red", "orange"),
-        ("red", "pink"),
-        ("orange", "yellow"),
-        ("orange", "brown"),
-        ("red", "brown"),
-        ("yellow", "green"),
-        ("green", "cyan"),
-        ("cyan", "blue"),
-        ("blue", "purple"),
-        ("purple", "pink"),
-        ("white", "grey"),
-        ("grey", "black"),
-    )
-)
+HUE_MARGIN, CHROMA_MARGIN, LIGHTNESS_MARGIN = 7.0, 2.5, 5.0  # how far a border may be for both its names to do
 
 
 def name_of(lightness: float, a: float, b: float) -> str:
@@ -55,6 +39,13 @@ def name_of(lightness: float, a: float, b: float) -> str:
     return name
 
 
-def agreement(wanted: str, seen: str) -> float:
-    """1 for the same name, 0.5 for neighbours that people mix up, 0 otherwise."""
-    return 1.0 if wanted == seen else 0.5 if frozenset((wanted, seen)) in NEIGHBOURS else 0.0
+def names_of(lightness: float, a: float, b: float) -> frozenset[str]:
+    """Every name that people may give a Lab colour: its own, and that across a border it lies next to."""
+    chroma, hue = math.hypot(a, b), math.atan2(b, a)
+    names: set[str] = set()
+    for turn in (-HUE_MARGIN, 0.0, HUE_MARGIN):
+        for more in (-CHROMA_MARGIN, 0.0, CHROMA_MARGIN):
+            for lift in (-LIGHTNESS_MARGIN, 0.0, LIGHTNESS_MARGIN):
+                angle, radius = hue + math.radians(turn), max(0.0, chroma + more)
+                names.add(name_of(lightness + lift, radius * math.cos(angle), radius * math.sin(angle)))
+    return frozenset(names)

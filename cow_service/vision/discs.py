@@ -13,6 +13,7 @@ TRIES = 120  # circles through three points of the outline
 NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
 ON_CIRCLE = 0.55  # share of the outline
 ON_EDGES = 0.8  # share of the circle
+FILLED, SPILLED = 0.72, 0.14  # share of the disc that the region fills; share of the region outside it
 SAMPLES = 72  # points tried on the circle
 LEAST_RADIUS = 5.0  # px
 
@@ -38,7 +39,8 @@ def as_disc(part: Mask, edges: NDArray[np.float32], fence: float) -> Mask | None
         return None
     ys, xs = np.mgrid[:height, :width]
     disc = np.hypot(xs - x, ys - y) <= radius + 0.5
-    return disc if (disc & part).sum() > 0.6 * disc.sum() else None
+    both = (disc & part).sum()
+    return disc if both > FILLED * disc.sum() and both > (1 - SPILLED) * part.sum() else None
 
 
 def _best_circle(outline: NDArray[np.float64]) -> tuple[float, float, float] | None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.vision.quilt import quilt
+from cow_service.vision.sizes import box_around
 
 INPAINT_RADIUS = 4  # px
 MARGIN = 8  # px around a drawing that the fill may look at
@@ -25,14 +26,14 @@ Mask = NDArray[np.bool_]
 
 def crop_of(mask: Mask, margin: int) -> tuple[slice, slice] | None:
     """Rows and columns that hold the mask [H, W] with a margin, or None for an empty mask."""
-    rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
-    if not len(rows):
+    window = box_around(mask)
+    if window is None:
         return None
-    height, width = mask.shape
-    return (
-        slice(max(0, int(rows[0]) - margin), min(height, int(rows[-1]) + 1 + margin)),
-        slice(max(0, int(columns[0]) - margin), min(width, int(columns[-1]) + 1 + margin)),
+    rows, columns = (
+        slice(max(0, side.start - margin), min(length, side.stop + margin))
+        for side, length in zip(window, mask.shape, strict=True)
     )
+    return rows, columns
 
 
 def erase_drawing(image: Image, mask: Mask) -> Image:

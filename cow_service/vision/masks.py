@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.vision.sizes import box_around, scaled
+
 WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
 POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
 ITERATIONS = 2
@@ -35,7 +37,7 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
     columns = slice(max(0, int(x0 - pad)), min(width, int(np.ceil(x1 + pad))))
     crop = image[rows, columns]
     scale = min(1.0, WORKING_SIDE / max(crop.shape[:2]))
-    small = _scaled(crop, scale)
+    small = scaled(crop, scale)
     h, w = small.shape[:2]
     box = np.array([x0 - columns.start, y0 - rows.start, x1 - columns.start, y1 - rows.start]) * scale
     if guess is None:
@@ -59,8 +61,8 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
 
 def bbox_of(mask: Mask) -> BBox:
     """Tight box [x0, y0, x1, y1] of a mask that is not empty; x1 and y1 lie one past the last pixel."""
-    columns, rows = np.nonzero(mask.any(axis=0))[0], np.nonzero(mask.any(axis=1))[0]
-    return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+    rows, columns = box_around(mask) or (slice(0, 1), slice(0, 1))
+    return float(columns.start), float(rows.start), float(columns.stop), float(rows.stop)
 
 
 def mask_from_point(image: Image, point: tuple[float, float]) -> Mask:
@@ -89,7 +91,7 @@ def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[
     columns = slice(max(0, int(point[0] - outer)), min(width, int(point[0] + outer) + 1))
     crop = image[rows, columns]
     scale = min(1.0, POINT_WORKING_SIDE / max(crop.shape[:2]))
-    small = _scaled(crop, scale)
+    small = scaled(crop, scale)
     h, w = small.shape[:2]
     x, y, r = (point[0] - columns.start) * scale, (point[1] - rows.start) * scale, half * scale
     box = _inside((x - r, y - r, x + r, y + r), w, h)
@@ -111,13 +113,6 @@ def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[
     mask = np.zeros((height, width), bool)
     mask[rows, columns] = soft > 0.5
     return on_edge - 0.6 * cramped, mask if mask.any() else None
-
-
-def _scaled(crop: Image, scale: float) -> Image:
-    """A crop made smaller; one that need not be is left as it is."""
-    if scale >= 1:
-        return crop
-    return np.asarray(cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _inside(bbox: BBox, width: int, height: int) -> BBox:

@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.colours import name_of
+from cow_service.vision.colours import name_of, names_of
+from cow_service.vision.cuttings import Cutting, enlarged
 from cow_service.vision.discs import as_disc
+from cow_service.vision.sizes import scaled
 
 WORKING_SIDE = 512  # px: images are searched at this size
 CHROMA_STEP = 9.0  # Lab units from the surroundings
@@ -25,6 +27,7 @@ SHARP_SHARE = 0.65  # of an outline that must lie on edges
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
 MIN_AREA = 0.0004  # of the image
 MAX_AREA = 0.25
+MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
 CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
 SPLIT_HUE = 36.0  # degrees: another colour, hence another object
 MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
@@ -39,11 +42,16 @@ Channel = NDArray[np.float32]
 class Region:
     """One object of the image as seen, without a noun: where it is and what colour. Not what moves."""
 
-    bbox: tuple[float, float, float, float]  # x0, y0, x1, y1, px of the image
-    mask: Mask  # [H, W] of the image
+    cutting: Cutting  # its mask in the image
     colour: str
+    colours: frozenset[str]  # other names that would do for it included
     roundness: float  # 0..1: how much of the smallest circle around it the region fills
     is_disc: bool  # its outline was measured as a circle: the mask is exact, no cut can better it
+
+    @property
+    def bbox(self) -> tuple[float, float, float, float]:
+        """Tight box [x0, y0, x1, y1], px of the image."""
+        return self.cutting.bbox
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -74,8 +82,7 @@ def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
     """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
-    small = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    view = _view(np.asarray(small, np.uint8))
+    view = _view(scaled(image, scale))
     core = _core(view)
     if core.mean() > CLUTTER:
         return ()
@@ -94,14 +101,14 @@ def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
                 whole = np.zeros(solid.shape, np.float32)
                 whole[window] = part if disc is None else disc
                 regions.append(_region(near.lab[part], whole, (height, width), disc is not None))
-    return tuple(sorted(regions, key=lambda region: -int(region.mask.sum())))
+    return tuple(sorted(regions, key=lambda region: -region.cutting.area)[:MAX_REGIONS])
 
 
 def _view(small: NDArray[np.uint8]) -> _View:
     """Measures every pixel against a median over half the image around it."""
     smooth = cv2.bilateralFilter(small, 5, 25, 5)
     lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
-    coarse = cv2.resize(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    coarse = scaled(np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.uint8), 0.25)
     side = int(0.5 * min(coarse.shape[:2])) | 1
     pad = side // 2
     padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)
@@ -228,15 +235,11 @@ def _blobs(mask: Mask, least: float) -> list[Mask]:
 
 def _region(lab: NDArray[np.float32], part: Channel, size: tuple[int, int], is_disc: bool) -> Region:
     """A part [h, w] at the working size, with the Lab colours [N, 3] of its pixels, as a region of the image."""
-    height, width = size
-    soft = cv2.GaussianBlur(part, (0, 0), MASK_SIGMA)
-    mask = (soft if part.shape == size else cv2.resize(soft, (width, height), interpolation=cv2.INTER_LINEAR)) > 0.5
-    ys, xs = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
-    bbox = (float(xs[0]), float(ys[0]), float(xs[-1] + 1), float(ys[-1] + 1))
+    cutting = enlarged(np.asarray(cv2.GaussianBlur(part, (0, 0), MASK_SIGMA), np.float32), size)
     chroma = np.hypot(lab[:, 1], lab[:, 2])
     told = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
-    colour = name_of(*(float(v) for v in np.median(told, axis=0)))
-    return Region(bbox, mask, colour, _roundness(mask), is_disc)
+    seen = [float(v) for v in np.median(told, axis=0)]
+    return Region(cutting, name_of(*seen), names_of(*seen), _roundness(cutting.patch), is_disc)
 
 
 def _roundness(mask: Mask) -> float:

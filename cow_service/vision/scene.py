@@ -84,7 +84,7 @@ class Scene:
             if bbox not in self._masks:
                 region = self.region_of(bbox)
                 known = region is not None and region.is_disc
-                guess = None if region is None else region.mask
+                guess = None if region is None else region.cutting.full()
                 self._masks[bbox] = guess if known and guess is not None else mask_from_bbox(self.clean, bbox, guess)
             return self._masks[bbox]
 
@@ -93,9 +93,11 @@ class Scene:
         x = min(self.width - 1, max(0, int(point[0])))
         y = min(self.height - 1, max(0, int(point[1])))
         with self._lock:
-            under = [region for region in self.regions if region.mask[y, x]]
+            pixel = np.zeros((self.height, self.width), bool)
+            pixel[y, x] = True
+            under = [region for region in self.regions if region.cutting.shared_with(pixel)]
             if under:
-                return min(under, key=lambda region: int(region.mask.sum())).bbox
+                return min(under, key=lambda region: region.cutting.area).bbox
             mask = mask_from_point(self.clean, (float(x), float(y)))
             bbox = bbox_of(mask)
             self._masks[bbox] = mask

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.vision.sizes import scaled
+
 WORKING_SIDE = 896  # px: longer images are searched at this size
 THIN = 41  # px: side of the median window; narrower structures stand out from it
 STANDS_OUT = 28  # grey levels from that median, in any channel
@@ -49,10 +51,7 @@ class WorkingImage:
 def working_image(image: Image) -> WorkingImage:
     """The image, scaled down where it is longer than the working size."""
     scale = min(1.0, WORKING_SIDE / max(image.shape[:2]))
-    if scale == 1.0:
-        return WorkingImage(image, scale)
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return WorkingImage(np.asarray(small, np.uint8), scale)
+    return WorkingImage(scaled(image, scale), scale)
 
 
 def find_strokes(image: Image) -> Iterator[Stroke]:
@@ -101,7 +100,7 @@ def full_size(mask: Mask, size: tuple[int, int]) -> Mask:
 
 def _thin_structures(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """255 where something narrow stands out from what is around it, and a little beyond."""
-    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    half = scaled(image, 0.5)
     around = cv2.medianBlur(half, THIN // 2 | 1)
     thin = (cv2.absdiff(half, around).max(axis=2) > STANDS_OUT).astype(np.uint8) * 255
     thin = cv2.dilate(thin, np.ones((3, 3), np.uint8))
@@ -159,12 +158,12 @@ def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
 
 def _patches(same: Image, most: float) -> list[tuple[tuple[int, int, int, int], Mask]]:
     """Connected patches (box [x, y, w, h], mask [h, w]) long enough for an arrow; `most` bounds area / diagonal^2."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(same, connectivity=8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(same, connectivity=8)
     patches: list[tuple[tuple[int, int, int, int], Mask]] = []
-    for i in range(1, count):
-        x, y, w, h, area = (int(v) for v in stats[i])
-        diagonal = float(np.hypot(w, h))
-        if area < 40 or diagonal < MIN_LENGTH or area > most * diagonal * diagonal:
-            continue
+    squared = (stats[:, 2:4].astype(np.int64) ** 2).sum(axis=1)
+    fitting = (stats[:, 4] >= 40) & (squared >= MIN_LENGTH**2) & (stats[:, 4] <= most * squared)
+    fitting[0] = False  # the background
+    for i in np.nonzero(fitting)[0]:
+        x, y, w, h = (int(v) for v in stats[i][:4])
         patches.append(((x, y, w, h), labels[y : y + h, x : x + w] == i))
     return patches

@@ -1,0 +1,75 @@
+"""Whose arrow is whose: the drawn arrow that belongs to an object, and the object at which an arrow stands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from cow_service.errors import CannotReadDirection
+from cow_service.records import BBox, Grounding
+from cow_service.vision.arrows import Arrow
+from cow_service.vision.regions import Region
+from cow_service.vision.scene import SAME_OBJECT, Scene, iou
+
+REACH = 1.5  # sizes of an object: an arrow further away is not its own
+RIVAL = 0.6  # another one, nearer than this share of the distance, makes the choice unsure
+
+
+def gap(arrow: Arrow, bbox: BBox) -> float:
+    """Distance from a box to the nearer end of an arrow, in sizes of the box."""
+    x0, y0, x1, y1 = bbox
+    ends = (arrow.tail, arrow.tip)
+    away = min(math.hypot(max(x0 - x, 0, x - x1), max(y0 - y, 0, y - y1)) for x, y in ends)
+    return away / max(x1 - x0, y1 - y0)
+
+
+def arrows_near(scene: Scene, bbox: BBox) -> list[Arrow]:
+    """Arrows that start or end close to a box and at no other object, nearest first."""
+    near = [arrow for arrow in scene.arrows if gap(arrow, bbox) <= REACH and not _stands_elsewhere(scene, arrow, bbox)]
+    return sorted(near, key=lambda arrow: gap(arrow, bbox))
+
+
+def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
+    """The mover's arrow: the only one near it, or the one clearly nearest. Raises `CannotReadDirection`."""
+    if not scene.arrows:
+        raise CannotReadDirection(
+            "The question speaks of an arrow, but no drawn arrow was found: looked for one flat colour with a straight "
+            f"shaft and a head. {remedy}"
+        )
+    own = arrows_near(scene, grounding.bbox)
+    if not own:
+        raise CannotReadDirection(
+            f"The question speaks of an arrow, but what was found stands elsewhere than the {grounding.object}: "
+            f"{_places(scene.arrows)}. {remedy}"
+        )
+    if len(own) > 1 and gap(own[0], grounding.bbox) > RIVAL * gap(own[1], grounding.bbox):
+        raise CannotReadDirection(
+            f"The question speaks of one arrow, but {len(own)} were found, and none is clearly that of the "
+            f"{grounding.object}: {_places(own)}. {remedy}"
+        )
+    return own[0]
+
+
+def at_arrow(scene: Scene, regions: Sequence[Region]) -> list[Region]:
+    """Of several regions the one at which the only arrow stands, if it stands at one of them and clearly so."""
+    if len(scene.arrows) != 1:
+        return []
+    arrow = scene.arrows[0]
+    ranked = sorted(scene.regions, key=lambda region: gap(arrow, region.bbox))
+    nearest = gap(arrow, ranked[0].bbox)
+    alone = len(ranked) == 1 or nearest < RIVAL * gap(arrow, ranked[1].bbox)
+    return [ranked[0]] if ranked[0] in regions and nearest <= REACH and alone else []
+
+
+def _stands_elsewhere(scene: Scene, arrow: Arrow, bbox: BBox) -> bool:
+    """Whether an arrow's tail lies at another object and far from this one."""
+    x, y = arrow.tail
+    for region in scene.regions:
+        x0, y0, x1, y1 = region.bbox
+        if iou(region.bbox, bbox) < SAME_OBJECT and x0 <= x < x1 and y0 <= y < y1 and gap(arrow, bbox) > REACH / 4:
+            return True
+    return False
+
+
+def _places(arrows: Sequence[Arrow]) -> str:
+    return "; ".join(f"from ({a.tail[0]:.0f}, {a.tail[1]:.0f}) to ({a.tip[0]:.0f}, {a.tip[1]:.0f})" for a in arrows)

@@ -1,0 +1,63 @@
+"""What a caller should know before trusting a simulation: what was taken one way and could be meant another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from cow_service.records import Grounding
+from cow_service.requests import SimulateRequest
+from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.scene import Scene
+
+OFF_CENTRE = 0.25  # of the object's size: a given path that begins further from its centre is remarked on
+
+
+def doubts(
+    scene: Scene, request: SimulateRequest, grounding: Grounding, obstacles: Sequence[Obstacle]
+) -> tuple[str, ...]:
+    """Warnings, in whole sentences; empty where there is nothing to say."""
+    found = (
+        _no_surroundings(scene, obstacles),
+        _cues_not_spoken_of(scene, request),
+        _motion_beside_path(request),
+        _path_off_object(request, grounding),
+    )
+    return tuple(told for told in found if told is not None)
+
+
+def _no_surroundings(scene: Scene, obstacles: Sequence[Obstacle]) -> str | None:
+    if scene.regions or obstacles:
+        return None
+    return (
+        "The surroundings could not be separated into objects, so encounters were not computed: "
+        "an empty list does not mean that nothing is hit."
+    )
+
+
+def _cues_not_spoken_of(scene: Scene, request: SimulateRequest) -> str | None:
+    words = request.question.lower()
+    places = [f"an arrow at ({a.tail[0]:.0f}, {a.tail[1]:.0f})" for a in scene.arrows if "arrow" not in words]
+    places += [f"a box at ({b.bbox[0]:.0f}, {b.bbox[1]:.0f})" for b in scene.boxes if "box" not in words]
+    if not places:
+        return None
+    return (
+        f"Taken for drawn over the image though the question speaks of none: {', '.join(places)}. "
+        f"A generator that cleans cues takes them out; `generator_options.clean_cues: false` keeps them."
+    )
+
+
+def _motion_beside_path(request: SimulateRequest) -> str | None:
+    if request.motion is None or request.trajectory is None:
+        return None
+    return "Both `motion` and `trajectory` were given: the object follows the trajectory, the motion only words it."
+
+
+def _path_off_object(request: SimulateRequest, grounding: Grounding) -> str | None:
+    if request.trajectory is None or request.grounding is None:
+        return None
+    x0, y0, x1, y1 = grounding.bbox
+    gap = math.dist(request.trajectory.points[0], grounding.point)
+    if gap <= OFF_CENTRE * max(x1 - x0, y1 - y0):
+        return None
+    return f"The given trajectory begins {gap:.0f} px from the object's centre: in the first frame it is drawn there."
