@@ -3,7 +3,7 @@
     python benchmarks/scenes.py DIR [--json FILE]
 
 DIR holds one folder per scene with image.jpg, clean.jpg, ids.png and meta.json, as `examples/` does. Per scene: box
-IoU, IoU, direction error (degrees), path error (% of the image's width: mean distance of the true centres, up to the first
+IoU, direction error (degrees), path error (% of the image's width: mean distance of the true centres, up to the first
 contact, to the computed path), centre error (px: where the mover is found in rendered frames against its trajectory),
 background error (grey levels: the largest difference to the input away from mover, hole and drawing), arrow error (grey
 levels: mean difference to clean.jpg where the arrow stood), and whether the encounters give the true answer.
