@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask, full_size
 
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
+SURE = 0.88  # a fit that needs no second look at the same place
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,13 @@ class _Profile:
 
 def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[Arrow, ...]:
     """Drawn arrows among the strokes of an image whose full size is [height, width]; overlapping findings are one."""
-    found = [(shape, stroke) for stroke in strokes if (shape := fit_arrow(stroke.patch)) is not None]
+    found: list[tuple[_Shape, Stroke]] = []
+    for stroke in strokes:
+        if any(shape.fit > SURE and _same_place(stroke, other) for shape, other in found):
+            continue
+        shape = fit_arrow(stroke.patch)
+        if shape is not None:
+            found.append((shape, stroke))
     found.sort(key=lambda item: -item[0].fit * np.linalg.norm(item[0].tip - item[0].tail) ** 0.25)
     arrows: list[Arrow] = []
     taken = np.zeros(image.pixels.shape[:2], bool)
@@ -99,6 +106,12 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int,
             )
         )
     return tuple(arrows)
+
+
+def _same_place(a: Stroke, b: Stroke) -> bool:
+    """Whether two strokes fill the same box, to a few pixels: then they are one drawing, found twice."""
+    corners = zip((a.x, a.y, *a.patch.shape), (b.x, b.y, *b.patch.shape), strict=True)
+    return all(abs(p - q) <= 3 for p, q in corners)
 
 
 def fit_arrow(patch: NDArray[np.bool_]) -> _Shape | None:

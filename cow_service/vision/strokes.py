@@ -21,7 +21,10 @@ TOLERANCES = (26, 52)  # grey levels around a flat colour: strict first, then wi
 FLAT = 14  # grey levels: median distance of a drawing's pixels from its colour
 SHARP = 56  # grey levels between a drawing and what lies beside it
 SHARP_SHARE = 0.85  # of what lies beside it
+FRINGE = 4  # px around a drawing that compression has mixed with it
+OUTLINE_MOST = 5  # px: the widest outline looked for
 MIN_LENGTH = 18.0  # px at the working size
+BIN = 16  # grey levels: colours this close are tried as one
 MAX_COLOURS = 36  # flat colours tried per thin structure
 
 _SQUARE = np.ones((3, 3), np.uint8)
@@ -71,18 +74,24 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
 
 def drawing_mask(image: Image, stroke: Stroke) -> Mask:
     """Mask [h, w] of the stroke with the outline around it, if it has one, and the fringe that compression leaves."""
-    mask = np.zeros(image.shape[:2], np.uint8)
+    pad = FRINGE + 2 * OUTLINE_MOST
     h, w = stroke.patch.shape
-    mask[stroke.y : stroke.y + h, stroke.x : stroke.x + w] = stroke.patch
+    y0, x0 = max(0, stroke.y - pad), max(0, stroke.x - pad)
+    window = slice(y0, stroke.y + h + pad), slice(x0, stroke.x + w + pad)
+    near = image[window]
+    patch = np.zeros(near.shape[:2], np.uint8)
+    patch[stroke.y - y0 : stroke.y - y0 + h, stroke.x - x0 : stroke.x - x0 + w] = stroke.patch
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
-    reach, grown = 4, cv2.dilate(mask, kernel)
-    for ring_index in range(1, 6):
+    reach, grown = FRINGE, cv2.dilate(patch, kernel)
+    for width in range(1, OUTLINE_MOST + 1):
         wider = cv2.dilate(grown, kernel)
-        ring = image[(wider > 0) & (grown == 0)].astype(np.float32)
-        if len(ring) and np.median(np.abs(ring - np.median(ring, axis=0)).max(axis=1)) < 14 and _is_ink(ring):
-            reach = ring_index + 5
+        ring = near[(wider > 0) & (grown == 0)].astype(np.float32)
+        if len(ring) and np.median(np.abs(ring - np.median(ring, axis=0)).max(axis=1)) < FLAT and _is_ink(ring):
+            reach = width + FRINGE + 1
         grown = wider
-    return cv2.dilate(mask, kernel, iterations=reach).astype(bool)
+    mask = np.zeros(image.shape[:2], bool)
+    mask[window] = cv2.dilate(patch, kernel, iterations=reach) > 0
+    return mask
 
 
 def _is_ink(ring: NDArray[np.float32]) -> bool:
@@ -135,11 +144,10 @@ def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
     """Colours [3] that many of the pixels [N, 3] share: a drawing has one, a shaded object spreads over many."""
     if len(pixels) < 40:
         return []
-    step = 16
-    bins = np.zeros((18, 18, 18), np.float32)
-    index = pixels.astype(np.int64) // step + 1
-    np.add.at(bins, (index[:, 0], index[:, 1], index[:, 2]), 1.0)
-    smooth = bins.copy()
+    binned = np.ascontiguousarray((pixels // BIN + 1).T).astype(np.int16)  # [3, N]; a margin of one bin all around
+    side = 256 // BIN + 2
+    flat = np.ravel_multi_index((binned[0], binned[1], binned[2]), (side, side, side))
+    smooth = np.bincount(flat, minlength=side**3).reshape(side, side, side).astype(np.float32)
     for axis in range(3):
         smooth = smooth + 0.5 * (np.roll(smooth, 1, axis) + np.roll(smooth, -1, axis))
     colours: list[NDArray[np.int64]] = []
@@ -147,7 +155,8 @@ def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
         peak = np.unravel_index(int(smooth.argmax()), smooth.shape)
         if smooth[peak] < 30:
             break
-        near = pixels[np.abs(index - np.array(peak)).max(axis=1) <= 1]
+        close = [np.abs(channel - np.int16(middle)) <= 1 for channel, middle in zip(binned, peak, strict=True)]
+        near = pixels[close[0] & close[1] & close[2]]
         colour = np.median(near, axis=0).astype(np.int64)
         if (np.abs(near - colour).max(axis=1) <= FLAT).sum() >= 24:
             colours.append(colour)
