@@ -12,7 +12,7 @@ import re
 import shutil
 import threading
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -107,13 +107,10 @@ class ArtifactStore:
     @contextmanager
     def scratch(self) -> Generator[Path]:
         """A path on the data folder's disk for a file in the making; removed afterwards unless `put_file` took it."""
-        with _storage_errors():
-            self._folder.mkdir(parents=True, exist_ok=True)
-        path = self._folder / f".{uuid4().hex}.part"
-        try:
+        with ExitStack() as stack:
+            with _storage_errors():
+                path = stack.enter_context(_temporary_beside(self._folder / "scratch"))
             yield path
-        finally:
-            path.unlink(missing_ok=True)
 
     def check(self) -> None:
         """Write, sync and remove a small file. Raises `StorageUnavailable` if that fails."""

@@ -11,7 +11,7 @@ from cow_service.vision.sizes import box_around, scaled
 WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
 POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
 ITERATIONS = 2
-GROW, SHRINK = 0.18, 0.04  # of its size: how far a guess may be from the object, outwards and inwards
+GROW, SHRINK = 0.05, 0.04  # of its size: how far a guess may be from the object, outwards and inwards
 LEAST_BACKGROUND = 0.15  # of a crop, to learn the background from
 CORE, LARGE_CORE = 0.25, 0.6  # of the box: the ellipse in its middle that is surely the object
 SPAN = 0.7  # of the box's sides: a box is tight, so a cut that spans less is tried again with the large core
