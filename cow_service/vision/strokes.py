@@ -24,6 +24,7 @@ SHARP_SHARE = 0.85  # of what lies beside it
 FRINGE = 4  # px around a drawing that compression has mixed with it
 OUTLINE_MOST = 5  # px: the widest outline looked for
 MIN_LENGTH = 18.0  # px at the working size
+ALIKE = 0.04  # of its area: a patch that differs less is the same one, found with another tolerance
 BIN = 16  # grey levels: colours this close are tried as one
 MAX_COLOURS = 36  # flat colours tried per thin structure
 
@@ -61,15 +62,27 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
     """Candidates in an RGB image [h, w, 3] of working size. The same drawing can come twice, a little different."""
     for (bx, by, bw, bh), thin in _patches(_thin_structures(image), most=1.0):
         window = image[by : by + bh, bx : bx + bw]
+        known: dict[tuple[int, int, int, int], int] = {}
         for colour in _flat_colours(window[thin]):
             for tolerance in TOLERANCES:
                 low, high = np.clip(colour - tolerance, 0, 255), np.clip(colour + tolerance, 0, 255)
                 same = np.asarray(cv2.inRange(window, low, high), np.uint8)
                 same[~thin] = 0
-                for (x, y, _, _), patch in _patches(same, most=0.30):
-                    stroke = Stroke(bx + x, by + y, patch, (int(colour[0]), int(colour[1]), int(colour[2])))
+                for box, patch in _patches(same, most=0.30):
+                    if _is_known(known, box, int(np.count_nonzero(patch))):
+                        continue
+                    stroke = Stroke(bx + box[0], by + box[1], patch, (int(colour[0]), int(colour[1]), int(colour[2])))
                     if _is_drawn(image, stroke):
                         yield stroke
+
+
+def _is_known(known: dict[tuple[int, int, int, int], int], box: tuple[int, int, int, int], area: int) -> bool:
+    """Whether a patch of this box and nearly this area was looked at before; if not, it now is."""
+    before = known.get(box)
+    if before is not None and abs(area - before) <= ALIKE * before:
+        return True
+    known[box] = area
+    return False
 
 
 def drawing_mask(image: Image, stroke: Stroke) -> Mask:
