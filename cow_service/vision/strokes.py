@@ -62,12 +62,12 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
     """Candidates in an RGB image [h, w, 3] of working size. The same drawing can come twice, a little different."""
     for (bx, by, bw, bh), thin in _patches(_thin_structures(image), most=1.0):
         window = image[by : by + bh, bx : bx + bw]
+        allowed = thin.astype(np.uint8) * np.uint8(255)
         known: dict[tuple[int, int, int, int], int] = {}
         for colour in _flat_colours(window[thin]):
             for tolerance in TOLERANCES:
                 low, high = np.clip(colour - tolerance, 0, 255), np.clip(colour + tolerance, 0, 255)
-                same = np.asarray(cv2.inRange(window, low, high), np.uint8)
-                same[~thin] = 0
+                same = np.asarray(cv2.bitwise_and(cv2.inRange(window, low, high), allowed), np.uint8)
                 for box, patch in _patches(same, most=0.30):
                     if _is_known(known, box, int(np.count_nonzero(patch))):
                         continue
