@@ -7,11 +7,12 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from cow_service import __version__
+from cow_service import __version__, models_cli, tracks_cli
 from cow_service.errors import CowError
 
 HINTS = {  # how the command line says what an error's remedy asks for
@@ -86,6 +87,14 @@ def simulate(
         Kind, typer.Option(help="Kind of motion, with --direction (or alone for fall and static).")
     ] = Kind.linear,
     speed: Annotated[float | None, typer.Option(help="px/s, with --direction.", show_default="0.26 widths/s")] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            help="JSON with the `trajectory` of a request, as `cow tracks import` makes it.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
     reader: Annotated[str | None, typer.Option(help="Who looks at the image.", show_default="COW_READER")] = None,
     generator: Annotated[str | None, typer.Option(help="Who makes the frames.", show_default="COW_GENERATOR")] = None,
     num_frames: Annotated[int, typer.Option(help="Frames of the clip.")] = 81,
@@ -109,6 +118,7 @@ def simulate(
             direction=direction,
             kind=kind.value,
             speed=speed,
+            trajectory=trajectory,
             reader=reader,
             generator=generator,
             num_frames=num_frames,
@@ -136,15 +146,6 @@ def serve(
         from cow_service.api.app import create_app  # noqa: PLC0415
 
         uvicorn.run(create_app(service), host=service.settings.host, port=service.settings.port, log_level="info")
-
-
-@app.command()
-def models(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
-    """List readers and generators, and whether each is ready."""
-    with _errors_told():
-        from cow_service.console import print_models  # noqa: PLC0415
-
-        print_models(_service().models(), as_json=as_json)
 
 
 @app.command()
@@ -197,6 +198,17 @@ def _errors_told() -> Generator[None]:
         typer.secho(str(error), fg="red", err=True)
         raise typer.Exit(2) from error
 
+
+class _Told(TyperGroup):
+    """A group of commands whose errors are told as those of the other commands are."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with _errors_told():
+            return super().invoke(ctx)
+
+
+app.add_typer(models_cli.app, name="models", cls=_Told)
+app.add_typer(tracks_cli.app, name="tracks", cls=_Told)
 
 if __name__ == "__main__":
     sys.exit(app())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +27,7 @@ def build_request(
     direction: str | None,
     kind: str,
     speed: float | None,
+    trajectory: Path | None,
     **rest: Any,
 ) -> dict[str, Any]:
     """The request's body without its image. Raises `InvalidRequest` naming the option that cannot be read."""
@@ -46,6 +48,8 @@ def build_request(
         }
     elif kind != "linear" or speed is not None:
         raise InvalidRequest("--kind and --speed go with --direction; without it the motion is read from the question.")
+    if trajectory is not None:
+        body["trajectory"] = _json(trajectory)
     return body
 
 
@@ -122,7 +126,9 @@ def print_models(models: Models, *, as_json: bool) -> None:
 def _readiness(backend: BackendInfo) -> str:
     if backend.ready is None:
         return "unknown"
-    return "[green]yes[/]" if backend.ready else f"[yellow]needs {', '.join(backend.missing)}[/]"
+    if backend.ready:
+        return "[green]yes[/]"
+    return f"[yellow]needs {', '.join(backend.missing) or 'its weights'}[/]"
 
 
 def _told(simulation: Simulation) -> dict[Stage, str]:
@@ -153,6 +159,13 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
             f"{option} takes {count} numbers with commas between, such as {','.join(['10'] * count)}; got '{text}'."
         )
     return values
+
+
+def _json(path: Path) -> object:
+    try:
+        return json.loads(_read(path))
+    except ValueError as error:
+        raise InvalidRequest(f"{path.name} is not JSON: {error}.") from error
 
 
 def _read(path: Path) -> bytes:

@@ -78,11 +78,11 @@ def print_report(report: Report, *, as_json: bool) -> None:
     free = "" if report.free_disk_gb is None else f" ({report.free_disk_gb:.1f} GB free)"
     console.print(f"data folder: {report.data_folder}{free}", highlight=False, soft_wrap=True)
     table = Table(box=None, pad_edge=False)
-    for heading in ("backend", "ready", "missing", "install with"):
+    for heading in ("backend", "ready", "missing", "get it with"):
         table.add_column(heading)
     for backend in report.backends:
         ready = {True: "[green]yes[/]", False: "[yellow]no[/]", None: "unknown"}[backend.ready]
-        table.add_row(backend.name, ready, ", ".join(backend.missing) or "-", backend.install or "-")
+        table.add_row(backend.name, ready, ", ".join(backend.missing) or "-", backend.install or backend.pull or "-")
     console.print(table)
     installed = ", ".join(f"{name} {found}" for name, found in report.packages.items() if found)
     absent = ", ".join(name for name, found in report.packages.items() if not found)

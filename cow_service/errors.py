@@ -17,6 +17,10 @@
     ├── CannotReadDirection        cannot-read-direction    422
     ├── ReaderUnavailable          reader-unavailable       503
     ├── GeneratorUnavailable       generator-unavailable    503
+    │   ├── WeightsUnavailable     weights-unavailable      503
+    │   └── CheckpointInvalid      checkpoint-invalid       503
+    ├── GeneratorOutOfMemory       generator-out-of-memory  503
+    ├── Canceled                   canceled                 409
     ├── StorageUnavailable         storage-unavailable      503
     └── InternalError              internal-error           500
 
@@ -156,6 +160,30 @@ class GeneratorUnavailable(CowError):
     """The generator cannot run on this server."""
 
     code, status = "generator-unavailable", 503
+
+
+class WeightsUnavailable(GeneratorUnavailable):
+    """Weights are missing here, or are not those that were recorded when they were downloaded."""
+
+    code = "weights-unavailable"
+
+
+class CheckpointInvalid(GeneratorUnavailable):
+    """A checkpoint does not fit the model."""
+
+    code = "checkpoint-invalid"
+
+
+class GeneratorOutOfMemory(CowError):
+    """The clip does not fit into the memory of the device."""
+
+    code, status = "generator-out-of-memory", 503
+
+
+class Canceled(CowError):
+    """The work was canceled."""
+
+    code, status = "canceled", 409
 
 
 class StorageUnavailable(CowError):

@@ -72,7 +72,7 @@ def simulate(
     Raises the errors of its stages: `InvalidRequest`, `CannotGround`, `CannotReadDirection`, `GeneratorUnavailable`...
     """
     options = read_options(backends.generator, request.generator_options)
-    check_frames(request)
+    check_frames(backends.generator, request)
     scene = Scene(image.pixels)
     clock = _Clock(progress)
     used: list[Stage] = []

@@ -214,6 +214,9 @@ class BackendInfo(Record):
     weights: str | None = Field(default=None, description="Repository of its weights; null where it has none.")
     missing: tuple[str, ...] = Field(default=(), description="Python modules that are not installed.")
     install: str | None = Field(default=None, description="The command that installs them.")
+    pull: str | None = Field(
+        default=None, description="The command that downloads its weights, where they are not here."
+    )
     defaults: dict[str, bool | int | float | str] = Field(default_factory=dict)
 
 

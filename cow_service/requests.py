@@ -88,14 +88,45 @@ class TrajectoryRequest(Record):
 
     points: tuple[tuple[Finite, Finite], ...] = Field(min_length=2, max_length=4096, description="[[x, y], ...], px.")
     fps: float = Field(default=16, gt=0, le=240)
+    visible: tuple[bool, ...] | None = Field(
+        default=None, max_length=4096, description="Per point: the object can be seen. By default inside the image."
+    )
+    tracks: tuple[tuple[tuple[Finite, Finite], ...], ...] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=64,
+        description="Paths of several points of the object, each like `points`. By default points in its mask.",
+    )
+    anchors: tuple[tuple[Finite, Finite], ...] | None = Field(
+        default=None, max_length=64, description="Points that stay where they are. By default spread over the image."
+    )
 
-    @field_validator("points")
+    @field_validator("points", "anchors")
     @classmethod
-    def _near_the_image(cls, points: tuple[Point, ...]) -> tuple[Point, ...]:
-        far = next((point for point in points if max(abs(point[0]), abs(point[1])) > 1e6), None)
+    def _near_the_image(cls, points: tuple[Point, ...] | None) -> tuple[Point, ...] | None:
+        far = next((point for point in points or () if max(abs(point[0]), abs(point[1])) > 1e6), None)
         if far is not None:
             raise ValueError(f"points lie at most 1,000,000 px from the image, got {list(far)}")
         return points
+
+    @field_validator("tracks")
+    @classmethod
+    def _tracks_near_the_image(
+        cls, tracks: tuple[tuple[Point, ...], ...] | None
+    ) -> tuple[tuple[Point, ...], ...] | None:
+        for track in tracks or ():
+            cls._near_the_image(track)
+        return tracks
+
+    @model_validator(mode="after")
+    def _same_length(self) -> TrajectoryRequest:
+        wanted = len(self.points)
+        if self.visible is not None and len(self.visible) != wanted:
+            raise ValueError(f"`visible` has {len(self.visible)} entries for {wanted} `points`")
+        wrong = next((len(track) for track in self.tracks or () if len(track) != wanted), None)
+        if wrong is not None:
+            raise ValueError(f"a track has {wrong} points where `points` has {wanted}")
+        return self
 
 
 class FramesRequest(Record):

@@ -24,6 +24,7 @@ from cow_service.readers.base import Reader
 from cow_service.records import Artifact, BackendInfo, Models, Simulation
 from cow_service.requests import ImageArtifact, ImageRef, ImageUrl, SimulateRequest
 from cow_service.settings import Settings, SettingsError
+from cow_service.weights import ready
 
 _DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)
 
@@ -38,8 +39,8 @@ class Service:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.artifacts = ArtifactStore(settings.data_dir / "artifacts")
-        self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable)
-        self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable)
+        self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable, settings)
+        self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable, settings)
         for setting, name, names in (
             ("COW_READER", settings.reader, self.readers.names()),
             ("COW_GENERATOR", settings.generator, self.generators.names()),
@@ -62,7 +63,7 @@ class Service:
         backends = Backends(
             reader_name=self._known("reader", request.reader or self.settings.reader, self.readers),
             reader=lambda: self.readers.get(request.reader or self.settings.reader),
-            generator=self.generators.get(
+            generator=self._generator(
                 self._known("generator", request.generator or self.settings.generator, self.generators)
             ),
             artifacts=self.artifacts,
@@ -80,7 +81,15 @@ class Service:
         """Raises the `CowError` that would keep the default request from succeeding."""
         self.artifacts.check()
         self.readers.get(self.settings.reader)
-        self.generators.get(self.settings.generator)
+        self._generator(self.settings.generator)
+
+    def _generator(self, name: str) -> Generator:
+        manifest = load_manifests().get(name)
+        if manifest is not None and (missing := manifest.missing_modules()):
+            raise GeneratorUnavailable(
+                f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
+            )
+        return self.generators.get(name)
 
     def _image(self, ref: ImageRef) -> DecodedImage:
         if isinstance(ref, ImageUrl) or (isinstance(ref, str) and ref[:8].lower().startswith(("http://", "https://"))):
@@ -101,16 +110,18 @@ class Service:
         if manifest is None:
             return BackendInfo(name=name, default=default, ready=None, summary="Registered by another package.")
         missing = manifest.missing_modules()
+        here = name in self.settings.checkpoints or ready(manifest, self.settings.weights_dir)
         return BackendInfo(
             name=name,
             default=default,
-            ready=not missing,
+            ready=here and not missing,
             needs=manifest.modules,
             summary=manifest.summary,
             licence=manifest.licence,
             weights=manifest.weights,
             missing=missing,
             install=manifest.install_line() if missing else None,
+            pull=None if here else f"cow models pull {name}",
             defaults=manifest.defaults,
         )
 

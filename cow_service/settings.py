@@ -33,7 +33,26 @@ class Settings(BaseSettings):
     max_body_mb: float = Field(
         default=32, gt=0, le=4096, allow_inf_nan=False, description="Largest request body taken, in MB (10^6 bytes)."
     )
+    models_dir: Path | None = Field(
+        default=None, description="Folder for weights; by default the folder `models` of the data folder."
+    )
+    checkpoints: dict[str, Path] = Field(
+        default_factory=dict,
+        description="Transformer checkpoints (a folder or one safetensors file) to use instead of those that "
+        "`cow models pull` brings, by generator, as JSON.",
+    )
+    profile: str = Field(default="exact", description="How video models run: a profile of their manifest.")
+    device: str = Field(
+        default="auto",
+        pattern=r"^(auto|cpu|cuda(:\d+)?)$",
+        description="Where video models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU.",
+    )
     concurrency: int = Field(default=2, ge=1, le=256, description="Simulations computed at the same time; others wait.")
+
+    @property
+    def weights_dir(self) -> Path:
+        """Folder for weights."""
+        return self.models_dir or self.data_dir / "models"
 
 
 def load_settings(**overrides: Any) -> Settings:

@@ -87,7 +87,7 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),
         ([QUESTION, "--kind", "projectile"], 1, "go with --direction"),
         ([QUESTION, "--object", "x"], 1, "goes with --point or --box"),
-        ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: cutout."),
+        ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: ati, cutout,"),
         ([QUESTION, "--num-frames", "1"], 1, "num_frames"),
         ([QUESTION, "--frames", "best"], 2, "'best'"),
         ([], 2, "QUESTION"),
@@ -119,7 +119,7 @@ def test_bad_settings_are_named(tmp_path: Path) -> None:
 def test_models_and_doctor(tmp_path: Path) -> None:
     assert "cutout (default)" in cow(tmp_path, "models").stdout
     models = Models.model_validate_json(cow(tmp_path, "models", "--json").stdout)
-    assert [m.name for m in models.generators] == ["cutout"]
+    assert "cutout" in [m.name for m in models.generators]
     result = cow(tmp_path, "doctor")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "The default request can be served." in result.stdout
@@ -142,7 +142,7 @@ def test_the_doctor_finds_what_is_wrong(tmp_path: Path) -> None:
 def test_a_default_backend_that_is_not_there_stops_the_start(tmp_path: Path) -> None:
     result = cow(tmp_path, "serve", COW_GENERATOR="dream")
     assert result.returncode == 2
-    assert "COW_GENERATOR='dream': there are only cutout" in result.stderr
+    assert "COW_GENERATOR='dream': there are only ati, cutout" in result.stderr
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path, picture: Path) -> None:

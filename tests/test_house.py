@@ -27,6 +27,9 @@ FLOORS: dict[str, int] = {
     "manifests": 2,
     "plugins": 2,
     "vision": 3,
+    "weights": 3,
+    "hub_errors": 3,
+    "hub": 4,
     "physics": 4,
     "readers": 5,
     "generators": 5,
@@ -36,7 +39,9 @@ FLOORS: dict[str, int] = {
     "api": 9,
     "console": 9,
     "doctor": 9,
-    "cli": 10,
+    "models_cli": 10,
+    "tracks_cli": 10,
+    "cli": 11,
 }
 HEAVY = ("torch", "transformers", "diffusers", "accelerate")
 

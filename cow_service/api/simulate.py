@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+from threading import Event
+
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request, Response
 
@@ -25,6 +28,9 @@ FAILURES = (
     errors.CannotReadDirection,
     errors.ReaderUnavailable,
     errors.GeneratorUnavailable,
+    errors.WeightsUnavailable,
+    errors.CheckpointInvalid,
+    errors.GeneratorOutOfMemory,
     errors.StorageUnavailable,
 )
 
@@ -34,10 +40,14 @@ def simulate_routes(service: Service) -> APIRouter:
     router = APIRouter()
     limiter = CapacityLimiter(service.settings.concurrency)
 
-    def run(posted: Posted) -> str:
+    def run(posted: Posted, left: Event) -> str:
+        def still_wanted(stage: str, done: float) -> None:
+            if left.is_set():
+                raise errors.Canceled("The caller went away before the simulation was done.")
+
         asked, image = check(posted, service)
         # Written here and not by the framework, which would check the record's thousands of numbers once more.
-        return service.simulate(asked, image=image).model_dump_json()
+        return service.simulate(asked, still_wanted, image).model_dump_json()
 
     @router.post(
         "/simulate",
@@ -49,9 +59,24 @@ def simulate_routes(service: Service) -> APIRouter:
         openapi_extra={"requestBody": BODY},
     )
     async def simulate(request: Request) -> Response:
-        """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once."""
+        """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once.
+
+        A caller who closes the connection ends the work: a video model stops after the step that it is in.
+        """
         posted = await receive(request)
-        body = await to_thread.run_sync(run, posted, limiter=limiter)
+        left = Event()
+        watcher = asyncio.create_task(_watch(request, left))
+        try:
+            body = await to_thread.run_sync(run, posted, left, limiter=limiter)
+        finally:
+            watcher.cancel()
         return Response(body, media_type="application/json")
 
     return router
+
+
+async def _watch(request: Request, left: Event) -> None:
+    """Sets `left` when the caller has closed the connection."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass  # an empty rest of the body
+    left.set()

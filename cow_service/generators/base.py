@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -37,10 +37,19 @@ class Generator(Protocol):
         """Who would make this clip, and what would have to be the same to make it again."""
         ...
 
+    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
+        """`(num_frames,)` where it can make a clip of that many frames, else the lengths next to it that it can."""
+        ...
+
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height (px) of the frames it makes for an image of this size."""
         ...
 
-    def render(self, shot: Shot, wanted: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-        """The wanted clip frames, RGB [h, w, 3] of `size`, in the order of their ascending indices."""
+    def render(
+        self, shot: Shot, wanted: Sequence[int], progress: Callable[[float], None]
+    ) -> Iterator[NDArray[np.uint8]]:
+        """The wanted clip frames, RGB [h, w, 3] of `size`, in the order of their ascending indices.
+
+        `progress` hears 0 to 1 after each step of the work, and may raise `Canceled`: then no more is computed.
+        """
         ...

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +16,7 @@ from cow_service.images import fit_within
 from cow_service.physics.camera import has_passed
 from cow_service.physics.encounters import box_at, stands_nearer
 from cow_service.records import BBox, GeneratorInfo
+from cow_service.settings import Settings
 from cow_service.vision.fill import crop_of, draw_in, fill_hole
 from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.sizes import resized_mask
@@ -57,19 +58,24 @@ class CutoutGenerator:
         """The same image, trajectory and version give the same frames; the seed changes nothing."""
         return GeneratorInfo(name="cutout", revision=__version__, seed=shot.seed, options=shot.options.model_dump())
 
+    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
+        """Any length."""
+        return (num_frames,)
+
     def size(self, width: int, height: int) -> tuple[int, int]:
         """The image's own size, up to 1280 px on the longer side."""
         factor = min(1.0, MAX_SIDE / max(width, height))
         return max(1, round(width * factor)), max(1, round(height * factor))
 
-    def render(self, shot: Shot, wanted: Sequence[int]) -> Iterator[Image]:
+    def render(self, shot: Shot, wanted: Sequence[int], progress: Callable[[float], None]) -> Iterator[Image]:
         """The wanted frames, RGB [h, w, 3]; only where the mover is are they composed anew."""
         layers = _layers(shot)
         start = np.array(shot.grounding.point)
         airborne = shot.motion.kind in ("projectile", "fall")
         depths = np.array([state[2] for state in shot.trajectory.states])
         gone = has_passed(depths, depths[0])
-        for index in wanted:
+        for done, index in enumerate(wanted):
+            progress(done / len(wanted))
             if gone[index]:  # behind the camera
                 yield layers.background.copy()
                 continue
@@ -79,7 +85,7 @@ class CutoutGenerator:
             yield _compose(layers, start, point, scale, in_front)
 
 
-def create() -> CutoutGenerator:
+def create(settings: Settings) -> CutoutGenerator:
     """Factory for the registry."""
     return CutoutGenerator()
 

@@ -14,6 +14,7 @@ from cow_service.readers.motion_words import MotionWords
 from cow_service.readers.phrases import ObjectPhrase
 from cow_service.readers.sentences import Question, parse
 from cow_service.records import BBox, Grounding, LocatedObject, ReaderInfo, Vector
+from cow_service.settings import Settings
 from cow_service.vision.scene import SAME_OBJECT, Scene, iou
 
 # Words that say which way, wherever they stand: where they were not understood, no arrow may stand in for them.
@@ -122,7 +123,7 @@ class EmbeddedReader:
         )
 
 
-def create() -> EmbeddedReader:
+def create(settings: Settings) -> EmbeddedReader:
     """Factory for the registry."""
     return EmbeddedReader()
 

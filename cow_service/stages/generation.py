@@ -66,10 +66,9 @@ def generate(
 
     def rendered() -> Iterator[Image]:
         keep = set(chosen)
-        for done, (index, pixels) in enumerate(zip(indices, generator.render(shot, indices), strict=True), 1):
+        for index, pixels in zip(indices, generator.render(shot, indices, progress), strict=True):
             if index in keep:
                 frames.append(_keep(pixels, index, trajectory.fps, wanted.max_side, artifacts))
-            progress(done / len(indices))
             yield pixels
 
     made = _keep_video(rendered(), trajectory.fps, (width, height), artifacts) if video else None

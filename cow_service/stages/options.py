@@ -26,8 +26,11 @@ def read_options(generator: Generator, given: dict[str, Any]) -> BaseModel:
         ) from error
 
 
-def check_frames(request: SimulateRequest) -> None:
-    """Raises `InvalidRequest` where the request asks for frames that its clip does not have."""
+def check_frames(generator: Generator, request: SimulateRequest) -> None:
+    """Raises `InvalidRequest` where the generator has no clip of that length, or the clip not the frames asked for."""
+    if request.num_frames not in (legal := generator.nearest_lengths(request.num_frames)):
+        detail = f"this generator makes no clip of {request.num_frames} frames; take {' or '.join(map(str, legal))}"
+        raise InvalidRequest(f"`num_frames`: {detail}.", errors=(FieldError("/num_frames", detail),))
     last = request.num_frames - 1
     errors = tuple(
         FieldError(f"/frames/indices/{place}", f"the clip has frames 0 to {last}, got {index}")

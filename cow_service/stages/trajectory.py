@@ -40,15 +40,20 @@ def compute_trajectory(
         & (points[:, 1] < scene.height)
         & ~camera.has_passed(states[:, :3])
     )
+    if given is not None and given.visible is not None:
+        visible &= np.array(given.visible)[_latest(given, times)]
     mask = scene.silhouette(grounding.bbox)
     airborne = motion.kind in ("projectile", "fall")
     sweep = Sweep(mask, grounding.bbox, np.array(grounding.point), points, scale, visible, airborne)
     movable = swept_mask(sweep)
     for obstacle in obstacles:
         obstacle.cutting.add_to(movable)
-    centre = np.array(grounding.point)
-    starts = points_inside(mask, grounding.point)
-    tracks = [points + scale[:, None] * (np.array(start) - centre) for start in starts]
+    if given is not None and given.tracks is not None:
+        tracks = [_sampled(np.array(track), given.fps, times) for track in given.tracks]
+    else:
+        offsets = [np.array(start) - grounding.point for start in points_inside(mask, grounding.point)]
+        tracks = [points + scale[:, None] * offset for offset in offsets]
+    anchors = spread_anchors(movable) if given is None or given.anchors is None else given.anchors
     return Trajectory(
         fps=fps,
         states=tuple(tuple(float(v) for v in state) for state in states),  # pyright: ignore[reportArgumentType]
@@ -56,7 +61,7 @@ def compute_trajectory(
         visible=tuple(bool(v) for v in visible),
         scale=tuple(float(v) for v in scale),
         tracks=tuple(_pairs(track) for track in tracks),
-        anchors=spread_anchors(movable),
+        anchors=anchors,
         encounters=find_encounters(sweep, obstacles),
     )
 
@@ -75,11 +80,23 @@ def _states_along(camera: Camera, given: TrajectoryRequest, times: Floats) -> Fl
     """States [F, 6] at the object's first depth along given points, linear between them, at rest after the last."""
     stamps = np.arange(len(given.points)) / given.fps
     path = np.array([camera.lift(point) for point in given.points])
-    position = np.stack([np.interp(times, stamps, path[:, axis]) for axis in range(3)], axis=1)
+    position = _sampled(path, given.fps, times)
     step = np.minimum(np.searchsorted(stamps, times, side="right"), len(stamps) - 1)
     velocity = (path[step] - path[step - 1]) * given.fps
     velocity[times >= stamps[-1]] = 0.0
     return np.hstack([position, velocity])
+
+
+def _sampled(path: Floats, fps: float, times: Floats) -> Floats:
+    """A path [P, D] given at `fps`, at other times: linear between its points, at rest after the last."""
+    stamps = np.arange(len(path)) / fps
+    return np.stack([np.interp(times, stamps, path[:, axis]) for axis in range(path.shape[1])], axis=1)
+
+
+def _latest(given: TrajectoryRequest, times: Floats) -> NDArray[np.int64]:
+    """The number of the given point that was reached last at each time."""
+    # The small term keeps a frame that falls on a point from landing before it.
+    return np.minimum((times * given.fps + 1e-6).astype(np.int64), len(given.points) - 1)
 
 
 def _pairs(points: Floats) -> tuple[tuple[float, float], ...]:

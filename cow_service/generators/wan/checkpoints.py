@@ -1,0 +1,230 @@
+"""Loads Wan transformers from every form in which their weights are published, and refuses what does not fit exactly.
+
+Forms: a diffusers folder; the original folder (class `WanModel`, sharded, original names); one safetensors file in
+either naming, in any floating type, fp8 with or without scales, with or without a prefix. Names and shapes are compared
+with the model's before a single weight is read. Safetensors only: a pickle can run code, and is never opened.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from accelerate import init_empty_weights
+from diffusers import WanTransformer3DModel
+from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from cow_service.errors import CheckpointInvalid
+
+PREFIX = "model.diffusion_model."
+SCALE = ".scale_weight"  # one number per fp8 weight: what it is multiplied by
+UNUSED = (".scale_input", "scaled_fp8")  # for fp8 arithmetic, and the marker that scales are there
+PICKLES = {".pth", ".pt", ".bin", ".ckpt", ".pkl", ".pickle"}
+FLOATING = {"F64", "F32", "F16", "BF16", "F8_E4M3", "F8_E5M2"}
+SHOWN = 8  # names per kind in an error
+IMAGE_DIM = 1280  # of the image encoder, fixed in the original models
+TEXT_LENGTH = 512
+
+Architecture = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A tensor as its file's header describes it."""
+
+    file: Path
+    shape: tuple[int, ...]
+    dtype: str
+
+
+def load_transformer(
+    path: Path, architecture: Architecture, dtype: torch.dtype, device: torch.device
+) -> WanTransformer3DModel:
+    """The transformer of a folder or file, in `dtype` (norms and time embedding stay float32), on `device`.
+
+    `architecture` has the sizes of a file that comes without a `config.json`, named as in the original configuration.
+    Raises `CheckpointInvalid` naming every file, name or shape that is wrong.
+    """
+    folder, files = _files_of(path)
+    config, original = _configuration(folder, architecture)
+    entries = _headers(files)
+    model = _empty(config)
+    plan = _plan(entries, model.state_dict(), original)
+    _fill(model, plan, entries, dtype, device)
+    return model.eval().requires_grad_(False)
+
+
+def diffusers_config(architecture: Architecture) -> dict[str, Any]:
+    """The model's arguments in diffusers from the names of the original configuration (`dim`, `num_heads`, ...)."""
+    if architecture.get("text_len", TEXT_LENGTH) != TEXT_LENGTH:
+        raise CheckpointInvalid(f"`text_len` is {architecture['text_len']}: the model takes {TEXT_LENGTH} tokens only.")
+    try:
+        return {
+            "patch_size": (1, 2, 2),
+            "num_attention_heads": architecture["num_heads"],
+            "attention_head_dim": architecture["dim"] // architecture["num_heads"],
+            "in_channels": architecture["in_dim"],
+            "out_channels": architecture["out_dim"],
+            "text_dim": architecture.get("text_dim", 4096),
+            "freq_dim": architecture["freq_dim"],
+            "ffn_dim": architecture["ffn_dim"],
+            "num_layers": architecture["num_layers"],
+            "eps": architecture.get("eps", 1e-6),
+            "image_dim": architecture.get("image_dim", IMAGE_DIM),
+            "added_kv_proj_dim": architecture["dim"],
+        }
+    except KeyError as error:
+        raise CheckpointInvalid(f"The configuration does not say `{error.args[0]}`.") from error
+
+
+def _files_of(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
+    """The folder of a configuration, where there is one, and the safetensors files in order."""
+    if path.suffix in PICKLES:
+        raise CheckpointInvalid(f"{path.name} is a pickle, which can run code when opened. Use its safetensors form.")
+    if path.is_file():
+        return None, (path,)
+    if not path.is_dir():
+        raise CheckpointInvalid(f"There is no checkpoint '{path.name}'.")
+    folder = path / "transformer" if (path / "transformer").is_dir() else path
+    files = tuple(sorted(folder.glob("*.safetensors")))
+    if not files:
+        pickles = [file.name for file in sorted(folder.iterdir()) if file.suffix in PICKLES]
+        told = f"only pickles ({', '.join(pickles)}), which can run code when opened" if pickles else "none"
+        raise CheckpointInvalid(f"'{path.name}' has no safetensors files: {told}.")
+    _check_shards(folder, files)
+    return folder, files
+
+
+def _check_shards(folder: Path, files: tuple[Path, ...]) -> None:
+    """Every shard that the index or a name like -00001-of-00007 promises must be there."""
+    present = {file.name for file in files}
+    promised: set[str] = set()
+    for index in folder.glob("*.safetensors.index.json"):
+        promised |= set(_json(index).get("weight_map", {}).values())
+    for name in present:
+        if numbered := re.fullmatch(r"(.*-)\d+-of-(\d+)\.safetensors", name):
+            count = int(numbered[2])
+            promised |= {f"{numbered[1]}{i:05d}-of-{numbered[2]}.safetensors" for i in range(1, count + 1)}
+    if absent := sorted(promised - present):
+        raise CheckpointInvalid(f"Shards are missing: {_listed(absent)}. Download the checkpoint again.")
+
+
+def _configuration(folder: Path | None, architecture: Architecture) -> tuple[dict[str, Any], bool | None]:
+    """The model's arguments, and whether names are the original ones; null where only the names can tell."""
+    file = folder / "config.json" if folder else None
+    if file is None or not file.is_file():
+        return diffusers_config(architecture), None
+    config = _json(file)
+    kind = config.get("_class_name")
+    if kind == "WanTransformer3DModel":
+        return {name: value for name, value in config.items() if not name.startswith("_")}, False
+    if kind == "WanModel":
+        if config.get("model_type", "i2v") != "i2v":
+            raise CheckpointInvalid(
+                f"`model_type` in config.json is '{config['model_type']}', not 'i2v': no image input."
+            )
+        return diffusers_config(config), True
+    raise CheckpointInvalid(f"config.json is of class '{kind}': neither WanModel nor WanTransformer3DModel.")
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointInvalid(f"{file.name} cannot be read: {error}.") from error
+
+
+def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
+    """What the files hold, by name without the prefix. Reads headers only."""
+    entries: dict[str, _Entry] = {}
+    for file in files:
+        try:
+            with safe_open(file, framework="pt") as opened:
+                for key in tuple(opened.keys()):
+                    name, part = key.removeprefix(PREFIX), opened.get_slice(key)
+                    if name in entries:
+                        raise CheckpointInvalid(f"'{name}' is both in {entries[name].file.name} and in {file.name}.")
+                    entries[name] = _Entry(file, tuple(part.get_shape()), part.get_dtype())
+        except (SafetensorError, OSError) as error:
+            raise CheckpointInvalid(
+                f"{file.name} is cut short or damaged ({error}). Download it again: `cow models pull`."
+            ) from error
+    return entries
+
+
+def _empty(config: dict[str, Any]) -> WanTransformer3DModel:
+    try:
+        with init_empty_weights():
+            return WanTransformer3DModel(**config)
+    except (TypeError, ValueError) as error:
+        raise CheckpointInvalid(f"The configuration does not make a Wan transformer: {error}.") from error
+
+
+def _plan(entries: dict[str, _Entry], wanted: Mapping[str, Tensor], original: bool | None) -> dict[str, str]:
+    """For each of the model's names, the checkpoint's. Raises `CheckpointInvalid` for all that does not fit."""
+    weights = {name for name in entries if not name.endswith((SCALE, *UNUSED))}
+    if original is None:
+        original = not any(name.startswith("condition_embedder.") for name in weights)
+    # The converter renames keys and looks at no value of this model: names stand in for the tensors.
+    names = {name: name for name in sorted(weights)}
+    plan = cast("dict[str, str]", convert_wan_transformer_to_diffusers(dict(names)) if original else names)
+    unknown = sorted(set(plan.values()) - {plan[name] for name in plan.keys() & wanted.keys()})
+    unknown += sorted(weights - set(plan.values()))  # two names became one
+    unknown += sorted(n for n in entries if n.endswith(SCALE) and n.removesuffix(SCALE) + ".weight" not in weights)
+    missing = sorted(wanted.keys() - plan.keys())
+    shapes = [
+        f"{plan[name]} is {list(entries[plan[name]].shape)}, not {list(tensor.shape)}"
+        for name, tensor in wanted.items()
+        if name in plan and entries[plan[name]].shape != tuple(tensor.shape)
+    ]
+    types = [f"{name} is {entries[name].dtype}" for name in sorted(weights) if entries[name].dtype not in FLOATING]
+    kinds = (("unknown", unknown), ("missing", missing), ("of another shape", shapes), ("not floating-point", types))
+    told = [f"{len(found)} {kind}: {_listed(found)}" for kind, found in kinds if found]
+    if told:
+        raise CheckpointInvalid(f"The checkpoint does not fit the model. {'; '.join(told)}.")
+    return plan
+
+
+def _fill(
+    model: WanTransformer3DModel,
+    plan: Mapping[str, str],
+    entries: Mapping[str, _Entry],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> None:
+    """Reads the weights, one at a time and file after file, straight to their device."""
+    precise = tuple(model._keep_in_fp32_modules or ())  # pyright: ignore[reportPrivateUsage]
+    state: dict[str, Tensor] = {}
+    for file in sorted({entry.file for entry in entries.values()}):
+        here = [(name, source) for name, source in plan.items() if entries[source].file == file]
+        try:
+            with safe_open(file, framework="pt", device=str(device)) as opened:
+                held = set(opened.keys())
+                for name, source in here:
+                    tensor = opened.get_tensor(PREFIX + source if PREFIX + source in held else source)
+                    scale = source.removesuffix(".weight") + SCALE
+                    if source.endswith(".weight") and scale in entries:
+                        tensor = tensor.float() * _scale(entries[scale].file, scale, device)
+                    keep = any(part in precise for part in name.split("."))
+                    state[name] = tensor.to(torch.float32 if keep else dtype)
+        except (SafetensorError, OSError) as error:
+            raise CheckpointInvalid(f"{file.name} is damaged ({error}). Download it again.") from error
+    model.load_state_dict(state, strict=True, assign=True)
+    cast(Any, model).to(device)  # the tables of the rotary embedding, which no checkpoint holds
+
+
+def _scale(file: Path, name: str, device: torch.device) -> Tensor:
+    with safe_open(file, framework="pt", device=str(device)) as opened:
+        return opened.get_tensor(PREFIX + name if PREFIX + name in set(opened.keys()) else name).float()
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more

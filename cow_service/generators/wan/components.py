@@ -1,0 +1,67 @@
+"""Loads what stands around the transformer from a diffusers folder: VAE, text encoder, image encoder, tokenizer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from diffusers import AutoencoderKLWan, WanTransformer3DModel
+from safetensors import SafetensorError
+from transformers import AutoTokenizer, CLIPImageProcessor, CLIPVisionModel, UMT5EncoderModel
+
+from cow_service.errors import CheckpointInvalid
+from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
+
+SHOWN = 8  # names in an error
+
+
+def assemble(
+    transformer: WanTransformer3DModel, base: Path, dtype: torch.dtype, vae_dtype: torch.dtype
+) -> WanTrackPipeline:
+    """The pipeline of a transformer and the other parts in the diffusers folder `base`, all still on the CPU.
+
+    Raises `CheckpointInvalid` naming the part and what does not fit.
+    """
+    return compose(
+        transformer=transformer,
+        vae=_model(AutoencoderKLWan, base, "vae", vae_dtype),
+        text_encoder=_model(UMT5EncoderModel, base, "text_encoder", dtype),
+        image_encoder=_model(CLIPVisionModel, base, "image_encoder", dtype),
+        tokenizer=_part(AutoTokenizer, base, "tokenizer"),
+        image_processor=_part(CLIPImageProcessor, base, "image_processor"),
+    )
+
+
+def _model(kind: Any, base: Path, part: str, dtype: torch.dtype) -> Any:
+    """A model whose checkpoint fits it name by name: the libraries themselves only warn, and make up the rest."""
+    model, report = _part(kind, base, part, torch_dtype=dtype, use_safetensors=True, output_loading_info=True)
+    told = [
+        f"{len(report[key])} {word}: {_listed(report[key])}"
+        for key, word in (
+            ("unexpected_keys", "unknown"),
+            ("missing_keys", "missing"),
+            ("mismatched_keys", "of another shape"),
+        )
+        if report.get(key)
+    ]
+    if told:
+        raise CheckpointInvalid(f"The weights of '{part}' do not fit. {'; '.join(told)}.")
+    return model.eval().requires_grad_(False)
+
+
+def _part(kind: Any, base: Path, part: str, **options: Any) -> Any:
+    if not (base / part).is_dir():
+        raise CheckpointInvalid(f"The checkpoint has no folder '{part}'.")
+    try:
+        return kind.from_pretrained(str(base / part), local_files_only=True, **options)
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+        reason = str(error).replace(str(base), "").splitlines()[0]
+        raise CheckpointInvalid(f"'{part}' cannot be loaded: {reason}") from error
+
+
+def _listed(names: Iterable[object]) -> str:
+    shown = sorted(str(name) for name in names)
+    more = f" and {len(shown) - SHOWN} more" if len(shown) > SHOWN else ""
+    return ", ".join(shown[:SHOWN]) + more

@@ -1,0 +1,97 @@
+"""Makes the video generators: weights found and checked, loaded, accelerated as the profile says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from cow_service.generators.wan import methods
+from cow_service.generators.wan.acceleration import accelerate
+from cow_service.generators.wan.checkpoints import load_transformer
+from cow_service.generators.wan.components import assemble
+from cow_service.generators.wan.device import choose_device
+from cow_service.generators.wan.generator import Model, WanGenerator
+from cow_service.generators.wan.lora import add_lora
+from cow_service.generators.wan.pipeline import WanTrackPipeline
+from cow_service.generators.wan.profiles import Profile, profile_of
+from cow_service.generators.wan.tiny import make_tiny
+from cow_service.manifests import Manifest, load_manifests
+from cow_service.settings import Settings
+from cow_service.weights import read_lock, verify
+
+
+def create_ati(settings: Settings) -> WanGenerator:
+    """ATI on Wan2.1-I2V-14B."""
+    return load("ati", methods.ati, settings)
+
+
+def create_wan_move(settings: Settings) -> WanGenerator:
+    """Wan-Move on Wan2.1-I2V-14B."""
+    return load("wan-move", methods.wan_move, settings)
+
+
+def create_tiny_ati(settings: Settings) -> WanGenerator:
+    """ATI at toy size."""
+    return load("tiny-ati", methods.ati, settings)
+
+
+def create_tiny_wan_move(settings: Settings) -> WanGenerator:
+    """Wan-Move at toy size."""
+    return load("tiny-wan-move", methods.wan_move, settings)
+
+
+def load(name: str, method: methods.Method, settings: Settings) -> WanGenerator:
+    """The generator of a manifest. A manifest without sources is made here, at the sizes that it gives.
+
+    Raises `WeightsUnavailable`, `CheckpointInvalid`, or `GeneratorUnavailable` for what this machine cannot do.
+    """
+    manifest = load_manifests()[name]
+    profile = profile_of(manifest, settings.profile)
+    device = choose_device(settings.device)
+    own = settings.checkpoints.get(name)
+    if own is None and not manifest.sources:
+        pipeline, repository, revision = make_tiny(manifest.architecture), None, None
+    else:
+        pipeline = _from_weights(manifest, profile, own, settings.weights_dir, device)
+        source = manifest.sources["transformer"]
+        repository = source.repository if own is None else own.name
+        lock = read_lock(settings.weights_dir, source.repository)
+        revision = lock.revision if lock is not None and own is None else None
+    pipeline.set_progress_bar_config(disable=True)
+    accelerate(pipeline, profile.acceleration, device)
+    return WanGenerator(
+        Model(
+            name=name,
+            repository=repository,
+            revision=revision,
+            pipeline=pipeline,
+            device=device,
+            profile_name=settings.profile,
+            profile=profile,
+            method=method,
+            max_area=int(manifest.defaults["max_area"]),
+            negative_prompt=str(manifest.defaults.get("negative_prompt", "")),
+            threads=int(manifest.defaults["threads"]) if "threads" in manifest.defaults else None,
+        )
+    )
+
+
+def _from_weights(
+    manifest: Manifest, profile: Profile, own: Path | None, weights_dir: Path, device: torch.device
+) -> WanTrackPipeline:
+    """The pipeline of the pulled weights, with the transformer from `own` where that is given."""
+    checkpoint = own or verify(manifest.sources["transformer"], weights_dir, manifest.name)
+    # A whole pipeline in diffusers' form brings its own other parts.
+    whole = own is not None and (own / "vae").is_dir()
+    base = own if own is not None and whole else verify(manifest.sources["base"], weights_dir, manifest.name)
+    lora = None if profile.lora is None else manifest.sources[profile.lora.source]
+    added = None if lora is None else verify(lora, weights_dir, manifest.name) / lora.files[0]
+    # Where parts are offloaded, or their weights made smaller, they must first be on the CPU.
+    direct = profile.acceleration.offload == "none"
+    dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
+    transformer = load_transformer(checkpoint, manifest.architecture, dtype, device if direct else torch.device("cpu"))
+    pipeline = assemble(transformer, base, dtype, vae_dtype)
+    if added is not None and profile.lora is not None:
+        add_lora(pipeline, added, profile.lora.scale)
+    return pipeline

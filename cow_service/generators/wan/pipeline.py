@@ -1,0 +1,139 @@
+"""diffusers' image-to-video pipeline in three parts that can be timed, cached and stopped: encode, denoise, decode.
+
+The parent's own methods do the encoding and its models all the work; what is added is a condition that differs between
+the guided and the plain pass, guidance over a window of steps, and a caller who hears of every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from diffusers import UniPCMultistepScheduler, WanImageToVideoPipeline
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from cow_service.generators.wan.acceleration import reset_cache
+from cow_service.generators.wan.sampling import Sampling
+
+TEXT_LENGTH = 512  # tokens, fixed by the model
+LATENT_CHANNELS = 16
+
+StepListener = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What the model is told of the first frame."""
+
+    embeds: Tensor  # [1, tokens, C] of the image encoder
+    condition: Tensor  # [20, T, h, w] float32: 4 mask channels, 16 latent channels
+
+
+@dataclass(frozen=True)
+class Guide:
+    """What one clip is denoised under."""
+
+    prompt: Tensor  # [1, 512, C] text embeddings
+    negative: Tensor  # the same, of what is to be avoided
+    image: Tensor  # [1, tokens, C]
+    condition: Tensor  # [20, T, h, w] of the guided pass
+    plain: Tensor  # [20, T, h, w] of the unconditional pass
+
+
+def compose(**parts: Any) -> WanTrackPipeline:
+    """A pipeline of `transformer`, `vae`, `text_encoder`, `image_encoder`, `tokenizer` and `image_processor`.
+
+    Its scheduler is there because the parent wants one: every clip is sampled with one of its own.
+    """
+    scheduler = UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True, flow_shift=3.0)
+    return WanTrackPipeline(scheduler=scheduler, **parts)  # pyright: ignore[reportArgumentType]: any flow scheduler
+
+
+def latent_shape(width: int, height: int, num_frames: int) -> tuple[int, int, int, int, int]:
+    """[1, 16, T, h, w] for a clip of this size (px, multiples of 16) and length (4n + 1 frames)."""
+    return 1, LATENT_CHANNELS, (num_frames - 1) // 4 + 1, height // 8, width // 8
+
+
+class WanTrackPipeline(WanImageToVideoPipeline):
+    """The parts of one clip. Not safe for two clips at a time."""
+
+    @torch.no_grad()
+    def embed_text(self, text: str) -> Tensor:
+        """Text embeddings [1, 512, C]."""
+        embeds, _ = self.encode_prompt(
+            prompt=text,
+            do_classifier_free_guidance=False,
+            max_sequence_length=TEXT_LENGTH,
+            device=self._execution_device,
+        )
+        return embeds
+
+    @torch.no_grad()
+    def embed_picture(self, image: NDArray[np.uint8], width: int, height: int, num_frames: int) -> Picture:
+        """Both encodings of the first frame, RGB [H, W, 3] of any size, for a clip of `width` x `height` px."""
+        device = self._execution_device
+        picture = Image.fromarray(image)
+        embeds = self.encode_image(picture, device)
+        pixels = self.video_processor.preprocess(picture, height=height, width=width).to(device, torch.float32)
+        _, condition = self.prepare_latents(
+            pixels,
+            batch_size=1,
+            num_channels_latents=LATENT_CHANNELS,
+            height=height,
+            width=width,
+            num_frames=num_frames,
+            dtype=torch.float32,
+            device=device,
+            latents=torch.empty(0),  # the noise is drawn for each clip; only the condition is wanted here
+        )
+        return Picture(embeds, condition[0])
+
+    @torch.no_grad()
+    def denoise(self, noise: Tensor, guide: Guide, sampling: Sampling, on_step: StepListener) -> Tensor:
+        """Latents [1, 16, T, h, w] from noise of that shape. `on_step` hears (done, all) and stops it by raising."""
+        device = self._execution_device
+        schedule = sampling.schedule(device)
+        latents = noise.to(device, torch.float32)
+        reset_cache(self.transformer, sampling.steps)
+        for step, time in enumerate(schedule.timesteps):
+            velocity = self._velocity("cond", latents, time, guide.condition, guide.prompt, guide.image)
+            if sampling.guides(step):
+                plain = self._velocity("uncond", latents, time, guide.plain, guide.negative, guide.image)
+                velocity = plain + sampling.guidance_scale * (velocity - plain)
+            latents = schedule.step(velocity, time, latents, return_dict=False)[0]
+            on_step(step + 1, sampling.steps)
+        return latents
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> NDArray[np.uint8]:
+        """Frames RGB [F, height, width, 3] of latents [1, 16, T, h, w]."""
+        vae = self.vae
+        latents = latents.to(self._execution_device, vae.dtype)
+        mean, std = (
+            torch.tensor(values, device=latents.device, dtype=latents.dtype).view(1, -1, 1, 1, 1)
+            for values in (vae.config.latents_mean, vae.config.latents_std)
+        )
+        video = vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
+        pixels = (video.float() / 2 + 0.5).clamp(0, 1).mul(255).round().to(torch.uint8)
+        return pixels.permute(1, 2, 3, 0).cpu().numpy()
+
+    def _velocity(
+        self, branch: str, latents: Tensor, time: Tensor, condition: Tensor, text: Tensor, image: Tensor
+    ) -> Tensor:
+        """The model's velocity [1, 16, T, h, w] in float32, so that guidance and solver lose nothing to bfloat16."""
+        transformer: Any = self.transformer
+        dtype = transformer.dtype
+        states = torch.cat([latents, condition.to(latents)[None]], dim=1).to(dtype)
+        with transformer.cache_context(branch):
+            return transformer(
+                hidden_states=states,
+                timestep=time.expand(1),
+                encoder_hidden_states=text.to(dtype),
+                encoder_hidden_states_image=image.to(dtype),
+                return_dict=False,
+            )[0].float()

@@ -1,0 +1,115 @@
+"""Tracks in the forms that ATI and Wan-Move read, made from a trajectory.
+
+A trajectory is sampled at the frames of its clip, in pixels of the input image. ATI's file form has 121 samples,
+1.5 for each frame of its 81-frame clip: 24 per second where the clip has 16. Wan-Move has one sample per frame. After
+its last frame a track stays where it is.
+
+Sources: the public implementations of ATI (arXiv 2505.22944) and Wan-Move (arXiv 2512.08765).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.records import Trajectory
+
+MAX_FRAMES = 81  # of a Wan2.1 clip
+STRIDE = 4  # clip frames per latent frame, after the first
+FILE_SAMPLES = 121
+FILE_UNITS_PER_PIXEL = 8
+SAMPLES_PER_FRAME = 1.5
+
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Where points of the image are in every frame of a clip."""
+
+    points: Floats  # [F, N, 2] x, y in px
+    visible: Bools  # [F, N]
+
+    @property
+    def num_frames(self) -> int:
+        """F, the frames of the clip."""
+        return self.points.shape[0]
+
+    def scaled(self, x: float, y: float) -> Tracks:
+        """The same tracks on the image resized by these factors."""
+        return Tracks((self.points * np.array([x, y])).astype(np.float32), self.visible)
+
+
+def nearest_lengths(num_frames: int) -> tuple[int, ...]:
+    """`(num_frames,)` where a clip may have that many frames (4n + 1, 5 to 81), else the legal lengths next to it."""
+    if num_frames >= MAX_FRAMES:
+        return (MAX_FRAMES,)
+    below = max((num_frames - 1) // STRIDE * STRIDE + 1, STRIDE + 1)
+    return (below,) if below >= num_frames else (below, below + STRIDE)
+
+
+def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
+    """The mover's tracks, then the anchors, on an image of this size (px). Points outside the image are not visible."""
+    frames = len(trajectory.points)
+    moving = np.array(trajectory.tracks, np.float64).reshape(-1, frames, 2)
+    still = np.repeat(np.array(trajectory.anchors, np.float64).reshape(-1, 1, 2), frames, axis=1)
+    points = np.concatenate([moving, still]).transpose(1, 0, 2)
+    inside = _inside(points, width, height)
+    centre = np.array(trajectory.points, np.float64)
+    # Inside the image and yet not visible: behind the camera or hidden, and so are the mover's other points.
+    hidden = _inside(centre, width, height) & ~np.array(trajectory.visible, bool)
+    visible = inside.copy()
+    visible[:, : len(moving)] &= ~hidden[:, None]
+    return Tracks(points.astype(np.float32), visible)
+
+
+def to_ati_file(tracks: Tracks) -> Floats:
+    """[N, 121, 1, 3]: x, y (px) and visible (0 or 1), each times 8, linear between frames."""
+    last = tracks.num_frames - 1
+    at = np.minimum(np.arange(FILE_SAMPLES) / SAMPLES_PER_FRAME, last)
+    before = np.floor(at).astype(int)
+    after = np.minimum(before + 1, last)
+    share = (at - before)[:, None, None]
+    points = tracks.points.astype(np.float64)
+    between = points[before] * (1 - share) + points[after] * share
+    visible = tracks.visible[np.rint(at).astype(int)]
+    samples = np.concatenate([between, visible[..., None]], axis=2) * FILE_UNITS_PER_PIXEL
+    return samples.transpose(1, 0, 2)[:, :, None].astype(np.float32)
+
+
+def from_ati_file(samples: Floats) -> Tracks:
+    """The tracks at the 81 frames of a clip from ATI's file form [N, 121, 1, 3]: each frame at its own time.
+
+    ATI's own reader (`to_ati_tensor`) takes every odd frame from the sample a third of a frame before it.
+    """
+    at = np.arange(MAX_FRAMES) * SAMPLES_PER_FRAME
+    before, after = np.floor(at).astype(int), np.ceil(at).astype(int)
+    values = samples[:, :, 0].astype(np.float64).transpose(1, 0, 2) / FILE_UNITS_PER_PIXEL
+    points = (values[before, :, :2] + values[after, :, :2]) / 2
+    return Tracks(points.astype(np.float32), values[np.rint(at).astype(int), :, 2] > 0.5)
+
+
+def to_ati_tensor(samples: Floats, width: int, height: int) -> Floats:
+    """[81, N, 4]: time, x, y and visible from ATI's file form [N, 121, 1, 3], on an image of this size (px).
+
+    Time and visible go from -1 to 1. The image's centre is x = y = 0 and its shorter side is 2 long.
+    """
+    picks = _picked_samples()
+    tracks = samples[:, picks, 0].astype(np.float64).transpose(1, 0, 2) / FILE_UNITS_PER_PIXEL
+    positions = (tracks[..., :2] - np.array([width, height]) / 2) / min(width, height) * 2
+    time = np.broadcast_to((2 * picks / (FILE_SAMPLES - 1) - 1)[:, None], tracks.shape[:2])
+    return np.concatenate([time[..., None], positions, 2 * tracks[..., 2:] - 1], axis=2).astype(np.float32)
+
+
+def _picked_samples() -> NDArray[np.int64]:
+    """Which of the 121 samples are the 81 frames: 0, then 1 + floor((3k + 1) / 2)."""
+    k = np.arange(MAX_FRAMES - 1)
+    return np.concatenate([[0], 1 + (3 * k + 1) // 2])
+
+
+def _inside(points: NDArray[np.float64], width: int, height: int) -> Bools:
+    x, y = points[..., 0], points[..., 1]
+    return (x >= 0) & (x < width) & (y >= 0) & (y < height)

@@ -1,0 +1,102 @@
+"""`cow tracks`: trajectories into the track files of ATI and Wan-Move, and back. Heavy imports stand inside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+
+from cow_service.errors import CowError
+
+Result = TypeVar("Result")
+
+app = typer.Typer(no_args_is_help=True, help="Write and read the track files of ATI and Wan-Move.")
+
+STILL = 1.0  # px: a track that never leaves its start by more is an anchor
+
+
+@app.command(name="export")
+def export_tracks(
+    simulation: Annotated[
+        Path, typer.Argument(metavar="SIMULATION", help="A simulation.json.", exists=True, dir_okay=False)
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="tracks.pth or .npz for ATI, tracks.npy for Wan-Move.")],
+) -> None:
+    """Write a simulation's tracks, in pixels of its input image: the mover's, then the anchors."""
+    from pydantic import ValidationError  # noqa: PLC0415
+
+    from cow_service.errors import InvalidRequest  # noqa: PLC0415
+    from cow_service.generators.wan.track_files import write_tracks  # noqa: PLC0415
+    from cow_service.generators.wan.tracks import tracks_of  # noqa: PLC0415
+    from cow_service.records import Simulation  # noqa: PLC0415
+
+    try:
+        record = Simulation.model_validate_json(simulation.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InvalidRequest(f"{simulation.name} is not a simulation: {place}: {first['msg']}.") from error
+    tracks = tracks_of(record.trajectory, record.image.width, record.image.height)
+    written = _written(out, lambda: write_tracks(tracks, out))
+    moving, still = len(record.trajectory.tracks), len(record.trajectory.anchors)
+    names = " and ".join(str(path) for path in written)
+    typer.echo(f"{moving} moving and {still} static tracks over {tracks.num_frames} frames: {names}")
+
+
+@app.command(name="import")
+def import_tracks(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help=".pth, .npz or .npy.", exists=True, dir_okay=False)],
+    visibility: Annotated[
+        Path | None,
+        typer.Option(
+            help="Wan-Move's other file.", exists=True, dir_okay=False, show_default="FILE's name with -visibility"
+        ),
+    ] = None,
+    fps: Annotated[float, typer.Option(help="Frames per second of the clip.")] = 16,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Where to write it.", show_default="standard output")
+    ] = None,
+) -> None:
+    """Turn a track file into the `trajectory` of a request, for `cow simulate --trajectory` or `POST /simulate`.
+
+    Tracks that stay where they are become anchors. `points` is the mean of those that move.
+    """
+    import numpy as np  # noqa: PLC0415
+    from pydantic import ValidationError  # noqa: PLC0415
+
+    from cow_service.errors import InvalidRequest  # noqa: PLC0415
+    from cow_service.generators.wan.track_files import read_tracks  # noqa: PLC0415
+    from cow_service.requests import TrajectoryRequest  # noqa: PLC0415
+
+    tracks = read_tracks(file, visibility)
+    moves = (
+        np.abs(tracks.points - tracks.points[:1]).max(axis=(0, 2)) > STILL if tracks.points.size else np.zeros(0, bool)
+    )
+    if not moves.any():
+        raise InvalidRequest(f"{file.name} has {moves.size} tracks, and none of them moves by more than {STILL:g} px.")
+    moving = tracks.points[:, moves].astype(float).round(3)
+    try:
+        trajectory = TrajectoryRequest(
+            points=tuple(map(tuple, moving.mean(axis=1).round(3).tolist())),
+            fps=fps,
+            visible=tuple(map(bool, np.any(tracks.visible[:, moves], axis=1).tolist())),
+            tracks=tuple(tuple(map(tuple, track)) for track in moving.transpose(1, 0, 2).tolist()),
+            anchors=tuple(map(tuple, tracks.points[0, ~moves].astype(float).round(3).tolist())),
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InvalidRequest(f"{file.name} does not make a trajectory: {first['msg']}.") from error
+    if out is None:
+        typer.echo(trajectory.model_dump_json())
+        return
+    _written(out, lambda: out.write_text(trajectory.model_dump_json(), encoding="utf-8"))
+    typer.echo(f"{int(moves.sum())} moving and {int((~moves).sum())} static tracks: {out}")
+
+
+def _written(out: Path, write: Callable[[], Result]) -> Result:
+    try:
+        return write()
+    except OSError as error:
+        raise CowError(f"'{out}' cannot be written: {error.strerror}. Choose another file with --out.") from error

@@ -1,0 +1,703 @@
+"""Every way to run the model faster or smaller, on the real class at toy size; and every reason not to.
+
+Graphics cards are described, never needed: what only they can do is tested as a refusal.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from diffusers import AutoencoderKLWan, FlowMatchEulerDiscreteScheduler, WanImageToVideoPipeline, WanTransformer3DModel
+from diffusers.models import attention_dispatch
+from pydantic import ValidationError
+from safetensors.torch import save_file
+from torch import Tensor
+
+from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
+from cow_service.generators.wan import acceleration as subject
+from cow_service.generators.wan.acceleration import (
+    Acceleration,
+    Machine,
+    accelerate,
+    add_lora,
+    look,
+    refusals,
+    reset_cache,
+)
+from cow_service.generators.wan.machine import BACKENDS, PACKAGES
+
+CPU = torch.device("cpu")
+WIDTH = 24  # of the toy's hidden states
+LAYERS = 3
+H200 = Machine(
+    device="cuda",
+    name="NVIDIA H200",
+    capability=(9, 0),
+    memory=150_000_000_000,
+    gpus=8,
+    packages=tuple(PACKAGES),
+    compiler=True,
+)
+BARE = Machine(device="cpu", name="x86_64", memory=1, gpus=0, compiler=False)
+
+with_torchao = pytest.mark.skipif(find_spec("torchao") is None, reason="torchao is not installed")
+with_accelerate = pytest.mark.skipif(find_spec("accelerate") is None, reason="accelerate is not installed")
+
+
+@pytest.fixture(autouse=True)
+def _same_attention_afterwards() -> Iterator[None]:
+    """diffusers' choice of a backend holds for the whole process."""
+    registry = attention_dispatch._AttentionBackendRegistry
+    before = registry._active_backend
+    yield
+    registry.set_active_backend(before)
+
+
+def toy(vae: bool = False) -> WanImageToVideoPipeline:
+    """The same weights every time."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        transformer = WanTransformer3DModel(
+            num_attention_heads=2, attention_head_dim=WIDTH // 2, in_channels=36, out_channels=16, text_dim=16,
+            freq_dim=32, ffn_dim=32, num_layers=LAYERS, image_dim=32, added_kv_proj_dim=WIDTH, rope_max_seq_len=32,
+        )  # fmt: skip
+        small: Any = {"base_dim": 4, "z_dim": 16, "dim_mult": [1, 1, 1, 1], "num_res_blocks": 1}
+        decoder = AutoencoderKLWan(**small, temperal_downsample=[False, True, True]) if vae else None
+    return WanImageToVideoPipeline(
+        tokenizer=None, text_encoder=None, image_encoder=None, image_processor=None,
+        vae=decoder, scheduler=FlowMatchEulerDiscreteScheduler(), transformer=transformer.eval(),
+    )  # fmt: skip
+
+
+def accelerated(**options: Any) -> Any:
+    pipeline = toy(vae=options.get("vae_tiling", False))
+    accelerate(pipeline, Acceleration(**options), CPU)
+    return pipeline.transformer
+
+
+def forward(transformer: Any, seed: int = 1, time: float = 500.0, branch: str = "cond") -> Tensor:
+    """The model's answer to inputs drawn from a seed."""
+    drawn = torch.Generator().manual_seed(seed)
+    with torch.no_grad(), transformer.cache_context(branch):
+        return transformer(
+            hidden_states=torch.randn(1, 36, 2, 4, 4, generator=drawn),
+            timestep=torch.tensor([time]),
+            encoder_hidden_states=torch.randn(1, 512, 16, generator=drawn),
+            encoder_hidden_states_image=torch.randn(1, 257, 32, generator=drawn),
+            return_dict=False,
+        )[0]
+
+
+def counted(pipeline: WanImageToVideoPipeline) -> list[int]:
+    """How often each block has really been computed; to be called before anything is put around the blocks."""
+    counts = [0] * LAYERS
+    for index, block in enumerate(pipeline.transformer.blocks):
+
+        def computed(*args: Any, _index: int = index, _forward: Any = block.forward, **kwargs: Any) -> Any:
+            counts[_index] += 1
+            return _forward(*args, **kwargs)
+
+        block.forward = computed
+    return counts
+
+
+CLIP = [(seed, 1000.0 - 100 * seed) for seed in range(1, 6)]
+
+
+def clip(transformer: Any, branch: str = "cond") -> list[Tensor]:
+    return [forward(transformer, seed, time, branch) for seed, time in CLIP]
+
+
+def same(ours: list[Tensor], theirs: list[Tensor]) -> bool:
+    return all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+
+
+def test_every_option_says_what_it_does():
+    assert all(len(field.description or "") > 60 for field in Acceleration.model_fields.values())
+
+
+@pytest.mark.parametrize("bad", [{"cache_threshold": -1}, {"context_parallel": 0}, {"fp8": "int4"}, {"speed": 9}])
+def test_unknown_options_are_refused(bad: dict[str, Any]):
+    with pytest.raises(ValidationError):
+        Acceleration(**bad)
+
+
+# Attention, tiling
+
+
+def test_native_attention_changes_nothing():
+    assert same(clip(accelerated()), clip(toy().transformer))
+
+
+def test_another_backend_really_is_used():
+    transformer = accelerated(attention="_native_math")
+    assert transformer.blocks[0].attn1.processor._attention_backend == "_native_math"
+    assert torch.allclose(forward(transformer), forward(toy().transformer), atol=1e-5)
+
+
+def test_the_vae_tiles_where_asked():
+    pipeline = toy(vae=True)
+    accelerate(pipeline, Acceleration(), CPU)
+    assert not pipeline.vae.use_tiling
+    pipeline = toy(vae=True)
+    accelerate(pipeline, Acceleration(vae_tiling=True), CPU)
+    assert pipeline.vae.use_tiling
+
+
+# Caches
+
+FIRST_BLOCK = {"cache": "first-block", "cache_threshold": 1e9}
+MAG = {"cache": "mag", "cache_threshold": 1e9, "mag_ratios": (1.0, 0.9, 0.9, 0.9, 0.9)}
+
+
+@pytest.mark.parametrize("options", [FIRST_BLOCK, MAG])
+def test_a_cache_that_allows_no_change_is_exact(options: dict[str, Any]):
+    assert same(clip(accelerated(**{**options, "cache_threshold": 0.0})), clip(toy().transformer))
+
+
+@pytest.mark.parametrize(
+    ("options", "computed"),
+    [
+        (FIRST_BLOCK, [5, 1, 1]),  # the first block decides, the others run in the first step only
+        (MAG, [2, 2, 2]),  # the first fifth of 5 steps, then 3 skipped in a row at most
+    ],
+)
+def test_a_cache_skips_blocks(options: dict[str, Any], computed: list[int]):
+    pipeline = toy()
+    counts = counted(pipeline)
+    accelerate(pipeline, Acceleration(**options), CPU)
+    frames = clip(pipeline.transformer)
+    assert counts == computed
+    assert torch.equal(frames[0], clip(toy().transformer)[0])
+    assert not torch.equal(frames[1], clip(toy().transformer)[1])
+
+
+@pytest.mark.parametrize("options", [FIRST_BLOCK, MAG])
+def test_nothing_of_one_clip_enters_the_next(options: dict[str, Any]):
+    transformer = accelerated(**options)
+    first = clip(transformer)
+    reset_cache(transformer)
+    assert same(clip(transformer), first)
+    reset_cache(transformer)
+    forward(transformer, seed=1)
+    reset_cache(transformer)  # after a clip that was stopped in the middle
+    assert torch.equal(forward(transformer, seed=9), forward(toy().transformer, seed=9))
+
+
+@pytest.mark.parametrize("options", [FIRST_BLOCK, MAG])
+def test_guidance_branches_do_not_mix(options: dict[str, Any]):
+    alone, plain, both = (accelerated(**options) for _ in range(3))
+    mixed = [
+        (forward(both, seed, time), forward(both, seed + 50, time, "uncond")) for seed, time in CLIP
+    ]  # as in a step: one branch after the other
+    assert same([cond for cond, _ in mixed], clip(alone))
+    assert same([uncond for _, uncond in mixed], [forward(plain, seed + 50, time, "uncond") for seed, time in CLIP])
+
+
+@pytest.mark.parametrize(("steps", "computed"), [(None, 2), (5, 2), (10, 4), (1, 5)])
+def test_ratios_are_spread_over_the_steps_of_the_clip(steps: int | None, computed: int):
+    pipeline = toy()
+    counts = counted(pipeline)
+    accelerate(pipeline, Acceleration(**MAG), CPU)
+    for _ in range(2):
+        counts[:] = [0] * LAYERS
+        reset_cache(pipeline.transformer, steps)
+        for seed in range(steps if steps and steps > 1 else 5):
+            forward(pipeline.transformer, seed)
+        assert counts == [computed] * LAYERS
+
+
+def test_without_a_cache_there_is_nothing_to_forget():
+    transformer = accelerated()
+    reset_cache(transformer, 40)
+    assert torch.equal(forward(transformer), forward(toy().transformer))
+
+
+def test_a_pipeline_is_accelerated_once():
+    pipeline = toy()
+    accelerate(pipeline, Acceleration(**FIRST_BLOCK), CPU)
+    with pytest.raises(GeneratorUnavailable, match=r"`cache: first-block` does not work here: .*already been enabled"):
+        accelerate(pipeline, Acceleration(**FIRST_BLOCK), CPU)
+
+
+# Compiled blocks
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, FIRST_BLOCK, MAG], ids=["none", "first-block", "mag"])
+def test_all_blocks_share_one_compiled_graph(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch):
+    """Without inductor, whose C++ takes half a minute; what is compiled, and how often, is the same."""
+    from torch._dynamo.testing import CompileCounter
+
+    graphs, compiler = CompileCounter(), torch.compile
+    torch._dynamo.reset()
+    monkeypatch.setattr(torch, "compile", lambda function: compiler(function, backend=graphs, fullgraph=True))
+    monkeypatch.setattr(subject, "look", lambda device: BARE.model_copy(update={"compiler": True}))
+    transformer = accelerated(compile="regional", **options)
+    assert same(clip(transformer), clip(accelerated(**options)))
+    reset_cache(transformer)
+    assert same(clip(transformer, "uncond"), clip(accelerated(**options)))
+    assert graphs.frame_count == 1
+    torch._dynamo.reset()
+
+
+# Float8
+
+
+def error(ours: Tensor, theirs: Tensor) -> float:
+    return ((ours - theirs).norm() / theirs.norm()).item()
+
+
+@with_torchao
+def test_weights_become_float8_in_the_blocks_alone():
+    from torchao.quantization import Float8Tensor
+
+    pipeline = toy()
+    before = sum(parameter.numel() for parameter in pipeline.transformer.blocks.parameters())
+    accelerate(pipeline, Acceleration(fp8="weights"), CPU)
+    transformer = pipeline.transformer
+    small = {name for name, weight in transformer.named_parameters() if isinstance(weight, Float8Tensor)}
+    assert small == {
+        f"{name}.weight" for name, layer in transformer.named_modules()
+        if isinstance(layer, torch.nn.Linear) and name.startswith("blocks.")
+    }  # fmt: skip
+    assert len(small) == LAYERS * 12
+    assert all(transformer.get_parameter(name).qdata.dtype == torch.float8_e4m3fn for name in small)
+    assert sum(parameter.numel() for parameter in transformer.blocks.parameters()) == before
+    assert transformer.dtype == torch.float32
+    assert 1e-4 < error(forward(transformer), forward(toy().transformer)) < 0.05
+
+
+@with_torchao
+@pytest.mark.parametrize("options", [FIRST_BLOCK, MAG])
+def test_a_cache_skips_float8_blocks_too(options: dict[str, Any]):
+    exact = clip(accelerated(fp8="weights"))
+    assert same(clip(accelerated(fp8="weights", **{**options, "cache_threshold": 0.0})), exact)
+    assert not same(clip(accelerated(fp8="weights", **options)), exact)
+
+
+@with_torchao
+def test_what_a_library_raises_is_told_with_the_option(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(subject, "look", lambda device: H200)
+    with pytest.raises(GeneratorUnavailable, match=r"`fp8: dynamic` does not work here: AssertionError: .*COW_PROFILE"):
+        accelerate(toy(), Acceleration(fp8="dynamic"), CPU)
+
+
+@with_torchao
+def test_weights_that_torchao_leaves_alone_are_told(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("torchao.quantization.quantize_", lambda block, config: None)
+    with pytest.raises(GeneratorUnavailable, match="not multiples of 16"):
+        accelerate(toy(), Acceleration(fp8="weights"), CPU)
+
+
+def test_no_folder_is_told(monkeypatch: pytest.MonkeyPatch):
+    pipeline = toy()
+
+    def fail(backend: str) -> None:
+        raise OSError(f"cannot open /home/secret/lib/kernel.so for {backend}\n  at /home/secret/x.py")
+
+    pipeline.transformer.set_attention_backend = fail
+    with pytest.raises(GeneratorUnavailable) as caught:
+        accelerate(pipeline, Acceleration(), CPU)
+    assert caught.value.detail.startswith("`attention: native` does not work here: OSError: cannot open kernel.so for")
+    assert "secret" not in caught.value.detail
+
+
+# Offloading: the CPU in the place of the GPU. (Sequential offloading cannot run from the CPU to the CPU.)
+
+
+@with_accelerate
+@pytest.mark.parametrize("offload", ["model", "group"])
+@pytest.mark.parametrize(
+    "options", [{}, FIRST_BLOCK, MAG, pytest.param({"fp8": "weights"}, marks=with_torchao)], ids=lambda o: str([*o])
+)
+def test_offloaded_parts_compute_the_same(offload: str, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch):
+    kept = accelerated(**options)
+    monkeypatch.setattr(subject, "look", lambda device: H200)
+    offloaded = accelerated(offload=offload, **options)
+    for _ in range(2):
+        assert same(clip(offloaded), clip(kept))
+        reset_cache(offloaded)
+        reset_cache(kept)
+
+
+# LoRA
+
+
+def pair(out: int = WIDTH, into: int = WIDTH, rank: int = 2, seed: int = 0) -> tuple[Tensor, Tensor]:
+    drawn = torch.Generator().manual_seed(seed)
+    return torch.randn(rank, into, generator=drawn), torch.randn(out, rank, generator=drawn)
+
+
+DOWN, UP = pair()
+WIDE_DOWN, WIDE_UP = pair(32, WIDTH, 3, seed=1)
+VECTOR = torch.linspace(-1, 1, WIDTH)
+ORIGINAL = {
+    "diffusion_model.blocks.0.self_attn.q.lora_down.weight": DOWN,
+    "diffusion_model.blocks.0.self_attn.q.lora_up.weight": UP,
+    "diffusion_model.blocks.1.cross_attn.k_img.lora_down.weight": DOWN,
+    "diffusion_model.blocks.1.cross_attn.k_img.lora_up.weight": UP,
+    "diffusion_model.blocks.2.ffn.0.lora_down.weight": WIDE_DOWN,
+    "diffusion_model.blocks.2.ffn.0.lora_up.weight": WIDE_UP,
+}
+CHANGED = {
+    "blocks.0.attn1.to_q.weight": UP @ DOWN,
+    "blocks.1.attn2.add_k_proj.weight": UP @ DOWN,
+    "blocks.2.ffn.net.0.proj.weight": WIDE_UP @ WIDE_DOWN,
+}
+
+
+def saved(tensors: dict[str, Tensor], folder: Path, said: dict[str, str] | None = None) -> Path:
+    file = folder / "lora.safetensors"
+    save_file({name: tensor.clone().contiguous() for name, tensor in tensors.items()}, file, said)
+    return file
+
+
+def changes(tensors: dict[str, Tensor], folder: Path, scale: float = 1.0) -> dict[str, Tensor]:
+    pipeline = toy()
+    before = {name: weight.clone() for name, weight in pipeline.transformer.state_dict().items()}
+    add_lora(pipeline, saved(tensors, folder), scale)
+    after = pipeline.transformer.state_dict()
+    return {name: after[name] - before[name] for name in before if not torch.equal(before[name], after[name])}
+
+
+def assert_changed(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    assert set(found) == set(expected)
+    for name, change in expected.items():
+        torch.testing.assert_close(found[name], change, atol=1e-5, rtol=0)
+
+
+def test_a_lora_in_the_original_names(tmp_path: Path):
+    assert_changed(changes(ORIGINAL, tmp_path, 0.7), {name: 0.7 * change for name, change in CHANGED.items()})
+
+
+def test_a_lora_in_the_names_of_diffusers(tmp_path: Path):
+    layer, names = "transformer.blocks.0.attn1.to_q", ("lora_A", "lora_B")
+    tensors = {f"{layer}.{name}.weight": tensor for name, tensor in zip(names, (DOWN, UP), strict=True)}
+    # Which norm this is depends on whose names these are.
+    tensors["transformer.blocks.0.norm2.diff"] = VECTOR
+    assert_changed(
+        changes(tensors, tmp_path), {"blocks.0.attn1.to_q.weight": UP @ DOWN, "blocks.0.norm2.weight": VECTOR}
+    )
+
+
+def test_a_lora_with_alpha(tmp_path: Path):
+    found = changes({**ORIGINAL, "diffusion_model.blocks.0.self_attn.q.alpha": torch.tensor(1.0)}, tmp_path)
+    assert_changed(found, {**CHANGED, "blocks.0.attn1.to_q.weight": UP @ DOWN / 2})
+
+
+def test_a_distilled_lora_with_whole_differences(tmp_path: Path):
+    """As lightx2v's are written: diffusers would leave most of these out without a word."""
+    table, patch = torch.randn(1, 6, WIDTH), torch.randn(WIDTH, 36, 1, 2, 2)
+    whole = {
+        "blocks.0.self_attn.q.diff_b": ("blocks.0.attn1.to_q.bias", VECTOR),
+        "blocks.1.self_attn.v.diff_b": ("blocks.1.attn1.to_v.bias", VECTOR),
+        "blocks.0.self_attn.norm_k.diff": ("blocks.0.attn1.norm_k.weight", VECTOR),
+        "blocks.0.cross_attn.norm_k_img.diff": ("blocks.0.attn2.norm_added_k.weight", VECTOR),
+        "blocks.0.norm3.diff": ("blocks.0.norm2.weight", VECTOR),
+        "blocks.0.norm3.diff_b": ("blocks.0.norm2.bias", VECTOR),
+        "blocks.0.diff_m": ("blocks.0.scale_shift_table", table),
+        "head.diff_m": ("scale_shift_table", table[:, :2]),
+        "head.head.diff": ("proj_out.weight", torch.randn(64, WIDTH)),
+        "patch_embedding.diff": ("patch_embedding.weight", patch),
+        "img_emb.proj.0.diff": ("condition_embedder.image_embedder.norm1.weight", torch.randn(32)),
+        "time_projection.1.diff_b": ("condition_embedder.time_proj.bias", torch.randn(6 * WIDTH)),
+    }
+    found = changes({**ORIGINAL, **{f"diffusion_model.{k}": tensor for k, (_, tensor) in whole.items()}}, tmp_path)
+    assert_changed(found, {**CHANGED, **dict(whole.values())})
+
+
+@pytest.mark.skipif(find_spec("peft") is None, reason="peft is not installed")
+def test_diffusers_own_way_gives_the_same_weights(tmp_path: Path):
+    ours, theirs = toy(), toy()
+    both = {name: tensor for name, tensor in ORIGINAL.items() if "k_img" not in name}  # it wants v_img with k_img
+    file = saved({**both, "diffusion_model.blocks.0.self_attn.q.alpha": torch.tensor(1.0)}, tmp_path)
+    add_lora(ours, file, 0.7)
+    theirs.load_lora_weights(str(file), adapter_name="one")
+    theirs.fuse_lora(lora_scale=0.7, adapter_names=["one"])
+    theirs.unload_lora_weights()
+    for name, weight in theirs.transformer.state_dict().items():
+        torch.testing.assert_close(ours.transformer.state_dict()[name], weight, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("extra", "reason"),
+    [
+        ({"diffusion_model.blocks.0.foo.lora_down.weight": DOWN}, "no place for blocks.0.foo.weight"),
+        ({"diffusion_model.blocks.9.norm3.diff": VECTOR}, "no place for blocks.9.norm3.weight"),
+        ({"text_encoder.q.lora_down.weight": DOWN}, "no place for text_encoder.q.weight"),
+        ({"diffusion_model.blocks.0.self_attn.q.dora_scale": VECTOR}, "no place for .*dora_scale"),
+        ({"blocks.0.self_attn.q.lora_A.weight": DOWN}, "no place for .*blocks.0.self_attn.q.lora_down.weight"),
+        ({f"diffusion_model.x{i}.diff": VECTOR for i in range(5)}, "x0.weight, x1.weight, x2.weight and 2 more"),
+        ({"diffusion_model.blocks.0.self_attn.k.lora_down.weight": DOWN}, "half of a pair .* blocks.0.attn1.to_k"),
+        ({"diffusion_model.blocks.0.self_attn.k.alpha": torch.tensor(1.0)}, "half of a pair .* blocks.0.attn1.to_k"),
+        ({"diffusion_model.blocks.0.norm3.diff": VECTOR[:5]}, "another shape for blocks.0.norm2.weight"),
+        ({"diffusion_model.blocks.2.ffn.0.lora_up.weight": UP}, "another shape for blocks.2.ffn.net.0.proj.weight"),
+        ({"diffusion_model.blocks.0.norm3.diff": VECTOR * torch.inf}, "infinite or undefined values"),
+    ],
+)
+def test_a_lora_that_does_not_fit_changes_nothing(extra: dict[str, Tensor], reason: str, tmp_path: Path):
+    pipeline = toy()
+    with pytest.raises(CheckpointInvalid, match=reason):
+        add_lora(pipeline, saved({**ORIGINAL, **extra}, tmp_path), 1.0)
+    assert torch.equal(forward(pipeline.transformer), forward(toy().transformer))
+
+
+def test_a_file_that_is_no_lora(tmp_path: Path):
+    with pytest.raises(WeightsUnavailable, match=r"no LoRA 'none\.safetensors'") as caught:
+        add_lora(toy(), tmp_path / "none.safetensors", 1.0)
+    assert str(tmp_path) not in caught.value.detail
+    (tmp_path / "bad.safetensors").write_bytes(b"not a checkpoint at all")
+    with pytest.raises(CheckpointInvalid, match=r"'bad\.safetensors' is not a readable safetensors file"):
+        add_lora(toy(), tmp_path / "bad.safetensors", 1.0)
+    with pytest.raises(CheckpointInvalid, match="no place for an empty one"):
+        add_lora(toy(), saved({}, tmp_path), 1.0)
+
+
+def test_a_scale_hidden_in_the_metadata(tmp_path: Path):
+    for said, refused in (({"r": 2, "lora_alpha": 2}, False), ({"r": 2, "lora_alpha": 4}, True)):
+        adapter = json.dumps({f"transformer.{key}": value for key, value in said.items()})
+        file = saved(ORIGINAL, tmp_path, {"lora_adapter_metadata": adapter})
+        if refused:
+            with pytest.raises(CheckpointInvalid, match="scaled by its metadata"):
+                add_lora(toy(), file, 1.0)
+        else:
+            add_lora(toy(), file, 1.0)
+
+
+@with_torchao
+def test_a_lora_comes_before_float8(tmp_path: Path):
+    pipeline = toy()
+    accelerate(pipeline, Acceleration(fp8="weights"), CPU)
+    with pytest.raises(GeneratorUnavailable, match="before the weights are made float8"):
+        add_lora(pipeline, saved(ORIGINAL, tmp_path), 1.0)
+
+
+# Refusals
+
+
+def without(*names: str) -> Machine:
+    return H200.model_copy(update={"packages": tuple(name for name in PACKAGES if name not in names)})
+
+
+def with_capability(major: int, minor: int) -> Machine:
+    return H200.model_copy(update={"name": "GPU", "capability": (major, minor)})
+
+
+@pytest.mark.parametrize(
+    ("options", "machine", "sentence"),
+    [
+        ({"attention": "quick"}, H200, f"attention: there is no 'quick'; choose one of {', '.join(BACKENDS)}."),
+        (
+            {"attention": "flash"},
+            BARE.model_copy(update={"packages": ("flash-attn",)}),
+            "attention: 'flash' needs a GPU of compute capability 8.0 or more, and this device is the CPU; choose "
+            "native.",
+        ),
+        (
+            {"attention": "_flash_3"},
+            with_capability(10, 0),
+            "attention: '_flash_3' needs a GPU of compute capability 9.0, and this device is GPU of compute capability "
+            "10.0; choose native.",
+        ),
+        (
+            {"attention": "sage"},
+            without("sageattention"),
+            "attention: 'sage' needs the package sageattention 2.1.1 or newer, which is not installed; install it, or "
+            "choose native.",
+        ),
+        (
+            {"compile": "regional"},
+            without("triton"),
+            "compile: regional needs the package triton 3.0.0 or newer, which is not installed; install it, or choose "
+            "none.",
+        ),
+        (
+            {"compile": "regional"},
+            BARE,
+            "compile: regional needs a C++ compiler and Python's headers; install them, or choose none.",
+        ),
+        (
+            {"compile": "regional", "offload": "sequential"},
+            H200,
+            "compile: sequential offload moves every layer by itself, which leaves nothing to compile; choose none.",
+        ),
+        (
+            {"cache": "mag"},
+            H200,
+            "cache: mag needs `mag_ratios`, measured on these weights; give them, or choose first-block.",
+        ),
+        (
+            {"cache": "first-block", "context_parallel": 2},
+            H200.model_copy(update={"ranks": 2}),
+            "cache: GPUs that share a video would not skip the same steps with first-block; choose mag or none.",
+        ),
+        (
+            {"fp8": "weights"},
+            BARE,
+            "fp8: weights needs the package torchao 0.15.0 or newer, which is not installed; install it, or choose "
+            "none.",
+        ),
+        (
+            {"fp8": "dynamic"},
+            with_capability(8, 0),
+            "fp8: dynamic needs a GPU of compute capability 8.9 or more, and this device is GPU of compute capability "
+            "8.0; choose none.",
+        ),
+        (
+            {"fp8": "weights", "compile": "regional"},
+            with_capability(8, 6),
+            "fp8: weights can only be compiled for compute capability 8.9 or more, and this device is GPU of compute "
+            "capability 8.6; choose `compile: none`.",
+        ),
+        *(
+            (
+                {"offload": offload},
+                BARE.model_copy(update={"packages": ("accelerate",)}),
+                f"offload: {offload} needs a GPU to move weights to, and this device is the CPU; choose none.",
+            )
+            for offload in ("model", "group", "sequential")
+        ),
+        (
+            {"offload": "group"},
+            without("accelerate"),
+            "offload: group needs the package accelerate 0.17.0 or newer, which is not installed; install it, or "
+            "choose none.",
+        ),
+        (
+            {"context_parallel": 16},
+            H200.model_copy(update={"ranks": 16}),
+            "context_parallel: 16 needs as many GPUs, and there are 8; choose 1.",
+        ),
+        (
+            {"context_parallel": 2},
+            H200,
+            "context_parallel: 2 needs as many processes, and there are 1; start them with "
+            "`torchrun --nproc-per-node 2`, or choose 1.",
+        ),
+        (
+            {"context_parallel": 2, "attention": "_flash_3"},
+            H200.model_copy(update={"ranks": 2}),
+            "context_parallel: attention '_flash_3' cannot be split among GPUs; choose one of native, _native_flash, "
+            "_native_cudnn, flash, flash_hub, _flash_3_hub, sage, sage_hub.",
+        ),
+    ],
+)
+def test_what_a_machine_cannot_do_is_said_with_reason_and_remedy(
+    options: dict[str, Any], machine: Machine, sentence: str
+):
+    assert refusals(Acceleration(**options), machine) == (sentence,)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"attention": "_flash_3", "compile": "regional", "fp8": "dynamic", "cache": "first-block"},
+        {"attention": "sage", "compile": "regional", "fp8": "weights", **MAG, "offload": "group", "vae_tiling": True},
+        {"offload": "sequential", "fp8": "weights"},
+        {"offload": "model"},
+    ],
+)
+def test_a_good_machine_can_do_it(options: dict[str, Any]):
+    assert refusals(Acceleration(**options), H200) == ()
+
+
+def test_everything_is_refused_at_once_and_nothing_is_changed():
+    pipeline = toy()
+    with pytest.raises(GeneratorUnavailable) as caught:
+        accelerate(pipeline, Acceleration(offload="model", cache="mag", context_parallel=2), CPU)
+    for option in ("offload", "cache", "context_parallel"):
+        assert f"{option}: " in caught.value.detail
+    assert not pipeline.transformer.is_cache_enabled
+
+
+def test_a_device_that_is_not_there():
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(GeneratorUnavailable, match="`device: cuda:7` does not work here"):
+        accelerate(toy(), Acceleration(), torch.device("cuda:7"))
+
+
+def test_the_machine_is_seen_as_it_is(monkeypatch: pytest.MonkeyPatch):
+    machine = look(CPU)
+    assert machine.device == "cpu"
+    assert machine.capability is None
+    assert machine.memory > 1e8
+    assert machine.ranks == 1
+    assert ("torchao" in machine.packages) == (find_spec("torchao") is not None)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    assert not look(CPU).compiler
+    assert look(CPU).ranks == 4
+
+
+def test_an_old_package_counts_as_none(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.14.9.post2" if name == "torchao" else "99")
+    assert set(look(CPU).packages) == set(PACKAGES) - {"torchao"}
+
+
+def test_our_tables_are_those_of_diffusers():
+    known = {backend.value for backend in attention_dispatch.AttentionBackendName}
+    splits = attention_dispatch._AttentionBackendRegistry._supports_context_parallel
+    assert set(BACKENDS) <= known
+    assert {name for name, backend in BACKENDS.items() if backend.splits} == splits & set(BACKENDS)
+    assert PACKAGES["flash-attn"] == attention_dispatch._REQUIRED_FLASH_VERSION
+    assert PACKAGES["sageattention"] == attention_dispatch._REQUIRED_SAGE_VERSION
+    assert PACKAGES["xformers"] == attention_dispatch._REQUIRED_XFORMERS_VERSION
+    assert {backend.package for backend in BACKENDS.values()} <= {None, *PACKAGES}
+
+
+# Several processes
+
+RANK = """
+import sys, torch
+sys.path.insert(0, sys.argv[1])
+import test_wan_acceleration as toy
+from cow_service.generators.wan import acceleration
+
+# diffusers takes the rank modulo the number of accelerators; the machine is described as one with two GPUs.
+torch.accelerator.device_count = lambda: 1
+acceleration.look = lambda device: toy.H200.model_copy(update={"ranks": 2})
+results = {}
+for name, options in (("none", {}), ("mag", toy.MAG)):
+    transformer = toy.accelerated(context_parallel=2, **options)
+    results[name] = toy.clip(transformer)
+torch.save(results, f"{sys.argv[2]}/{torch.distributed.get_rank()}.pt")
+torch.distributed.destroy_process_group()
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_compute_what_one_does(tmp_path: Path):
+    """Over gloo: every rank holds the whole result, with and without a cache."""
+    (tmp_path / "rank.py").write_text(RANK)
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(tmp_path / "rank.py")]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    finished = subprocess.run(
+        [sys.executable, *command, str(Path(__file__).parent), str(tmp_path)],
+        capture_output=True, text=True, check=False, env=environment,
+    )  # fmt: skip
+    assert finished.returncode == 0, finished.stderr[-3000:]
+    for rank in range(2):
+        results = torch.load(tmp_path / f"{rank}.pt")
+        for name, options in (("none", {}), ("mag", MAG)):
+            for ours, theirs in zip(results[name], clip(accelerated(**options)), strict=True):
+                torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=0)
+
+
+@pytest.mark.slow
+def test_nothing_optional_is_imported_before_it_is_needed():
+    suspects = ("torchao", "peft", "accelerate")
+    code = f"import sys, {subject.__name__}; print(*[m for m in {suspects} if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == []

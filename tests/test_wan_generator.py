@@ -1,0 +1,321 @@
+"""The video generators at toy size: the whole way, its cancellation, its failures, and what is not done twice."""
+
+from __future__ import annotations
+
+import base64
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import Example, example
+
+from cow_service.errors import Canceled, CowError, GeneratorOutOfMemory, GeneratorUnavailable, InvalidRequest
+from cow_service.generators.wan.generator import WanGenerator
+from cow_service.generators.wan.pipeline import WanTrackPipeline
+from cow_service.records import Simulation
+from cow_service.requests import SimulateRequest
+from cow_service.service import Service
+from cow_service.settings import Settings
+
+BALL = example("ball-and-mug")
+SHORT = {"num_frames": 17, "frames": {"indices": list(range(17)), "max_side": None}}
+
+
+def body(scene: Example = BALL, **rest: object) -> dict[str, object]:
+    encoded = "data:image/jpeg;base64," + base64.b64encode(scene.image).decode()
+    return {"image": encoded, "question": scene.meta["question"], "generator": "tiny-ati", **SHORT, **rest}
+
+
+@pytest.fixture(scope="module")
+def toys(tmp_path_factory: pytest.TempPathFactory) -> Service:
+    """One service for all: to make its models takes seconds."""
+    return Service(Settings(data_dir=tmp_path_factory.mktemp("toys")))
+
+
+def simulate(service: Service, progress: Callable[[str, float], None] | None = None, **rest: object) -> Simulation:
+    listener = progress or (lambda stage, done: None)
+    return service.simulate(SimulateRequest.model_validate(body(**rest)), listener)
+
+
+def pipeline_of(service: Service, name: str = "tiny-ati") -> WanTrackPipeline:
+    generator = service.generators.get(name)
+    assert isinstance(generator, WanGenerator)
+    return generator._model.pipeline
+
+
+def pictures(simulation: Simulation) -> list[str]:
+    return [frame.sha256 for frame in simulation.frames]
+
+
+@pytest.mark.parametrize("name", ["tiny-ati", "tiny-wan-move"])
+def test_frames_and_video(toys: Service, name: str) -> None:
+    found = simulate(toys, generator=name)
+    assert found.video is not None
+    assert (found.video.num_frames, found.video.width % 16, found.video.height % 16) == (17, 0, 0)
+    assert found.frames[0].width / found.frames[0].height == pytest.approx(832 / 480, rel=0.1)
+    assert len(set(pictures(found))) > 8  # it moves
+    info = found.generator
+    assert (info.name, info.steps, info.seed) == (name, 4, 0)
+    assert info.options["prompt"] == found.motion.sentence
+    assert info.options["profile"] == "exact"
+
+
+def test_the_seed_decides(toys: Service) -> None:
+    first, again, other = (simulate(toys, seed=seed, video=False) for seed in (3, 3, 4))
+    assert pictures(first) == pictures(again)
+    assert pictures(first) != pictures(other)
+
+
+def test_what_was_asked_for_changes_the_frames(toys: Service) -> None:
+    """Each input of the model reaches it."""
+    plain = pictures(simulate(toys, video=False))
+    for change in (
+        {"generator": "tiny-wan-move"},
+        {"motion": {"direction": [0, -1]}},
+        {"generator_options": {"prompt": "something else"}},
+        {"generator_options": {"negative_prompt": "something else"}},
+        {"generator_options": {"guidance_scale": 1.0}},
+        {"generator_options": {"shift": 3.0}},
+        {"generator_options": {"steps": 3}},
+        {"generator_options": {"clean_cues": False}},
+    ):
+        assert pictures(simulate(toys, video=False, **change)) != plain, change
+
+
+def test_options_are_recorded(toys: Service) -> None:
+    found = simulate(toys, video=False, generator_options={"steps": 2, "shift": 3.0, "negative_prompt": "blur"})
+    assert found.generator.steps == 2
+    assert found.generator.options["shift"] == 3.0
+    assert found.generator.options["negative_prompt"] == "blur"
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer", "said"),
+    [
+        ({"num_frames": 16, "frames": {}}, "/num_frames", "13 or 17"),
+        ({"num_frames": 2, "frames": {}}, "/num_frames", "take 5"),
+        ({"num_frames": 85, "frames": {}}, "/num_frames", "take 81"),
+        ({"generator_options": {"steps": 0}}, "/generator_options/steps", "greater than or equal to 1"),
+        ({"generator_options": {"speed": 1}}, "/generator_options/speed", "not permitted"),
+    ],
+)
+def test_what_it_cannot_make_is_refused_before_any_work(
+    toys: Service, change: dict[str, object], pointer: str, said: str
+) -> None:
+    heard: list[str] = []
+    with pytest.raises(InvalidRequest) as caught:
+        simulate(toys, lambda stage, done: heard.append(stage), **change)
+    assert not heard
+    assert [(error.pointer, said in error.detail) for error in caught.value.errors] == [(pointer, True)]
+
+
+def test_progress_after_every_step(toys: Service) -> None:
+    heard: list[float] = []
+    simulate(toys, lambda stage, done: heard.append(done) if stage == "generation" else None, video=False)
+    assert heard == sorted(heard)
+    assert [round(done, 3) for done in heard if 0 < done < 0.95] == [0.225, 0.45, 0.675, 0.9]
+    assert heard[-1] == 1
+
+
+def count(monkeypatch: pytest.MonkeyPatch, pipeline: WanTrackPipeline, *names: str) -> dict[str, int]:
+    """How often methods of the pipeline are called."""
+    calls = dict.fromkeys(names, 0)
+    for name in names:
+        method = getattr(pipeline, name)
+
+        def counted(*args: object, _name: str = name, _method: Callable[..., object] = method) -> object:
+            calls[_name] += 1
+            return _method(*args)
+
+        monkeypatch.setattr(pipeline, name, counted)
+    return calls
+
+
+def test_a_cancel_takes_effect_within_one_step(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = pipeline_of(toys)
+    calls = count(monkeypatch, pipeline, "decode")
+    passes: list[int] = []
+    hook = pipeline.transformer.register_forward_hook(lambda *_: passes.append(1))
+
+    def cancel(stage: str, done: float) -> None:
+        if stage == "generation" and done > 0.4:  # after the second of four steps
+            raise Canceled("The caller went away.")
+
+    try:
+        with pytest.raises(Canceled):
+            simulate(toys, cancel)
+    finally:
+        hook.remove()
+    assert len(passes) == 4  # two steps, guided and plain
+    assert calls["decode"] == 0
+    assert len(simulate(toys, video=False).frames) == 17  # the device is free again
+
+
+def test_text_and_image_are_encoded_once(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulate(toys, video=False)
+    calls = count(monkeypatch, pipeline_of(toys), "embed_text", "embed_picture")
+    simulate(toys, video=False, seed=7, motion={"direction": [0.3, 1]}, generator_options={"prompt": "new words"})
+    assert calls == {"embed_text": 1, "embed_picture": 0}
+    simulate(toys, video=False, num_frames=13, frames={})
+    assert calls["embed_picture"] == 1
+
+
+def test_running_out_of_memory(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real allocation that no machine can serve, in the middle of a step; afterwards all is as before."""
+    before = pictures(simulate(toys, video=False))
+    pipeline = pipeline_of(toys)
+
+    def too_much(module: torch.nn.Module, args: object, output: object) -> None:
+        torch.empty(2**50, dtype=torch.float64)
+
+    hook = pipeline.transformer.register_forward_hook(too_much)
+    calls = count(monkeypatch, pipeline, "embed_picture")
+    try:
+        with pytest.raises(GeneratorOutOfMemory, match="A clip of 17 frames at 112 x 64 does not fit") as caught:
+            simulate(toys, video=False)
+    finally:
+        hook.remove()
+    assert caught.value.code == "generator-out-of-memory"
+    assert caught.value.__cause__ is None  # no traceback that holds the tensors
+    assert pictures(simulate(toys, video=False)) == before
+    assert calls["embed_picture"] == 1  # what was kept had been let go
+
+
+def test_other_failures_pass_through(toys: Service) -> None:
+    def fail(module: torch.nn.Module, args: object, output: object) -> None:
+        raise RuntimeError("something else")
+
+    hook = pipeline_of(toys).transformer.register_forward_hook(fail)
+    try:
+        with pytest.raises(RuntimeError, match="something else"):
+            simulate(toys, video=False)
+    finally:
+        hook.remove()
+
+
+def test_one_clip_at_a_time(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several at once give what each gives alone; one that waits can be given up."""
+    alone = {seed: pictures(simulate(toys, video=False, seed=seed)) for seed in (0, 1, 2)}
+    pipeline = pipeline_of(toys)
+    at_once, most = 0, 0
+    denoise = pipeline.denoise
+
+    def watched(*args: object) -> torch.Tensor:
+        nonlocal at_once, most
+        at_once += 1
+        most = max(most, at_once)
+        try:
+            return denoise(*args)  # pyright: ignore[reportArgumentType]
+        finally:
+            at_once -= 1
+
+    monkeypatch.setattr(pipeline, "denoise", watched)
+    found: dict[int, list[str]] = {}
+    threads = [
+        threading.Thread(
+            target=lambda seed=seed: found.update({seed: pictures(simulate(toys, video=False, seed=seed))})
+        )
+        for seed in alone
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == alone
+    assert most == 1
+
+
+def test_one_that_waits_can_be_given_up(toys: Service) -> None:
+    pipeline = pipeline_of(toys)
+    inside, go_on = threading.Event(), threading.Event()
+
+    def hold(module: torch.nn.Module, args: object, output: object) -> None:
+        inside.set()
+        go_on.wait(30)
+
+    def give_up(stage: str, done: float) -> None:
+        if stage == "generation":
+            raise Canceled("Not wanted any more.")
+
+    hook = pipeline.transformer.register_forward_hook(hold)
+    holder = threading.Thread(target=lambda: simulate(toys, video=False))
+    holder.start()
+    try:
+        assert inside.wait(30)
+        with pytest.raises(Canceled):
+            simulate(toys, give_up, video=False)
+        assert holder.is_alive()
+    finally:
+        go_on.set()
+        holder.join()
+        hook.remove()
+
+
+def test_a_moved_track_moves_the_condition(toys: Service) -> None:
+    """Features of the object's first place stand along its path in the guided condition, and nowhere else."""
+    seen: list[torch.Tensor] = []
+    hook = pipeline_of(toys).transformer.register_forward_pre_hook(
+        lambda module, args, kwargs: seen.append(kwargs["hidden_states"][0, 16:20].clone()), with_kwargs=True
+    )
+    path = {"points": [[208, 240], [624, 240]], "fps": 1, "anchors": [], "tracks": [[[208, 240], [624, 240]]]}
+    try:
+        simulate(toys, video=False, fps=16, trajectory=path, grounding={"bbox": [188, 220, 228, 260]})
+    finally:
+        hook.remove()
+    mask = seen[0][0].numpy()  # [T, h, w]
+    assert (mask[0] == 1).all()
+    columns = np.array([(mask[t] * np.arange(mask.shape[2])).sum() / mask[t].sum() for t in range(1, 5)])
+    # Latent frame t takes clip frames 4t - 3 to 4t, and ATI's grid has its first and last cell at the image's edges.
+    middle = np.array([np.mean([208 + 416 * f / 16 for f in range(4 * t - 3, 4 * t + 1)]) for t in range(1, 5)])
+    np.testing.assert_allclose(columns, middle / 832 * (mask.shape[2] - 1), atol=0.5)
+
+
+class TestProfiles:
+    @pytest.mark.parametrize("profile", ["fast", "turbo"])
+    def test_they_make_a_clip(self, tmp_path: Path, profile: str) -> None:
+        service = Service(Settings(data_dir=tmp_path, profile=profile))
+        passes: list[int] = []
+        pipeline_of(service).transformer.register_forward_hook(lambda *_: passes.append(1))
+        found = simulate(service, video=False)
+        assert found.generator.options["profile"] == profile
+        assert len(passes) == (4 if profile == "turbo" else 8)
+        assert found.generator.options["solver"] == ("euler" if profile == "turbo" else "unipc")
+        assert pictures(found) == pictures(simulate(service, video=False))
+
+    def test_one_that_there_is_not(self, tmp_path: Path) -> None:
+        with pytest.raises(GeneratorUnavailable, match=r"no profile 'warp'\. It has: exact, fast, turbo"):
+            simulate(Service(Settings(data_dir=tmp_path, profile="warp")))
+
+    def test_what_this_machine_cannot_do_is_said_at_load(self, tmp_path: Path) -> None:
+        with pytest.raises(GeneratorUnavailable, match="no GPU 'cuda'"):
+            Service(Settings(data_dir=tmp_path, device="cuda", generator="tiny-ati")).check()
+
+
+@pytest.mark.parametrize("name", ["ati", "wan-move"])
+def test_without_weights_it_says_how_to_get_them(tmp_path: Path, name: str) -> None:
+    with pytest.raises(CowError, match=f"cow models pull {name}") as caught:
+        simulate(Service(Settings(data_dir=tmp_path)), generator=name)
+    assert caught.value.code == "weights-unavailable"
+
+
+@pytest.mark.parametrize(
+    ("size", "wanted"),
+    [
+        ((832, 480), (832, 480)),
+        ((480, 832), (480, 832)),
+        ((1024, 1024), (624, 624)),
+        ((1086, 724), (768, 512)),
+        ((4000, 30), (7296, 48)),
+        ((8, 8), (624, 624)),
+    ],
+)
+def test_the_size_of_a_clip(toys: Service, size: tuple[int, int], wanted: tuple[int, int]) -> None:
+    from dataclasses import replace
+
+    generator = toys.generators.get("tiny-ati")
+    assert isinstance(generator, WanGenerator)
+    full = WanGenerator(replace(generator._model, max_area=480 * 832))
+    assert full.size(*size) == wanted

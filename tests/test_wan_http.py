@@ -1,0 +1,162 @@
+"""The video generators over HTTP, and the track files on the command line, as a caller meets them."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import torch
+from conftest import example
+from test_cli import cow
+
+from cow_service.api.app import create_app
+from cow_service.generators.wan.generator import WanGenerator
+from cow_service.records import Simulation
+from cow_service.service import Service
+from cow_service.settings import Settings
+
+BALL = example("ball-and-mug")
+
+
+def body(**rest: object) -> dict[str, Any]:
+    encoded = "data:image/jpeg;base64," + base64.b64encode(BALL.image).decode()
+    return {"image": encoded, "question": BALL.meta["question"], "generator": "tiny-ati", "num_frames": 17, **rest}
+
+
+def test_frames_and_mp4(http: httpx.Client) -> None:
+    answer = http.post("/simulate", json=body())
+    assert answer.status_code == 200, answer.text
+    found = Simulation.model_validate_json(answer.text)
+    assert found.generator.name == "tiny-ati"
+    assert found.video is not None
+    assert http.get(found.video.url).content[4:8] == b"ftyp"
+    assert http.get(found.frames[0].url).content.startswith(b"\x89PNG")
+
+
+def test_a_length_that_it_cannot_make(http: httpx.Client) -> None:
+    answer = http.post("/simulate", json=body(num_frames=80))
+    assert answer.status_code == 422
+    assert answer.json()["errors"] == [
+        {"pointer": "/num_frames", "detail": "this generator makes no clip of 80 frames; take 77 or 81"}
+    ]
+
+
+def test_without_weights(http: httpx.Client) -> None:
+    answer = http.post("/simulate", json=body(generator="ati"))
+    assert answer.status_code == 503
+    assert answer.json()["type"] == "urn:cow:problem:weights-unavailable"
+    assert "cow models pull ati" in answer.json()["detail"]
+    backends = {backend["name"]: backend for backend in http.get("/models").json()["generators"]}
+    assert backends["ati"]["ready"] is False
+    assert backends["ati"]["pull"] == "cow models pull ati"
+    assert backends["tiny-ati"]["ready"] is True
+
+
+def test_a_caller_who_goes_away_ends_the_work(tmp_path: Path) -> None:
+    service = Service(Settings(data_dir=tmp_path))
+    generator = service.generators.get("tiny-ati")
+    assert isinstance(generator, WanGenerator)
+    passes: list[int] = []
+    sent = json.dumps(body(video=False, generator_options={"steps": 100})).encode()
+
+    async def call() -> None:
+        loop, gone = asyncio.get_running_loop(), asyncio.Event()
+
+        def after(module: torch.nn.Module, args: object, output: object) -> None:
+            passes.append(1)
+            loop.call_soon_threadsafe(gone.set)
+
+        generator._model.pipeline.transformer.register_forward_hook(after)
+        messages = [{"type": "http.request", "body": sent, "more_body": False}]
+
+        async def receive() -> dict[str, Any]:
+            if messages:
+                return messages.pop()
+            await gone.wait()
+            return {"type": "http.disconnect"}
+
+        async def send(message: dict[str, Any]) -> None:
+            """Nobody is there to hear."""
+
+        scope = {
+            "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST", "path": "/simulate",
+            "raw_path": b"/simulate", "query_string": b"", "root_path": "", "scheme": "http", "server": ("test", 80),
+            "headers": [(b"content-type", b"application/json")],
+        }  # fmt: skip
+        await create_app(service)(scope, receive, send)
+
+    asyncio.run(call())
+    assert 1 <= len(passes) < 100  # of 200
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated")
+    (folder / "image.jpg").write_bytes(BALL.image)
+    done = cow(
+        folder, "simulate", "image.jpg", BALL.meta["question"], "--num-frames", "81", "--no-video", "--out", "out"
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.parametrize("suffix", ["pth", "npy"])
+def test_tracks_out_and_back(simulated: Path, suffix: str) -> None:
+    """An exported trajectory, imported and simulated, is the same trajectory."""
+    exported = cow(simulated, "tracks", "export", "out/simulation.json", "--out", f"tracks.{suffix}")
+    assert exported.returncode == 0, exported.stderr
+    assert "5 moving and 8 static tracks over 81 frames" in exported.stdout
+    imported = cow(simulated, "tracks", "import", f"tracks.{suffix}", "--out", "trajectory.json")
+    assert imported.returncode == 0, imported.stderr
+    assert "5 moving and 8 static tracks" in imported.stdout
+    question = BALL.meta["question"]
+    options = ("--trajectory", "trajectory.json", "--no-video", "--out", f"{suffix}-out")
+    again = cow(simulated, "simulate", "image.jpg", question, *options)
+    assert again.returncode == 0, again.stderr
+    first, second = (
+        Simulation.model_validate_json((simulated / name / "simulation.json").read_bytes()).trajectory
+        for name in ("out", f"{suffix}-out")
+    )
+    # A point that has left the image is not visible, and its place in the file is the same for all that.
+    np.testing.assert_allclose(second.tracks, first.tracks, atol=0.01)
+    np.testing.assert_allclose(second.anchors, first.anchors, atol=0.01)
+    inside = np.array(first.visible)
+    middle = np.mean(first.tracks, axis=0)
+    np.testing.assert_allclose(np.array(second.points)[inside], middle[inside], atol=0.01)
+
+
+def test_import_prints_what_a_request_takes(simulated: Path) -> None:
+    cow(simulated, "tracks", "export", "out/simulation.json", "--out", "a.npz")
+    printed = json.loads(cow(simulated, "tracks", "import", "a.npz", "--fps", "8").stdout)
+    assert printed["fps"] == 8
+    assert len(printed["points"]) == len(printed["visible"]) == 81
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("export", "image.jpg", "--out", "a.npz"), "image.jpg is not a simulation"),
+        (("export", "out/simulation.json", "--out", "a.csv"), "suffix '.csv'"),
+        (("export", "out/simulation.json", "--out", "absent/a.npz"), "cannot be written"),
+        (("import", "image.jpg"), "suffix '.jpg'"),
+        (("import", "still.npy"), "none of them moves"),
+    ],
+)
+def test_what_cannot_be_done_is_said(simulated: Path, arguments: tuple[str, ...], said: str) -> None:
+    np.save(simulated / "still.npy", np.full((81, 3, 2), 5.0))
+    done = cow(simulated, "tracks", *arguments)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_trajectory_that_is_not_json(simulated: Path) -> None:
+    done = cow(simulated, "simulate", "image.jpg", "?", "--trajectory", "image.jpg")
+    assert done.returncode == 1
+    assert "image.jpg is not JSON" in done.stderr

@@ -1,0 +1,283 @@
+"""Tracks of any number, on images of any size, wherever they go, in the forms of ATI and Wan-Move and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from cow_service.errors import InvalidRequest
+from cow_service.generators.wan.conditioning import ati_condition, wan_move_latent
+from cow_service.generators.wan.track_files import read_tracks, write_tracks
+from cow_service.generators.wan.tracks import (
+    FILE_SAMPLES,
+    MAX_FRAMES,
+    Tracks,
+    from_ati_file,
+    nearest_lengths,
+    to_ati_file,
+    to_ati_tensor,
+    tracks_of,
+)
+from cow_service.records import Trajectory
+
+sides = st.integers(8, 4000)
+lengths = st.integers(2, MAX_FRAMES)
+coordinates = st.floats(-1e6, 1e6, width=32)
+
+
+@st.composite
+def tracks(draw: st.DrawFn, frames: st.SearchStrategy[int] = lengths) -> Tracks:
+    """Any number of tracks over any number of frames: off the image, invisible and static ones among them."""
+    f, n = draw(frames), draw(st.integers(0, 6))
+    points = draw(arrays.arrays(np.float32, (f, n, 2), elements=coordinates, fill=st.just(13.0)))
+    return Tracks(points, draw(arrays.arrays(np.bool_, (f, n))))
+
+
+def straight(frames: int, start: tuple[float, float] = (10, 20), step: tuple[float, float] = (3, -2)) -> Tracks:
+    points = np.array(start) + np.arange(frames)[:, None, None] * np.array(step)
+    return Tracks(points.astype(np.float32), np.ones((frames, 1), bool))
+
+
+@given(tracks())
+def test_the_file_form_holds_the_last_position(some: Tracks) -> None:
+    file = to_ati_file(some)
+    assert file.shape == (some.points.shape[1], FILE_SAMPLES, 1, 3)
+    assert file.dtype == np.float32
+    last = int(np.ceil((some.num_frames - 1) * 1.5))
+    np.testing.assert_allclose(
+        file[:, last:, 0, :2] / 8, np.broadcast_to(some.points[-1][:, None], file[:, last:, 0, :2].shape), rtol=1e-5
+    )
+    assert ((file[:, last:, 0, 2] == 8) == some.visible[-1][:, None]).all()
+    assert set(np.unique(file[..., 2])) <= {0, 8}
+
+
+@given(tracks(), sides, sides)
+def test_the_tensor_is_finite_and_in_the_public_units(some: Tracks, width: int, height: int) -> None:
+    tensor = to_ati_tensor(to_ati_file(some), width, height)
+    assert tensor.shape == (MAX_FRAMES, some.points.shape[1], 4)
+    assert np.isfinite(tensor).all()
+    assert set(np.unique(tensor[..., 3])) <= {-1, 1}
+    first = (some.points[0] - np.array([width, height]) / 2) / min(width, height) * 2
+    np.testing.assert_allclose(tensor[0, :, 1:3], first, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(16, 81), (8, 81), (24, 17), (16, 5)])
+def test_straight_motion_keeps_its_clock(fps: float, frames: int) -> None:
+    """Frame k of the clip is sample 1.5 k of the file, whatever the rate at which it is played."""
+    some = straight(frames)
+    back = from_ati_file(to_ati_file(some))
+    np.testing.assert_allclose(back.points[:frames], some.points, atol=1e-3)
+    np.testing.assert_allclose(back.points[frames:], np.broadcast_to(some.points[-1], back.points[frames:].shape))
+    assert back.visible.all()
+
+
+def test_the_image_corners_are_where_the_model_has_them() -> None:
+    corners = Tracks(np.array([[[0, 0], [832, 480], [416, 240]]] * 2, np.float32), np.ones((2, 3), bool))
+    tensor = to_ati_tensor(to_ati_file(corners), 832, 480)
+    np.testing.assert_allclose(tensor[0, :, 1:3], [[-832 / 480, -1], [832 / 480, 1], [0, 0]], atol=1e-6)
+
+
+@given(st.integers(1, 500))
+def test_nearest_lengths(num_frames: int) -> None:
+    legal = [4 * n + 1 for n in range(1, 21)]
+    found = nearest_lengths(num_frames)
+    assert set(found) <= set(legal)
+    if num_frames in legal:
+        assert found == (num_frames,)
+    else:
+        assert num_frames not in found
+        assert min(abs(f - num_frames) for f in found) == min(abs(f - num_frames) for f in legal)
+
+
+def trajectory(points: list[tuple[float, float]], visible: list[bool], **rest: object) -> Trajectory:
+    fields = {
+        "fps": 16, "states": [(0, 0, 1, 0, 0, 0)] * len(points), "points": points, "visible": visible,
+        "scale": [1] * len(points), "tracks": [points], "anchors": [(5, 5), (90, 5)],
+    }  # fmt: skip
+    return Trajectory.model_validate(fields | rest)
+
+
+def test_visibility_of_tracks_and_anchors() -> None:
+    points = [(50.0, 50.0), (90.0, 50.0), (130.0, 50.0), (50.0, 50.0)]
+    other = [(x - 35, y) for x, y in points]
+    found = tracks_of(trajectory(points, [True, True, False, False], tracks=[points, other]), 100, 100)
+    assert found.points.shape == (4, 4, 2)
+    # Out of the image at frame 2 the other point is still inside it; at frame 3 the object is hidden as a whole.
+    assert found.visible[:, 0].tolist() == [True, True, False, False]
+    assert found.visible[:, 1].tolist() == [True, True, True, False]
+    assert found.visible[:, 2:].all()
+    assert (found.points[:, 2] == [5, 5]).all()
+
+
+def test_no_tracks_at_all() -> None:
+    none = tracks_of(trajectory([(1, 1), (2, 2)], [True, True], tracks=[], anchors=[]), 10, 10)
+    assert none.points.shape == (2, 0, 2)
+    condition = torch.randn(20, 1 + 1, 4, 6)
+    changed = ati_condition(condition, torch.from_numpy(to_ati_tensor(to_ati_file(none), 10, 10)))
+    assert torch.equal(changed[4:], condition[4:])
+    assert (changed[:4, 0] == 1).all()
+    assert not changed[:4, 1].any()
+    assert torch.equal(
+        wan_move_latent(condition[4:], *map(torch.from_numpy, (none.points, none.visible))), condition[4:]
+    )
+
+
+@given(
+    tracks(st.sampled_from([5, 9, 13])),
+    st.integers(1, 7),
+    st.integers(1, 9),
+    st.sampled_from([torch.float32, torch.bfloat16]),
+)
+def test_ati_is_what_its_definition_says(some: Tracks, h: int, w: int, dtype: torch.dtype) -> None:
+    """Cell for cell and track for track, without any of the vector arithmetic."""
+    frames = (some.num_frames - 1) // 4 + 1
+    condition = torch.randn(6, frames, h, w, generator=torch.Generator().manual_seed(h * w)).to(dtype)
+    tensor = to_ati_tensor(to_ati_file(some), 100, 60)
+    found = ati_condition(condition, torch.from_numpy(tensor))
+    assert found.dtype == dtype
+    wanted = by_definition(condition.double().numpy(), tensor.astype(np.float64))
+    tolerance = 1e-4 if dtype == torch.float32 else 3e-2
+    np.testing.assert_allclose(found.double().numpy(), wanted, atol=tolerance, rtol=tolerance)
+
+
+def by_definition(condition: np.ndarray, tracks: np.ndarray) -> np.ndarray:
+    _, frames, h, w = condition.shape
+    m, latent = min(h, w), condition[4:]
+    xs, ys = np.linspace(-w / m, w / m, w), np.linspace(-h / m, h / m, h)
+    out = condition.copy()
+    out[:4] = 0
+    out[:4, 0] = 1
+    for t in range(1, frames):
+        part = tracks[4 * t - 3 : 4 * t + 1]
+        seen = (part[..., 3] + 1) / 2
+        count = seen.sum(0)
+        centre = (seen[..., None] * part[..., 1:3]).sum(0) / (count + 1e-5)[:, None]
+        for y in range(h):
+            for x in range(w):
+                gaps = (centre[:, 0] - xs[x]) ** 2 + (centre[:, 1] - ys[y]) ** 2
+                weights = np.exp(-220 * gaps) * np.minimum(count, 1)
+                best = np.argsort(-weights, kind="stable")[:2]
+                total = weights[best].sum()
+                carried = sum(
+                    (weights[n] * feature(latent[:, 0], tracks[0, n, 1:3]) for n in best), np.zeros(len(latent))
+                )
+                out[4:, t, y, x] = carried + latent[:, t, y, x] * (1 - min(total, 1))
+                out[:4, t, y, x] = total
+    return out
+
+
+def feature(image: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Bilinear between cell centres, zero beyond the edge."""
+    _, h, w = image.shape
+    m = min(h, w)
+    x = (np.clip(place[0] / (w / m), -1, 1) + 1) / 2 * w - 0.5
+    y = (np.clip(place[1] / (h / m), -1, 1) + 1) / 2 * h - 0.5
+    total = np.zeros(len(image))
+    for row in (int(np.floor(y)), int(np.floor(y)) + 1):
+        for column in (int(np.floor(x)), int(np.floor(x)) + 1):
+            if 0 <= row < h and 0 <= column < w:
+                total += image[:, row, column] * max(0, 1 - abs(x - column)) * max(0, 1 - abs(y - row))
+    return total
+
+
+@given(tracks(st.sampled_from([5, 9, 13])), st.integers(1, 7), st.integers(1, 9))
+def test_wan_move_is_what_its_definition_says(some: Tracks, h: int, w: int) -> None:
+    near = Tracks(np.mod(some.points, 120).astype(np.float32) - 20, some.visible)
+    frames = (near.num_frames - 1) // 4 + 1
+    latent = torch.randn(3, frames, h, w, generator=torch.Generator().manual_seed(h + w))
+    wanted = latent.clone()
+    inside = near.visible & (near.points >= 0).all(-1) & (near.points[..., 0] < 8 * w) & (near.points[..., 1] < 8 * h)
+    for t in range(1, frames):
+        for n in range(near.points.shape[1]):
+            if inside[0, n] and inside[4 * t, n]:
+                (x0, y0), (x, y) = (near.points[0, n] // 8).astype(int), (near.points[4 * t, n] // 8).astype(int)
+                wanted[:, t, y, x] = latent[:, 0, y0, x0]
+    found = wan_move_latent(latent, torch.from_numpy(near.points), torch.from_numpy(near.visible))
+    assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".npz", ".npy"])
+def test_files_come_back_as_they_were_written(tmp_path: Path, suffix: str) -> None:
+    some = straight(MAX_FRAMES)
+    hidden = Tracks(np.repeat(some.points, 3, axis=1), np.array([[True, False, True]] * MAX_FRAMES))
+    written = write_tracks(hidden, tmp_path / f"a{suffix}")
+    assert all(path.is_file() for path in written)
+    back = read_tracks(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(back.points, hidden.points, atol=1e-3)
+    assert (back.visible == hidden.visible).all()
+
+
+def test_the_pth_is_what_ati_reads(tmp_path: Path) -> None:
+    """Bytes of an .npz file whose array is called `array`."""
+    import io
+
+    write_tracks(straight(17), tmp_path / "a.pth")
+    saved = torch.load(tmp_path / "a.pth", weights_only=True)
+    with np.load(io.BytesIO(saved)) as opened:
+        assert opened["array"].shape == (1, FILE_SAMPLES, 1, 3)
+
+
+def test_a_pickle_that_would_run_code_is_not_opened(tmp_path: Path) -> None:
+    import pickle
+
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "sprung",))
+
+    torch.save(Trap(), tmp_path / "trap.pth")
+    (tmp_path / "raw.pth").write_bytes(pickle.dumps(Trap(), protocol=2))
+    np.save(tmp_path / "trap.npy", np.array([Trap()], dtype=object), allow_pickle=True)
+    for name in ("trap.pth", "raw.pth", "trap.npy"):
+        with pytest.raises(InvalidRequest, match=name):
+            read_tracks(tmp_path / name)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_files_that_are_no_tracks_are_refused(tmp_path: Path) -> None:
+    def npz(name: str, **held: np.ndarray) -> Path:
+        np.savez(tmp_path / name, **held)
+        return tmp_path / name
+
+    def npy(name: str, held: np.ndarray) -> Path:
+        np.save(tmp_path / name, held)
+        return tmp_path / name
+
+    good = npy("good.npy", np.zeros((81, 2, 2)))
+    (tmp_path / "noise.npz").write_bytes(b"PK nonsense")
+    (tmp_path / "noise.pth").write_bytes(b"nonsense")
+    (tmp_path / "a.txt").write_text("1 2 3")
+    torch.save([1, 2], tmp_path / "list.pth")
+    for path, said in (
+        (npz("key.npz", tracks=np.zeros((1, 121, 1, 3))), "array"),
+        (npz("shape.npz", array=np.zeros((1, 120, 1, 3))), "121"),
+        (npz("text.npz", array=np.full((1, 121, 1, 3), "x")), "not numbers"),
+        (npz("nan.npz", array=np.full((1, 121, 1, 3), np.nan)), "finite"),
+        (npy("flat.npy", np.zeros((81, 2))), r"\[F, N, 2\]"),
+        (tmp_path / "noise.npz", "cannot be read"),
+        (tmp_path / "noise.pth", "damaged"),
+        (tmp_path / "list.pth", "list"),
+        (tmp_path / "absent.npz", "cannot be read"),
+        (tmp_path / "a.txt", "suffix"),
+    ):
+        with pytest.raises(InvalidRequest, match=said):
+            read_tracks(path)
+    with pytest.raises(InvalidRequest, match=r"\[81, 2\]"):
+        read_tracks(good, npy("visible.npy", np.ones((80, 2), bool)))
+    with pytest.raises(InvalidRequest, match="suffix"):
+        write_tracks(straight(17), tmp_path / "a.csv")
+    with pytest.raises(InvalidRequest, match="81"):
+        write_tracks(straight(161), tmp_path / "a.npz")
+
+
+def test_time_first_and_batched_files_are_read_too(tmp_path: Path) -> None:
+    some = straight(MAX_FRAMES)
+    np.savez(tmp_path / "a.npz", array=to_ati_file(some).transpose(1, 0, 2, 3))
+    np.testing.assert_allclose(read_tracks(tmp_path / "a.npz").points, some.points, atol=1e-3)
+    np.save(tmp_path / "b.npy", some.points)
+    assert read_tracks(tmp_path / "b.npy").visible.all()
