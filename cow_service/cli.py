@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -19,6 +20,9 @@ HINTS = {  # how the command line says what an error's remedy asks for
     "cannot-ground": "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME).",
     "cannot-read-direction": "Here: --direction DX,DY.",
 }
+
+# Notes that these libraries print when they are imported, such as on optional packages, are not for our users.
+QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
 
 if TYPE_CHECKING:
     from cow_service.service import Service
@@ -97,6 +101,10 @@ def simulate(
     ] = None,
     reader: Annotated[str | None, typer.Option(help="Who looks at the image.", show_default="COW_READER")] = None,
     generator: Annotated[str | None, typer.Option(help="Who makes the frames.", show_default="COW_GENERATOR")] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="An option of the generator, such as steps=20; may be repeated."),
+    ] = None,
     num_frames: Annotated[int, typer.Option(help="Frames of the clip.")] = 81,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 16,
     seed: Annotated[int, typer.Option(help="For generators that draw random numbers.")] = 0,
@@ -121,6 +129,7 @@ def simulate(
             trajectory=trajectory,
             reader=reader,
             generator=generator,
+            option=option or [],
             num_frames=num_frames,
             fps=fps,
             seed=seed,
@@ -176,6 +185,8 @@ def _service(host: str | None = None, port: int | None = None) -> Service:
     from cow_service.service import Service  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 
+    for name, level in QUIET.items():
+        os.environ.setdefault(name, level)
     return Service(load_settings(host=host, port=port))
 
 

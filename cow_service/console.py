@@ -28,10 +28,11 @@ def build_request(
     kind: str,
     speed: float | None,
     trajectory: Path | None,
+    option: list[str],
     **rest: Any,
 ) -> dict[str, Any]:
     """The request's body without its image. Raises `InvalidRequest` naming the option that cannot be read."""
-    body = dict(rest)
+    body = {**rest, "generator_options": dict(map(_option, option))}
     if point is not None or box is not None:
         body["grounding"] = {
             "object": name,
@@ -159,6 +160,17 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
             f"{option} takes {count} numbers with commas between, such as {','.join(['10'] * count)}; got '{text}'."
         )
     return values
+
+
+def _option(given: str) -> tuple[str, object]:
+    """Name and value; what is no JSON is text."""
+    name, equals, text = given.partition("=")
+    if not name or not equals:
+        raise InvalidRequest(f"--option takes NAME=VALUE, such as steps=20; got '{given}'.")
+    try:
+        return name, json.loads(text)
+    except ValueError:
+        return name, text
 
 
 def _json(path: Path) -> object:

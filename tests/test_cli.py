@@ -88,6 +88,8 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         ([QUESTION, "--kind", "projectile"], 1, "go with --direction"),
         ([QUESTION, "--object", "x"], 1, "goes with --point or --box"),
         ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: ati, cutout,"),
+        ([QUESTION, "--option", "steps"], 1, "--option takes NAME=VALUE"),
+        ([QUESTION, "--option", "steps=4"], 1, "/generator_options/steps"),
         ([QUESTION, "--num-frames", "1"], 1, "num_frames"),
         ([QUESTION, "--frames", "best"], 2, "'best'"),
         ([], 2, "QUESTION"),

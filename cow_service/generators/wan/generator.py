@@ -130,28 +130,27 @@ class WanGenerator:
         noise = torch.randn(latent_shape(width, height, frames), generator=drawn)
         progress(0.0)
         try:
-            guide = self._guide(shot, width, height)
+            sampling = self._sampling(shot)
+            guide = self._guide(shot, width, height, guided=sampling.passes > sampling.steps)
             progress(0.0)
-            latents = pipeline.denoise(
-                noise, guide, self._sampling(shot), lambda done, steps: progress(STEPS_SHARE * done / steps)
-            )
+            latents = pipeline.denoise(noise, guide, sampling, lambda done, steps: progress(STEPS_SHARE * done / steps))
             return pipeline.decode(latents)
         finally:
             pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure
 
-    def _guide(self, shot: Shot, width: int, height: int) -> Guide:
+    def _guide(self, shot: Shot, width: int, height: int, *, guided: bool) -> Guide:
         scene, frames = shot.scene, len(shot.trajectory.points)
         first = scene.clean if _options(shot).clean_cues else scene.image
         picture = self._encodings.picture(first, width, height, frames)
         tracks = tracks_of(shot.trajectory, scene.width, scene.height)
         # In pixels of the clip: its sides are rounded, so that its aspect ratio is not quite the image's.
         tracks = tracks.scaled(width / scene.width, height / scene.height)
-        guided, plain = self._model.method(picture.condition, tracks, width, height)
+        condition, plain = self._model.method(picture.condition, tracks, width, height)
         return Guide(
             prompt=self._encodings.text(self._prompt(shot)),
-            negative=self._encodings.text(self._negative_prompt(shot)),
+            negative=self._encodings.text(self._negative_prompt(shot)) if guided else None,
             image=picture.embeds,
-            condition=guided,
+            condition=condition,
             plain=plain,
         )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ class Guide:
     """What one clip is denoised under."""
 
     prompt: Tensor  # [1, 512, C] text embeddings
-    negative: Tensor  # the same, of what is to be avoided
+    negative: Tensor | None  # the same, of what is to be avoided; null where no step is guided
     image: Tensor  # [1, tokens, C]
     condition: Tensor  # [20, T, h, w] of the guided pass
     plain: Tensor  # [20, T, h, w] of the unconditional pass
@@ -97,13 +97,19 @@ class WanTrackPipeline(WanImageToVideoPipeline):
     def denoise(self, noise: Tensor, guide: Guide, sampling: Sampling, on_step: StepListener) -> Tensor:
         """Latents [1, 16, T, h, w] from noise of that shape. `on_step` hears (done, all) and stops it by raising."""
         device = self._execution_device
+        dtype = cast(torch.dtype, self.transformer.dtype)  # found by a walk over all weights: once per clip
         schedule = sampling.schedule(device)
         latents = noise.to(device, torch.float32)
+        guided, plain_condition = (part.to(latents)[None] for part in (guide.condition, guide.plain))
+        image, prompt = guide.image.to(dtype), guide.prompt.to(dtype)
+        negative = None if guide.negative is None else guide.negative.to(dtype)
         reset_cache(self.transformer, sampling.steps)
         for step, time in enumerate(schedule.timesteps):
-            velocity = self._velocity("cond", latents, time, guide.condition, guide.prompt, guide.image)
-            if sampling.guides(step):
-                plain = self._velocity("uncond", latents, time, guide.plain, guide.negative, guide.image)
+            states = torch.cat([latents, guided], dim=1).to(dtype)
+            velocity = self._velocity("cond", states, time, prompt, image)
+            if negative is not None and sampling.guides(step):
+                states = torch.cat([latents, plain_condition], dim=1).to(dtype)
+                plain = self._velocity("uncond", states, time, negative, image)
                 velocity = plain + sampling.guidance_scale * (velocity - plain)
             latents = schedule.step(velocity, time, latents, return_dict=False)[0]
             on_step(step + 1, sampling.steps)
@@ -122,18 +128,14 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         pixels = (video.float() / 2 + 0.5).clamp(0, 1).mul(255).round().to(torch.uint8)
         return pixels.permute(1, 2, 3, 0).cpu().numpy()
 
-    def _velocity(
-        self, branch: str, latents: Tensor, time: Tensor, condition: Tensor, text: Tensor, image: Tensor
-    ) -> Tensor:
+    def _velocity(self, branch: str, states: Tensor, time: Tensor, text: Tensor, image: Tensor) -> Tensor:
         """The model's velocity [1, 16, T, h, w] in float32, so that guidance and solver lose nothing to bfloat16."""
         transformer: Any = self.transformer
-        dtype = transformer.dtype
-        states = torch.cat([latents, condition.to(latents)[None]], dim=1).to(dtype)
         with transformer.cache_context(branch):
             return transformer(
                 hidden_states=states,
                 timestep=time.expand(1),
-                encoder_hidden_states=text.to(dtype),
-                encoder_hidden_states_image=image.to(dtype),
+                encoder_hidden_states=text,
+                encoder_hidden_states_image=image,
                 return_dict=False,
             )[0].float()

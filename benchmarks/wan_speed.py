@@ -1,0 +1,399 @@
+"""Measures how fast the video model runs on this machine: each profile of a manifest, part by part.
+
+    python benchmarks/wan_speed.py [--model ati] [--profile exact ...] [--against plain] [--num-frames 81]
+        [--width 832 --height 480] [--steps N] [--runs N] [--json FILE]
+
+On a GPU it is the 14B model with random weights; without one, the toy. Every profile gets a pipeline of its own and one
+clip that is not counted, of the full size and two steps, in which everything is compiled. Then come `--runs` clips,
+whose medians are given; text and picture are encoded anew in each. `plain` is diffusers' own pipeline, in the same run.
+
+Floating-point operations are counted by formula (`pass_flops`), 135 PFLOP for 832x480x81 in 40 guided steps; those that
+a cache skipped are left out. Their share of the peak is that of bfloat16 matrix products measured here, whatever the
+profile computes in. How many passes a cache skips depends on the weights: on random ones it says nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import platform
+import resource
+import statistics
+import sys
+import traceback
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import accelerate
+import diffusers
+import torch
+import transformers
+
+# On a bare GPU machine the package is not installed.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from wan_models import Case, Clock, Studio, Timing, do_without_ftfy
+
+from cow_service.errors import CowError
+from cow_service.generators.wan.acceleration import look, refusals
+from cow_service.generators.wan.checkpoints import diffusers_config
+from cow_service.generators.wan.device import choose_device, on_threads, within_memory
+from cow_service.generators.wan.pipeline import TEXT_LENGTH, latent_shape
+from cow_service.generators.wan.profiles import Profile, profile_of
+from cow_service.generators.wan.tracks import nearest_lengths
+from cow_service.manifests import load_manifests
+
+PLAIN = "plain"
+WARM_UP_STEPS = 2
+IMAGE_TOKENS = 257  # of CLIP ViT-H: 16 x 16 patches and one for the whole
+PARTS = ("text encoder", "image encoder", "VAE encode", "condition", "denoising", "decode", "other")
+MATMUL_SECONDS, MATMUL_TRIES = 0.2, 5  # the best try counts
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one profile gave."""
+
+    name: str
+    status: Literal["measured", "refused", "failed"]
+    reason: str | None = None
+    notes: tuple[str, ...] = ()
+    figures: dict[str, Any] = field(default_factory=dict)
+
+
+def pass_flops(
+    architecture: Mapping[str, Any],
+    num_frames: int,
+    width: int,
+    height: int,
+    image_tokens: int = IMAGE_TOKENS,
+    layers: int | None = None,
+) -> int:
+    """Floating-point operations of the matrix products in one pass through the transformer, or through `layers` of it.
+
+    A linear layer takes 2 x its weights per token. With L tokens of the video, C of text and image, width d and inner
+    width f, each layer takes
+        2 L (6 d^2 + 2 d f)   self-attention's query, key, value, output; cross-attention's query, output; feed-forward
+        2 C (2 d^2)           cross-attention's keys and values
+        4 L^2 d + 4 L C d     self- and cross-attention: 2 for scores, 2 for their product with the values
+    and around the layers lie patches, embeddings of time, text and image, and the last layer: a thousandth.
+    """
+    config = diffusers_config(architecture)
+    _, _, frames, rows, columns = latent_shape(width, height, num_frames)
+    tokens, context = frames * (rows // 2) * (columns // 2), TEXT_LENGTH + image_tokens
+    d, f = int(architecture["dim"]), int(config["ffn_dim"])
+    text, image, frequencies = config["text_dim"], config["image_dim"], config["freq_dim"]
+    linear = 2 * tokens * (6 * d * d + 2 * d * f) + 2 * context * 2 * d * d
+    attention = 4 * tokens * tokens * d + 4 * tokens * context * d
+    patches = 2 * tokens * 4 * d * (config["in_channels"] + config["out_channels"])
+    embeddings = 2 * (TEXT_LENGTH * (text * d + d * d) + image_tokens * (image * image + image * d))
+    times = 2 * (frequencies * d + 7 * d * d)
+    count = config["num_layers"] if layers is None else layers
+    return count * (linear + attention) + patches + embeddings + times
+
+
+def matmul_peak(device: torch.device) -> float:
+    """FLOP/s of large square matrix products in bfloat16."""
+    side = 8192 if device.type == "cuda" else 512
+    a, b = (torch.randn(side, side, device=device).to(torch.bfloat16) for _ in range(2))
+    clock, best, count = Clock(device), 0.0, 3
+    for _ in range(MATMUL_TRIES + 1):
+        begun = clock.now()
+        for _ in range(count):
+            torch.matmul(a, b)
+        rate = count / (clock.now() - begun)
+        best, count = max(best, rate), max(1, int(rate * MATMUL_SECONDS))
+    return best * 2 * side**3
+
+
+def measure(name: str, case: Case, peak: float) -> Result:
+    """One profile, or `plain`; whatever goes wrong becomes its result, and the memory is free afterwards."""
+    profile = profile_of(case.manifest, next(iter(case.manifest.profiles)) if name == PLAIN else name)
+    if name == PLAIN:  # of the first profile it takes the sampling alone
+        profile = Profile(summary="", sampling=profile.sampling)
+    sentences = refusals(profile.acceleration, look(case.device))
+    if sentences:
+        return Result(name, "refused", " ".join(sentences))
+    defaults = case.manifest.defaults
+    try:
+        with (
+            on_threads(int(defaults["threads"]) if "threads" in defaults else None),
+            within_memory(case.device, lambda: None, f"Profile '{name}'"),
+        ):
+            return Result(name, "measured", None, _notes(name, profile), _figures(name, profile, case, peak))
+    except CowError as error:
+        return Result(name, "failed", error.detail)
+    except Exception as error:  # noqa: BLE001 - the other profiles are measured all the same
+        traceback.print_exc()
+        traceback.clear_frames(error.__traceback__)  # they hold the model
+        return Result(name, "failed", f"{type(error).__name__}: {error}")
+    finally:
+        torch.compiler.reset()  # the next pipeline's layers would count as recompilations, which are limited
+        gc.collect()
+        if case.device.type == "cuda":
+            torch.cuda.empty_cache()
+
+
+def _notes(name: str, profile: Profile) -> tuple[str, ...]:
+    notes = {
+        "diffusers' own pipeline, attention and precisions; nothing is compiled": name == PLAIN,
+        "without its LoRA, which once loaded is part of the weights and takes no time": profile.lora is not None,
+        "how many passes its cache skips is due to random weights": profile.acceleration.cache != "none",
+    }
+    return tuple(note for note, applies in notes.items() if applies)
+
+
+def _figures(name: str, profile: Profile, case: Case, peak: float) -> dict[str, Any]:
+    """Builds, warms up, measures."""
+    sampling = case.sampled(profile.sampling)
+    studio = Studio(case, None if name == PLAIN else profile)
+    warm_up = studio.clip(sampling.model_copy(update={"steps": min(WARM_UP_STEPS, sampling.steps)})).total
+    if case.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(case.device)
+    timings = [studio.clip(sampling) for _ in range(case.runs)]
+    vision: Any = studio.pipeline.image_encoder.config
+    flops = _flops(profile, case, timings[-1], (vision.image_size // vision.patch_size) ** 2 + 1)
+    return {
+        "steps": sampling.steps,
+        **_seconds(timings, profile.sampling.steps),
+        "passes": timings[-1].passes,
+        "passes_computed": timings[-1].computed,
+        **_rates(timings, flops, peak),
+        **_memory(case.device),
+        "build_s": _rounded(studio.built),
+        "warm_up_s": _rounded(warm_up),
+    }
+
+
+def _seconds(timings: list[Timing], steps_of_profile: int) -> dict[str, Any]:
+    """Medians over the clips and, where other steps were run than the profile's, what all of its own would take."""
+    steps = [step for timing in timings for step in timing.steps]
+    parts = {part: statistics.median(timing.parts[part] for timing in timings) for part in timings[0].parts}
+    total = statistics.median(timing.total for timing in timings)
+    ratio = steps_of_profile / len(timings[0].steps)
+    computed = total + (ratio - 1) * parts["denoising"]
+    return {
+        "step_s": {
+            name: _rounded(of(steps)) for name, of in (("median", statistics.median), ("min", min), ("max", max))
+        },
+        "parts_s": {part: _rounded(parts[part]) for part in PARTS if part in parts},
+        "total_s": _rounded(total),
+    } | ({} if ratio == 1 else {"computed": {"steps": steps_of_profile, "total_s": _rounded(computed)}})
+
+
+def _flops(profile: Profile, case: Case, timing: Timing, image_tokens: int) -> int:
+    """Of one clip's denoising; of a pass that the cache skipped, only what is computed before it decides."""
+    size = case.manifest.architecture, case.num_frames, case.width, case.height, image_tokens
+    looked_at = 1 if profile.acceleration.cache == "first-block" else 0
+    skipped = timing.passes - timing.computed
+    return timing.computed * pass_flops(*size) + skipped * pass_flops(*size, layers=looked_at)
+
+
+def _rates(timings: list[Timing], flops: int, peak: float) -> dict[str, float]:
+    rate = flops / statistics.median(timing.parts["denoising"] for timing in timings)
+    return {"pflop": _rounded(flops / 1e15), "tflops": _rounded(rate / 1e12), "share_of_peak": _rounded(rate / peak)}
+
+
+def _memory(device: torch.device) -> dict[str, float]:
+    """Largest so far, GB: on a GPU since the warm-up, else of the whole process."""
+    if device.type == "cuda":
+        allocated, reserved = torch.cuda.max_memory_allocated(device), torch.cuda.max_memory_reserved(device)
+        return {"peak_allocated_gb": _rounded(allocated / 1e9), "peak_reserved_gb": _rounded(reserved / 1e9)}
+    kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"peak_resident_gb": _rounded(kib * 1024 / 1e9)}
+
+
+def _rounded(value: float) -> float:
+    """To four digits."""
+    return float(f"{value:.4g}")
+
+
+def survey(case: Case, names: Iterable[str], file: Path | None) -> dict[str, Any]:
+    """Measures one after the other. What is there so far is in `file` whenever one is done."""
+    peak = matmul_peak(case.device)
+    found = {**_surroundings(case), "matmul_bf16_tflops": _rounded(peak / 1e12)}
+    results: list[Result] = []
+    for name in names:
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        results.append(measure(name, case, peak))
+        found["results"] = [asdict(result) for result in _compared(results)]
+        if file is not None:
+            file.write_text(json.dumps(found, indent=2) + "\n")
+    return found
+
+
+def _compared(results: list[Result]) -> list[Result]:
+    """Once `plain` is measured, with how many times longer its clip and its step take."""
+    plain = next((r.figures for r in results if r.name == PLAIN and r.status == "measured"), None)
+    compared: list[Result] = []
+    for result in results:
+        own, added = result.figures, {}
+        if plain is not None and own and result.name != PLAIN:
+            clip, step = plain["total_s"] / own["total_s"], plain["step_s"]["median"] / own["step_s"]["median"]
+            added = {"times_as_fast_as_plain": {"clip": _rounded(clip), "step": _rounded(step)}}
+        compared.append(replace(result, figures={**own, **added}))
+    return compared
+
+
+def _surroundings(case: Case) -> dict[str, Any]:
+    """Machine, versions and clip."""
+    machine = look(case.device)
+    return {
+        "machine": {
+            "device": machine.device,
+            "name": machine.name,
+            "memory_gb": _rounded(machine.memory / 1e9),
+            "gpus": machine.gpus,
+            "cores": os.cpu_count(),
+            "packages": list(machine.packages),
+        },
+        "versions": {"python": platform.python_version(), "cuda": torch.version.cuda}
+        | {library.__name__: str(library.__version__) for library in (torch, diffusers, transformers, accelerate)},
+        "clip": {
+            "model": case.manifest.name,
+            "size": "toy" if case.toy else "full",
+            "weights": "random",
+            "num_frames": case.num_frames,
+            "width": case.width,
+            "height": case.height,
+            "tokens": case.tokens,
+        },
+        "runs": case.runs,
+        "warm_up_steps": WARM_UP_STEPS,
+    }
+
+
+def table(found: dict[str, Any]) -> str:
+    """The figures, a column for each profile, and below them what has to be said in words."""
+    machine, clip, versions = found["machine"], found["clip"], found["versions"]
+    measured = [result for result in found["results"] if result["figures"]]
+    rows = [["", *(result["name"] for result in measured)], *_rows([result["figures"] for result in measured])]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        f"{clip['model']}, {clip['size']} size, random weights: {clip['num_frames']} frames, {clip['width']} x "
+        f"{clip['height']} px, {clip['tokens']} tokens. Clips per profile: {found['runs']}.",
+        f"{machine['device']}: {machine['name']}, {machine['memory_gb']:g} GB, {machine['cores']} cores. torch "
+        f"{versions['torch']}, diffusers {versions['diffusers']}.",
+        f"Matrix products in bfloat16: {found['matmul_bf16_tflops']:g} TFLOP/s.",
+        "",
+    ]
+    for first, *cells in rows:
+        shown = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+        lines.append("  ".join([first.ljust(widths[0]), *shown]).rstrip())
+    return "\n".join([*lines, "", *_words(found["results"])]).rstrip()
+
+
+def _rows(figures: list[dict[str, Any]]) -> list[list[str]]:
+    """A label, then a cell for each profile. What none of them has is left out."""
+    paths: list[tuple[str, tuple[str, ...]]] = [
+        ("steps", ("steps",)),
+        ("one step, s", ("step_s", "median")),
+        ("  fastest", ("step_s", "min")),
+        ("  slowest", ("step_s", "max")),
+        *((f"{part}, s", ("parts_s", part)) for part in PARTS),
+        ("whole clip, s", ("total_s",)),
+        ("  plain / this", ("times_as_fast_as_plain", "clip")),
+        ("  plain / this, one step", ("times_as_fast_as_plain", "step")),
+        ("passes", ("passes",)),
+        ("  not skipped", ("passes_computed",)),
+        ("PFLOP", ("pflop",)),
+        ("TFLOP/s", ("tflops",)),
+        ("  share of the peak", ("share_of_peak",)),
+        ("peak allocated, GB", ("peak_allocated_gb",)),
+        ("peak reserved, GB", ("peak_reserved_gb",)),
+        ("peak of the process, GB", ("peak_resident_gb",)),
+        ("build, s", ("build_s",)),
+        ("warm-up clip, s", ("warm_up_s",)),
+    ]
+    rows = [[label, *(_cell(figure, path) for figure in figures)] for label, path in paths]
+    return [row for row in rows if set(row[1:]) - {"-"}]
+
+
+def _cell(figures: dict[str, Any], path: tuple[str, ...]) -> str:
+    value: Any = figures
+    for key in path:
+        value = value.get(key, {})
+    return "-" if value == {} else f"{value:.4g}"
+
+
+def _words(results: list[dict[str, Any]]) -> list[str]:
+    lines: list[str] = []
+    for result in results:
+        name, figures = result["name"], result["figures"]
+        lines += [f"{name}: {note}." for note in result["notes"]]
+        if result["reason"]:
+            lines.append(f"{name}: {result['status']}. {result['reason']}")
+        if computed := figures.get("computed"):
+            run = f"{name}: {figures['steps']} of its steps were run"
+            lines.append(f"{run}; x {computed['steps']} steps: {computed['total_s']:g} s (computed).")
+    return lines
+
+
+def case_of(arguments: argparse.Namespace) -> Case:
+    """What was asked for. Raises `ValueError` with a sentence for what cannot be measured here."""
+    device = choose_device("auto")
+    models = {name: manifest for name, manifest in load_manifests().items() if manifest.architecture}
+    name = arguments.model or ("tiny-ati" if device.type == "cpu" else "ati")
+    if name not in models:
+        raise ValueError(f"There is no model '{name}'. There are: {', '.join(models)}.")
+    toy = not models[name].sources
+    if device.type == "cpu" and not toy:
+        raise ValueError(f"'{name}' at its real size needs a GPU, and there is none here. Take tiny-ati.")
+    frames, width, height, runs = (17, 112, 64, 5) if toy else (81, 832, 480, 1)
+    case = Case(
+        manifest=models[name],
+        device=device,
+        num_frames=arguments.num_frames or frames,
+        width=arguments.width or width,
+        height=arguments.height or height,
+        steps=arguments.steps,
+        runs=arguments.runs or runs,
+    )
+    if nearest_lengths(case.num_frames) != (case.num_frames,):
+        raise ValueError(f"A clip has 4n + 1 frames, 5 to 81, not {case.num_frames}.")
+    if case.width % 16 or case.height % 16 or min(case.width, case.height) < 16:
+        raise ValueError(f"The sides of a clip are multiples of 16 px, not {case.width} x {case.height}.")
+    return case
+
+
+def _count(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError("1 or more")
+    return number
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--model", help="a manifest's name; by default ati on a GPU, else tiny-ati")
+    parser.add_argument("--profile", action="append", help="one of the manifest's, or plain; by default all of them")
+    parser.add_argument("--against", choices=[PLAIN], help="diffusers' own pipeline as well")
+    parser.add_argument("--num-frames", type=_count)
+    parser.add_argument("--width", type=_count, help="px")
+    parser.add_argument("--height", type=_count, help="px")
+    parser.add_argument("--steps", type=_count, help="instead of the profile's own")
+    parser.add_argument("--runs", type=_count, help="clips that count; by default 1, of a toy 5")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    try:
+        case = case_of(arguments)
+        names = list(arguments.profile or case.manifest.profiles) + [PLAIN] * (arguments.against == PLAIN)
+        for name in {*names} - {PLAIN}:
+            profile_of(case.manifest, name)
+    except (ValueError, CowError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    if do_without_ftfy():
+        print("ftfy is not installed: texts are encoded without its clean-up, which takes no time.", file=sys.stderr)
+    found = survey(case, dict.fromkeys(names), arguments.json)
+    print(table(found))
+    return 1 if any(result["status"] == "failed" for result in found["results"]) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
