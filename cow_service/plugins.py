@@ -5,6 +5,7 @@ The built-in backends are registered in `pyproject.toml` exactly as those of a t
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
@@ -13,6 +14,8 @@ from typing import Generic, TypeVar, cast
 
 from cow_service.errors import CowError
 from cow_service.settings import Settings
+
+RETRY = 30.0  # seconds before one that failed to load is tried again: checking tens of gigabytes takes that long
 
 Backend = TypeVar("Backend")
 
@@ -28,6 +31,7 @@ class Registry(Generic[Backend]):
         self._unavailable = unavailable
         self._settings = settings
         self._made: dict[str, Backend] = {}
+        self._failed: dict[str, tuple[float, CowError]] = {}  # when, and why
         self._guard = Lock()
         self._locks: dict[str, Lock] = {}
 
@@ -40,19 +44,31 @@ class Registry(Generic[Backend]):
         return tuple(sorted(self._points))
 
     def get(self, name: str) -> Backend:
-        """The backend of that name, made once. Raises `KeyError` for a name that is not registered."""
+        """The backend of that name, made once. Raises `KeyError` for a name that is not registered.
+
+        What its factory raises passes through, and is raised again without another try for the next 30 seconds.
+        """
         point = self._points[name]
         with self._guard:
             lock = self._locks.setdefault(name, Lock())
         with lock:  # one that takes minutes to load keeps nobody from the others
             if name not in self._made:
-                try:
-                    factory = cast(Callable[[Settings], Backend], point.load())
-                except ModuleNotFoundError as error:
-                    missing = error.name or "a module"
-                    raise self._unavailable(
-                        f"'{name}' needs the Python package that provides '{missing}', which is not installed here. "
-                        f"`cow doctor` shows the line that installs it."
-                    ) from error
-                self._made[name] = factory(self._settings)
+                self._made[name] = self._make(name, point)
             return self._made[name]
+
+    def _make(self, name: str, point: EntryPoint) -> Backend:
+        since, failure = self._failed.get(name, (0.0, None))
+        if failure is not None and time.monotonic() < since + RETRY:
+            raise failure.with_traceback(None)
+        try:
+            factory = cast(Callable[[Settings], Backend], point.load())
+            return factory(self._settings)
+        except ModuleNotFoundError as error:
+            missing = error.name or "a module"
+            raise self._unavailable(
+                f"'{name}' needs the Python package that provides '{missing}', which is not installed here. "
+                f"`cow doctor` shows the line that installs it."
+            ) from error
+        except CowError as error:
+            self._failed[name] = time.monotonic(), error
+            raise

@@ -132,3 +132,27 @@ def test_a_backend_that_cannot_be_imported_is_unavailable() -> None:
     with pytest.raises(KeyError):
         registry.get("near")
     assert registry.names() == ("far",)
+
+
+def test_a_backend_that_failed_to_load_is_not_tried_at_every_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    from types import SimpleNamespace
+
+    from cow_service import plugins
+
+    tries: list[Settings] = []
+
+    def create(settings: Settings) -> object:
+        tries.append(settings)
+        if len(tries) == 1:
+            raise errors.WeightsUnavailable("Pull them.")
+        return object()
+
+    registry: Registry = Registry("none", errors.GeneratorUnavailable, Settings())
+    registry.__dict__["_points"] = {"slow": SimpleNamespace(load=lambda: create)}
+    for _ in range(3):
+        with pytest.raises(errors.WeightsUnavailable, match="Pull them"):
+            registry.get("slow")
+    assert len(tries) == 1
+    monkeypatch.setattr(plugins, "RETRY", 0.0)
+    assert registry.get("slow") is registry.get("slow")
+    assert len(tries) == 2
