@@ -219,3 +219,15 @@ def test_a_size_that_the_encoder_refuses(path):
         write_mp4([frame], path, fps=16, width=40_000, height=2)
     assert str(path) not in caught.value.detail
     assert not path.exists()
+
+
+def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
+    """Busy frames, encoded many times while memory is in use otherwise: an artifact is named by its bytes."""
+    random = np.random.default_rng(0)
+    frames = [random.integers(0, 60, (96, 160, 3), np.uint8) + np.uint8(4 * i) for i in range(17)]
+    held, digests = [], set()
+    for _ in range(40):
+        held = [*held[-20:], random.integers(0, 255, random.integers(1, 200_000), np.uint8)]
+        write_mp4(frames, tmp_path / "a.mp4", fps=16, width=160, height=96)
+        digests.add((tmp_path / "a.mp4").read_bytes())
+    assert len(digests) == 1
