@@ -24,6 +24,8 @@ HINTS = {  # how the command line says what an error's remedy asks for
 # Notes that these libraries print when they are imported, such as on optional packages, are not for our users.
 QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
 
+GRACE = 10  # seconds that requests in progress are given when the server stops
+
 if TYPE_CHECKING:
     from cow_service.service import Service
 
@@ -154,7 +156,13 @@ def serve(
 
         from cow_service.api.app import create_app  # noqa: PLC0415
 
-        uvicorn.run(create_app(service), host=service.settings.host, port=service.settings.port, log_level="info")
+        uvicorn.run(
+            create_app(service),
+            host=service.settings.host,
+            port=service.settings.port,
+            log_level="info",
+            timeout_graceful_shutdown=GRACE,
+        )
 
 
 @app.command()

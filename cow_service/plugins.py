@@ -31,7 +31,8 @@ class Registry(Generic[Backend]):
         self._unavailable = unavailable
         self._settings = settings
         self._made: dict[str, Backend] = {}
-        self._failed: dict[str, tuple[float, CowError]] = {}  # when, and why
+        # When, and why: not the error itself, whose traceback would keep what was half loaded.
+        self._failed: dict[str, tuple[float, type[CowError], str]] = {}
         self._guard = Lock()
         self._locks: dict[str, Lock] = {}
 
@@ -57,9 +58,10 @@ class Registry(Generic[Backend]):
             return self._made[name]
 
     def _make(self, name: str, point: EntryPoint) -> Backend:
-        since, failure = self._failed.get(name, (0.0, None))
-        if failure is not None and time.monotonic() < since + RETRY:
-            raise failure.with_traceback(None)
+        if name in self._failed:
+            since, kind, detail = self._failed[name]
+            if time.monotonic() < since + RETRY:
+                raise kind(detail)
         try:
             factory = cast(Callable[[Settings], Backend], point.load())
             return factory(self._settings)
@@ -70,5 +72,5 @@ class Registry(Generic[Backend]):
                 f"`cow doctor` shows the line that installs it."
             ) from error
         except CowError as error:
-            self._failed[name] = time.monotonic(), error
+            self._failed[name] = time.monotonic(), type(error), error.detail
             raise

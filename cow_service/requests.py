@@ -89,7 +89,7 @@ class TrajectoryRequest(Record):
     points: tuple[tuple[Finite, Finite], ...] = Field(min_length=2, max_length=4096, description="[[x, y], ...], px.")
     fps: float = Field(default=16, gt=0, le=240)
     visible: tuple[bool, ...] | None = Field(
-        default=None, max_length=4096, description="Per point: the object can be seen. By default inside the image."
+        default=None, max_length=4096, description="Per point inside the image: the object can be seen there."
     )
     tracks: tuple[tuple[tuple[Finite, Finite], ...], ...] | None = Field(
         default=None,

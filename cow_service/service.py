@@ -47,6 +47,10 @@ class Service:
         ):
             if name not in names:
                 raise SettingsError(f"Bad settings: {setting}={name!r}: there are only {', '.join(names) or 'none'}.")
+        loadable = [name for name, manifest in load_manifests().items() if "transformer" in manifest.sources]
+        for name in settings.checkpoints:
+            if name not in loadable:
+                raise SettingsError(f"Bad settings: COW_CHECKPOINTS for {name!r}: only for {', '.join(loadable)}.")
 
     def keep_image(self, data: bytes) -> tuple[Artifact, DecodedImage]:
         """Decodes an image (PNG, JPEG or WebP) and keeps its bytes as sent. Raises the errors of `images.decode`."""
@@ -110,7 +114,7 @@ class Service:
         if manifest is None:
             return BackendInfo(name=name, default=default, ready=None, summary="Registered by another package.")
         missing = manifest.missing_modules()
-        here = name in self.settings.checkpoints or ready(manifest, self.settings.weights_dir)
+        here = ready(manifest, self.settings.weights_dir, without=self.settings.own_parts(name))
         return BackendInfo(
             name=name,
             default=default,

@@ -54,6 +54,13 @@ class Settings(BaseSettings):
         """Folder for weights."""
         return self.models_dir or self.data_dir / "models"
 
+    def own_parts(self, name: str) -> tuple[str, ...]:
+        """Parts of a model that come from a checkpoint of one's own, and need not be pulled."""
+        checkpoint = self.checkpoints.get(name)
+        if checkpoint is None:
+            return ()
+        return ("transformer", "base") if (checkpoint / "vae").is_dir() else ("transformer",)
+
 
 def load_settings(**overrides: Any) -> Settings:
     """Settings from the environment, with overrides that are not None. Raises `SettingsError` for a bad value."""

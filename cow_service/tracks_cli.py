@@ -70,7 +70,7 @@ def import_tracks(
     from cow_service.generators.wan.track_files import read_tracks  # noqa: PLC0415
     from cow_service.requests import TrajectoryRequest  # noqa: PLC0415
 
-    tracks = read_tracks(file, visibility)
+    tracks = read_tracks(file, visibility).held()
     moves = (
         np.abs(tracks.points - tracks.points[:1]).max(axis=(0, 2)) > STILL if tracks.points.size else np.zeros(0, bool)
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Generator, Iterable
+from collections.abc import Container, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
@@ -68,7 +68,7 @@ class Finding(Record):
     """Something about weights that is not as it should be."""
 
     file: str = Field(description="Relative to the repository; a pattern where its files were never pulled.")
-    problem: Literal["missing", "wrong-size", "wrong-digest", "not-pulled"]
+    problem: Literal["missing", "wrong-size", "wrong-digest", "not-pulled", "not-recorded"]
     wanted: str | None = None
     found: str | None = None
 
@@ -76,6 +76,8 @@ class Finding(Record):
         """The finding in words."""
         if self.problem == "not-pulled":
             return f"{self.file} was not pulled"
+        if self.problem == "not-recorded":
+            return f"{self.file} lies there but is not of this revision: delete it"
         return f"{self.file} is missing" if self.found is None else f"{self.file} has {self.found}, not {self.wanted}"
 
 
@@ -85,7 +87,7 @@ def folder_of(weights_dir: Path, repository: str) -> Path:
 
 
 def check(source: Source, weights_dir: Path, digests: bool = True) -> tuple[Finding, ...]:
-    """Compares the files of a source with their record; empty when all is right. Other files are not looked at.
+    """Compares the files of a source with their record; empty when all is right.
 
     Without `digests` only sizes are compared. Raises `WeightsUnavailable` where something cannot be read.
     """
@@ -93,7 +95,11 @@ def check(source: Source, weights_dir: Path, digests: bool = True) -> tuple[Find
     if lock is None:
         return tuple(Finding(file=pattern, problem="not-pulled") for pattern in source.files)
     unpulled = [Finding(file=name, problem="not-pulled") for name in source.files if name not in lock.patterns]
-    return (*unpulled, *examine(lock, chosen(lock, source.files), weights_dir, digests))
+    return (
+        *unpulled,
+        *_strangers(lock, source, weights_dir),
+        *examine(lock, chosen(lock, source.files), weights_dir, digests),
+    )
 
 
 def verify(source: Source, weights_dir: Path, name: str) -> Path:
@@ -113,10 +119,14 @@ def verify(source: Source, weights_dir: Path, name: str) -> Path:
     return folder_of(weights_dir, source.repository)
 
 
-def ready(manifest: Manifest, weights_dir: Path) -> bool:
-    """All files that the manifest needs are here with the right sizes. Quick: nothing is hashed."""
+def ready(manifest: Manifest, weights_dir: Path, without: Container[str] = ()) -> bool:
+    """All files that the manifest needs, but those of the parts `without`, are here with the right sizes.
+
+    Quick: nothing is hashed.
+    """
+    sources = [source for part, source in manifest.sources.items() if part not in without]
     try:
-        return not any(check(source, weights_dir, digests=False) for source in manifest.sources.values())
+        return not any(check(source, weights_dir, digests=False) for source in sources)
     except WeightsUnavailable:
         return False
 
@@ -161,6 +171,18 @@ def merged(old: Lock | None, new: Lock) -> Lock:
             "files": tuple(files[path] for path in sorted(files)),
         }
     )
+
+
+def _strangers(lock: Lock, source: Source, weights_dir: Path) -> list[Finding]:
+    """Weights beside those of the record, such as another revision's shards: a loader would take them for its own."""
+    folder, known = folder_of(weights_dir, lock.repository), {file.path for file in lock.files}
+    with disk_told(lock.repository):
+        here = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.safetensors*") if path.is_file())
+    return [
+        Finding(file=path, problem="not-recorded")
+        for path in here
+        if path not in known and not path.startswith(".") and any(fnmatchcase(path, glob) for glob in source.files)
+    ]
 
 
 def chosen(lock: Lock, patterns: Iterable[str]) -> tuple[LockedFile, ...]:

@@ -204,6 +204,9 @@ def test_pickles_are_never_opened(tmp_path: Path) -> None:
     ("config", "said"),
     [
         ("{", "config.json cannot be read"),
+        ("[]", "config.json is no JSON object"),
+        (json.dumps(ARCHITECTURE | {"_class_name": "WanModel", "num_heads": 0}), "sizes that cannot be"),
+        (json.dumps(ARCHITECTURE | {"_class_name": "WanModel", "num_heads": "2"}), "sizes that cannot be"),
         ('{"_class_name": "UNet"}', "UNet"),
         ('{"_class_name": "WanModel", "model_type": "t2v"}', "t2v"),
         ('{"_class_name": "WanModel", "dim": 24}', "num_heads"),
@@ -224,6 +227,22 @@ def test_nothing_there(tmp_path: Path) -> None:
         loaded(tmp_path / "absent")
     with pytest.raises(CheckpointInvalid, match="no safetensors files: none"):
         loaded(tmp_path)
+
+
+def test_a_scale_for_each_row_is_refused(tmp_path: Path) -> None:
+    """It would be multiplied along the wrong side."""
+    held = original_weights() | {KEY: original_weights()[KEY].to(torch.float8_e4m3fn)}
+    held[KEY.removesuffix("weight") + "scale_weight"] = torch.ones(24)
+    with pytest.raises(CheckpointInvalid, match=r"scale_weight is \[24\], not one number"):
+        loaded(single(tmp_path, held))
+
+
+def test_a_shard_that_points_nowhere(tmp_path: Path) -> None:
+    folder = original_folder(tmp_path)
+    (folder / "z.safetensors").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(CheckpointInvalid, match=r"z\.safetensors") as caught:
+        loaded(folder)
+    assert str(tmp_path) not in caught.value.detail
 
 
 def test_errors_hold_no_path(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from cow_service.generators.wan.pipeline import WanTrackPipeline
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
-from cow_service.settings import Settings
+from cow_service.settings import Settings, SettingsError
 
 BALL = example("ball-and-mug")
 SHORT = {"num_frames": 17, "frames": {"indices": list(range(17)), "max_side": None}}
@@ -100,6 +100,7 @@ def test_options_are_recorded(toys: Service) -> None:
         ({"num_frames": 2, "frames": {}}, "/num_frames", "take 5"),
         ({"num_frames": 85, "frames": {}}, "/num_frames", "take 81"),
         ({"generator_options": {"steps": 0}}, "/generator_options/steps", "greater than or equal to 1"),
+        ({"generator_options": {"steps": "3"}}, "/generator_options/steps", "valid integer"),
         ({"generator_options": {"speed": 1}}, "/generator_options/speed", "not permitted"),
     ],
 )
@@ -320,3 +321,63 @@ def test_the_size_of_a_clip(toys: Service, size: tuple[int, int], wanted: tuple[
     assert isinstance(generator, WanGenerator)
     full = WanGenerator(replace(generator._model, max_area=480 * 832))
     assert full.size(*size) == wanted
+
+
+def test_an_image_too_narrow_for_the_model(toys: Service) -> None:
+    generator = toys.generators.get("tiny-ati")
+    assert generator.size(8, 1_000) == (16, 1008)
+    with pytest.raises(InvalidRequest, match="8 x 400000 px is too narrow") as caught:
+        generator.size(8, 400_000)
+    assert caught.value.errors[0].pointer == "/image"
+
+
+def test_models_made_at_once_are_those_made_alone(tmp_path: Path) -> None:
+    def weights(service: Service, name: str) -> torch.Tensor:
+        return pipeline_of(service, name).transformer.proj_out.weight
+
+    service, found = Service(Settings(data_dir=tmp_path)), {}
+    names = ("tiny-ati", "tiny-wan-move")
+    threads = [threading.Thread(target=lambda n=name: found.update({n: weights(service, n)})) for name in names]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert torch.equal(found["tiny-ati"], found["tiny-wan-move"])
+    assert torch.equal(found["tiny-ati"], weights(Service(Settings(data_dir=tmp_path)), "tiny-ati"))
+
+
+def test_the_whole_image_is_looked_at(toys: Service) -> None:
+    """Also its outer fifths, which a square cut out of its middle would not have."""
+    image = np.zeros((480, 832, 3), np.uint8)
+    pipeline, found = pipeline_of(toys), []
+    for left in (0, 255):
+        image[:, :100] = left
+        found.append(pipeline.embed_picture(image, 112, 64, 5).embeds)
+    assert not torch.allclose(found[0], found[1])
+
+
+@pytest.mark.parametrize("name", ["tiny-ati", "tiny-wan-move"])
+def test_what_each_pass_is_conditioned_on(toys: Service, name: str) -> None:
+    """ATI: both on the tracks. Wan-Move: the guided pass alone."""
+    seen: list[torch.Tensor] = []
+    hook = pipeline_of(toys, name).transformer.register_forward_pre_hook(
+        lambda module, args, kwargs: seen.append(kwargs["hidden_states"][0, 16:].clone()), with_kwargs=True
+    )
+    try:
+        simulate(toys, video=False, generator=name)
+    finally:
+        hook.remove()
+    guided, plain = seen[0], seen[1]
+    assert torch.equal(guided, plain) == (name == "tiny-ati")
+    frames = plain[4:, 1:]
+    moved = guided[4:, 1:]
+    assert name == "tiny-ati" or not torch.equal(moved, frames)
+    # Wan-Move copies features of the first frame; the plain condition has none of them in later frames.
+    first = guided[4:, 0].flatten(1).T
+    copies = (moved.flatten(1).T[:, None] == first[None]).all(-1).any(1).sum()
+    assert (copies > 0) == (name == "tiny-wan-move")
+
+
+def test_a_checkpoint_for_a_model_that_takes_none(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="COW_CHECKPOINTS for 'tiny-ati': only for ati, wan-move"):
+        Service(Settings(data_dir=tmp_path, checkpoints={"tiny-ati": tmp_path}))

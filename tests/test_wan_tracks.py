@@ -115,6 +115,16 @@ def test_visibility_of_tracks_and_anchors() -> None:
     assert (found.points[:, 2] == [5, 5]).all()
 
 
+def test_a_track_that_is_not_seen_stays_where_it_was_seen() -> None:
+    points = np.array([[[0, 0], [5, 5], [1, 1]], [[10, 0], [0, 0], [2, 2]], [[0, 0], [0, 0], [3, 3]]], np.float32)
+    visible = np.array([[False, True, False], [True, False, False], [False, False, False]])
+    held = Tracks(points, visible).held()
+    assert held.points[:, 0].tolist() == [[10, 0], [10, 0], [10, 0]]
+    assert held.points[:, 1].tolist() == [[5, 5], [5, 5], [5, 5]]
+    assert held.points.shape == (3, 2, 2)
+    assert (held.visible == visible[:, :2]).all()
+
+
 def test_no_tracks_at_all() -> None:
     none = tracks_of(trajectory([(1, 1), (2, 2)], [True, True], tracks=[], anchors=[]), 10, 10)
     assert none.points.shape == (2, 0, 2)
@@ -252,10 +262,14 @@ def test_files_that_are_no_tracks_are_refused(tmp_path: Path) -> None:
     (tmp_path / "noise.npz").write_bytes(b"PK nonsense")
     (tmp_path / "noise.pth").write_bytes(b"nonsense")
     (tmp_path / "a.txt").write_text("1 2 3")
+    (tmp_path / "renamed.npz").write_bytes(good.read_bytes())
     torch.save([1, 2], tmp_path / "list.pth")
     for path, said in (
         (npz("key.npz", tracks=np.zeros((1, 121, 1, 3))), "array"),
         (npz("shape.npz", array=np.zeros((1, 120, 1, 3))), "121"),
+        (npz("complex.npz", array=np.ones((1, 121, 1, 3)) * 1j), "not numbers"),
+        (npz("large.npz", array=np.zeros((30_000, 121, 1, 3), np.int8)), "more than"),
+        (tmp_path / "renamed.npz", "cannot be read"),
         (npz("text.npz", array=np.full((1, 121, 1, 3), "x")), "not numbers"),
         (npz("nan.npz", array=np.full((1, 121, 1, 3), np.nan)), "finite"),
         (npy("flat.npy", np.zeros((81, 2))), r"\[F, N, 2\]"),

@@ -68,7 +68,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def cow(home: Path, hub: Hub, *arguments: str, **settings: str) -> subprocess.CompletedProcess[str]:
     environment = {
-        "COW_DATA_DIR": str(home / "data"), "COW_PROFILE": "plain", "COW_DEVICE": "cpu", "HF_ENDPOINT": hub.address,
+        "COW_DATA_DIR": str(home / "data"), "COW_PROFILE": "portable", "COW_DEVICE": "cpu", "HF_ENDPOINT": hub.address,
         "HF_HOME": str(home / "hub"), "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb",
     }  # fmt: skip
     command = [sys.executable, "-m", "cow_service.cli", *arguments]

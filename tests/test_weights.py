@@ -534,3 +534,13 @@ def test_names_and_revisions_that_cannot_be_pulled(toy: Callable[..., tuple[int,
     assert code == 1
     assert "Parts of 'acme/toy' share its folder" in told
     assert toy("--json", "check", "toy")[0] == 2
+
+
+def test_weights_of_another_revision_beside_these_are_found(hub: Hub, folder: Path) -> None:
+    """A loader would take them for its own."""
+    pull(SOURCE, folder, endpoint=hub.address)
+    stranger = folder_of(folder, TOY) / "model-00002-of-00002.safetensors"
+    stranger.write_bytes(b"old")
+    assert [(finding.file, finding.problem) for finding in check(SOURCE, folder)] == [(stranger.name, "not-recorded")]
+    with pytest.raises(WeightsUnavailable, match="is not of this revision: delete it"):
+        verify(SOURCE, folder, "toy")

@@ -67,8 +67,9 @@ def simulate_routes(service: Service) -> APIRouter:
         left = Event()
         watcher = asyncio.create_task(_watch(request, left))
         try:
-            body = await to_thread.run_sync(run, posted, left, limiter=limiter)
+            body = await to_thread.run_sync(run, posted, left, limiter=limiter, abandon_on_cancel=True)
         finally:
+            left.set()  # also when the server stops: the thread is not waited for
             watcher.cancel()
         return Response(body, media_type="application/json")
 

@@ -37,14 +37,14 @@ class Acceleration(Record):
     compile: Literal["none", "regional"] = Field(
         default="none",
         description="regional compiles the transformer's block once for all of its layers; the same to rounding. The "
-        "first clip of every new shape waits for the compiler.",
+        "first clips of new shapes wait for the compiler.",
     )
     cache: Literal["none", "first-block", "mag"] = Field(
         default="none",
         description="Skips the transformer in steps that would change little, and so changes the frames. first-block "
         "runs the first layer of every step and skips the others if its output changed by less than `cache_threshold`. "
         "mag decides by `mag_ratios` alone: never in the first fifth of the steps, never more than 3 in a row. Both "
-        "keep a copy of the video's hidden states per guidance branch. Of no use with few, distilled steps.",
+        "keep one to three copies of the hidden states per guidance branch. Of no use with few, distilled steps.",
     )
     cache_threshold: float = Field(
         default=0.05,
@@ -289,7 +289,7 @@ def _translated(option: str) -> Generator[None]:
     """Whatever a library raises becomes a `GeneratorUnavailable` with the option and the reason, without folders."""
     try:
         yield
-    except CowError:
+    except (CowError, torch.OutOfMemoryError):
         raise
     except Exception as error:
         reason = re.sub(r"(/[\w.+-]+)+/", "", (str(error).splitlines() or [""])[0])[:300]

@@ -8,6 +8,7 @@ with the model's before a single weight is read. Safetensors only: a pickle can 
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -82,6 +83,8 @@ def diffusers_config(architecture: Architecture) -> dict[str, Any]:
         }
     except KeyError as error:
         raise CheckpointInvalid(f"The configuration does not say `{error.args[0]}`.") from error
+    except (TypeError, ZeroDivisionError) as error:
+        raise CheckpointInvalid(f"The configuration holds sizes that cannot be: {error}.") from error
 
 
 def _files_of(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
@@ -136,9 +139,17 @@ def _configuration(folder: Path | None, architecture: Architecture) -> tuple[dic
 
 def _json(file: Path) -> dict[str, Any]:
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        found = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise CheckpointInvalid(f"{file.name} cannot be read: {error}.") from error
+        raise CheckpointInvalid(f"{file.name} cannot be read: {_reason(error)}.") from error
+    if not isinstance(found, dict):
+        raise CheckpointInvalid(f"{file.name} is no JSON object.")
+    return cast("dict[str, Any]", found)
+
+
+def _reason(error: Exception) -> str:
+    """What went wrong, without the path that the operating system adds."""
+    return error.strerror or "unreadable" if isinstance(error, OSError) else str(error)
 
 
 def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
@@ -154,7 +165,7 @@ def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
                     entries[name] = _Entry(file, tuple(part.get_shape()), part.get_dtype())
         except (SafetensorError, OSError) as error:
             raise CheckpointInvalid(
-                f"{file.name} is cut short or damaged ({error}). Download it again: `cow models pull`."
+                f"{file.name} is cut short or damaged ({_reason(error)}). Download it again: `cow models pull`."
             ) from error
     return entries
 
@@ -163,7 +174,7 @@ def _empty(config: dict[str, Any]) -> WanTransformer3DModel:
     try:
         with init_empty_weights():
             return WanTransformer3DModel(**config)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, ZeroDivisionError, RuntimeError) as error:
         raise CheckpointInvalid(f"The configuration does not make a Wan transformer: {error}.") from error
 
 
@@ -183,6 +194,11 @@ def _plan(entries: dict[str, _Entry], wanted: Mapping[str, Tensor], original: bo
         f"{plan[name]} is {list(entries[plan[name]].shape)}, not {list(tensor.shape)}"
         for name, tensor in wanted.items()
         if name in plan and entries[plan[name]].shape != tuple(tensor.shape)
+    ]
+    shapes += [
+        f"{name} is {list(entry.shape)}, not one number"
+        for name, entry in entries.items()
+        if name.endswith(SCALE) and math.prod(entry.shape) != 1
     ]
     types = [f"{name} is {entries[name].dtype}" for name in sorted(weights) if entries[name].dtype not in FLOATING]
     kinds = (("unknown", unknown), ("missing", missing), ("of another shape", shapes), ("not floating-point", types))
@@ -215,7 +231,7 @@ def _fill(
                     keep = any(part in precise for part in name.split("."))
                     state[name] = tensor.to(torch.float32 if keep else dtype)
         except (SafetensorError, OSError) as error:
-            raise CheckpointInvalid(f"{file.name} is damaged ({error}). Download it again.") from error
+            raise CheckpointInvalid(f"{file.name} is damaged ({_reason(error)}). Download it again.") from error
     model.load_state_dict(state, strict=True, assign=True)
     cast(Any, model).to(device)  # the tables of the rotary embedding, which no checkpoint holds
 

@@ -57,7 +57,7 @@ def _part(kind: Any, base: Path, part: str, **options: Any) -> Any:
     try:
         return kind.from_pretrained(str(base / part), local_files_only=True, **options)
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
-        reason = str(error).replace(str(base), "").splitlines()[0]
+        reason = (str(error).replace(str(base), "").splitlines() or [type(error).__name__])[0]
         raise CheckpointInvalid(f"'{part}' cannot be loaded: {reason}") from error
 
 

@@ -12,6 +12,8 @@ import torch
 
 from cow_service.errors import GeneratorOutOfMemory, GeneratorUnavailable
 
+# What the CPU's allocator, the CUDA runtime, cuBLAS and cuDNN say, all in plain runtime errors.
+OUT_OF_MEMORY = ("can't allocate memory", "CUDA error: out of memory", "_STATUS_ALLOC_FAILED")
 WAIT = 0.2  # seconds between looks at whether the one who waits still wants it
 
 _locks: dict[str, Lock] = {}
@@ -83,8 +85,7 @@ def within_memory(device: torch.device, forget: Callable[[], None], what: str) -
 
 
 def _is_out_of_memory(error: RuntimeError) -> bool:
-    # The CPU's allocator raises a plain RuntimeError.
-    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+    return isinstance(error, torch.OutOfMemoryError) or any(words in str(error) for words in OUT_OF_MEMORY)
 
 
 def _memory(device: torch.device) -> str:

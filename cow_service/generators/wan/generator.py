@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from cow_service.errors import FieldError, InvalidRequest
 from cow_service.generators.base import Shot
 from cow_service.generators.wan.device import alone_on, on_threads, within_memory
 from cow_service.generators.wan.encodings import Encodings
@@ -23,6 +24,7 @@ from cow_service.generators.wan.tracks import nearest_lengths, tracks_of
 from cow_service.records import GeneratorInfo
 
 SIDE_UNIT = 16  # px: the sides of a clip are multiples of it
+LONGEST_SIDE = 1024 * SIDE_UNIT  # px: the model knows 1024 positions each way
 STEPS_SHARE = 0.9  # of the progress; the rest is decoding
 
 Image = NDArray[np.uint8]
@@ -31,7 +33,7 @@ Image = NDArray[np.uint8]
 class WanOptions(BaseModel):
     """What `generator_options` may hold for a video model. What is not given is as the profile says."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     steps: int | None = Field(default=None, ge=1, le=200, description="Denoising steps.")
     shift: float | None = Field(default=None, gt=0, le=50, description="Shift of the noise schedule.")
@@ -48,6 +50,7 @@ class Model:
     name: str
     repository: str | None
     revision: str | None
+    revisions: dict[str, str]  # of the other parts that were pulled
     pipeline: WanTrackPipeline
     device: torch.device
     profile_name: str
@@ -75,16 +78,23 @@ class WanGenerator:
         return nearest_lengths(num_frames)
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """The model's area at the image's aspect ratio, sides rounded down to multiples of 16 px."""
+        """The model's area at the image's aspect ratio, sides rounded down to multiples of 16 px.
+
+        Raises `InvalidRequest` for an image so narrow that no clip of that shape can be made.
+        """
         area = self._model.max_area
         sides = math.sqrt(area * width / height), math.sqrt(area * height / width)
         # The small term keeps an exact 480 from becoming 464 when the root is a hair below it.
         across, down = (max(SIDE_UNIT, int(side / SIDE_UNIT + 1e-6) * SIDE_UNIT) for side in sides)
+        if max(across, down) > LONGEST_SIDE:
+            detail = f"{width} x {height} px is too narrow for a video model: crop it"
+            raise InvalidRequest(f"`image`: {detail}.", errors=(FieldError("/image", detail),))
         return across, down
 
     def describe(self, shot: Shot) -> GeneratorInfo:
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""
         model, sampling = self._model, self._sampling(shot)
+        acceleration = model.profile.acceleration.model_dump(exclude_defaults=True, mode="json")
         return GeneratorInfo(
             name=model.name,
             model=model.repository,
@@ -96,11 +106,18 @@ class WanGenerator:
                 "solver": sampling.solver,
                 "shift": sampling.shift,
                 "guidance_scale": sampling.guidance_scale,
+                "guidance_window": str(list(sampling.guidance_window)),
                 "dtype": model.profile.dtype,
+                "vae_dtype": model.profile.vae_dtype,
                 "device": model.device.type,
                 "prompt": self._prompt(shot),
-                "negative_prompt": self._negative_prompt(shot),
+                "negative_prompt": self._negative_prompt(shot) if sampling.passes > sampling.steps else "",
                 "clean_cues": _options(shot).clean_cues,
+            }
+            | {f"{part}_revision": revision for part, revision in model.revisions.items()}
+            | {
+                name: value if isinstance(value, bool | int | float | str) else str(value)
+                for name, value in acceleration.items()
             },
         )
 
@@ -136,6 +153,7 @@ class WanGenerator:
             latents = pipeline.denoise(noise, guide, sampling, lambda done, steps: progress(STEPS_SHARE * done / steps))
             return pipeline.decode(latents)
         finally:
+            pipeline.vae.clear_cache()  # features of a clip that was not decoded to its end
             pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure
 
     def _guide(self, shot: Shot, width: int, height: int, *, guided: bool) -> Guide:
@@ -159,7 +177,8 @@ class WanGenerator:
         return self._model.profile.sampling.model_copy(update=given)
 
     def _prompt(self, shot: Shot) -> str:
-        return _options(shot).prompt or shot.motion.sentence
+        given = _options(shot).prompt
+        return shot.motion.sentence if given is None else given
 
     def _negative_prompt(self, shot: Shot) -> str:
         given = _options(shot).negative_prompt

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from threading import Lock
 
 import torch
 
+from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan import methods
 from cow_service.generators.wan.acceleration import accelerate
 from cow_service.generators.wan.checkpoints import load_transformer
 from cow_service.generators.wan.components import assemble
-from cow_service.generators.wan.device import choose_device
+from cow_service.generators.wan.device import choose_device, within_memory
 from cow_service.generators.wan.generator import Model, WanGenerator
 from cow_service.generators.wan.lora import add_lora
 from cow_service.generators.wan.pipeline import WanTrackPipeline
@@ -19,6 +21,9 @@ from cow_service.generators.wan.tiny import make_tiny
 from cow_service.manifests import Manifest, load_manifests
 from cow_service.settings import Settings
 from cow_service.weights import read_lock, verify
+
+# Seeds and lazy initialisation are the whole process's: two models made at once would get into each other's weights.
+_one_at_a_time = Lock()
 
 
 def create_ati(settings: Settings) -> WanGenerator:
@@ -44,27 +49,32 @@ def create_tiny_wan_move(settings: Settings) -> WanGenerator:
 def load(name: str, method: methods.Method, settings: Settings) -> WanGenerator:
     """The generator of a manifest. A manifest without sources is made here, at the sizes that it gives.
 
-    Raises `WeightsUnavailable`, `CheckpointInvalid`, or `GeneratorUnavailable` for what this machine cannot do.
+    Raises `WeightsUnavailable`, `CheckpointInvalid`, `GeneratorOutOfMemory`, or `GeneratorUnavailable` for what this
+    machine cannot do.
     """
     manifest = load_manifests()[name]
     profile = profile_of(manifest, settings.profile)
     device = choose_device(settings.device)
+    if profile.acceleration.context_parallel > 1:
+        raise GeneratorUnavailable(
+            "`context_parallel` needs several processes that make the same clip; a server is one. Set COW_PROFILE."
+        )
     own = settings.checkpoints.get(name)
-    if own is None and not manifest.sources:
-        pipeline, repository, revision = make_tiny(manifest.architecture), None, None
-    else:
-        pipeline = _from_weights(manifest, profile, own, settings.weights_dir, device)
-        source = manifest.sources["transformer"]
-        repository = source.repository if own is None else own.name
-        lock = read_lock(settings.weights_dir, source.repository)
-        revision = lock.revision if lock is not None and own is None else None
-    pipeline.set_progress_bar_config(disable=True)
-    accelerate(pipeline, profile.acceleration, device)
+    with _one_at_a_time, within_memory(device, lambda: None, f"'{name}'"):
+        if manifest.sources:
+            pipeline = _from_weights(manifest, profile, own, settings.weights_dir, device)
+        else:
+            pipeline = make_tiny(manifest.architecture)
+        pipeline.set_progress_bar_config(disable=True)
+        accelerate(pipeline, profile.acceleration, device)
+    revisions = _revisions(manifest, profile, own, settings.weights_dir)
+    repository = manifest.sources["transformer"].repository if manifest.sources else None
     return WanGenerator(
         Model(
             name=name,
-            repository=repository,
-            revision=revision,
+            repository=repository if own is None else own.name,
+            revision=revisions.pop("transformer", None),
+            revisions=revisions,
             pipeline=pipeline,
             device=device,
             profile_name=settings.profile,
@@ -87,11 +97,21 @@ def _from_weights(
     base = own if own is not None and whole else verify(manifest.sources["base"], weights_dir, manifest.name)
     lora = None if profile.lora is None else manifest.sources[profile.lora.source]
     added = None if lora is None else verify(lora, weights_dir, manifest.name) / lora.files[0]
-    # Where parts are offloaded, or their weights made smaller, they must first be on the CPU.
-    direct = profile.acceleration.offload == "none"
+    # Where parts are offloaded, or their weights made smaller, the device need not hold all of them at once.
+    direct = profile.acceleration.offload == "none" and profile.acceleration.fp8 == "none"
     dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
     transformer = load_transformer(checkpoint, manifest.architecture, dtype, device if direct else torch.device("cpu"))
     pipeline = assemble(transformer, base, dtype, vae_dtype)
     if added is not None and profile.lora is not None:
         add_lora(pipeline, added, profile.lora.scale)
     return pipeline
+
+
+def _revisions(manifest: Manifest, profile: Profile, own: Path | None, weights_dir: Path) -> dict[str, str]:
+    """The revision of every pulled part that the model is made of."""
+    lora = None if profile.lora is None else profile.lora.source
+    used = {"transformer" if own is None else None, "base", lora}
+    locks = {
+        part: read_lock(weights_dir, source.repository) for part, source in manifest.sources.items() if part in used
+    }
+    return {part: lock.revision for part, lock in locks.items() if lock is not None}

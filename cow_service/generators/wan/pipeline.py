@@ -78,7 +78,10 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         """Both encodings of the first frame, RGB [H, W, 3] of any size, for a clip of `width` x `height` px."""
         device = self._execution_device
         picture = Image.fromarray(image)
-        embeds = self.encode_image(picture, device)
+        # The image encoder takes a square: the whole image, squeezed, as in the public implementation. The processor of
+        # the pipeline would cut out its middle.
+        side = self.image_encoder.config.image_size
+        embeds = self.encode_image(picture.resize((side, side), Image.Resampling.BICUBIC), device)
         pixels = self.video_processor.preprocess(picture, height=height, width=width).to(device, torch.float32)
         _, condition = self.prepare_latents(
             pixels,

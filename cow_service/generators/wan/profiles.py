@@ -48,7 +48,10 @@ def profile_of(manifest: Manifest, name: str) -> Profile:
             f"'{manifest.name}' has no profile '{name}'. It has: {', '.join(manifest.profiles)}. Set COW_PROFILE."
         )
     try:
-        return Profile.model_validate(manifest.profiles[name])
+        profile = Profile.model_validate(manifest.profiles[name])
+        if profile.lora is not None and profile.lora.source not in manifest.sources:
+            raise GeneratorUnavailable(f"'{manifest.name}' has no source '{profile.lora.source}' for its LoRA.")
+        return profile
     except ValidationError as error:
         told = "; ".join(f"{'.'.join(str(p) for p in item['loc'])}: {item['msg']}" for item in error.errors())
         raise GeneratorUnavailable(f"Profile '{name}' of '{manifest.name}' is not valid: {told}.") from error

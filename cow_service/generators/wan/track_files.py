@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -20,6 +21,7 @@ from cow_service.generators.wan.tracks import FILE_SAMPLES, MAX_FRAMES, Floats, 
 
 ARRAY = "array"  # its name in the .npz file
 VISIBILITY = "-visibility"  # between the name of Wan-Move's file of positions and its suffix
+MOST = 10_000_000  # numbers in a file
 SUFFIXES = (".pth", ".npz", ".npy")
 
 
@@ -58,8 +60,9 @@ def read_tracks(path: Path, visibility: Path | None = None) -> Tracks:
         if path.suffix == ".npy":
             return _wan_move(path, visibility)
         return from_ati_file(_ati_array(path))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InvalidRequest(f"{path.name} cannot be read: {error}.") from error
+    except (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise InvalidRequest(f"{path.name} cannot be read: {reason}.") from error
 
 
 def _ati_array(path: Path) -> Floats:
@@ -88,7 +91,7 @@ def _saved_bytes(path: Path) -> bytes | NDArray[np.generic]:
     if isinstance(saved, bytes):
         return saved
     if isinstance(saved, torch.Tensor):
-        return saved.numpy()
+        return saved.detach().float().numpy()
     raise InvalidRequest(f"{path.name} holds a {type(saved).__name__}: ATI's tracks are the bytes of an .npz file.")
 
 
@@ -109,7 +112,9 @@ def _wan_move(path: Path, visibility: Path | None) -> Tracks:
 
 
 def _numbers(path: Path, data: NDArray[np.generic]) -> Floats:
-    if not np.issubdtype(data.dtype, np.number):
+    if data.size > MOST:
+        raise InvalidRequest(f"{path.name} holds {data.size} numbers, more than {MOST}.")
+    if not np.issubdtype(data.dtype, np.number) or np.iscomplexobj(data):
         raise InvalidRequest(f"{path.name} holds {data.dtype}, not numbers.")
     array = data.astype(np.float32)
     if not np.isfinite(array).all():

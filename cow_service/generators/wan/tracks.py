@@ -38,6 +38,15 @@ class Tracks:
         """F, the frames of the clip."""
         return self.points.shape[0]
 
+    def held(self) -> Tracks:
+        """Without tracks that are never visible; where one is not, it stays where it was seen last (or first)."""
+        seen = self.visible.any(axis=0)
+        points, visible = self.points[:, seen].copy(), self.visible[:, seen]
+        for track in range(points.shape[1]):
+            last = np.maximum.accumulate(np.where(visible[:, track], np.arange(self.num_frames), -1))
+            points[:, track] = points[np.where(last < 0, visible[:, track].argmax(), last), track]
+        return Tracks(points, visible)
+
     def scaled(self, x: float, y: float) -> Tracks:
         """The same tracks on the image resized by these factors."""
         return Tracks((self.points * np.array([x, y])).astype(np.float32), self.visible)
@@ -59,7 +68,8 @@ def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
     points = np.concatenate([moving, still]).transpose(1, 0, 2)
     inside = _inside(points, width, height)
     centre = np.array(trajectory.points, np.float64)
-    # Inside the image and yet not visible: behind the camera or hidden, and so are the mover's other points.
+    # Inside the image and yet not visible: behind the camera or hidden, and so are the mover's other points. Outside
+    # it the centre says nothing of them.
     hidden = _inside(centre, width, height) & ~np.array(trajectory.visible, bool)
     visible = inside.copy()
     visible[:, : len(moving)] &= ~hidden[:, None]
