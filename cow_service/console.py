@@ -6,7 +6,7 @@ import json
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from pydantic import ValidationError
 from rich.console import Console
@@ -39,8 +39,8 @@ def build_request(
             "point": None if point is None else _numbers("--point", point, 2),
             "bbox": None if box is None else _numbers("--box", box, 4),
         }
-    elif name is not None:
-        raise InvalidRequest("--object goes with --point or --box; without them the question names the object.")
+    elif name is not None and trajectory is None:
+        raise InvalidRequest("--object goes with --point, --box or --trajectory; else the question names the object.")
     if direction is not None or kind in ("fall", "static"):
         body["motion"] = {
             "direction": None if direction is None else _numbers("--direction", direction, 2),
@@ -50,7 +50,12 @@ def build_request(
     elif kind != "linear" or speed is not None:
         raise InvalidRequest("--kind and --speed go with --direction; without it the motion is read from the question.")
     if trajectory is not None:
-        body["trajectory"] = _json(trajectory)
+        body["trajectory"] = path = _json(trajectory)
+        if name is not None and "grounding" not in body and isinstance(path, dict):
+            body["grounding"] = {
+                "object": name,
+                "point": next(iter(cast("dict[str, Any]", path).get("points", [])), None),
+            }
     return body
 
 

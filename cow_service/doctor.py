@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 from pydantic import BaseModel
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cow_service import __version__
@@ -82,7 +83,9 @@ def print_report(report: Report, *, as_json: bool) -> None:
         table.add_column(heading)
     for backend in report.backends:
         ready = {True: "[green]yes[/]", False: "[yellow]no[/]", None: "unknown"}[backend.ready]
-        table.add_row(backend.name, ready, ", ".join(backend.missing) or "-", backend.install or backend.pull or "-")
+        table.add_row(
+            backend.name, ready, ", ".join(backend.missing) or "-", escape(backend.install or backend.pull or "-")
+        )
     console.print(table)
     installed = ", ".join(f"{name} {found}" for name, found in report.packages.items() if found)
     absent = ", ".join(name for name, found in report.packages.items() if not found)

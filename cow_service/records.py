@@ -123,6 +123,9 @@ class Trajectory(Record):
     tracks: tuple[tuple[Point, ...], ...] = Field(
         description="Several points inside the object's mask, each [x, y] per frame, px."
     )
+    tracks_visible: tuple[tuple[bool, ...], ...] | None = Field(
+        default=None, description="Per track and frame, where it was given: the point can be seen."
+    )
     anchors: tuple[Point, ...] = Field(description="Static points that hold the camera still, px.")
     encounters: tuple[Encounter, ...] = ()
 

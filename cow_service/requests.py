@@ -10,6 +10,8 @@ from pydantic import Field, field_validator, model_validator
 from cow_service.records import BBox, FramePolicy, MotionKind, Point, Record, Sha256, Vector
 
 MAX_FRAMES = 481
+MAX_TRACKS = 1024
+MAX_TRACK_POINTS = 262_144  # of all tracks together
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -94,11 +96,18 @@ class TrajectoryRequest(Record):
     tracks: tuple[tuple[tuple[Finite, Finite], ...], ...] | None = Field(
         default=None,
         min_length=1,
-        max_length=64,
+        max_length=MAX_TRACKS,
         description="Paths of several points of the object, each like `points`. By default points in its mask.",
     )
+    tracks_visible: tuple[tuple[bool, ...], ...] | None = Field(
+        default=None,
+        max_length=MAX_TRACKS,
+        description="Per track and point: it can be seen. By default inside the image.",
+    )
     anchors: tuple[tuple[Finite, Finite], ...] | None = Field(
-        default=None, max_length=64, description="Points that stay where they are. By default spread over the image."
+        default=None,
+        max_length=MAX_TRACKS,
+        description="Points that stay where they are. By default spread over the image.",
     )
 
     @field_validator("points", "anchors")
@@ -126,6 +135,12 @@ class TrajectoryRequest(Record):
         wrong = next((len(track) for track in self.tracks or () if len(track) != wanted), None)
         if wrong is not None:
             raise ValueError(f"a track has {wrong} points where `points` has {wanted}")
+        if len(self.tracks or ()) * wanted > MAX_TRACK_POINTS:
+            raise ValueError(f"`tracks` holds more than {MAX_TRACK_POINTS} points")
+        if self.tracks_visible is not None and [len(t) for t in self.tracks_visible] != [wanted] * len(
+            self.tracks or ()
+        ):
+            raise ValueError("`tracks_visible` must have an entry for every point of every track")
         return self
 
 

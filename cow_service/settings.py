@@ -8,6 +8,7 @@ from typing import Any
 from platformdirs import user_data_path
 from pydantic import Field, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import SettingsError as UnreadableSetting
 
 
 class SettingsError(Exception):
@@ -57,7 +58,7 @@ class Settings(BaseSettings):
     def own_parts(self, name: str) -> tuple[str, ...]:
         """Parts of a model that come from a checkpoint of one's own, and need not be pulled."""
         checkpoint = self.checkpoints.get(name)
-        if checkpoint is None:
+        if checkpoint is None or not checkpoint.exists():
             return ()
         return ("transformer", "base") if (checkpoint / "vae").is_dir() else ("transformer",)
 
@@ -66,6 +67,9 @@ def load_settings(**overrides: Any) -> Settings:
     """Settings from the environment, with overrides that are not None. Raises `SettingsError` for a bad value."""
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
+    except UnreadableSetting as error:
+        field = str(error).split('"')[1:2]
+        raise SettingsError(f"Bad settings: COW_{''.join(field).upper()} is not JSON.") from error
     except ValidationError as error:
         told = "; ".join(
             f"COW_{str(item['loc'][0]).upper()}={item['input']!r}: {item['msg']}" for item in error.errors()

@@ -8,7 +8,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from cow_service.errors import CowError
+from cow_service.errors import InvalidRequest
 
 Result = TypeVar("Result")
 
@@ -27,7 +27,6 @@ def export_tracks(
     """Write a simulation's tracks, in pixels of its input image: the mover's, then the anchors."""
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from cow_service.errors import InvalidRequest  # noqa: PLC0415
     from cow_service.generators.wan.track_files import write_tracks  # noqa: PLC0415
     from cow_service.generators.wan.tracks import tracks_of  # noqa: PLC0415
     from cow_service.records import Simulation  # noqa: PLC0415
@@ -36,7 +35,7 @@ def export_tracks(
         record = Simulation.model_validate_json(simulation.read_bytes())
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
+        place = ".".join(str(part) for part in first["loc"]) or "the file"
         raise InvalidRequest(f"{simulation.name} is not a simulation: {place}: {first['msg']}.") from error
     tracks = tracks_of(record.trajectory, record.image.width, record.image.height)
     written = _written(out, lambda: write_tracks(tracks, out))
@@ -66,11 +65,13 @@ def import_tracks(
     import numpy as np  # noqa: PLC0415
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from cow_service.errors import InvalidRequest  # noqa: PLC0415
     from cow_service.generators.wan.track_files import read_tracks  # noqa: PLC0415
     from cow_service.requests import TrajectoryRequest  # noqa: PLC0415
 
-    tracks = read_tracks(file, visibility).held()
+    read = read_tracks(file, visibility)
+    if not read.visible.any():
+        raise InvalidRequest(f"{file.name} has {read.points.shape[1]} tracks, and none of them is ever visible.")
+    tracks = read.held()
     moves = (
         np.abs(tracks.points - tracks.points[:1]).max(axis=(0, 2)) > STILL if tracks.points.size else np.zeros(0, bool)
     )
@@ -82,12 +83,14 @@ def import_tracks(
             points=tuple(map(tuple, moving.mean(axis=1).round(3).tolist())),
             fps=fps,
             visible=tuple(map(bool, np.any(tracks.visible[:, moves], axis=1).tolist())),
+            tracks_visible=tuple(tuple(map(bool, track)) for track in tracks.visible[:, moves].T.tolist()),
             tracks=tuple(tuple(map(tuple, track)) for track in moving.transpose(1, 0, 2).tolist()),
             anchors=tuple(map(tuple, tracks.points[0, ~moves].astype(float).round(3).tolist())),
         )
     except ValidationError as error:
         first = error.errors()[0]
-        raise InvalidRequest(f"{file.name} does not make a trajectory: {first['msg']}.") from error
+        place = ".".join(str(part) for part in first["loc"]) or "trajectory"
+        raise InvalidRequest(f"{file.name} does not make a trajectory: {place}: {first['msg']}.") from error
     if out is None:
         typer.echo(trajectory.model_dump_json())
         return
@@ -99,4 +102,4 @@ def _written(out: Path, write: Callable[[], Result]) -> Result:
     try:
         return write()
     except OSError as error:
-        raise CowError(f"'{out}' cannot be written: {error.strerror}. Choose another file with --out.") from error
+        raise InvalidRequest(f"'{out}' cannot be written: {error.strerror}. Choose another file with --out.") from error

@@ -86,7 +86,7 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers with commas between"),
         ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),
         ([QUESTION, "--kind", "projectile"], 1, "go with --direction"),
-        ([QUESTION, "--object", "x"], 1, "goes with --point or --box"),
+        ([QUESTION, "--object", "x"], 1, "goes with --point, --box or --trajectory"),
         ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: ati, cutout,"),
         ([QUESTION, "--option", "steps"], 1, "--option takes NAME=VALUE"),
         ([QUESTION, "--option", "steps=4"], 1, "/generator_options/steps"),
@@ -160,3 +160,10 @@ def test_version_and_help(tmp_path: Path) -> None:
     shown = cow(tmp_path, "--help").stdout
     for command in ("simulate", "serve", "models", "doctor"):
         assert command in shown
+
+
+def test_a_setting_that_is_not_json_is_named(tmp_path: Path) -> None:
+    result = cow(tmp_path, "models", COW_CHECKPOINTS="nonsense")
+    assert result.returncode == 2
+    assert "COW_CHECKPOINTS is not JSON" in result.stderr
+    assert "Traceback" not in result.stderr

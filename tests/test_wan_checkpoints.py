@@ -24,6 +24,7 @@ ARCHITECTURE = {
     "dim": 24, "ffn_dim": 32, "freq_dim": 32, "in_dim": 36, "num_heads": 2, "num_layers": 2, "out_dim": 16,
     "text_dim": 16,
 }  # fmt: skip
+TOY = load_manifests()["tiny-ati"].architecture
 KEY = "blocks.0.self_attn.q.weight"
 
 
@@ -61,7 +62,7 @@ def test_a_diffusers_folder(tmp_path: Path, truth: dict[str, torch.Tensor]) -> N
     assert same(loaded(tmp_path / "whole"), truth)
 
 
-@pytest.mark.parametrize("prefix", ["", PREFIX])
+@pytest.mark.parametrize("prefix", ["", PREFIX, "diffusion_model."])
 def test_one_file(tmp_path: Path, truth: dict[str, torch.Tensor], prefix: str) -> None:
     assert same(loaded(single(tmp_path, original_weights(), prefix)), truth)
 
@@ -211,7 +212,8 @@ def test_pickles_are_never_opened(tmp_path: Path) -> None:
         ('{"_class_name": "WanModel", "model_type": "t2v"}', "t2v"),
         ('{"_class_name": "WanModel", "dim": 24}', "num_heads"),
         (json.dumps(ARCHITECTURE | {"_class_name": "WanModel", "text_len": 77}), "text_len"),
-        ('{"_class_name": "WanTransformer3DModel", "nonsense": 1}', "nonsense"),
+        ('{"_class_name": "WanTransformer3DModel", "in_channels": 36, "image_dim": 9, "nonsense": 1}', "nonsense"),
+        ('{"_class_name": "WanTransformer3DModel", "in_channels": 16}', "takes no image"),
         (json.dumps(ARCHITECTURE | {"_class_name": "WanModel", "num_layers": 3}), r"missing: blocks\.2"),
     ],
 )
@@ -256,15 +258,15 @@ def test_errors_hold_no_path(tmp_path: Path) -> None:
 class TestTheOtherParts:
     @pytest.fixture
     def base(self, tmp_path: Path) -> Path:
-        make_tiny(load_manifests()["tiny-ati"].architecture).save_pretrained(tmp_path / "base")
+        make_tiny(TOY).save_pretrained(tmp_path / "base")
         return tmp_path / "base"
 
     def transformer(self):
-        return make_tiny(load_manifests()["tiny-ati"].architecture).transformer
+        return make_tiny(TOY).transformer
 
     def test_they_load_as_they_were_saved(self, base: Path) -> None:
         found = assemble(self.transformer(), base, torch.float32, torch.float32)
-        wanted = make_tiny(load_manifests()["tiny-ati"].architecture)
+        wanted = make_tiny(TOY)
         for part in ("vae", "text_encoder", "image_encoder"):
             assert same(getattr(found, part).state_dict(), getattr(wanted, part).state_dict()), part
         assert torch.equal(found.embed_text("a ball"), wanted.embed_text("a ball"))
@@ -287,6 +289,11 @@ class TestTheOtherParts:
         with pytest.raises(CheckpointInvalid, match=part) as caught:
             assemble(self.transformer(), base, torch.float32, torch.float32)
         assert str(base) not in caught.value.detail
+
+    def test_parts_of_another_width(self, base: Path) -> None:
+        wider = TOY | {"text_dim": 24}
+        with pytest.raises(CheckpointInvalid, match="'text_encoder' is 16 wide, and the transformer takes 24"):
+            assemble(make_tiny(wider).transformer, base, torch.float32, torch.float32)
 
     def test_a_part_that_is_not_there(self, base: Path) -> None:
         (base / "tokenizer").rename(base / "elsewhere")

@@ -299,7 +299,7 @@ class TestProfiles:
 @pytest.mark.parametrize("name", ["ati", "wan-move"])
 def test_without_weights_it_says_how_to_get_them(tmp_path: Path, name: str) -> None:
     with pytest.raises(CowError, match=f"cow models pull {name}") as caught:
-        simulate(Service(Settings(data_dir=tmp_path)), generator=name)
+        simulate(Service(Settings(data_dir=tmp_path, profile="portable")), generator=name)
     assert caught.value.code == "weights-unavailable"
 
 

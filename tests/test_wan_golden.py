@@ -97,6 +97,16 @@ def test_the_schedule() -> None:
     assert found.tolist() == tensors("tiny_denoise")["timesteps_s4_shift5.0"].tolist()
 
 
+@pytest.mark.parametrize(("solver", "steps", "shift"), [("unipc", 100, 12), ("unipc", 40, 1e-9), ("euler", 60, 50)])
+def test_steps_whose_times_round_to_the_same(solver: str, steps: int, shift: float) -> None:
+    schedule = Sampling(solver=solver, steps=steps, shift=shift, guidance_scale=1.0).schedule(CPU)
+    sample = torch.ones(1, 1, 1, 2, 2)
+    for time in schedule.timesteps:
+        sample = schedule.step(torch.zeros_like(sample), time, sample, return_dict=False)[0]
+    assert len(schedule.timesteps) == steps
+    assert torch.isfinite(sample).all()
+
+
 def test_guidance_over_a_window_takes_fewer_passes(pipeline: WanTrackPipeline) -> None:
     golden = tensors("tiny_denoise")
     whole = Sampling(steps=4, shift=5.0, guidance_scale=5.0)

@@ -47,11 +47,12 @@ def test_a_length_that_it_cannot_make(http: httpx.Client) -> None:
     ]
 
 
-def test_without_weights(http: httpx.Client) -> None:
+def test_what_this_machine_cannot_do(http: httpx.Client) -> None:
     answer = http.post("/simulate", json=body(generator="ati"))
     assert answer.status_code == 503
-    assert answer.json()["type"] == "urn:cow:problem:weights-unavailable"
-    assert "cow models pull ati" in answer.json()["detail"]
+    assert answer.json()["type"] == "urn:cow:problem:generator-unavailable"
+    assert "needs a GPU" in answer.json()["detail"]
+    assert "COW_PROFILE" in answer.json()["detail"]
     backends = {backend["name"]: backend for backend in http.get("/models").json()["generators"]}
     assert backends["ati"]["ready"] is False
     assert backends["ati"]["pull"] == "cow models pull ati"
@@ -146,14 +147,35 @@ def test_import_prints_what_a_request_takes(simulated: Path) -> None:
         (("export", "out/simulation.json", "--out", "absent/a.npz"), "cannot be written"),
         (("import", "image.jpg"), "suffix '.jpg'"),
         (("import", "still.npy"), "none of them moves"),
+        (("import", "hidden.npy"), "none of them is ever visible"),
     ],
 )
 def test_what_cannot_be_done_is_said(simulated: Path, arguments: tuple[str, ...], said: str) -> None:
     np.save(simulated / "still.npy", np.full((81, 3, 2), 5.0))
+    np.save(simulated / "hidden.npy", np.zeros((81, 3, 2)))
+    np.save(simulated / "hidden-visibility.npy", np.zeros((81, 3), bool))
     done = cow(simulated, "tracks", *arguments)
     assert done.returncode == 1
     assert said in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_file_of_many_tracks_keeps_each_ones_visibility(simulated: Path) -> None:
+    frames, count = 81, 400
+    points = np.arange(frames)[:, None, None] * [1.0, 0.5] + np.linspace(50, 200, count)[None, :, None]
+    visible = np.random.default_rng(0).random((frames, count)) < 0.9
+    visible[0] = visible[-1] = True
+    np.save(simulated / "many.npy", points.astype(np.float32))
+    np.save(simulated / "many-visibility.npy", visible)
+    imported = cow(simulated, "tracks", "import", "many.npy", "--out", "many.json")
+    assert "400 moving and 0 static tracks" in imported.stdout, imported.stderr
+    told = ("--object", "yellow ball", "--trajectory", "many.json", "--num-frames", "41")
+    done = cow(simulated, "simulate", "image.jpg", "?", *told, "--no-video", "--out", "many-out")
+    assert done.returncode == 0, done.stderr
+    found = Simulation.model_validate_json((simulated / "many-out" / "simulation.json").read_bytes())
+    assert (visible[:41] == np.array(found.trajectory.tracks_visible).T).all()
+    assert found.motion.sentence.startswith("The yellow ball")
+    assert any("lasts 5.00 s and the clip 2.50 s: its rest is not shown" in told for told in found.warnings)
 
 
 def test_a_trajectory_that_is_not_json(simulated: Path) -> None:

@@ -112,15 +112,18 @@ def test_visibility_of_tracks_and_anchors() -> None:
     assert found.visible[:, 0].tolist() == [True, True, False, False]
     assert found.visible[:, 1].tolist() == [True, True, True, False]
     assert found.visible[:, 2:].all()
+    given = [[True, False, True, True], [True] * 4]
+    shown = trajectory(points, [True] * 4, tracks=[points, other], tracks_visible=given)
+    assert tracks_of(shown, 100, 100).visible[:, 0].tolist() == [True, False, False, True]
     assert (found.points[:, 2] == [5, 5]).all()
 
 
 def test_a_track_that_is_not_seen_stays_where_it_was_seen() -> None:
-    points = np.array([[[0, 0], [5, 5], [1, 1]], [[10, 0], [0, 0], [2, 2]], [[0, 0], [0, 0], [3, 3]]], np.float32)
+    points = np.array([[[0, 0], [5, 5], [1, 1]], [[10, 0], [0, 0], [2, 2]], [[0, 0], [9, 9], [3, 3]]], np.float32)
     visible = np.array([[False, True, False], [True, False, False], [False, False, False]])
     held = Tracks(points, visible).held()
     assert held.points[:, 0].tolist() == [[10, 0], [10, 0], [10, 0]]
-    assert held.points[:, 1].tolist() == [[5, 5], [5, 5], [5, 5]]
+    assert held.points[:, 1].tolist() == [[5, 5], [5, 5], [9, 9]]  # a place off the image is one
     assert held.points.shape == (3, 2, 2)
     assert (held.visible == visible[:, :2]).all()
 
@@ -295,3 +298,8 @@ def test_time_first_and_batched_files_are_read_too(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_tracks(tmp_path / "a.npz").points, some.points, atol=1e-3)
     np.save(tmp_path / "b.npy", some.points)
     assert read_tracks(tmp_path / "b.npy").visible.all()
+    np.save(tmp_path / "tracks.npy", some.points[None])
+    np.save(tmp_path / "visibility.npy", np.zeros((1, MAX_FRAMES, 1), bool))
+    assert not read_tracks(tmp_path / "tracks.npy").visible.any()
+    with pytest.raises(InvalidRequest, match="holds its own visibility"):
+        read_tracks(tmp_path / "a.npz", tmp_path / "visibility.npy")

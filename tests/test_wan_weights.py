@@ -118,6 +118,8 @@ def test_damaged_weights_are_not_loaded(home: Path, hub: Hub) -> None:
 
 def test_a_checkpoint_of_ones_own(home: Path, hub: Hub, tmp_path: Path) -> None:
     """One file in place of the pulled transformer; what is wrong with it is named, and no path of this machine."""
+    absent = simulate(home, hub, COW_CHECKPOINTS=json.dumps({"ati": str(tmp_path / "absent.safetensors")}))
+    assert "There is no checkpoint 'absent.safetensors'" in absent.stderr
     (tmp_path / "mine.safetensors").write_bytes(
         save({"blocks.0.self_attn.q.weight": original_weights()["head.head.bias"]})
     )

@@ -22,6 +22,7 @@ def doubts(
         _cues_not_spoken_of(scene, request),
         _motion_beside_path(request),
         _path_off_object(request, grounding),
+        _path_of_another_length(request),
     )
     return tuple(told for told in found if told is not None)
 
@@ -61,3 +62,15 @@ def _path_off_object(request: SimulateRequest, grounding: Grounding) -> str | No
     if gap <= OFF_CENTRE * max(x1 - x0, y1 - y0):
         return None
     return f"The given trajectory begins {gap:.0f} px from the object's centre: in the first frame it is drawn there."
+
+
+def _path_of_another_length(request: SimulateRequest) -> str | None:
+    """A path that ends where the clip does, or a frame beside it, is of its length."""
+    if request.trajectory is None:
+        return None
+    path = (len(request.trajectory.points) - 1) / request.trajectory.fps
+    clip = (request.num_frames - 1) / request.fps
+    if abs(path - clip) * request.fps <= 1.5:
+        return None
+    happens = "its rest is not shown" if path > clip else "from its end on the object stays where it is"
+    return f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}."

@@ -61,6 +61,7 @@ def compute_trajectory(
         visible=tuple(bool(v) for v in visible),
         scale=tuple(float(v) for v in scale),
         tracks=tuple(_pairs(track) for track in tracks),
+        tracks_visible=_seen(given, times),
         anchors=anchors,
         encounters=find_encounters(sweep, obstacles),
     )
@@ -91,6 +92,14 @@ def _sampled(path: Floats, fps: float, times: Floats) -> Floats:
     """A path [P, D] given at `fps`, at other times: linear between its points, at rest after the last."""
     stamps = np.arange(len(path)) / fps
     return np.stack([np.interp(times, stamps, path[:, axis]) for axis in range(path.shape[1])], axis=1)
+
+
+def _seen(given: TrajectoryRequest | None, times: Floats) -> tuple[tuple[bool, ...], ...] | None:
+    """Per track and frame, as given."""
+    if given is None or given.tracks_visible is None:
+        return None
+    frames = _latest(given, times)
+    return tuple(tuple(track[frame] for frame in frames) for track in given.tracks_visible)
 
 
 def _latest(given: TrajectoryRequest, times: Floats) -> NDArray[np.int64]:

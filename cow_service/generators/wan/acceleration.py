@@ -89,6 +89,14 @@ def refusals(acceleration: Acceleration, machine: Machine) -> tuple[str, ...]:
     return tuple(sentence for check in checks for sentence in check(acceleration, machine))
 
 
+def check_machine(acceleration: Acceleration, device: torch.device) -> None:
+    """Raises `GeneratorUnavailable` with everything that this machine cannot do. Quick: nothing is loaded."""
+    with _translated(f"device: {device}"):
+        sentences = refusals(acceleration, look(device))
+    if sentences:
+        raise GeneratorUnavailable(f"{' '.join(sentences)} Another profile may do (COW_PROFILE).")
+
+
 def accelerate(pipeline: object, acceleration: Acceleration, device: torch.device) -> None:
     """Applies every option to the pipeline's parts and puts them where they run; only once per pipeline.
 
@@ -97,10 +105,7 @@ def accelerate(pipeline: object, acceleration: Acceleration, device: torch.devic
     """
     wanted, parts = acceleration, cast(Any, pipeline)
     transformer = parts.transformer
-    with _translated(f"device: {device}"):
-        sentences = refusals(acceleration, look(device))
-    if sentences:
-        raise GeneratorUnavailable(" ".join(sentences))
+    check_machine(acceleration, device)
     steps: tuple[tuple[str, bool, Callable[[], object]], ...] = (
         (f"fp8: {wanted.fp8}", wanted.fp8 != "none", lambda: _quantise(transformer, wanted, device)),
         (f"attention: {wanted.attention}", True, lambda: transformer.set_attention_backend(wanted.attention)),

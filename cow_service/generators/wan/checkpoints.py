@@ -24,13 +24,14 @@ from torch import Tensor
 
 from cow_service.errors import CheckpointInvalid
 
-PREFIX = "model.diffusion_model."
+PREFIXES = ("model.diffusion_model.", "diffusion_model.")  # of names in one-file checkpoints
 SCALE = ".scale_weight"  # one number per fp8 weight: what it is multiplied by
 UNUSED = (".scale_input", "scaled_fp8")  # for fp8 arithmetic, and the marker that scales are there
 PICKLES = {".pth", ".pt", ".bin", ".ckpt", ".pkl", ".pickle"}
 FLOATING = {"F64", "F32", "F16", "BF16", "F8_E4M3", "F8_E5M2"}
 SHOWN = 8  # names per kind in an error
 IMAGE_DIM = 1280  # of the image encoder, fixed in the original models
+IN_CHANNELS = 36  # noise, mask and image
 TEXT_LENGTH = 512
 
 Architecture = Mapping[str, Any]
@@ -41,6 +42,7 @@ class _Entry:
     """A tensor as its file's header describes it."""
 
     file: Path
+    key: str  # with its prefix
     shape: tuple[int, ...]
     dtype: str
 
@@ -53,7 +55,7 @@ def load_transformer(
     `architecture` has the sizes of a file that comes without a `config.json`, named as in the original configuration.
     Raises `CheckpointInvalid` naming every file, name or shape that is wrong.
     """
-    folder, files = _files_of(path)
+    folder, files = checkpoint_files(path)
     config, original = _configuration(folder, architecture)
     entries = _headers(files)
     model = _empty(config)
@@ -87,8 +89,11 @@ def diffusers_config(architecture: Architecture) -> dict[str, Any]:
         raise CheckpointInvalid(f"The configuration holds sizes that cannot be: {error}.") from error
 
 
-def _files_of(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
-    """The folder of a configuration, where there is one, and the safetensors files in order."""
+def checkpoint_files(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
+    """The folder of a configuration, where there is one, and the safetensors files in order.
+
+    Raises `CheckpointInvalid` where there are none, or shards are missing. Opens none of them.
+    """
     if path.suffix in PICKLES:
         raise CheckpointInvalid(f"{path.name} is a pickle, which can run code when opened. Use its safetensors form.")
     if path.is_file():
@@ -127,6 +132,10 @@ def _configuration(folder: Path | None, architecture: Architecture) -> tuple[dic
     config = _json(file)
     kind = config.get("_class_name")
     if kind == "WanTransformer3DModel":
+        if config.get("in_channels") != IN_CHANNELS or config.get("image_dim") is None:
+            raise CheckpointInvalid(
+                "The model of config.json takes no image: `in_channels` is not 36, or no `image_dim`."
+            )
         return {name: value for name, value in config.items() if not name.startswith("_")}, False
     if kind == "WanModel":
         if config.get("model_type", "i2v") != "i2v":
@@ -159,13 +168,13 @@ def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
         try:
             with safe_open(file, framework="pt") as opened:
                 for key in tuple(opened.keys()):
-                    name, part = key.removeprefix(PREFIX), opened.get_slice(key)
+                    name, part = _unprefixed(key), opened.get_slice(key)
                     if name in entries:
                         raise CheckpointInvalid(f"'{name}' is both in {entries[name].file.name} and in {file.name}.")
-                    entries[name] = _Entry(file, tuple(part.get_shape()), part.get_dtype())
+                    entries[name] = _Entry(file, key, tuple(part.get_shape()), part.get_dtype())
         except (SafetensorError, OSError) as error:
             raise CheckpointInvalid(
-                f"{file.name} is cut short or damaged ({_reason(error)}). Download it again: `cow models pull`."
+                f"{file.name} is cut short or damaged ({_reason(error)}). Download it again."
             ) from error
     return entries
 
@@ -222,12 +231,11 @@ def _fill(
         here = [(name, source) for name, source in plan.items() if entries[source].file == file]
         try:
             with safe_open(file, framework="pt", device=str(device)) as opened:
-                held = set(opened.keys())
                 for name, source in here:
-                    tensor = opened.get_tensor(PREFIX + source if PREFIX + source in held else source)
+                    tensor = opened.get_tensor(entries[source].key)
                     scale = source.removesuffix(".weight") + SCALE
                     if source.endswith(".weight") and scale in entries:
-                        tensor = tensor.float() * _scale(entries[scale].file, scale, device)
+                        tensor = tensor.float() * _scale(entries[scale], device)
                     keep = any(part in precise for part in name.split("."))
                     state[name] = tensor.to(torch.float32 if keep else dtype)
         except (SafetensorError, OSError) as error:
@@ -236,9 +244,14 @@ def _fill(
     cast(Any, model).to(device)  # the tables of the rotary embedding, which no checkpoint holds
 
 
-def _scale(file: Path, name: str, device: torch.device) -> Tensor:
-    with safe_open(file, framework="pt", device=str(device)) as opened:
-        return opened.get_tensor(PREFIX + name if PREFIX + name in set(opened.keys()) else name).float()
+def _scale(entry: _Entry, device: torch.device) -> Tensor:
+    with safe_open(entry.file, framework="pt", device=str(device)) as opened:
+        return opened.get_tensor(entry.key).float()
+
+
+def _unprefixed(key: str) -> str:
+    prefix = next((prefix for prefix in PREFIXES if key.startswith(prefix)), "")
+    return key.removeprefix(prefix)
 
 
 def _listed(names: list[str]) -> str:

@@ -24,11 +24,20 @@ def assemble(
 
     Raises `CheckpointInvalid` naming the part and what does not fit.
     """
+    text_encoder = _model(UMT5EncoderModel, base, "text_encoder", dtype)
+    image_encoder = _model(CLIPVisionModel, base, "image_encoder", dtype)
+    sizes: Any = transformer.config
+    for name, wanted, found in (
+        ("text_encoder", sizes.text_dim, text_encoder.config.d_model),
+        ("image_encoder", sizes.image_dim, image_encoder.config.hidden_size),
+    ):
+        if wanted != found:
+            raise CheckpointInvalid(f"'{name}' is {found} wide, and the transformer takes {wanted}.")
     return compose(
         transformer=transformer,
         vae=_model(AutoencoderKLWan, base, "vae", vae_dtype),
-        text_encoder=_model(UMT5EncoderModel, base, "text_encoder", dtype),
-        image_encoder=_model(CLIPVisionModel, base, "image_encoder", dtype),
+        text_encoder=text_encoder,
+        image_encoder=image_encoder,
         tokenizer=_part(AutoTokenizer, base, "tokenizer"),
         image_processor=_part(CLIPImageProcessor, base, "image_processor"),
     )

@@ -9,8 +9,8 @@ import torch
 
 from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan import methods
-from cow_service.generators.wan.acceleration import accelerate
-from cow_service.generators.wan.checkpoints import load_transformer
+from cow_service.generators.wan.acceleration import accelerate, check_machine
+from cow_service.generators.wan.checkpoints import checkpoint_files, load_transformer
 from cow_service.generators.wan.components import assemble
 from cow_service.generators.wan.device import choose_device, within_memory
 from cow_service.generators.wan.generator import Model, WanGenerator
@@ -59,7 +59,10 @@ def load(name: str, method: methods.Method, settings: Settings) -> WanGenerator:
         raise GeneratorUnavailable(
             "`context_parallel` needs several processes that make the same clip; a server is one. Set COW_PROFILE."
         )
+    check_machine(profile.acceleration, device)
     own = settings.checkpoints.get(name)
+    if own is not None:
+        checkpoint_files(own)
     with _one_at_a_time, within_memory(device, lambda: None, f"'{name}'"):
         if manifest.sources:
             pipeline = _from_weights(manifest, profile, own, settings.weights_dir, device)

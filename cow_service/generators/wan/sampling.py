@@ -68,6 +68,7 @@ class Sampling(Record):
             # Distilled weights know the noise levels 1, 1 - 1/n, ... before the shift (lightx2v: 1000, 750, 500, 250).
             euler = FlowMatchEulerDiscreteScheduler(num_train_timesteps=TRAIN_STEPS, shift=self.shift)
             euler.set_timesteps(sigmas=[1 - i / self.steps for i in range(self.steps)], device=device)
+            euler.set_begin_index(0)
             return cast(Schedule, euler)
         unipc = UniPCMultistepScheduler(
             num_train_timesteps=TRAIN_STEPS,
@@ -77,4 +78,6 @@ class Sampling(Record):
         )
         highest = 1 - 1 / TRAIN_STEPS
         unipc.set_timesteps(sigmas=cast(Any, np.linspace(highest, 0, self.steps + 1)[:-1]), device=device)
+        # Steps are counted: found by their times, which are whole numbers, two with the same would be taken for one.
+        unipc.set_begin_index(0)
         return cast(Schedule, unipc)

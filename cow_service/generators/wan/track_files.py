@@ -7,6 +7,7 @@ ATI's `.pth` is a saved string of bytes: the `.npz` file, whose array is called 
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -56,12 +57,15 @@ def read_tracks(path: Path, visibility: Path | None = None) -> Tracks:
     """
     if path.suffix not in SUFFIXES:
         raise _unknown(path)
+    if visibility is not None and path.suffix != ".npy":
+        raise InvalidRequest(f"{path.name} holds its own visibility: a file of it goes with .npy alone.")
     try:
         if path.suffix == ".npy":
             return _wan_move(path, visibility)
         return from_ati_file(_ati_array(path))
     except (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        missing = isinstance(error, FileNotFoundError)
+        reason = "there is no such file" if missing else f"it is damaged, or no {path.suffix} file of plain numbers"
         raise InvalidRequest(f"{path.name} cannot be read: {reason}.") from error
 
 
@@ -83,8 +87,10 @@ def _ati_array(path: Path) -> Floats:
 def _saved_bytes(path: Path) -> bytes | NDArray[np.generic]:
     torch = _torch()
     try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-    except (UnpicklingError, RuntimeError) as error:
+        with warnings.catch_warnings():  # PyTorch remarks on how it was pickled
+            warnings.simplefilter("ignore")
+            saved = torch.load(path, map_location="cpu", weights_only=True)
+    except (UnpicklingError, RuntimeError, KeyError, EOFError) as error:
         raise InvalidRequest(
             f"{path.name} is damaged, or holds more than plain data, which is not read: it could run code."
         ) from error
@@ -100,8 +106,14 @@ def _wan_move(path: Path, visibility: Path | None) -> Tracks:
     points = points[0] if points.ndim == 4 and points.shape[0] == 1 else points
     if points.ndim != 3 or points.shape[2] != 2 or not points.shape[0]:
         raise InvalidRequest(f"{path.name} holds {list(points.shape)}: Wan-Move's tracks are [F, N, 2].")
-    beside = path.with_name(path.stem + VISIBILITY + path.suffix)
-    file = visibility or (beside if beside.is_file() else None)
+    # As `write_tracks` names it, and as Wan-Move's own examples do.
+    names = (
+        path.stem + VISIBILITY,
+        path.stem.replace("tracks", "visibility"),
+        path.stem.replace("track", "visibility"),
+    )
+    beside = [path.with_name(name + path.suffix) for name in names if name != path.stem]
+    file = visibility or next((other for other in beside if other.is_file()), None)
     if file is None:
         return Tracks(points, np.ones(points.shape[:2], bool))
     visible = np.load(file, allow_pickle=False)

@@ -39,12 +39,17 @@ class Tracks:
         return self.points.shape[0]
 
     def held(self) -> Tracks:
-        """Without tracks that are never visible; where one is not, it stays where it was seen last (or first)."""
-        seen = self.visible.any(axis=0)
-        points, visible = self.points[:, seen].copy(), self.visible[:, seen]
+        """Without tracks that are never visible; zeros where a track is not, which stand for no place, become its last.
+
+        Before a track is first seen they become its first place.
+        """
+        ever = self.visible.any(axis=0)
+        points, visible = self.points[:, ever].copy(), self.visible[:, ever]
+        placed = visible | points.any(axis=2)
         for track in range(points.shape[1]):
-            last = np.maximum.accumulate(np.where(visible[:, track], np.arange(self.num_frames), -1))
-            points[:, track] = points[np.where(last < 0, visible[:, track].argmax(), last), track]
+            known = placed[:, track]
+            last = np.maximum.accumulate(np.where(known, np.arange(self.num_frames), -1))
+            points[:, track] = points[np.where(last < 0, known.argmax(), last), track]
         return Tracks(points, visible)
 
     def scaled(self, x: float, y: float) -> Tracks:
@@ -73,6 +78,8 @@ def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
     hidden = _inside(centre, width, height) & ~np.array(trajectory.visible, bool)
     visible = inside.copy()
     visible[:, : len(moving)] &= ~hidden[:, None]
+    if trajectory.tracks_visible is not None:
+        visible[:, : len(moving)] &= np.array(trajectory.tracks_visible, bool).reshape(len(moving), frames).T
     return Tracks(points.astype(np.float32), visible)
 
 
