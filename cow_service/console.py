@@ -73,8 +73,10 @@ def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Pat
     columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[Stage, TaskID] = {}
+        loading = bars.add_task("loading", total=None)  # a model takes its time before the first stage
 
         def show(stage: Stage, done: float) -> None:
+            bars.update(loading, visible=False)
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=1.0)
             bars.update(tasks[stage], completed=done)

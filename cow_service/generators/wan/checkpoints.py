@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -32,7 +32,7 @@ FLOATING = {"F64", "F32", "F16", "BF16", "F8_E4M3", "F8_E5M2"}
 SHOWN = 8  # names per kind in an error
 IMAGE_DIM = 1280  # of the image encoder, fixed in the original models
 IN_CHANNELS = 36  # noise, mask and image
-TEXT_LENGTH = 512
+TEXT_LENGTH = 512  # tokens, fixed by the model
 
 Architecture = Mapping[str, Any]
 
@@ -121,7 +121,7 @@ def _check_shards(folder: Path, files: tuple[Path, ...]) -> None:
             count = int(numbered[2])
             promised |= {f"{numbered[1]}{i:05d}-of-{numbered[2]}.safetensors" for i in range(1, count + 1)}
     if absent := sorted(promised - present):
-        raise CheckpointInvalid(f"Shards are missing: {_listed(absent)}. Download the checkpoint again.")
+        raise CheckpointInvalid(f"Shards are missing: {listed(absent)}. Download the checkpoint again.")
 
 
 def _configuration(folder: Path | None, architecture: Architecture) -> tuple[dict[str, Any], bool | None]:
@@ -211,7 +211,7 @@ def _plan(entries: dict[str, _Entry], wanted: Mapping[str, Tensor], original: bo
     ]
     types = [f"{name} is {entries[name].dtype}" for name in sorted(weights) if entries[name].dtype not in FLOATING]
     kinds = (("unknown", unknown), ("missing", missing), ("of another shape", shapes), ("not floating-point", types))
-    told = [f"{len(found)} {kind}: {_listed(found)}" for kind, found in kinds if found]
+    told = [f"{len(found)} {kind}: {listed(found)}" for kind, found in kinds if found]
     if told:
         raise CheckpointInvalid(f"The checkpoint does not fit the model. {'; '.join(told)}.")
     return plan
@@ -254,6 +254,7 @@ def _unprefixed(key: str) -> str:
     return key.removeprefix(prefix)
 
 
-def _listed(names: list[str]) -> str:
+def listed(names: Sequence[str]) -> str:
+    """The first few of many names, and how many more there are."""
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return ", ".join(names[:SHOWN]) + more

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,8 @@ from safetensors import SafetensorError
 from transformers import AutoTokenizer, CLIPImageProcessor, CLIPVisionModel, UMT5EncoderModel
 
 from cow_service.errors import CheckpointInvalid
+from cow_service.generators.wan.checkpoints import listed
 from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
-
-SHOWN = 8  # names in an error
 
 
 def assemble(
@@ -47,7 +45,7 @@ def _model(kind: Any, base: Path, part: str, dtype: torch.dtype) -> Any:
     """A model whose checkpoint fits it name by name: the libraries themselves only warn, and make up the rest."""
     model, report = _part(kind, base, part, torch_dtype=dtype, use_safetensors=True, output_loading_info=True)
     told = [
-        f"{len(report[key])} {word}: {_listed(report[key])}"
+        f"{len(report[key])} {word}: {listed(sorted(map(str, report[key])))}"
         for key, word in (
             ("unexpected_keys", "unknown"),
             ("missing_keys", "missing"),
@@ -68,9 +66,3 @@ def _part(kind: Any, base: Path, part: str, **options: Any) -> Any:
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         reason = (str(error).replace(str(base), "").splitlines() or [type(error).__name__])[0]
         raise CheckpointInvalid(f"'{part}' cannot be loaded: {reason}") from error
-
-
-def _listed(names: Iterable[object]) -> str:
-    shown = sorted(str(name) for name in names)
-    more = f" and {len(shown) - SHOWN} more" if len(shown) > SHOWN else ""
-    return ", ".join(shown[:SHOWN]) + more

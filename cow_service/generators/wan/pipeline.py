@@ -18,9 +18,9 @@ from PIL import Image
 from torch import Tensor
 
 from cow_service.generators.wan.acceleration import reset_cache
+from cow_service.generators.wan.checkpoints import TEXT_LENGTH
 from cow_service.generators.wan.sampling import Sampling
 
-TEXT_LENGTH = 512  # tokens, fixed by the model
 LATENT_CHANNELS = 16
 
 StepListener = Callable[[int, int], None]
