@@ -76,7 +76,7 @@ def pull(
     """Downloads what is missing of a source, checks it, and returns its folder.
 
     `revision` is a branch, tag or commit; without it, it is the recorded one, or at first the newest. `endpoint` is
-    the hub's address, by default HF_ENDPOINT or https://huggingface.co. Raises `WeightsUnavailable`.
+    the hub's address, by default HF_ENDPOINT or the public one. Raises `WeightsUnavailable`.
     """
     fetch([plan(source, weights_dir, revision, endpoint=endpoint)], weights_dir, progress, endpoint=endpoint)
     return folder_of(weights_dir, source.repository)
