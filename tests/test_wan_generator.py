@@ -381,3 +381,23 @@ def test_what_each_pass_is_conditioned_on(toys: Service, name: str) -> None:
 def test_a_checkpoint_for_a_model_that_takes_none(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="COW_CHECKPOINTS for 'tiny-ati': only for ati, wan-move"):
         Service(Settings(data_dir=tmp_path, checkpoints={"tiny-ati": tmp_path}))
+
+
+def test_parts_of_ones_own_carry_no_pulled_revision(tmp_path: Path) -> None:
+    """A whole pipeline of one's own brings its own other parts, whatever was pulled."""
+    from cow_service.generators.wan.loading import _revisions
+    from cow_service.generators.wan.profiles import profile_of
+    from cow_service.manifests import load_manifests
+    from cow_service.weights import Lock, folder_of, write_lock
+
+    manifest = load_manifests()["ati"]
+    profile = profile_of(manifest, "portable")
+    for source in manifest.sources.values():
+        folder_of(tmp_path / "models", source.repository).mkdir(parents=True)
+        write_lock(tmp_path / "models", Lock(repository=source.repository, revision="a" * 40, patterns=(), files=()))
+    (tmp_path / "whole" / "vae").mkdir(parents=True)
+    (tmp_path / "one.safetensors").touch()
+    for own, parts in (({}, ["base", "transformer"]), ("one.safetensors", ["base"]), ("whole", [])):
+        checkpoints = {"ati": tmp_path / own} if own else {}
+        settings = Settings(data_dir=tmp_path, checkpoints=checkpoints)
+        assert sorted(_revisions(manifest, profile, settings)) == parts

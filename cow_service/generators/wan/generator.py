@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -68,10 +67,7 @@ class WanGenerator:
 
     def __init__(self, model: Model) -> None:
         self._model = model
-
-    @cached_property
-    def _encodings(self) -> Encodings:
-        return Encodings(self._model.pipeline)
+        self._encodings = Encodings(model.pipeline)
 
     def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
         """4n + 1 frames, 5 to 81."""
@@ -111,7 +107,7 @@ class WanGenerator:
                 "vae_dtype": model.profile.vae_dtype,
                 "device": model.device.type,
                 "prompt": self._prompt(shot),
-                "negative_prompt": self._negative_prompt(shot) if sampling.passes > sampling.steps else "",
+                "negative_prompt": self._negative_prompt(shot) if sampling.guided else "",
                 "clean_cues": _options(shot).clean_cues,
             }
             | {f"{part}_revision": revision for part, revision in model.revisions.items()}
@@ -148,7 +144,7 @@ class WanGenerator:
         progress(0.0)
         try:
             sampling = self._sampling(shot)
-            guide = self._guide(shot, width, height, guided=sampling.passes > sampling.steps)
+            guide = self._guide(shot, width, height, guided=sampling.guided)
             progress(0.0)
             latents = pipeline.denoise(noise, guide, sampling, lambda done, steps: progress(STEPS_SHARE * done / steps))
             return pipeline.decode(latents)

@@ -65,12 +65,12 @@ def load(name: str, method: methods.Method, settings: Settings) -> WanGenerator:
         checkpoint_files(own)
     with _one_at_a_time, within_memory(device, lambda: None, f"'{name}'"):
         if manifest.sources:
-            pipeline = _from_weights(manifest, profile, own, settings.weights_dir, device)
+            pipeline = _from_weights(manifest, profile, settings, device)
         else:
             pipeline = make_tiny(manifest.architecture)
         pipeline.set_progress_bar_config(disable=True)
         accelerate(pipeline, profile.acceleration, device)
-    revisions = _revisions(manifest, profile, own, settings.weights_dir)
+    revisions = _revisions(manifest, profile, settings)
     repository = manifest.sources["transformer"].repository if manifest.sources else None
     return WanGenerator(
         Model(
@@ -90,31 +90,36 @@ def load(name: str, method: methods.Method, settings: Settings) -> WanGenerator:
     )
 
 
-def _from_weights(
-    manifest: Manifest, profile: Profile, own: Path | None, weights_dir: Path, device: torch.device
-) -> WanTrackPipeline:
-    """The pipeline of the pulled weights, with the transformer from `own` where that is given."""
-    checkpoint = own or verify(manifest.sources["transformer"], weights_dir, manifest.name)
-    # A whole pipeline in diffusers' form brings its own other parts.
-    whole = own is not None and (own / "vae").is_dir()
-    base = own if own is not None and whole else verify(manifest.sources["base"], weights_dir, manifest.name)
-    lora = None if profile.lora is None else manifest.sources[profile.lora.source]
-    added = None if lora is None else verify(lora, weights_dir, manifest.name) / lora.files[0]
+def _from_weights(manifest: Manifest, profile: Profile, settings: Settings, device: torch.device) -> WanTrackPipeline:
+    """The pipeline of the pulled weights, but for the parts that come from a checkpoint of one's own."""
+    own = settings.own_parts(manifest.name)
+
+    def folder(part: str) -> Path:
+        if part in own:
+            return settings.checkpoints[manifest.name]
+        return verify(manifest.sources[part], settings.weights_dir, manifest.name)
+
+    checkpoint, base = folder("transformer"), folder("base")
+    lora = profile.lora
+    added = None if lora is None else folder(lora.source) / manifest.sources[lora.source].files[0]
     # Where parts are offloaded, or their weights made smaller, the device need not hold all of them at once.
     direct = profile.acceleration.offload == "none" and profile.acceleration.fp8 == "none"
     dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
     transformer = load_transformer(checkpoint, manifest.architecture, dtype, device if direct else torch.device("cpu"))
     pipeline = assemble(transformer, base, dtype, vae_dtype)
-    if added is not None and profile.lora is not None:
-        add_lora(pipeline, added, profile.lora.scale)
+    if added is not None and lora is not None:
+        add_lora(pipeline, added, lora.scale)
     return pipeline
 
 
-def _revisions(manifest: Manifest, profile: Profile, own: Path | None, weights_dir: Path) -> dict[str, str]:
+def _revisions(manifest: Manifest, profile: Profile, settings: Settings) -> dict[str, str]:
     """The revision of every pulled part that the model is made of."""
-    lora = None if profile.lora is None else profile.lora.source
-    used = {"transformer" if own is None else None, "base", lora}
+    used = {"transformer", "base"} - set(settings.own_parts(manifest.name))
+    if profile.lora is not None:
+        used.add(profile.lora.source)
     locks = {
-        part: read_lock(weights_dir, source.repository) for part, source in manifest.sources.items() if part in used
+        part: read_lock(settings.weights_dir, source.repository)
+        for part, source in manifest.sources.items()
+        if part in used
     }
     return {part: lock.revision for part, lock in locks.items() if lock is not None}

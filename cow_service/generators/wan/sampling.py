@@ -55,6 +55,11 @@ class Sampling(Record):
         return self.guidance_scale != 1 and begin <= step / self.steps < end
 
     @property
+    def guided(self) -> bool:
+        """Whether any step takes the second pass."""
+        return any(self.guides(step) for step in range(self.steps))
+
+    @property
     def passes(self) -> int:
         """Passes through the transformer for the whole clip."""
         return self.steps + sum(self.guides(step) for step in range(self.steps))
