@@ -89,6 +89,17 @@ def stands_nearer(mover: BBox, other: BBox, *, airborne: bool) -> bool:
     return airborne or foot_line(mover) >= foot_line(other)
 
 
+def floor_gap(box: BBox, other: BBox, squash: float) -> tuple[float, float, float]:
+    """How far apart two boxes stand on the floor: sideways, in depth, and their summed half widths, all in px.
+
+    `squash` is how much flatter than wide a circle on the floor is seen; depth is positive where the first is nearer.
+    """
+    width, other_width = box[2] - box[0], other[2] - other[0]
+    middle, other_middle = foot_line(box) - squash * width / 2, foot_line(other) - squash * other_width / 2
+    across = (box[0] + box[2] - other[0] - other[2]) / 2
+    return across, (middle - other_middle) / squash, (width + other_width) / 2
+
+
 def box_at(bbox: BBox, start: Floats, point: Floats, scale: float) -> BBox:
     """The mover's box when its centre has gone from `start` to `point` and it appears `scale` times as large."""
     left, top, right, bottom = bbox
@@ -104,12 +115,8 @@ def _kind(sweep: Sweep, point: Floats, scale: float, other: BBox) -> EncounterKi
     box = box_at(sweep.bbox, sweep.start, point, scale)
     if sweep.airborne:
         return "touches" if foot_line(box) <= foot_line(other) else "occludes"
-    width, other_width = box[2] - box[0], other[2] - other[0]
-    squash = float(np.sin(PITCH))  # a circle on the floor is seen this much flatter than wide
-    middle, other_middle = foot_line(box) - squash * width / 2, foot_line(other) - squash * other_width / 2
-    across = (box[0] + box[2] - other[0] - other[2]) / 2
-    away = (middle - other_middle) / squash
-    if float(np.hypot(across, away)) <= REACH * (width + other_width) / 2:
+    across, away, reach = floor_gap(box, other, float(np.sin(PITCH)))
+    if float(np.hypot(across, away)) <= REACH * reach:
         return "touches"
     return "occludes" if stands_nearer(box, other, airborne=False) else "occluded-by"
 

@@ -1,0 +1,234 @@
+"""Where a ball in the air comes down and whether it then rolls into something, told by its shadow on the floor.
+
+A thrown ball comes down, bounces and rolls on in its heading, at whatever speed. What decides is how deep in the scene
+it flies. Its shadow tells that, but only along with the light, which slants: on the floor, the shadow of a ball is a
+circle drawn out along the light. Its centre and its shape in the image are five numbers, and camera pitch, height,
+and slant of the light are four; the fit of these to those also says how sure they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.physics.camera import FOCAL_WIDTHS, PITCH
+from cow_service.physics.encounters import REACH, floor_gap
+from cow_service.records import BBox
+from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.scene import SAME_OBJECT, Scene, iou
+from cow_service.vision.shadows import Shadow, find_shadow
+
+UPRIGHT = 0.5  # of the heading's length, sideways in the image: less is up, down or away, not along the floor's rows
+SURE = 0.88  # chance from which an answer is given
+RULE_ERROR = 0.12  # of the reach: what stands on the floor is no circle, and boxes are a little off
+CLEAR = 1.2  # of the reach: what lies so far back is not met
+GUESSES = (PITCH, 4.0, 0.0, 0.1)  # rad, radii, radii per radius: pitch, height, slant of the light sideways and away
+DOUBTS = (0.21, 4.0, 0.5, 0.35)  # of the guesses, in their units: a room's light falls steeper than 45 degrees
+# Of what is measured: the centre in radii of the ball, the log of width and height, the correlation.
+ERRORS = (0.05, 0.05, 0.06, 0.08, 0.05)
+WORST_FIT = 14.0  # squared deviations in all: a patch that fits worse is not the ball's shadow
+LOWEST = 1.4  # radii, from the floor to the ball's centre: lower, it stands
+STEPS = 12  # of the fit
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Landing:
+    """The ball on the floor below where it is in the air, as one light would have it. Not where it comes to rest."""
+
+    footprint: BBox  # px: the circle on the floor that is as wide as the ball, around where it touches
+    pitch: float  # rad: how far the camera looks down
+
+    @property
+    def squash(self) -> float:
+        """Height of a circle on the floor, of its width."""
+        return math.sin(self.pitch)
+
+
+def rolls_into(
+    scene: Scene, mover: BBox, heading: tuple[float, float], target: BBox, obstacles: Sequence[Obstacle] = ()
+) -> bool | None:
+    """Whether the ball in box `mover` thrown along `heading` (px, y down) rolls into what stands in box `target`.
+
+    The heading's upward part is taken for elevation, not depth. None where no shadow tells where the ball is, where
+    the heading is too steep, where it is too close to call, or where an obstacle might be met before the target.
+    """
+    region, length = scene.region_of(mover), float(np.hypot(*heading))
+    if region is None or not region.is_disc or length == 0 or abs(heading[0]) < UPRIGHT * length:
+        return None
+    shadow = find_shadow(scene, mover)
+    if shadow is None:
+        return None
+    landings = landings_below(shadow, mover, (scene.width, scene.height))
+    if not landings:
+        return None
+    sense = float(np.sign(heading[0]))
+    verdict = _verdict(scene, landings, sense, target)
+    if verdict is None:
+        return None
+    for obstacle in obstacles:
+        if iou(obstacle.bbox, target) >= SAME_OBJECT or iou(obstacle.bbox, mover) >= SAME_OBJECT:
+            continue
+        before = sense * (obstacle.bbox[0] + obstacle.bbox[2] - target[0] - target[2]) < 0
+        if before and _verdict(scene, landings, sense, obstacle.bbox) is not False:
+            return None
+    return verdict
+
+
+def _verdict(scene: Scene, landings: Sequence[Landing], sense: float, bbox: BBox) -> bool | None:
+    """Whether the ball meets what stands in a box, where that is sure, be a round thing a ball or a block."""
+    region = scene.region_of(bbox)
+    shapes = (False, True) if region is not None and region.is_disc else (False,)
+    chances = [_chance(landings, sense, _Thing(bbox, is_ball)) for is_ball in shapes]
+    verdicts = {None if chance is None or 1 - SURE < chance < SURE else chance >= SURE for chance in chances}
+    return verdicts.pop() if len(verdicts) == 1 else None
+
+
+@dataclass(frozen=True)
+class _Thing:
+    """What stands on the floor."""
+
+    bbox: BBox  # px
+    is_ball: bool
+
+
+def _standing(thing: _Thing, landing: Landing) -> BBox:
+    """The box of a thing, down to the foot of its footprint: a ball is seen further down than that."""
+    left, top, right, bottom = thing.bbox
+    if not thing.is_ball:
+        return thing.bbox
+    overhang = (math.cos(landing.pitch) + landing.squash - 1) * (right - left) / 2
+    return left, top, right, bottom + overhang
+
+
+def _chance(landings: Sequence[Landing], sense: float, other: _Thing) -> float | None:
+    """How likely the ball, rolling on along its row of the image, comes within reach of what stands in a box.
+
+    None where it may come down upon that very thing, or beside it.
+    """
+    gaps = [floor_gap(landing.footprint, _standing(other, landing), landing.squash) for landing in landings]
+    ratios = [away / (REACH * reach) for _, away, reach in gaps]
+    variance = sum(((more - less) / 2) ** 2 for less, more in zip(ratios[1::2], ratios[2::2], strict=True))
+    deviation = math.sqrt(variance + RULE_ERROR**2)
+    chance = _below((1 - ratios[0]) / deviation) - _below((-1 - ratios[0]) / deviation)
+    across, _, reach = gaps[0]
+    if -sense * across > REACH * reach:
+        return chance
+    if sense * across > CLEAR * REACH * reach:
+        return 0.0
+    return chance if chance < 1 - SURE else None
+
+
+def _below(deviations: float) -> float:
+    """Share of a normal distribution below so many standard deviations."""
+    return (1 + math.erf(deviations / math.sqrt(2))) / 2
+
+
+def landings_below(shadow: Shadow, ball: BBox, size: tuple[int, int]) -> tuple[Landing, ...]:
+    """The likeliest landing of a ball in a box of an image of a size (width, height), px, then pairs to either side.
+
+    Each pair lies one standard deviation from it, one pair for each independent doubt. Empty where no likely camera
+    and light would make that shadow of a ball in the air.
+    """
+    view = _View.of(ball, size)
+    fit = _fit(view, shadow)
+    if fit is None:
+        return ()
+    parameters, covariance = fit
+    values, axes = np.linalg.eigh(covariance)
+    steps = axes * np.sqrt(np.maximum(values, 0))
+    around = [parameters, *(parameters + sign * steps[:, i] for i in range(len(values)) for sign in (-1, 1))]
+    return tuple(view.landing(_bounded(each)) for each in around)
+
+
+@dataclass(frozen=True)
+class _View:
+    """A ball seen by a pinhole camera, in radii of the ball: x right, y down, z ahead."""
+
+    focal: float  # px
+    middle: Floats  # [2] px
+    ball: Floats  # [3]: its centre
+
+    @staticmethod
+    def of(bbox: BBox, size: tuple[int, int]) -> _View:
+        focal, middle = FOCAL_WIDTHS * size[0], np.array(size) / 2
+        radius = (bbox[2] - bbox[0] + bbox[3] - bbox[1]) / 4
+        centre = np.array([bbox[0] + bbox[2], bbox[1] + bbox[3]]) / 2
+        return _View(focal, middle, np.array([*((centre - middle) / radius), focal / radius]))
+
+    def image(self, points: Floats) -> Floats:
+        """Image points [N, 2] (px) of points [N, 3]."""
+        return self.focal * points[:, :2] / np.maximum(points[:, 2:], 1e-3) + self.middle
+
+    def shadow(self, parameters: Floats) -> Floats:
+        """Centre [2] and spread [3] (px, px^2) of the shadow that such pitch, height and light make."""
+        pitch, height, sideways, away = parameters
+        up, ahead = _axes(pitch)
+        right = np.array([1.0, 0.0, 0.0])
+        centre = self.ball + height * (sideways * right + away * ahead - up)
+        slant = np.array([sideways, away])
+        # A ball's shadow has the matrix 1 + slant slant^T: as wide as the ball, drawn out along the light.
+        stretch = np.eye(2) + np.outer(slant, slant) / (1 + np.sqrt(1 + slant @ slant))
+        turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ stretch
+        points = self.image(centre + rim[:, :1] * right + rim[:, 1:] * ahead)
+        spread = np.cov(points.T, bias=True) / 2
+        return np.array([*points.mean(axis=0), spread[0, 0], spread[1, 1], spread[0, 1]])
+
+    def landing(self, parameters: Floats) -> Landing:
+        """The ball on the floor under it."""
+        up, _ = _axes(parameters[0])
+        touching = self.ball - parameters[1] * up
+        (x, y), radius = self.image(touching[None])[0], self.focal / (touching + up)[2]
+        high = radius * math.sin(parameters[0])
+        return Landing((x - radius, y - high, x + radius, y + high), float(parameters[0]))
+
+
+def _axes(pitch: float) -> tuple[Floats, Floats]:
+    """The directions up and straight ahead over the floor [3] for a camera that looks down by a pitch (rad)."""
+    sine, cosine = np.sin(pitch), np.cos(pitch)
+    return np.array([0.0, -cosine, -sine]), np.array([0.0, -sine, cosine])
+
+
+def _bounded(parameters: Floats) -> Floats:
+    return np.clip(parameters, [0.1, 1.0, -1.5, -1.5], [1.3, 40.0, 1.5, 1.5])
+
+
+def _fit(view: _View, shadow: Shadow) -> tuple[Floats, Floats] | None:
+    """Pitch, height and slant of the light [4] with their covariance [4, 4], by Gauss-Newton from the guesses.
+
+    None where no likely camera and light would make that shadow of the ball in the air.
+    """
+    guesses, doubts = np.array(GUESSES), np.array(DOUBTS)
+    radius = view.focal / view.ball[2]
+
+    def misfit(parameters: Floats) -> Floats:
+        seen = _numbers(np.array([*shadow.centre, *shadow.spread]), radius)
+        made = _numbers(view.shadow(_bounded(parameters)), radius)
+        return np.concatenate([(made - seen) / np.array(ERRORS), (parameters - guesses) / doubts])
+
+    drop = shadow.centre[1] - float(view.image(view.ball[None])[0, 1])
+    parameters = _bounded(np.array([guesses[0], drop / radius / math.cos(guesses[0]), *guesses[2:]]))
+    slopes = np.zeros((9, 4))
+    for _ in range(STEPS):
+        now = misfit(parameters)
+        slopes = np.stack([(misfit(parameters + step) - now) / 1e-4 for step in 1e-4 * np.eye(4)], axis=1)
+        move = np.clip(np.linalg.lstsq(slopes, -now, rcond=None)[0], [-0.2, -2, -0.4, -0.4], [0.2, 2, 0.4, 0.4])
+        parameters = _bounded(parameters + move)
+        if float(np.abs(move).max()) < 1e-3:
+            break
+    cost = float((misfit(parameters) ** 2).sum())
+    if cost > WORST_FIT or parameters[1] < LOWEST:
+        return None
+    return parameters, np.asarray(np.linalg.pinv(slopes.T @ slopes), np.float64)
+
+
+def _numbers(shadow: Floats, radius: float) -> Floats:
+    """A shadow's centre in radii, log half width and half height, and correlation."""
+    x, y, xx, yy, xy = shadow
+    return np.array([x / radius, y / radius, np.log(xx) / 2, np.log(yy) / 2, xy / np.sqrt(xx * yy)])

@@ -1,0 +1,256 @@
+"""Finds the shadow that a ball in the air casts on the floor: a patch of ellipse shape, darker than the floor about it.
+
+The floor keeps its hue in a shade and only darkens. What is of another hue, joined to an object, of another shape or
+size, or one of several such patches is not told to be the shadow: nothing is reported instead of something wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.vision.cuttings import BBox
+from cow_service.vision.scene import Scene
+from cow_service.vision.sizes import resized_mask, scaled
+
+WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
+LEAST_WIDTH = 14.0  # px in the image: the shadow of something smaller is lost in the floor's grain
+LIKELY_WIDTH = 0.95  # of the object's width: shadows looked for; the fit settles the rest
+FLATNESS = (0.25, 0.36, 0.5, 0.66)  # of their own width: their heights, on a floor seen at a slant
+RING = (1.15, 1.5)  # of the ellipse: the floor about it that it is compared with
+SLANT = 1.1  # px sideways per px down: light lower than this is none of a room's
+NEAREST = 0.6  # of the object's width, from its foot down to the shadow's middle: nearer, it may touch the floor
+LEAST_SHADE, MOST_SHADE = 0.025, 0.6  # of the floor's lightness that a shadow takes away; more is an object
+TRIES, CANDIDATES = 40, 3  # the darkest patches are looked at, and so many that stand alone measured
+RIVAL = 0.6  # of the darkest patch's shade: another one as dark leaves it open which is the shadow
+EXPLAINED = 0.5  # of what a smooth floor leaves unexplained around the patch, by a soft ellipse in it
+SOFTNESS = (0.02, 0.3)  # of the ellipse: the width of its edge. An object's is sharper, a smear of light wider
+SAME_HUE = 5.0  # Lab units in the a*b* plane, by which a shade may differ from the floor about it, darkened
+EVEN = 0.35  # of the mean step up to the floor on the four sides: the least of them
+QUARTERS = (0.0, np.pi / 2, np.pi, -np.pi / 2)  # radians
+LEAST_PIXELS, MOST_PIXELS = 60, 700  # of the floor about a patch, at the working size
+STEPS = 8  # of the fit
+
+Mask = NDArray[np.bool_]
+Channel = NDArray[np.float32]
+Floats = NDArray[np.float64]
+Ellipse = tuple[float, float, float, float]  # centre and half axes, px
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """A shadow on the floor as an ellipse of the image. It does not say where the light is."""
+
+    bbox: BBox  # [x0, y0, x1, y1], px
+    centre: tuple[float, float]  # px
+    spread: tuple[float, float, float]  # px^2: a quarter of the squared half width and height, and the covariance
+    shade: float  # 0..1: how much of the floor's lightness it takes away
+
+
+@dataclass(frozen=True)
+class _Floor:
+    """The image below the object at the working size, with other objects blanked out."""
+
+    lab: NDArray[np.float32]  # [h, w, 3] CIE Lab
+    free: Mask  # [h, w]: no object there
+    box: BBox  # of the object in the air
+    top: int  # px: the row of the image at which it begins
+    stretch: tuple[float, float]  # back to the image's size
+
+
+def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
+    """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None where it has none or several patches could be it."""
+    region = scene.region_of(bbox)
+    width = bbox[2] - bbox[0]
+    if region is None or width < LEAST_WIDTH:
+        return None
+    scale = min(1.0, WORKING_WIDTH / width)
+    floor = _floor(scene, bbox, scale)
+    fits = [shadow for shadow in (_fitted(floor, ellipse) for ellipse in _seen(floor)) if shadow is not None]
+    fits.sort(key=lambda fit: -fit.shade)
+    if not fits or (len(fits) > 1 and fits[1].shade > RIVAL * fits[0].shade):
+        return None
+    shadow = fits[0]
+    fx, fy = floor.stretch
+    (x0, y0, x1, y1), (x, y), (xx, yy, xy) = shadow.bbox, shadow.centre, shadow.spread
+    box = (x0 * fx, (y0 + floor.top) * fy, x1 * fx, (y1 + floor.top) * fy)
+    return Shadow(box, (x * fx, (y + floor.top) * fy), (xx * fx * fx, yy * fy * fy, xy * fx * fy), shadow.shade)
+
+
+def _floor(scene: Scene, bbox: BBox, scale: float) -> _Floor:
+    small = scaled(scene.clean, scale)
+    height, width = small.shape[:2]
+    lab = np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
+    taken = np.zeros((scene.height, scene.width), bool)
+    for region in scene.regions:
+        region.cutting.add_to(taken)
+    taken[max(0, int(bbox[1])) : int(np.ceil(bbox[3])), max(0, int(bbox[0])) : int(np.ceil(bbox[2]))] = True
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    grown = cv2.dilate(resized_mask(taken, (width, height)).astype(np.uint8), kernel) > 0
+    top = min(height - 1, max(0, int(bbox[3] * scale)))
+    box = (bbox[0] * scale, bbox[1] * scale - top, bbox[2] * scale, bbox[3] * scale - top)
+    return _Floor(lab[top:], ~grown[top:], box, top, (scene.width / width, scene.height / height))
+
+
+def _seen(floor: _Floor) -> Iterator[Ellipse]:
+    """Upright ellipses below the object that stand out from the ring about them, the clearest first."""
+    left, top, right, bottom = floor.box
+    width = right - left
+    ys, xs = np.mgrid[: floor.free.shape[0], : floor.free.shape[1]]
+    below = (ys > bottom + NEAREST * width) & (
+        np.abs(xs - (left + right) / 2) < SLANT * (ys - (top + bottom) / 2) + 0.5 * width
+    )
+    best = np.zeros(floor.free.shape, np.float32)
+    which = np.zeros(floor.free.shape, np.int64)
+    sizes = [(LIKELY_WIDTH * width / 2, flat * LIKELY_WIDTH * width / 2) for flat in FLATNESS]
+    for i, (a, b) in enumerate(sizes):
+        contrast = _contrast(floor, a, b)
+        better = contrast > best
+        best[better], which[better] = contrast[better], i
+    best[~below] = 0
+    least, alone = 0.6 * LEAST_SHADE, 0
+    for _ in range(TRIES):
+        y, x = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
+        if best[y, x] < least or alone == CANDIDATES:
+            return
+        a, b = sizes[int(which[y, x])]
+        if _stands_alone(floor, (float(x), float(y), a, b)):
+            least, alone, cleared = max(least, 0.4 * float(best[y, x])), alone + 1, 1.2
+            yield float(x), float(y), a, b
+        else:
+            cleared = 0.6
+        best[((xs - x) / (cleared * a)) ** 2 + ((ys - y) / (cleared * b)) ** 2 <= 1] = 0
+
+
+def _stands_alone(floor: _Floor, seen: Ellipse) -> bool:
+    """Whether the floor is lighter than the ellipse on each of its four sides, unlike beside an edge of light."""
+    x, y, a, b = seen
+    rows = slice(max(0, int(y - RING[1] * b)), int(y + RING[1] * b) + 2)
+    columns = slice(max(0, int(x - RING[1] * a)), int(x + RING[1] * a) + 2)
+    light, free = floor.lab[rows, columns, 0], floor.free[rows, columns]
+    v, u = np.mgrid[: light.shape[0], : light.shape[1]].astype(np.float64)
+    u, v = (u + columns.start - x) / a, (v + rows.start - y) / b
+    radius, angle = np.hypot(u, v), np.arctan2(v, u)
+    middle = float(light[free & (radius < 0.8)].mean())
+    ring = free & (radius > RING[0]) & (radius < RING[1])
+    sides = [ring & (np.abs((angle - turn + np.pi) % (2 * np.pi) - np.pi) < np.pi / 4) for turn in QUARTERS]
+    steps = [float(light[side].mean()) - middle for side in sides if side.any()]
+    return min(steps) > EVEN * float(np.mean(steps))
+
+
+def _contrast(floor: _Floor, a: float, b: float) -> Channel:
+    """Per pixel [h, w] how much darker an ellipse there is than the ring about it, as a share; 0 beside objects."""
+    ry, rx = int(np.ceil(RING[1] * b)), int(np.ceil(RING[1] * a))
+    ys, xs = np.mgrid[-ry : ry + 1, -rx : rx + 1]
+    radius = np.sqrt((xs / a) ** 2 + (ys / b) ** 2)
+    inner, ring = (radius <= 0.9).astype(np.float32), ((radius >= RING[0]) & (radius <= RING[1])).astype(np.float32)
+    weight = floor.free.astype(np.float32)
+    light = floor.lab[..., 0] * weight
+    inside, about = (
+        [cv2.filter2D(values, cv2.CV_32F, kernel / kernel.sum(), borderType=cv2.BORDER_CONSTANT)
+         for values in (light, weight)]
+        for kernel in (inner, ring)
+    )  # fmt: skip
+    whole = (inside[1] > 0.97) & (about[1] > 0.7)
+    dark = 1 - (inside[0] / np.maximum(inside[1], 1e-3)) / np.maximum(about[0] / np.maximum(about[1], 1e-3), 1.0)
+    return np.where(whole, dark, 0).astype(np.float32)
+
+
+def _fitted(floor: _Floor, seen: Ellipse) -> Shadow | None:
+    """A soft tilted ellipse on a smooth floor, fitted to the lightness around what was seen."""
+    x, y, a, b = seen
+    rows = slice(max(0, round(y - 2.2 * b - 2)), round(y + 2.2 * b + 3))
+    columns = slice(max(0, round(x - 1.8 * a)), round(x + 1.8 * a + 1))
+    free = floor.free[rows, columns]
+    if free.sum() < LEAST_PIXELS:
+        return None
+    every = max(1, int(free.sum()) // MOST_PIXELS)
+    ys, xs = (axis[::every] for axis in np.nonzero(free))
+    points = np.stack([xs + columns.start + 0.5, ys + rows.start + 0.5], axis=1).astype(np.float64)
+    lab = floor.lab[rows, columns][free][::every].astype(np.float64)
+    u, v = (points[:, 0] - x) / a, (points[:, 1] - y) / a
+    smooth = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    start = np.array([x + 0.5, y + 0.5, np.log(a), np.log(b), 0.0, np.log(0.15)])
+    parameters, dark = _least_squares(points, lab[:, 0], smooth, start)
+    inside = _soft_ellipse(points, parameters)
+    plain = lab - smooth @ np.linalg.lstsq(smooth, lab, rcond=None)[0]
+    terms = np.column_stack([smooth, inside])
+    weights = np.linalg.lstsq(terms, lab, rcond=None)[0]
+    left_over = lab[:, 0] - terms @ weights[:, 0]
+    core = inside > 0.5
+    if not core.any():
+        return None
+    level, *hue = np.median((smooth @ weights[:-1])[core], axis=0)
+    # What takes a share of the light away takes the same share of a* and b* as of L* + 16.
+    tint = weights[-1, 1:] - np.array(hue) * weights[-1, 0] / (float(level) + 16)
+    explained = 1 - float((left_over**2).sum()) / max(1e-9, float((plain[:, 0] ** 2).sum()))
+    px, py, log_a, log_b, tilt, log_soft = (float(p) for p in parameters)
+    wide, high, soft = float(np.exp(log_a)), float(np.exp(log_b)), float(np.exp(log_soft))
+    shade = -dark / max(float(level), 1.0)
+    width = floor.box[2] - floor.box[0]
+    fits = (
+        LEAST_SHADE < shade < MOST_SHADE
+        and explained > EXPLAINED
+        and SOFTNESS[0] < soft < SOFTNESS[1]
+        and float(np.hypot(*tint)) < SAME_HUE
+        and 0.7 * width < 2 * wide < 1.6 * width
+        and 0.15 < high / wide < 0.95
+        and float(np.hypot((px - x) / a, (py - y) / b)) < 0.6
+        and abs(tilt) < 0.7
+    )
+    if not fits:
+        return None
+    spread = wide**2 / 4, high**2 / 4 * (1 + tilt**2), tilt * wide * high / 4
+    half = 2 * float(np.sqrt(spread[1]))
+    return Shadow((px - wide, py - half, px + wide, py + half), (px, py), spread, shade)
+
+
+def _soft_ellipse(points: Floats, parameters: Floats) -> Floats:
+    """1 inside, 0 outside; parameters: centre, log half width and height, shear of the rows, log width of the edge."""
+    x, y, log_a, log_b, tilt, log_soft = parameters
+    u = (points[:, 0] - x) / np.exp(log_a)
+    v = (points[:, 1] - y) / np.exp(log_b) - tilt * u
+    edge = (1 - np.sqrt(u * u + v * v + 1e-9)) / np.exp(log_soft)
+    return 1 / (1 + np.exp(-2 * np.clip(edge, -20, 20)))
+
+
+def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats) -> tuple[Floats, float]:
+    """Damped Gauss-Newton over the ellipse; floor and darkness follow from it linearly."""
+
+    basis = np.linalg.qr(smooth)[0]
+    plain = light - basis @ (basis.T @ light)
+
+    def residual(parameters: Floats) -> tuple[Floats, float]:
+        ellipse = _soft_ellipse(points, parameters)
+        ellipse -= basis @ (basis.T @ ellipse)
+        dark = float(ellipse @ plain) / (float(ellipse @ ellipse) + 1e-6)
+        return plain - dark * ellipse, dark
+
+    parameters, damping = start, 1e-2
+    rest, dark = residual(parameters)
+    step = np.array([0.1, 0.1, 0.02, 0.02, 0.02, 0.05])
+    for _ in range(STEPS):
+        slopes = np.stack(list(_slopes(lambda p: residual(p)[0], parameters, rest, step)), axis=1)
+        normal = slopes.T @ slopes
+        move = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), slopes.T @ rest)
+        tried = parameters + np.clip(move, -5 * step, 5 * step)
+        new_rest, new_dark = residual(tried)
+        if new_rest @ new_rest < rest @ rest:
+            done = rest @ rest - new_rest @ new_rest < 1e-4 * (rest @ rest)
+            parameters, rest, dark, damping = tried, new_rest, new_dark, damping / 3
+            if done:
+                break
+        else:
+            damping *= 5
+    return parameters, dark
+
+
+def _slopes(function: Callable[[Floats], Floats], at: Floats, value: Floats, step: Floats) -> Iterator[Floats]:
+    for i, size in enumerate(step):
+        moved = at.copy()
+        moved[i] += size
+        yield (function(moved) - value) / size
