@@ -29,6 +29,7 @@ openapi: $(VENV)/.base ## write openapi.yaml from the app
 
 bench: $(VENV)/.base ## the figures of the README
 	$(BIN)/python benchmarks/scenes.py examples
+	$(BIN)/python benchmarks/answers.py examples
 	$(BIN)/python benchmarks/latency.py
 
 clean: ## remove what the other targets made

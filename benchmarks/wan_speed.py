@@ -336,7 +336,11 @@ def _words(results: list[dict[str, Any]]) -> list[str]:
 def case_of(arguments: argparse.Namespace) -> Case:
     """What was asked for. Raises `ValueError` with a sentence for what cannot be measured here."""
     device = choose_device("auto")
-    models = {name: manifest for name, manifest in load_manifests().items() if manifest.architecture}
+    models = {
+        name: manifest
+        for name, manifest in load_manifests().items()
+        if manifest.architecture and manifest.door == "generator"
+    }
     name = arguments.model or ("tiny-ati" if device.type == "cpu" else "ati")
     if name not in models:
         raise ValueError(f"There is no model '{name}'. There are: {', '.join(models)}.")

@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,10 +13,12 @@ import typer
 from typer.core import TyperGroup
 
 from cow_service import __version__, models_cli, tracks_cli
+from cow_service import cli_options as options
 from cow_service.errors import CowError
 
 HINTS = {  # how the command line says what an error's remedy asks for
     "cannot-ground": "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME).",
+    "object-not-found": "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME).",
     "cannot-read-direction": "Here: --direction DX,DY.",
 }
 
@@ -37,23 +38,6 @@ app = typer.Typer(
 )
 
 
-class Policy(StrEnum):
-    """Which frames to keep as pictures."""
-
-    initial = "initial"
-    uniform = "uniform"
-    events = "events"
-
-
-class Kind(StrEnum):
-    """Kinds of motion."""
-
-    linear = "linear"
-    projectile = "projectile"
-    fall = "fall"
-    static = "static"
-
-
 def _version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"cow {__version__}")
@@ -71,49 +55,28 @@ def main(
 
 @app.command()
 def simulate(
-    image: Annotated[
-        Path, typer.Argument(metavar="IMAGE", help="PNG, JPEG or WebP.", exists=True, dir_okay=False, readable=True)
-    ],
-    question: Annotated[
-        str,
-        typer.Argument(
-            metavar="QUESTION", help='For example "If the red ball moves to the left, will it hit the vase?"'
-        ),
-    ],
+    image: options.Image,
+    question: options.Question,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the results.", show_default="./<image>-cow")
     ] = None,
-    point: Annotated[str | None, typer.Option(help="X,Y of a point on the object that moves, px.")] = None,
-    box: Annotated[str | None, typer.Option(help="X0,Y0,X1,Y1 of the object that moves, px.")] = None,
-    name: Annotated[
-        str | None, typer.Option("--object", help="What the object is called, with --point or --box.")
-    ] = None,
-    direction: Annotated[str | None, typer.Option(help="DX,DY of the motion, px, x right, y down.")] = None,
-    kind: Annotated[
-        Kind, typer.Option(help="Kind of motion, with --direction (or alone for fall and static).")
-    ] = Kind.linear,
-    speed: Annotated[float | None, typer.Option(help="px/s, with --direction.", show_default="0.26 widths/s")] = None,
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(
-            help="JSON with the `trajectory` of a request, as `cow tracks import` makes it.",
-            exists=True,
-            dir_okay=False,
-        ),
-    ] = None,
-    reader: Annotated[str | None, typer.Option(help="Who looks at the image.", show_default="COW_READER")] = None,
-    generator: Annotated[str | None, typer.Option(help="Who makes the frames.", show_default="COW_GENERATOR")] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="An option of the generator, such as steps=20; may be repeated."),
-    ] = None,
-    num_frames: Annotated[int, typer.Option(help="Frames of the clip.")] = 81,
-    fps: Annotated[float, typer.Option(help="Frames per second.")] = 16,
-    seed: Annotated[int, typer.Option(help="For generators that draw random numbers.")] = 0,
+    point: options.Place = None,
+    box: options.Box = None,
+    name: options.Name = None,
+    direction: options.Direction = None,
+    kind: options.KindOfMotion = options.Kind.linear,
+    speed: options.Speed = None,
+    trajectory: options.Path_ = None,
+    reader: options.Reader = None,
+    generator: options.Generator = None,
+    option: options.GeneratorOption = None,
+    num_frames: options.NumFrames = 81,
+    fps: options.Fps = 16,
+    seed: options.Seed = 0,
     video: Annotated[bool, typer.Option(help="Make the mp4.")] = True,
-    frames: Annotated[Policy, typer.Option(help="Which frames to keep as pictures.")] = Policy.initial,
-    count: Annotated[int, typer.Option(help="How many of them.")] = 3,
-    max_side: Annotated[int, typer.Option(help="Their longest side, px; 0 for the clip's own size.")] = 512,
+    frames: options.Frames = options.Policy.initial,
+    count: options.Count = 3,
+    max_side: options.MaxSide = 512,
     as_json: Annotated[bool, typer.Option("--json", help="Print the simulation as JSON, and nothing else.")] = False,
 ) -> None:
     """Imagine one image's future: frames, video, overlay and simulation.json in a folder."""
@@ -138,7 +101,75 @@ def simulate(
             video=video,
             frames={"policy": frames.value, "count": count, "max_side": max_side or None},
         )
-        run_simulation(_service(), image, request, out or Path(f"{image.stem}-cow"), as_json=as_json)
+        with _service() as service:
+            run_simulation(service, image, request, out or Path(f"{image.stem}-cow"), as_json=as_json)
+
+
+@app.command()
+def answer(
+    image: options.Image,
+    question: options.Question,
+    choice: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TEXT",
+            help="An answer to choose from, in order A, B, C...; may be repeated.",
+            show_default="those in the question",
+        ),
+    ] = None,
+    imagine: Annotated[bool, typer.Option(help="Simulate first, or answer from the image alone.")] = True,
+    votes: Annotated[int, typer.Option(help="How often to ask; the most frequent answer is taken.")] = 1,
+    baseline: Annotated[bool, typer.Option("--baseline", help="Answer without frames, too, for comparison.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the simulation and answer.json.", show_default="none")
+    ] = None,
+    point: options.Place = None,
+    box: options.Box = None,
+    name: options.Name = None,
+    direction: options.Direction = None,
+    kind: options.KindOfMotion = options.Kind.linear,
+    speed: options.Speed = None,
+    trajectory: options.Path_ = None,
+    reader: options.Reader = None,
+    generator: options.Generator = None,
+    option: options.GeneratorOption = None,
+    num_frames: options.NumFrames = 81,
+    fps: options.Fps = 16,
+    seed: options.Seed = 0,
+    frames: options.Frames = options.Policy.initial,
+    count: options.Count = 3,
+    max_side: options.MaxSide = 512,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON, and nothing else.")] = False,
+) -> None:
+    """Look, then answer: the answer, the votes, the baseline, tokens and time."""
+    with _errors_told():
+        from cow_service.answer_console import run_answer  # noqa: PLC0415
+        from cow_service.console import build_request  # noqa: PLC0415
+
+        request = build_request(
+            question=question,
+            options=choice,
+            imagine="always" if imagine else "never",
+            votes=votes,
+            baseline=baseline,
+            point=point,
+            box=box,
+            name=name,
+            direction=direction,
+            kind=kind.value,
+            speed=speed,
+            trajectory=trajectory,
+            reader=reader,
+            generator=generator,
+            option=option or [],
+            num_frames=num_frames,
+            fps=fps,
+            seed=seed,
+            video=out is not None,
+            frames={"policy": frames.value, "count": count, "max_side": max_side or None},
+        )
+        with _service() as service:
+            run_answer(service, image, request, out, as_json=as_json)
 
 
 @app.command()
@@ -171,7 +202,8 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
     with _errors_told():
         from cow_service.doctor import examine, print_report  # noqa: PLC0415
 
-        report = examine(_service())
+        with _service() as service:
+            report = examine(service)
         print_report(report, as_json=as_json)
         if not report.healthy:
             raise typer.Exit(1)

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
 from cow_service.errors import CowError, InvalidRequest
+from cow_service.images import DecodedImage
 from cow_service.records import BackendInfo, Models, Simulation
 from cow_service.requests import SimulateRequest, Stage
 from cow_service.service import Service
+
+Body = TypeVar("Body", bound=SimulateRequest)
 
 
 def build_request(
@@ -61,15 +65,38 @@ def build_request(
 
 def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Path, *, as_json: bool) -> None:
     """Simulates, showing each stage as it runs, writes the results into a folder, and says what came out."""
-    console = Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)
-    with _writable(out):
-        out.mkdir(parents=True, exist_ok=True)
+    console = console_for(as_json)
+    make_folder(out)
+    request, decoded = read_request(service, image, body, SimulateRequest)
+    with stages_shown(console) as show:
+        simulation = service.simulate(request, show, decoded)
+    written = save(service, simulation, out)
+    if as_json:
+        print(simulation.model_dump_json(indent=2))
+        return
+    tell(console, simulation)
+    tell_warnings(console, simulation.warnings)
+    console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
+
+
+def console_for(as_json: bool) -> Console:
+    """Where people read; silent where a program does."""
+    return Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)
+
+
+def read_request(service: Service, image: Path, body: dict[str, Any], model: type[Body]) -> tuple[Body, DecodedImage]:
+    """The checked request and its image, which the service keeps. Raises `InvalidRequest` naming the fields."""
     artifact, decoded = service.keep_image(_read(image))
     try:
-        request = SimulateRequest.model_validate({"image": {"artifact": artifact.sha256}, **body})
+        return model.model_validate({"image": {"artifact": artifact.sha256}, **body}), decoded
     except ValidationError as error:
         told = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
         raise InvalidRequest(told) from error
+
+
+@contextmanager
+def stages_shown(console: Console) -> Generator[Callable[[Stage, float], None]]:
+    """Bars for the stages, as they run."""
     columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[Stage, TaskID] = {}
@@ -81,16 +108,25 @@ def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Pat
                 tasks[stage] = bars.add_task(stage, total=1.0)
             bars.update(tasks[stage], completed=done)
 
-        simulation = service.simulate(request, show, decoded)
-    written = save(service, simulation, out)
-    if as_json:
-        print(simulation.model_dump_json(indent=2))
-        return
+        yield show
+
+
+def tell(console: Console, simulation: Simulation) -> None:
+    """A line for each stage of what came out of it."""
     for stage, said in _told(simulation).items():
-        console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {said}")
-    for warning in simulation.warnings:
-        console.print(f"[yellow]warning[/]: {warning}")
-    console.print(f"Wrote to [bold]{out}[/]: {', '.join(written)}")
+        console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {escape(said)}")
+
+
+def tell_warnings(console: Console, warnings: Iterable[str]) -> None:
+    """A line for each."""
+    for warning in warnings:
+        console.print(f"[yellow]warning[/]: {escape(warning)}")
+
+
+def make_folder(out: Path) -> None:
+    """Before any work is done, so that it is not lost."""
+    with writable(out):
+        out.mkdir(parents=True, exist_ok=True)
 
 
 def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
@@ -99,7 +135,7 @@ def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
     files["overlay.png"] = simulation.overlay.sha256
     if simulation.video is not None:
         files["video.mp4"] = simulation.video.sha256
-    with _writable(out):
+    with writable(out):
         for name, sha256 in files.items():
             (out / name).write_bytes(service.artifacts.read(sha256))
         (out / "simulation.json").write_text(simulation.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -107,7 +143,7 @@ def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
 
 
 @contextmanager
-def _writable(out: Path) -> Generator[None]:
+def writable(out: Path) -> Generator[None]:
     """Says which folder could not be written, where one could not."""
     try:
         yield
@@ -128,7 +164,9 @@ def print_models(models: Models, *, as_json: bool) -> None:
             table.add_row(
                 door, backend.name + (" (default)" if backend.default else ""), _readiness(backend), backend.summary
             )
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    console.print(f"\nCOW_MLLM takes one of these, or provider:model: {', '.join(models.mllms)}", highlight=False)
 
 
 def _readiness(backend: BackendInfo) -> str:

@@ -28,6 +28,8 @@ PACKAGES = (
     "torch",
     "diffusers",
     "transformers",
+    "pydantic-ai-slim",
+    "llguidance",
 )
 
 

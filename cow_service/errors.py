@@ -14,8 +14,11 @@
     ├── ImageTypeUnsupported       image-type-unsupported   415
     ├── ImageUrlNotAllowed         image-url-not-allowed    422
     ├── CannotGround               cannot-ground            422
+    │   └── ObjectNotFound         object-not-found         422
     ├── CannotReadDirection        cannot-read-direction    422
     ├── ReaderUnavailable          reader-unavailable       503
+    ├── MllmBadReply               mllm-bad-reply           502
+    ├── MllmUnavailable            mllm-unavailable         503
     ├── GeneratorUnavailable       generator-unavailable    503
     │   ├── WeightsUnavailable     weights-unavailable      503
     │   └── CheckpointInvalid      checkpoint-invalid       503
@@ -144,6 +147,12 @@ class CannotGround(CowError):
     code, status = "cannot-ground", 422
 
 
+class ObjectNotFound(CannotGround):
+    """The multimodal LLM did not see the object in the image."""
+
+    code = "object-not-found"
+
+
 class CannotReadDirection(CowError):
     """The direction of the motion could not be read."""
 
@@ -154,6 +163,18 @@ class ReaderUnavailable(CowError):
     """The reader cannot run on this server."""
 
     code, status = "reader-unavailable", 503
+
+
+class MllmBadReply(CowError):
+    """The multimodal LLM gave no reply that can be used."""
+
+    code, status = "mllm-bad-reply", 502
+
+
+class MllmUnavailable(CowError):
+    """The multimodal LLM could not be reached."""
+
+    code, status = "mllm-unavailable", 503
 
 
 class GeneratorUnavailable(CowError):

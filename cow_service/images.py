@@ -120,6 +120,14 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     return DecodedImage(pixels, info, f"image/{kind.lower()}")
 
 
+def decode_own(data: bytes) -> NDArray[np.uint8]:
+    """Upright RGB pixels [H, W, 3] of a PNG that this service wrote. Raises `InternalError` where it is damaged."""
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise InternalError("A picture that was written before can no longer be read.")
+    return np.ascontiguousarray(pixels[..., ::-1], np.uint8)
+
+
 def encode_png(pixels: NDArray[np.uint8] | NDArray[np.bool_], *, level: int = 1) -> bytes:
     """Encode [H, W, 3] RGB, [H, W] grey or an [H, W] boolean mask (0 and 255) as PNG.
 

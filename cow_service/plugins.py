@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from threading import Lock
-from typing import Generic, TypeVar, cast
+from typing import Generic, Protocol, TypeVar, cast, runtime_checkable
 
 from cow_service.errors import CowError
 from cow_service.settings import Settings
@@ -18,6 +18,15 @@ from cow_service.settings import Settings
 RETRY = 30.0  # seconds before one that failed to load is tried again: checking tens of gigabytes takes that long
 
 Backend = TypeVar("Backend")
+
+
+@runtime_checkable
+class Closable(Protocol):
+    """A backend that holds something open, such as connections."""
+
+    def close(self) -> None:
+        """Lets go of it."""
+        ...
 
 
 class Registry(Generic[Backend]):
@@ -56,6 +65,14 @@ class Registry(Generic[Backend]):
             if name not in self._made:
                 self._made[name] = self._make(name, point)
             return self._made[name]
+
+    def close(self) -> None:
+        """Closes the backends that were made and can be closed; each is made anew when it is asked for again."""
+        with self._guard:
+            made, self._made = self._made, {}
+        for backend in made.values():
+            if isinstance(backend, Closable):
+                backend.close()
 
     def _make(self, name: str, point: EntryPoint) -> Backend:
         if name in self._failed:

@@ -18,7 +18,7 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 Source = Literal["mllm", "embedded", "request"]
 MotionKind = Literal["linear", "projectile", "fall", "static"]
-Cue = Literal["arrow", "orientation", "text", "gravity", "request"]
+Cue = Literal["arrow", "trail", "orientation", "text", "gravity", "request"]
 EncounterKind = Literal["touches", "occludes", "occluded-by"]
 FramePolicy = Literal["initial", "uniform", "events"]
 
@@ -57,7 +57,7 @@ class Grounding(Record):
     """Stage 1: which object moves, and where it is. It does not say how it moves."""
 
     object: str = Field(description="Words that single it out.")
-    point: Point = Field(description="[x, y], px: the centre of the box.")
+    point: Point = Field(description="[x, y], px: the centre of the box, or where a reader pointed that gave no box.")
     bbox: BBox = Field(description="[x0, y0, x1, y1], px.")
     mask: Artifact | None = Field(default=None, description="PNG of the image's size, white where the object is.")
     others: tuple[LocatedObject, ...] = Field(
@@ -167,11 +167,27 @@ class ReaderInfo(Record):
     """Who read the image, and what would have to be the same to read it so again."""
 
     name: str
-    model: str | None = None
+    model: str | None = Field(default=None, description="The multimodal LLM, as it is served.")
     revision: str | None = None
-    stages: tuple[Literal["grounding", "motion"], ...] = Field(
+    prompts: dict[str, int] = Field(default_factory=dict, description="Version of each prompt that it was sent.")
+    stages: tuple[Literal["grounding", "motion", "answering"], ...] = Field(
         default=(), description="The stages it was asked for; the others came with the request."
     )
+
+
+class Usage(Record):
+    """What the multimodal LLM was asked, re-asks and failed tries that it counted included."""
+
+    calls: int = Field(default=0, ge=0)
+    input_tokens: int = Field(default=0, ge=0)
+    output_tokens: int = Field(default=0, ge=0)
+
+    def __add__(self, other: Usage) -> Usage:
+        return Usage(
+            calls=self.calls + other.calls,
+            input_tokens=self.input_tokens + other.input_tokens,
+            output_tokens=self.output_tokens + other.output_tokens,
+        )
 
 
 class GeneratorInfo(Record):
@@ -201,6 +217,45 @@ class Simulation(Record):
     overlay: Artifact = Field(description="The input with box, point, arrow and path drawn.")
     generator: GeneratorInfo
     reader: ReaderInfo
+    usage: Usage = Usage()
+    timings: dict[str, float] = Field(description="Seconds per stage.")
+    warnings: tuple[str, ...] = ()
+
+
+class AnswerOption(Record):
+    """One of the answers that a question offers."""
+
+    letter: str = Field(pattern="^[A-Z]$")
+    text: str
+
+
+class Verdict(Record):
+    """What was answered, and how sure that is. The reasoning is the answerer's own; none is made up for it."""
+
+    answer: str | None = Field(
+        description="A letter, or text for an open question; null where it is not sure and no option says so."
+    )
+    option: str | None = Field(default=None, description="Text of the option with that letter.")
+    not_sure: bool
+    reasoning: str = ""
+    votes: dict[str, int] = Field(
+        default_factory=dict, description="How often each was answered; `not sure` where no option says so."
+    )
+
+
+class Answer(Verdict):
+    """The way from image and question to an answer: what `POST /answer` returns."""
+
+    id: str
+    status: Literal["succeeded"] = "succeeded"
+    created_at: str = Field(description="RFC 3339, UTC.")
+    question: str
+    options: tuple[AnswerOption, ...] = Field(description="From the request or the question; empty where it is open.")
+    image: ImageInfo
+    simulation: Simulation | None = Field(description="Null where nothing was imagined, or that failed.")
+    baseline: Verdict | None = Field(description="The answer without frames, where it was asked for.")
+    reader: ReaderInfo
+    usage: Usage = Field(description="Of everything together: simulation, votes and baseline.")
     timings: dict[str, float] = Field(description="Seconds per stage.")
     warnings: tuple[str, ...] = ()
 
@@ -215,7 +270,9 @@ class BackendInfo(Record):
     summary: str
     licence: str | None = None
     weights: str | None = Field(default=None, description="Repository of its weights; null where it has none.")
-    missing: tuple[str, ...] = Field(default=(), description="Python modules that are not installed.")
+    missing: tuple[str, ...] = Field(
+        default=(), description="Python modules that are not installed, and settings (COW_...) that are not set."
+    )
     install: str | None = Field(default=None, description="The command that installs them.")
     pull: str | None = Field(
         default=None, description="The command that downloads its weights, where they are not here."
@@ -228,3 +285,4 @@ class Models(Record):
 
     readers: tuple[BackendInfo, ...]
     generators: tuple[BackendInfo, ...]
+    mllms: tuple[str, ...] = Field(default=(), description="Manifests of multimodal LLMs: what `COW_MLLM` may name.")

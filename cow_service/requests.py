@@ -1,4 +1,4 @@
-"""What a caller may ask: the body of `POST /simulate`. Checked once, here; inside, these values are trusted."""
+"""What a caller may ask: the bodies of `POST /simulate` and `POST /answer`. Checked once, here, then trusted."""
 
 from __future__ import annotations
 
@@ -166,8 +166,11 @@ class SimulateRequest(Record):
 
     image: ImageRef
     question: str = Field(min_length=1, max_length=4000)
-    options: tuple[Annotated[str, Field(max_length=400)], ...] | None = Field(
-        default=None, max_length=26, description="Answer options; for `/answer`, ignored here."
+    options: tuple[Annotated[str, Field(min_length=1, max_length=400)], ...] | None = Field(
+        default=None,
+        max_length=26,
+        description="Answers to choose from, lettered A, B, C...; by default those that the question lists. "
+        "Used by `/answer`.",
     )
     grounding: GroundingRequest | None = None
     motion: MotionRequest | None = None
@@ -181,6 +184,14 @@ class SimulateRequest(Record):
     frames: FramesRequest = FramesRequest()
     generator_options: dict[str, Any] = Field(default_factory=dict, description="As the generator defines them.")
 
+    @field_validator("options")
+    @classmethod
+    def _differ(cls, options: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        plain = [" ".join(option.lower().split()) for option in options or ()]
+        if len(plain) == 1 or len(set(plain)) < len(plain) or "" in plain:
+            raise ValueError(f"options must be two or more different texts, got {list(options or ())}")
+        return options or None
+
     @field_validator("question")
     @classmethod
     def _says_something(cls, question: str) -> str:
@@ -189,4 +200,14 @@ class SimulateRequest(Record):
         return question
 
 
-Stage = Literal["grounding", "motion", "trajectory", "generation"]
+class AnswerRequest(SimulateRequest):
+    """As a simulation, and how to answer from it."""
+
+    imagine: Literal["always", "never"] = Field(
+        default="always", description="never: answer from the image alone, without a simulation."
+    )
+    baseline: bool = Field(default=False, description="Answer without frames, too, for comparison.")
+    votes: int = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer is taken.")
+
+
+Stage = Literal["grounding", "motion", "trajectory", "generation", "answering"]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 PROMPTS = ("prompts", ".md")
 MANIFESTS = ("models", ".yaml")
+FAMILIES = ("models/families", ".yaml")
 
 
 def _folder(name: str) -> Traversable:
@@ -47,6 +48,11 @@ def manifest_names() -> tuple[str, ...]:
     return tuple(_named(MANIFESTS))
 
 
+def family_names() -> tuple[str, ...]:
+    """Names of the shipped families of MLLMs, sorted."""
+    return tuple(_named(FAMILIES))
+
+
 def read_prompt_text(name: str) -> str:
     """A prompt file's text. Raises `LookupError`, naming those that exist."""
     return _read(PROMPTS, "prompt", name)
@@ -55,3 +61,8 @@ def read_prompt_text(name: str) -> str:
 def read_manifest_text(name: str) -> str:
     """A model manifest's text. Raises `LookupError`, naming those that exist."""
     return _read(MANIFESTS, "manifest", name)
+
+
+def read_family_text(name: str) -> str:
+    """A family file's text. Raises `LookupError`, naming those that exist."""
+    return _read(FAMILIES, "family of MLLMs", name)

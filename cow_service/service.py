@@ -18,11 +18,11 @@ from cow_service.errors import (
 from cow_service.generators.base import Generator
 from cow_service.images import DecodedImage, decode
 from cow_service.manifests import load_manifests
-from cow_service.pipeline import Backends, Progress, simulate
+from cow_service.pipeline import Backends, Progress, answer, simulate
 from cow_service.plugins import Registry
 from cow_service.readers.base import Reader
-from cow_service.records import Artifact, BackendInfo, Models, Simulation
-from cow_service.requests import ImageArtifact, ImageRef, ImageUrl, SimulateRequest
+from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulation
+from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, SimulateRequest
 from cow_service.settings import Settings, SettingsError
 from cow_service.weights import ready
 
@@ -47,7 +47,8 @@ class Service:
         ):
             if name not in names:
                 raise SettingsError(f"Bad settings: {setting}={name!r}: there are only {', '.join(names) or 'none'}.")
-        loadable = [name for name, manifest in load_manifests().items() if "transformer" in manifest.sources]
+        parts = {"transformer", "weights"}
+        loadable = [name for name, manifest in load_manifests().items() if parts & manifest.sources.keys()]
         for name in settings.checkpoints:
             if name not in loadable:
                 raise SettingsError(f"Bad settings: COW_CHECKPOINTS for {name!r}: only for {', '.join(loadable)}.")
@@ -64,35 +65,59 @@ class Service:
 
         Raises any `CowError` of its stages.
         """
-        backends = Backends(
-            reader_name=self._known("reader", request.reader or self.settings.reader, self.readers),
-            reader=lambda: self.readers.get(request.reader or self.settings.reader),
-            generator=self._generator(
-                self._known("generator", request.generator or self.settings.generator, self.generators)
-            ),
-            artifacts=self.artifacts,
-        )
+        backends = self._backends(request)
         return simulate(request, image or self._image(request.image), backends, progress)
+
+    def answer(self, request: AnswerRequest, progress: Progress = _ignore, image: DecodedImage | None = None) -> Answer:
+        """One answer, start to end; `image` is that of the request where it was decoded before.
+
+        Raises any `CowError` that leaves no answer.
+        """
+        backends = self._backends(request)
+        return answer(request, image or self._image(request.image), backends, progress)
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
         return Models(
             readers=tuple(self._describe("reader", name) for name in self.readers.names()),
             generators=tuple(self._describe("generator", name) for name in self.generators.names()),
+            mllms=tuple(name for name, manifest in load_manifests().items() if manifest.door == "mllm"),
         )
+
+    def __enter__(self) -> Service:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Lets go of what its backends hold open, such as connections."""
+        self.readers.close()
+        self.generators.close()
 
     def check(self) -> None:
         """Raises the `CowError` that would keep the default request from succeeding."""
         self.artifacts.check()
-        self.readers.get(self.settings.reader)
+        self._reader(self.settings.reader)
         self._generator(self.settings.generator)
 
+    def _backends(self, request: SimulateRequest) -> Backends:
+        """Who does the work of a request. Raises `InvalidRequest` for a name that nobody has."""
+        reader = self._known("reader", request.reader or self.settings.reader, self.readers)
+        generator = self._known("generator", request.generator or self.settings.generator, self.generators)
+        return Backends(
+            reader_name=reader,
+            reader=lambda: self._reader(reader),
+            generator=lambda: self._generator(generator),
+            artifacts=self.artifacts,
+        )
+
+    def _reader(self, name: str) -> Reader:
+        _check_modules(name, ReaderUnavailable)
+        return self.readers.get(name)
+
     def _generator(self, name: str) -> Generator:
-        manifest = load_manifests().get(name)
-        if manifest is not None and (missing := manifest.missing_modules()):
-            raise GeneratorUnavailable(
-                f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
-            )
+        _check_modules(name, GeneratorUnavailable)
         return self.generators.get(name)
 
     def _image(self, ref: ImageRef) -> DecodedImage:
@@ -113,20 +138,30 @@ class Service:
         default = name == (self.settings.reader if door == "reader" else self.settings.generator)
         if manifest is None:
             return BackendInfo(name=name, default=default, ready=None, summary="Registered by another package.")
-        missing = manifest.missing_modules()
+        modules = manifest.missing_modules()
+        unset = tuple(name for name in manifest.settings if not self.settings.has(name))
         here = ready(manifest, self.settings.weights_dir, without=self.settings.own_parts(name))
         return BackendInfo(
             name=name,
             default=default,
-            ready=here and not missing,
+            ready=here and not modules and not unset,
             needs=manifest.modules,
             summary=manifest.summary,
             licence=manifest.licence,
             weights=manifest.weights,
-            missing=missing,
-            install=manifest.install_line() if missing else None,
+            missing=(*modules, *unset),
+            install=manifest.install_line() if modules else None,
             pull=None if here else f"cow models pull {name}",
             defaults=manifest.defaults,
+        )
+
+
+def _check_modules(name: str, unavailable: type[CowError]) -> None:
+    """Raises `unavailable`, with the command that helps, where a backend's modules are not installed."""
+    manifest = load_manifests().get(name)
+    if manifest is not None and (missing := manifest.missing_modules()):
+        raise unavailable(
+            f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
         )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from platformdirs import user_data_path
-from pydantic import Field, ValidationError
+from pydantic import Field, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from pydantic_settings import SettingsError as UnreadableSetting
 
@@ -26,7 +26,29 @@ class Settings(BaseSettings):
     )
     host: str = Field(default="127.0.0.1", description="Address the server listens on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port the server listens on; 0 takes a free one.")
-    reader: str = Field(default="embedded", description="Reader where a request names none.")
+    mllm: str | None = Field(
+        default=None, min_length=1, description="Multimodal LLM to ask: a manifest's name, or provider:model."
+    )
+    mllm_base_url: str | None = Field(
+        default=None, pattern=r"^https?://", description="Address of the server that serves it, OpenAI-compatible."
+    )
+    mllm_api_key: SecretStr | None = Field(
+        default=None, description="Its key; by default that of the provider's own environment variable."
+    )
+    mllm_model: str | None = Field(
+        default=None, min_length=1, description="Name under which it is served, where that is not the manifest's."
+    )
+    mllm_timeout: float = Field(
+        default=60, gt=0, le=3600, allow_inf_nan=False, description="Longest wait for one reply, seconds."
+    )
+    mllm_budget: float = Field(
+        default=180, gt=0, le=7200, allow_inf_nan=False, description="Longest wait with all retries, seconds."
+    )
+    mllm_concurrency: int = Field(default=8, ge=1, le=1024, description="Calls of it at the same time; others wait.")
+    reader: str = Field(
+        default_factory=lambda told: "mllm" if told.get("mllm") else "embedded",
+        description="Reader where a request names none; `mllm` where COW_MLLM is set.",
+    )
     generator: str = Field(default="cutout", description="Generator where a request names none.")
     max_image_megapixels: float = Field(
         default=25, gt=0, le=500, allow_inf_nan=False, description="Largest image taken, in millions of pixels."
@@ -54,6 +76,10 @@ class Settings(BaseSettings):
     def weights_dir(self) -> Path:
         """Folder for weights."""
         return self.models_dir or self.data_dir / "models"
+
+    def has(self, name: str) -> bool:
+        """Whether a setting, by its name in the environment (COW_...), is set."""
+        return getattr(self, name.removeprefix("COW_").lower()) is not None
 
     def own_parts(self, name: str) -> tuple[str, ...]:
         """Parts of a model that come from a checkpoint of one's own, and need not be pulled."""

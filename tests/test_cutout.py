@@ -38,8 +38,8 @@ def no_reader():
 def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion) -> Shot:
     scene = Scene(image)
     grounding: Grounding
-    grounding, _ = ground(scene, "?", GroundingRequest(point=CENTRE), no_reader, lambda mask: ARTIFACT)
-    moving, _ = read_motion(scene, "?", grounding, MotionRequest(**motion), None, no_reader)
+    grounding, _ = ground(scene, GroundingRequest(point=CENTRE), no_reader, lambda mask: ARTIFACT)
+    moving, _ = read_motion(scene, grounding, MotionRequest(**motion), None, no_reader)
     obstacles = obstacles_of(scene, grounding.bbox)
     trajectory = compute_trajectory(scene, grounding, moving, obstacles, None, frames, fps)
     return Shot(scene, grounding, moving, trajectory, obstacles, 0, CutoutOptions(clean_cues=clean))

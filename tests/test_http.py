@@ -198,7 +198,9 @@ def test_probes_and_models(http: httpx.Client) -> None:
     assert http.get("/livez").json() == {"status": "ok"}
     assert http.get("/readyz").json() == {"status": "ok"}
     models = Models.model_validate(http.get("/models").json())
-    assert [(m.name, m.default, m.ready) for m in models.readers] == [("embedded", True, True)]
+    assert [(m.name, m.default) for m in models.readers] == [("embedded", True), ("local", False), ("mllm", False)]
+    assert models.readers[0].ready
+    assert {"qwen3-vl-8b", "gpt-5", "generic"} <= set(models.mllms)
     assert [(m.name, m.ready) for m in models.generators if m.default] == [("cutout", True)]
     assert next(m for m in models.generators if m.default).needs == ("cv2", "numpy", "av")
 

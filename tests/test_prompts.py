@@ -9,6 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jinja2.exceptions import SecurityError
 
+from cow_service.manifests import Coordinates
+from cow_service.readers.choices import read_choices
+from cow_service.readers.coordinates import View
+from cow_service.readers.mllm import choose, identify, locate, scale
 from cow_service.readers.prompts import load_prompt, parse_prompt
 from cow_service.readers.wording import direction_words, motion_sentence
 from cow_service.records import MotionKind, Vector
@@ -28,8 +32,67 @@ def test_every_shipped_prompt_loads(name: str) -> None:
 
 def test_fields() -> None:
     prompt = load_prompt("motion-sentence")
-    assert (prompt.stage, prompt.version, prompt.output) == ("motion", 1, "text")
-    assert prompt.inputs == ("object", "kind", "words")
+    assert (prompt.stage, prompt.version, prompt.output) == ("motion", 2, "text")
+    assert prompt.inputs == ("object", "kind", "words", "told")
+
+
+SAMPLES: dict[str, object] = {
+    "object": "red ball",
+    "kind": "linear",
+    "words": "to the left",
+    "told": "",
+    "question": "If the ball moves,\nwill it hit the vase?",
+    "others": ("blue vase",),
+    "bbox": "[1, 2, 3, 4]",
+    "units": "integers from 0 to 1000",
+    "box_key": "bbox_2d",
+    "box_order": "[x0, y0, x1, y1]",
+    "line_order": "[x0, y0, x1, y1]",
+    "wants_box": True,
+    "wants_direction": True,
+    "options": read_choices("", ["Yes", "No"]),
+    "sentence": "The ball moves.",
+    "times": "0.06 s",
+    "encounters": ("touches the vase, 0.5 s in",),
+}
+
+
+@pytest.mark.parametrize("name", prompt_names())
+def test_every_shipped_prompt_renders_its_inputs_and_no_others(name: str) -> None:
+    prompt = load_prompt(name)
+    inputs = {each: SAMPLES[each] for each in prompt.inputs}
+    text = prompt.render(**inputs)
+    assert "{{" not in text
+    assert "{%" not in text
+    assert not any(line.endswith(" ") for line in text.splitlines())
+    for each in ("question", "object", "sentence"):
+        if each in inputs and name != "motion-sentence":
+            assert all(f"> {line}" in text.splitlines() for line in str(inputs[each]).splitlines()), each
+    with pytest.raises(TypeError, match="not declared: extra"):
+        prompt.render(**inputs, extra="x")
+    if inputs:
+        with pytest.raises(TypeError, match=f"missing: {prompt.inputs[0]}"):
+            prompt.render(**{key: value for key, value in inputs.items() if key != prompt.inputs[0]})
+
+
+VIEW = View(640, 480, (640, 480), Coordinates(units="thousandths"))
+SCHEMAS = {
+    "identified": identify.schema(100),
+    "located": locate.schema(VIEW, True, True, True, 100),
+    "scaled": scale.schema(VIEW, 100),
+    "answered": choose.schema(read_choices("", ["Yes", "No"]), 100),
+}
+
+
+@pytest.mark.parametrize("name", [name for name in prompt_names() if load_prompt(name).output != "text"])
+def test_a_prompt_shows_the_fields_of_its_schema(name: str) -> None:
+    prompt = load_prompt(name)
+    text = prompt.render(**{each: SAMPLES[each] for each in prompt.inputs})
+    shape = text.splitlines()[-1]
+    fields = list(SCHEMAS[prompt.output]["properties"])
+    places = [shape.index(f'"{field}"') for field in fields]
+    assert places == sorted(places), "the shape names the fields in the schema's order"
+    assert fields[0] == "reasoning"
 
 
 def test_unknown_prompt_names_those_that_exist() -> None:

@@ -36,12 +36,12 @@ def scene() -> Scene:
 
 def grounded(scene: Scene, **given) -> Grounding:
     artifact = Artifact(sha256="0" * 64, url="/artifacts/0", media_type="image/png", size=1)
-    return ground(scene, "?", GroundingRequest(**given), no_reader, lambda mask: artifact)[0]
+    return ground(scene, GroundingRequest(**given), no_reader, lambda mask: artifact)[0]
 
 
 def moved(scene: Scene, path: TrajectoryRequest | None = None, **given) -> Motion:
     request = MotionRequest(**given) if given else None
-    return read_motion(scene, "?", grounded(scene, point=(200, 200)), request, path, no_reader)[0]
+    return read_motion(scene, grounded(scene, point=(200, 200)), request, path, no_reader)[0]
 
 
 def rolled(scene: Scene, motion: Motion, path: TrajectoryRequest | None = None, frames=81, fps=16.0) -> Trajectory:
@@ -219,13 +219,13 @@ def test_requests_that_cannot_be_meant(body, told) -> None:
 
 
 def test_a_reader_is_asked_where_the_request_is_silent(scene: Scene) -> None:
-    class OneReader:
+    class OneLook:
         source = "embedded"
 
-        def read_motion(self, scene, question, grounding):
+        def read_motion(self, grounding):
             return MotionReading("linear", (0.0, -2.0), "text", warnings=("careful",))
 
-    motion, warnings = read_motion(scene, "?", grounded(scene, point=(200, 200)), None, None, OneReader)
+    motion, warnings = read_motion(scene, grounded(scene, point=(200, 200)), None, None, OneLook)
     assert motion.direction == (0, -1)
     assert motion.source == "embedded"
     assert warnings == ("careful",)

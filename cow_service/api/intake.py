@@ -1,10 +1,10 @@
-"""Reads the body of a simulation request, JSON or multipart, within the limits, into one checked record."""
+"""Reads the body of a request, JSON or multipart, within the limits, into one checked record."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from fastapi import Request
 from pydantic import ValidationError
@@ -17,24 +17,28 @@ from cow_service.images import DecodedImage
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 
-BODY = {
-    "required": True,
-    "content": {
-        "application/json": {"schema": {"$ref": "#/components/schemas/SimulateRequest"}},
-        "multipart/form-data": {
-            "schema": {
-                "type": "object",
-                "required": ["image"],
-                "additionalProperties": False,
-                "properties": {
-                    "image": {"type": "string", "format": "binary", "description": "PNG, JPEG or WebP."},
-                    "question": {"type": "string", "description": "Here, or in `request`."},
-                    "request": {"type": "string", "description": "The rest of `SimulateRequest` as JSON."},
-                },
-            }
+Body = TypeVar("Body", bound=SimulateRequest)
+
+
+def body_of(model: type[SimulateRequest]) -> dict[str, Any]:
+    """The request body of an operation that takes this record, for the OpenAPI document."""
+    form = {
+        "type": "object",
+        "required": ["image"],
+        "additionalProperties": False,
+        "properties": {
+            "image": {"type": "string", "format": "binary", "description": "PNG, JPEG or WebP."},
+            "question": {"type": "string", "description": "Here, or in `request`."},
+            "request": {"type": "string", "description": f"The rest of `{model.__name__}` as JSON."},
         },
-    },
-}
+    }
+    return {
+        "required": True,
+        "content": {
+            "application/json": {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}},
+            "multipart/form-data": {"schema": form},
+        },
+    }
 
 
 @dataclass(frozen=True)
@@ -59,11 +63,11 @@ async def receive(request: Request) -> Posted:
     )
 
 
-def check(posted: Posted, service: Service) -> tuple[SimulateRequest, DecodedImage | None]:
+def check(posted: Posted, model: type[Body], service: Service) -> tuple[Body, DecodedImage | None]:
     """The checked request, and the image of a form, kept and decoded. This computes: not for the event loop."""
     try:
         if posted.json is not None:
-            return SimulateRequest.model_validate_json(posted.json), None
+            return model.model_validate_json(posted.json), None
         given = _object(posted.request)
         twice = [name for name in ("image", "question") if name in given and getattr(posted, name) is not None]
         if twice:
@@ -78,7 +82,7 @@ def check(posted: Posted, service: Service) -> tuple[SimulateRequest, DecodedIma
         if posted.image is not None:
             artifact, image = service.keep_image(posted.image)
             given["image"] = {"artifact": artifact.sha256}
-        return SimulateRequest.model_validate(given), image
+        return model.model_validate(given), image
     except ValidationError as error:
         raise invalid(error) from error
 

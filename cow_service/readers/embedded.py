@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from functools import cached_property
 
 from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.arrow_choice import arrow_of, arrows_near, at_arrow
-from cow_service.readers.base import GroundingReading, MotionReading
+from cow_service.readers.base import AnswerReading, Asked, GroundingReading, Imagined, MotionReading
+from cow_service.readers.encounter_answers import choose_option
+from cow_service.readers.judging import judge
 from cow_service.readers.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.motion_words import MotionWords
 from cow_service.readers.phrases import ObjectPhrase
 from cow_service.readers.sentences import Question, parse
-from cow_service.records import BBox, Grounding, LocatedObject, ReaderInfo, Vector
+from cow_service.records import AnswerOption, BBox, Grounding, LocatedObject, ReaderInfo, Source, Usage, Vector
 from cow_service.settings import Settings
 from cow_service.vision.scene import SAME_OBJECT, Scene, iou
 
@@ -29,18 +33,44 @@ GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pix
 
 
 class EmbeddedReader:
-    """Colour and noun of the mover, words and arrows for its direction. Nothing is kept between calls."""
+    """Colour and noun of the mover, words and arrows for its direction, encounters for the answer."""
 
-    source = "embedded"
+    def look(self, scene: Scene, asked: Asked) -> EmbeddedLook:
+        """Begins to read an image for a question."""
+        return EmbeddedLook(scene, asked.question)
+
+
+class EmbeddedLook:
+    """One image and one question under the rules."""
+
+    source: Source = "embedded"
+    usage = Usage()  # it asks nobody
+
+    def __init__(self, scene: Scene, question: str) -> None:
+        self._scene = scene
+        self._text = question
+        self._grounded: GroundingReading | None = None
 
     @property
     def info(self) -> ReaderInfo:
         """Rules change with the version alone."""
         return ReaderInfo(name="embedded", revision=__version__)
 
-    def ground(self, scene: Scene, question: str) -> GroundingReading:
+    @cached_property
+    def _question(self) -> Question:
+        return parse(self._text)
+
+    def answer(
+        self, options: Sequence[AnswerOption], imagined: Imagined | None, votes: int
+    ) -> tuple[AnswerReading, ...]:
+        """What geometry decides, the same for every vote; not sure where it does not. It gives no reasoning."""
+        simulation = None if imagined is None else imagined.simulation
+        happens = judge(self._scene, self._question, self._grounded, simulation)
+        return (choose_option(options, happens),) * votes
+
+    def ground(self) -> GroundingReading:
         """The region that fits the mover's words; `CannotGround` where none or several do."""
-        asked = parse(question)
+        scene, asked = self._scene, self._question
         if asked.mover is None or not _speaks_of_motion(asked.motion):
             raise CannotGround(
                 'The question does not say in words what moves. Ask like "If the red ball moves to the left, '
@@ -50,11 +80,13 @@ class EmbeddedReader:
         others = _others(scene, asked, bbox)
         found = {other.object for other in others}
         missing = [phrase.text for phrase in asked.others if phrase.text not in found]
-        return GroundingReading(asked.mover.text, bbox, others, tuple(_not_found(scene, text) for text in missing))
+        doubts = tuple(_not_found(scene, text) for text in missing)
+        self._grounded = GroundingReading(asked.mover.text, bbox, others=others, warnings=doubts)
+        return self._grounded
 
-    def read_motion(self, scene: Scene, question: str, grounding: Grounding) -> MotionReading:
+    def read_motion(self, grounding: Grounding) -> MotionReading:
         """Kind and direction from the words, and from the arrow where the words speak of one."""
-        asked = parse(question)
+        scene, question, asked = self._scene, self._text, self._question
         words = asked.motion
         kind = words.kind or "linear"
         if kind == "static" and _DIRECTIONS.search(question):

@@ -41,10 +41,14 @@ def _flat_words(direction: Vector | None) -> str:
     return (main, f"{main} and slightly {side}", f"{main} and {side}", f"{side} and slightly {main}")[sector % 4]
 
 
-def motion_sentence(object: str, kind: MotionKind, direction: Vector | None, depth: float) -> str:
-    """The motion in one line: a declarative sentence and a remark that the camera stays still."""
+def motion_sentence(
+    object: str, kind: MotionKind, direction: Vector | None, depth: float, told: str | None = None
+) -> str:
+    """The motion in one line: a declarative sentence, `told` by a reader or made here; and that the camera stays."""
     name = " ".join(object.split())[:MAX_OBJECT].rstrip()
     determiner = next((word for word in _DETERMINERS if name.lower().startswith(word)), "")
     words = direction_words(direction, depth)
-    text = load_prompt("motion-sentence").render(object=name[len(determiner) :], kind=kind, words=words)
+    told = "" if told is None else told.strip().rstrip(".") + "."
+    prompt = load_prompt("motion-sentence")
+    text = prompt.render(object=name[len(determiner) :], kind=kind, words=words, told=told)
     return " ".join(text.split())

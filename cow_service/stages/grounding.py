@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import FieldError, InvalidRequest
-from cow_service.readers.base import Reader
+from cow_service.readers.base import Look
 from cow_service.records import Artifact, BBox, Grounding, Point
 from cow_service.requests import GroundingRequest
 from cow_service.vision.scene import Scene
@@ -18,26 +18,33 @@ DEFAULT_NAME = "object"
 
 def ground(
     scene: Scene,
-    question: str,
     given: GroundingRequest | None,
-    reader: Callable[[], Reader],
+    look: Callable[[], Look],
     keep_mask: Callable[[NDArray[np.bool_]], Artifact],
 ) -> tuple[Grounding, tuple[str, ...]]:
-    """The mover, from the request where it says so, else from the reader; and warnings. Its mask [H, W] is kept.
+    """The mover, from the request where it says so, else from a reader's look; and warnings.
+
+    Its mask [H, W] is kept.
 
     Raises `InvalidRequest` for a place outside the image, and what the reader raises.
     """
     if given is not None:
         bbox = _bbox_given(scene, given)
-        name, others, source = given.object or DEFAULT_NAME, (), "request"
+        name, others, point, source = given.object or DEFAULT_NAME, (), None, "request"
         warnings = _guessed(scene, given, bbox)
     else:
-        reading = reader().ground(scene, question)
-        bbox, name, others, source = reading.bbox, reading.object, reading.others, reader().source
+        reading = look().ground()
+        bbox, name, others, point, source = (
+            reading.bbox,
+            reading.object,
+            reading.others,
+            reading.point,
+            look().source,
+        )
         warnings = reading.warnings
     grounding = Grounding(
         object=name,
-        point=_centre(bbox),
+        point=point or _centre(bbox),
         bbox=bbox,
         mask=keep_mask(scene.silhouette(bbox)),
         others=others,

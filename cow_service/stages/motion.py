@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
-from cow_service.readers.base import MotionReading, Reader
+from cow_service.readers.base import Look, MotionReading
 from cow_service.readers.wording import motion_sentence
 from cow_service.records import Grounding, MetresPerPixel, Motion, Source, Vector
 from cow_service.requests import MotionRequest, TrajectoryRequest
@@ -18,13 +18,12 @@ FALLING = ("projectile", "fall")
 
 def read_motion(
     scene: Scene,
-    question: str,
     grounding: Grounding,
     given: MotionRequest | None,
     path: TrajectoryRequest | None,
-    reader: Callable[[], Reader],
+    look: Callable[[], Look],
 ) -> tuple[Motion, tuple[str, ...]]:
-    """The motion, from the request where it gives one or a whole path, else from the reader; and its warnings."""
+    """The motion, from the request where it gives one or a whole path, else from a reader's look; and its warnings."""
     speed = None
     if given is not None:
         speed = given.speed
@@ -37,8 +36,7 @@ def read_motion(
         reading, speed = _along(path)
         source = "request"
     else:
-        reading = reader().read_motion(scene, question, grounding)
-        source = reader().source
+        reading, source = look().read_motion(grounding), look().source
     motion = _complete(scene, grounding, reading, speed, source)
     return motion, (*reading.warnings, *_assumed(motion, speed))
 
@@ -62,11 +60,17 @@ def _complete(
         cue=reading.cue,
         along_arrow=reading.along_arrow,
         speed=(DEFAULT_SPEED * scene.width if speed is None else speed) if moves else 0.0,
-        gravity=(0.0, GRAVITY / scale.value) if reading.kind in FALLING else (0.0, 0.0),
+        gravity=_gravity(reading.down, scale) if reading.kind in FALLING else (0.0, 0.0),
         metres_per_pixel=scale,
-        sentence=motion_sentence(grounding.object, reading.kind, direction, depth),
+        sentence=motion_sentence(grounding.object, reading.kind, direction, depth, reading.sentence),
         source=source,
     )
+
+
+def _gravity(down: Vector, scale: MetresPerPixel) -> Vector:
+    """px/s^2."""
+    strength = GRAVITY / scale.value
+    return down[0] * strength, down[1] * strength
 
 
 def _assumed(motion: Motion, speed: float | None) -> tuple[str, ...]:

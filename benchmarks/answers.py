@@ -1,0 +1,149 @@
+"""Measures answers: those of the embedded reader against scenes with known truth, and what asking an MLLM adds.
+
+    python benchmarks/answers.py DIR [--runs N] [--json FILE]
+
+DIR holds one folder per scene with image.jpg and meta.json, as `examples/` does. Each scene is asked as a caller would,
+by image and question alone; right, wrong and not sure are counted. Then one scene is answered through a server on
+loopback that replies at once: what is left is our own time (prompts, images, HTTP, reading the replies, simulation).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from cow_service.requests import AnswerRequest
+from cow_service.service import Service
+from cow_service.settings import Settings
+
+
+class Instant(BaseHTTPRequestHandler):
+    """Replies at once: the object, its place and a letter, whichever is asked for."""
+
+    protocol_version = "HTTP/1.1"
+    replies: dict[str, dict[str, Any]] = {}  # noqa: RUF012
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Says nothing."""
+
+    def do_POST(self) -> None:
+        """One completion, told by a field that only its schema has."""
+        body = json.loads(self.rfile.read(int(self.headers["content-length"])))
+        fields = body["response_format"]["json_schema"]["schema"]["properties"]
+        text = next(json.dumps(reply) for field, reply in self.replies.items() if field in fields)
+        choice = {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": text}}
+        data = json.dumps(
+            {"id": "x", "object": "chat.completion", "created": 0, "model": "instant", "choices": [choice]}
+        ).encode()
+        self.send_response(200)
+        self.send_header("content-type", "application/json")
+        self.send_header("content-length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+
+def request_of(service: Service, folder: Path, **body: Any) -> AnswerRequest:
+    """The image and question of a scene."""
+    meta = json.loads((folder / "meta.json").read_text())
+    image, _ = service.keep_image((folder / "image.jpg").read_bytes())
+    return AnswerRequest.model_validate(
+        {"image": {"artifact": image.sha256}, "question": meta["question"], "video": False} | body
+    )
+
+
+def measure_scenes(service: Service, folders: list[Path]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """A row per scene, and the counts."""
+    rows: list[dict[str, Any]] = []
+    for folder in folders:
+        meta = json.loads((folder / "meta.json").read_text())
+        started = time.perf_counter()
+        answer = service.answer(request_of(service, folder))
+        outcome = "not sure" if answer.not_sure else "right" if answer.answer == meta["answer"] else "wrong"
+        rows.append(
+            {
+                "scene": folder.name,
+                "task": meta["task"],
+                "truth": meta["answer"],
+                "answer": answer.answer,
+                "outcome": outcome,
+                "ms": round(1000 * (time.perf_counter() - started), 1),
+            }
+        )
+    counts = Counter(row["outcome"] for row in rows)
+    summary = {name: counts[name] for name in ("right", "wrong", "not sure")}
+    return rows, summary | {"p50_ms": round(statistics.median(row["ms"] for row in rows), 1)}
+
+
+def measure_overhead(folder: Path, runs: int) -> dict[str, float]:
+    """Milliseconds of an answer whose every call of the MLLM is answered at once, and without a simulation."""
+    meta = json.loads((folder / "meta.json").read_text())
+    x0, y0, x1, y1 = meta["bbox"]
+    width, height = meta["image_size"]
+    box = [round(1000 * v / s) for v, s in zip((x0, y0, x1, y1), (width, height, width, height), strict=True)]
+    middle = [(box[0] + box[2]) // 2, (box[1] + box[3]) // 2]
+    line = [*middle, middle[0] + round(200 * meta["direction"][0]), middle[1] + round(200 * meta["direction"][1])]
+    Instant.replies = {
+        "kind": {"reasoning": "", "object": meta["object"], "others": [], "kind": "linear", "sentence": "It moves on."},
+        "bbox_2d": {"label": meta["object"], "bbox_2d": box, "cue": "orientation", "direction": line},
+        "answer": {"reasoning": "", "answer": "A"},
+    }
+    with ThreadingHTTPServer(("127.0.0.1", 0), Instant) as server, tempfile.TemporaryDirectory() as data:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/v1"
+        settings = Settings(data_dir=Path(data), mllm="qwen3-vl-8b", mllm_base_url=address)
+        with Service(settings) as service:
+            figures: dict[str, float] = {}
+            for imagine in ("always", "never"):
+                request = request_of(service, folder, imagine=imagine)
+                service.answer(request)
+                times: list[float] = []
+                for _ in range(runs):
+                    started = time.perf_counter()
+                    service.answer(request)
+                    times.append(1000 * (time.perf_counter() - started))
+                figures[f"imagine {imagine}, p50_ms"] = round(statistics.median(times), 1)
+        server.shutdown()
+    return figures
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--json", type=Path, default=None, help="write rows and summary here")
+    arguments = parser.parse_args()
+    folders = sorted(path.parent for path in arguments.folder.glob("*/meta.json"))
+    if not folders:
+        print(f"No scenes in {arguments.folder}: it needs folders with image.jpg and meta.json.", file=sys.stderr)
+        return 2
+    with tempfile.TemporaryDirectory() as data, Service(Settings(data_dir=Path(data), reader="embedded")) as service:
+        rows, summary = measure_scenes(service, folders)
+    table = Table(box=None, pad_edge=False)
+    for name in rows[0]:
+        table.add_column(name)
+    for row in rows:
+        table.add_row(*(str(value) for value in row.values()))
+    Console(width=120).print(table)
+    summary = summary | measure_overhead(folders[0], arguments.runs)
+    for name, value in summary.items():
+        print(f"{name}: {value}")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps({"summary": summary, "scenes": rows}, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

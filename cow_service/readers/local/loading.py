@@ -1,0 +1,191 @@
+"""Makes the multimodal LLM of this process: its manifest found, its weights checked and loaded, foreign errors told."""
+
+from __future__ import annotations
+
+import json
+import re
+import traceback
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Lock
+from typing import Any, Literal
+
+import torch
+from pydantic import Field, ValidationError
+from pydantic_ai.settings import ModelSettings
+from transformers import AutoModelForImageTextToText, PreTrainedModel, ProcessorMixin
+
+from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
+from cow_service.manifests import Manifest, load_manifests
+from cow_service.readers.local.engine import Engine
+from cow_service.readers.local.model import LocalModel
+from cow_service.readers.local.processors import load_processor
+from cow_service.readers.local.tiny import make_tiny
+from cow_service.readers.local.worker import is_out_of_memory
+from cow_service.records import Record
+from cow_service.settings import Settings
+from cow_service.weights import verify
+
+SHOWN = 4  # weights in an error
+
+# Seeds and lazy initialisation are the whole process's: two models made at once would get into each other's weights.
+_one_at_a_time = Lock()
+
+
+class LocalOptions(Record):
+    """How an MLLM runs in this process: the section `local` of its manifest."""
+
+    dtype: Literal["float32", "bfloat16", "float16", "auto"] = Field(
+        default="auto", description="Of the weights; auto takes them as they are saved."
+    )
+    device_map: str = Field(
+        default="auto", description="Over which GPUs accelerate spreads it, where COW_DEVICE is auto and there are any."
+    )
+    attn_implementation: str = "sdpa"
+    max_batch: int = Field(default=4, ge=1, le=256, description="Replies that are written together.")
+    max_new_tokens: int = Field(default=2048, ge=1, description="The most tokens of a reply.")
+    threads: int | None = Field(default=None, ge=1, description="Of the CPU; null for PyTorch's own number.")
+
+
+def load_local(settings: Settings) -> LocalModel:
+    """The model that `settings.mllm` names. One without sources is made here, at the sizes of its manifest.
+
+    Raises `ReaderUnavailable` for what there is not or this machine cannot do, `WeightsUnavailable` and
+    `CheckpointInvalid`.
+    """
+    manifest = _manifest(settings.mllm)
+    own = settings.checkpoints.get(manifest.name)
+    if own is None and not manifest.sources and not manifest.architecture:
+        raise ReaderUnavailable(
+            f"'{manifest.name}' has no weights that run here: it is served by others. Take the reader 'mllm', or set "
+            f"COW_MLLM to one of {_with_weights()}."
+        )
+    try:
+        options = LocalOptions.model_validate(manifest.local)
+    except ValidationError as error:
+        places = ", ".join(".".join(str(part) for part in found["loc"]) for found in error.errors())
+        raise ReaderUnavailable(f"The manifest of '{manifest.name}' is wrong in `local`: {places}.") from error
+    places = device_map(settings.device, options.device_map)
+    with _one_at_a_time, _told(manifest.name):
+        if own is None and not manifest.sources:
+            model, processor = make_tiny(manifest.architecture)
+            torch.nn.Module.to(model, torch.device(places[""] if isinstance(places, dict) else "cuda"))
+        else:
+            folder = own or verify(manifest.sources["weights"], settings.weights_dir, manifest.name)
+            model, processor = _from_folder(folder, manifest, options, places)
+        engine = Engine(model, processor)
+    defaults: Any = {name: value for name, value in manifest.defaults.items() if name in ModelSettings.__annotations__}
+    return LocalModel(
+        manifest.name,
+        engine,
+        max_batch=options.max_batch,
+        max_new_tokens=options.max_new_tokens,
+        threads=options.threads,
+        settings=ModelSettings(**defaults),
+    )
+
+
+def device_map(device: str, spread: str) -> str | dict[str, str]:
+    """Where the weights go, as accelerate takes it. Raises `ReaderUnavailable` for a GPU that is not here."""
+    if device == "auto":
+        return spread if torch.cuda.is_available() else {"": "cpu"}
+    if device == "cpu":
+        return {"": "cpu"}
+    index = int(device.partition(":")[2] or 0)
+    if index >= torch.cuda.device_count():
+        raise ReaderUnavailable(
+            f"There is no GPU '{device}': PyTorch {torch.__version__} sees {torch.cuda.device_count()}. Set COW_DEVICE."
+        )
+    return {"": f"cuda:{index}"}
+
+
+def _manifest(name: str | None) -> Manifest:
+    if name is None:
+        raise ReaderUnavailable(f"No multimodal LLM is chosen: set COW_MLLM to one of {_with_weights()}.")
+    manifest = load_manifests().get(name)
+    if manifest is None or manifest.door != "mllm":
+        raise ReaderUnavailable(
+            f"'{name}' is no multimodal LLM that runs in this process: set COW_MLLM to one of "
+            f"{_with_weights()}, or take the reader 'mllm'."
+        )
+    return manifest
+
+
+def _with_weights() -> str:
+    found = load_manifests().values()
+    return ", ".join(one.name for one in found if one.door == "mllm" and (one.sources or one.architecture))
+
+
+def _from_folder(
+    folder: Path, manifest: Manifest, options: LocalOptions, places: str | dict[str, str]
+) -> tuple[PreTrainedModel, ProcessorMixin]:
+    """The model and processor of a checkpoint. Opens safetensors only: a pickle can run code."""
+    _check(folder, manifest)
+    processor = load_processor(folder)
+    dtype: Any = options.dtype if options.dtype == "auto" else getattr(torch, options.dtype)
+    loaded: Any = AutoModelForImageTextToText.from_pretrained(
+        folder,
+        dtype=dtype,
+        device_map=places,
+        attn_implementation=options.attn_implementation,
+        local_files_only=True,
+        use_safetensors=True,
+        trust_remote_code=False,
+        output_loading_info=True,
+    )
+    model, found = loaded
+    # transformers only warns of these, and fills what is missing with random numbers.
+    for kind, what in (("missing_keys", "lacks"), ("unexpected_keys", "has, beyond its model,")):
+        if names := sorted(found[kind]):
+            raise CheckpointInvalid(f"The checkpoint '{folder.name}' {what} {_listed(names)}. Download it again.")
+    return model, processor
+
+
+def _check(folder: Path, manifest: Manifest) -> None:
+    try:
+        kind = str(json.loads((folder / "config.json").read_text(encoding="utf-8"))["model_type"])
+        files = sorted(file.name for file in folder.iterdir())
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise CheckpointInvalid(
+            f"'{folder.name}' is no folder of a transformers checkpoint: no `config.json` says its `model_type`."
+        ) from error
+    if not any(name.endswith(".safetensors") for name in files):
+        raise CheckpointInvalid(f"'{folder.name}' has no safetensors files, and pickles are never opened.")
+    # How places are written goes with the family. Another one's would be read wrong without a sign of it.
+    if manifest.family is not None and not _letters(kind).startswith(_letters(manifest.family)):
+        raise CheckpointInvalid(
+            f"'{folder.name}' is of the type '{kind}', and '{manifest.name}' of the family '{manifest.family}', which "
+            f"writes places in its own way. Name it under a manifest of its family in COW_CHECKPOINTS."
+        )
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+@contextmanager
+def _told(name: str) -> Generator[None]:
+    """Whatever transformers, safetensors or PyTorch raise becomes a `CowError` with the reason, without folders."""
+    try:
+        yield
+    except CowError:
+        raise
+    except Exception as error:
+        # The failed frames hold what was half loaded, and live as long as the traceback does.
+        traceback.clear_frames(error.__traceback__)
+        if isinstance(error, RuntimeError) and is_out_of_memory(error):
+            raise ReaderUnavailable(
+                f"'{name}' does not fit into memory. Set COW_MLLM to a smaller model, or COW_DEVICE to a larger device."
+            ) from error
+        reason = re.sub(r"(?<!\w)(/[\w.+-]+)+/?", "…", (str(error).splitlines() or [""])[0])[:300]
+        if isinstance(error, ImportError):
+            raise ReaderUnavailable(
+                f"'{name}' cannot be loaded: {type(error).__name__}: {reason} Install what it names."
+            ) from error
+        raise CheckpointInvalid(f"'{name}' cannot be loaded: {type(error).__name__}: {reason}") from error
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more

@@ -1,0 +1,141 @@
+"""The multimodal LLM of this process as a model of pydantic-ai, which the reader asks like any provider's."""
+
+from __future__ import annotations
+
+import asyncio
+
+from pydantic_ai.exceptions import UserError
+from pydantic_ai.messages import ModelMessage, ModelResponse, TextPart, ThinkingPart
+from pydantic_ai.models import Model, ModelRequestParameters
+from pydantic_ai.profiles import ModelProfile
+from pydantic_ai.settings import ModelSettings
+from pydantic_ai.usage import RequestUsage
+
+from cow_service.errors import MllmUnavailable
+from cow_service.readers.local.chat import chat_of
+from cow_service.readers.local.decoding import Sampling
+from cow_service.readers.local.engine import Engine, Wish
+from cow_service.readers.local.worker import Worker
+
+PROFILE = ModelProfile(
+    supports_tools=False,
+    supports_json_schema_output=True,
+    default_structured_output_mode="native",
+    # A grammar holds the reply to the schema but tells the model nothing: what it may write stands in its prompt.
+    native_output_requires_schema_in_instructions=True,
+    supports_document_input=False,
+    supports_audio_file_input=False,
+    supports_video_input=False,
+)
+_UNPREPARED = ("retry-feedback", "retry-prompt")
+
+
+class LocalModel(Model[None]):
+    """A model of images and text in this process. Safe to ask from several threads and event loops at once.
+
+    Replies are held to the JSON schema of the request's output, where it has one; a model that thinks first thinks
+    freely. Temperature 0 takes the likeliest tokens; where the settings do not say, the checkpoint's own advice counts.
+    Calls that wait together are written together, `max_batch` at most: in float32 that changes no reply; in half
+    precision it can change a token that was nearly as likely as another.
+    """
+
+    unsupported_settings = frozenset(
+        {
+            "extra_body", "extra_headers", "frequency_penalty", "logit_bias", "max_retries", "parallel_tool_calls",
+            "presence_penalty", "service_tier", "stop_sequences",
+        }
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        name: str,
+        engine: Engine,
+        *,
+        max_batch: int = 4,
+        max_new_tokens: int = 1024,
+        threads: int | None = None,
+        settings: ModelSettings | None = None,
+    ) -> None:
+        """`max_new_tokens` is a reply's limit whatever the request says; `settings`, what counts where it says nothing.
+
+        `threads` are those of the CPU; null for PyTorch's own number.
+        """
+        super().__init__(profile=PROFILE, settings=settings)
+        self._name = name
+        self._engine = engine
+        self._worker = Worker(engine, name, max_batch, threads)
+        self._max_new_tokens = max_new_tokens
+
+    @property
+    def model_name(self) -> str:
+        """The name of its manifest."""
+        return self._name
+
+    @property
+    def system(self) -> str:
+        """Who serves it: this process."""
+        return "local"
+
+    async def request(
+        self,
+        messages: list[ModelMessage],
+        model_settings: ModelSettings | None,
+        model_request_parameters: ModelRequestParameters,
+    ) -> ModelResponse:
+        """The reply. Its finish reason is `length` where it was cut off, as the caller's limit or the model's wants it.
+
+        Raises `MllmUnavailable` where memory runs out or the setting `timeout` (seconds) is over, `ImageUnreadable` and
+        the other errors of `images.decode` for images, and `UserError` for tools, files that are no images, schemas
+        that replies cannot be held to, and settings out of range.
+        """
+        settings, parameters = self.prepare_request(model_settings, model_request_parameters)
+        settings = settings or ModelSettings()
+        # Decoding images takes long enough to hold up an event loop.
+        wish = await asyncio.to_thread(self._wish, messages, settings, parameters)
+        timeout = settings.get("timeout")
+        seconds = timeout if isinstance(timeout, int | float) else None
+        try:
+            # Giving up cancels the future, and so takes the call out of the queue or ends its reply.
+            async with asyncio.timeout(seconds):
+                reply = await asyncio.wrap_future(self._worker.submit(wish))
+        except TimeoutError as error:
+            raise MllmUnavailable(
+                f"'{self._name}' gave no reply in {seconds:g} s. Allow it more (COW_MLLM_TIMEOUT), send fewer requests "
+                f"at a time, or set COW_MLLM to a smaller model."
+            ) from error
+        return ModelResponse(
+            parts=[*([ThinkingPart(reply.thought)] if reply.thought else []), TextPart(reply.text)],
+            usage=RequestUsage(input_tokens=reply.input_tokens, output_tokens=reply.output_tokens),
+            model_name=self._name,
+            provider_name=self.system,
+            finish_reason=reply.finish,
+        )
+
+    def _wish(self, messages: list[ModelMessage], settings: ModelSettings, parameters: ModelRequestParameters) -> Wish:
+        if parameters.function_tools:
+            raise UserError("A model in this process takes no tools.")
+        if any(part.part_kind in _UNPREPARED for said in messages for part in said.parts):
+            messages = self.prepare_messages(messages, parameters)  # as agents do before they ask
+        output = parameters.output_object if parameters.output_mode == "native" else None
+        instructions = self._get_instruction_parts(messages, parameters) or []
+        return Wish(
+            chat=chat_of(messages, [part.content for part in instructions], self._engine.special()),
+            sampling=_sampling(settings, self._engine.advice),
+            limit=min(settings.get("max_tokens", self._max_new_tokens), self._max_new_tokens),
+            grammar=None if output is None else self._engine.grammar(output.json_schema),
+        )
+
+
+def _sampling(settings: ModelSettings, advice: Sampling) -> Sampling:
+    found = Sampling(
+        temperature=settings.get("temperature", advice.temperature),
+        top_p=settings.get("top_p", advice.top_p),
+        top_k=settings.get("top_k", advice.top_k),
+        seed=settings.get("seed"),
+    )
+    if found.temperature < 0 or not 0 < found.top_p <= 1 or found.top_k < 0 or settings.get("max_tokens", 1) < 1:
+        raise UserError(
+            "A model in this process takes a temperature from 0, a top_p above 0 and up to 1, a top_k from 0 and "
+            f"max_tokens from 1; not {found} and {settings.get('max_tokens')}."
+        )
+    return found

@@ -1,0 +1,102 @@
+"""Qwen3-VL at toy size: the real classes with seeded random weights and a toy tokenizer, made here from nothing.
+
+It goes the whole way in a fraction of a second on a CPU. What it says means nothing: it is for tests, and to try a
+deployment out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers
+from transformers import (
+    GenerationConfig,
+    PreTrainedTokenizerFast,
+    ProcessorMixin,
+    Qwen3VLConfig,
+    Qwen3VLForConditionalGeneration,
+    Qwen3VLProcessor,
+)
+from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+
+from cow_service.manifests import load_manifests
+from cow_service.readers.local.processors import still
+
+NAME = "tiny-qwen3-vl"
+SEED = 0
+PIXELS = {"shortest_edge": 32 * 32, "longest_edge": 128 * 128}  # least and most of an image as it is seen
+PADDING, START, END = "<|endoftext|>", "<|im_start|>", "<|im_end|>"
+VISION_START, VISION_END, IMAGE, VIDEO = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>"
+THOUGHT = ("<think>", "</think>")
+SPECIAL = (PADDING, START, END, VISION_START, VISION_END, IMAGE, VIDEO)
+TEMPLATE = (
+    "{% for turn in messages %}" + START + "{{ turn.role }}\n"
+    "{% for part in turn.content %}"
+    "{% if part.type == 'image' %}" + VISION_START + IMAGE + VISION_END + "{% else %}{{ part.text }}{% endif %}"
+    "{% endfor %}" + END + "\n"
+    "{% endfor %}"
+    "{% if add_generation_prompt %}" + START + "assistant\n{% endif %}"
+)
+
+
+def make_tiny(architecture: Mapping[str, Any]) -> tuple[Qwen3VLForConditionalGeneration, ProcessorMixin]:
+    """A model of these sizes and its processor; the same sizes give the same weights.
+
+    Names are those of Qwen3-VL's configuration, with a dot where it nests: `text_config.hidden_size`.
+    """
+    tokenizer = _tokenizer()
+    config = _configuration(architecture, tokenizer)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(SEED)
+        model = Qwen3VLForConditionalGeneration(config)
+    model.generation_config = GenerationConfig(eos_token_id=tokenizer.eos_token_id, pad_token_id=tokenizer.pad_token_id)
+    patch = architecture["vision_config.patch_size"]
+    images = Qwen2VLImageProcessorPil(patch_size=patch, temporal_patch_size=2, merge_size=2, size=PIXELS)
+    return model, still(Qwen3VLProcessor)(images, tokenizer, chat_template=TEMPLATE)
+
+
+def save_tiny(folder: Path) -> None:
+    """Writes the toy of the manifest as a checkpoint, as its real sisters are published."""
+    model, processor = make_tiny(load_manifests()[NAME].architecture)
+    model.save_pretrained(folder)
+    processor.save_pretrained(folder)
+
+
+def _configuration(architecture: Mapping[str, Any], tokenizer: PreTrainedTokenizerFast) -> Qwen3VLConfig:
+    text, vision = _section(architecture, "text_config"), _section(architecture, "vision_config")
+    third = text["head_dim"] // 6  # half a head's channels turn: by time, height and width in about equal parts
+    text["rope_parameters"] = {
+        "rope_type": "default",
+        "rope_theta": 10_000.0,
+        "mrope_interleaved": True,
+        "mrope_section": [text["head_dim"] // 2 - 2 * third, third, third],
+    }
+    ids: dict[str, Any] = {name: tokenizer.convert_tokens_to_ids(token) for name, token in (
+        ("image_token_id", IMAGE), ("video_token_id", VIDEO),
+        ("vision_start_token_id", VISION_START), ("vision_end_token_id", VISION_END),
+    )}  # fmt: skip
+    return Qwen3VLConfig(
+        text_config={**text, "vocab_size": len(tokenizer), "pad_token_id": tokenizer.pad_token_id},
+        vision_config={**vision, "out_hidden_size": text["hidden_size"], "deepstack_visual_indexes": [0]},
+        tie_word_embeddings=True,
+        **ids,
+    )
+
+
+def _section(architecture: Mapping[str, Any], name: str) -> dict[str, Any]:
+    start = name + "."
+    return {key.removeprefix(start): value for key, value in architecture.items() if key.startswith(start)}
+
+
+def _tokenizer() -> PreTrainedTokenizerFast:
+    """Every byte is a token."""
+    vocabulary = {byte: i for i, byte in enumerate(sorted(pre_tokenizers.ByteLevel.alphabet()))}
+    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    tokenizer.add_special_tokens([AddedToken(token, special=True) for token in SPECIAL])
+    tokenizer.add_tokens([AddedToken(token) for token in THOUGHT])
+    return PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token=PADDING, eos_token=END)

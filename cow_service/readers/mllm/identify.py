@@ -1,0 +1,141 @@
+"""First prompt: which object the question sets in motion, in words, and how it moves."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast, get_args
+
+from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
+from cow_service.readers.replies import ReplyError, fields_of, first_of, text_of, values_in, without_thinking
+from cow_service.records import MotionKind
+
+MAX_OBJECT = 120  # characters
+MAX_OTHERS = 4
+MAX_SENTENCE = 240  # characters
+KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
+_NAMES = ("object", "moving_object", "mover", "object_name", "final_result", "result", "target", "answer")
+_NONE = frozenset({"", "none", "null", "n/a", "not found", "nothing"})
+_LETTERED = re.compile(r"\W*[(\[]?[A-Za-z][)\].:](\s|$)|\W*[A-Za-z]\W*$")
+_SAID = re.compile(
+    r"(?:final result|(?:moving )?object|mover|(?:object|thing) that moves)[*\"'`]*\s*(?:is|:|=)\s*(?P<name>[^\n]+)",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What moves, in words; nothing about where it is. `kind` and `sentence` are None where the reply has none."""
+
+    object: str
+    others: tuple[str, ...] = ()
+    kind: MotionKind | None = None
+    sentence: str | None = None
+
+
+def schema(reasoning_length: int) -> Schema:
+    """JSON schema of the reply."""
+    return object_of(
+        reasoning=words(reasoning_length),
+        object=nullable(words(MAX_OBJECT)),
+        others={"type": "array", "items": words(MAX_OBJECT), "maxItems": MAX_OTHERS},
+        kind=one_of(*KINDS),
+        sentence=words(MAX_SENTENCE),
+    )
+
+
+def read_identified(reply: str) -> Identified | None:
+    """The object that a reply names; None where it says that there is none. Raises `ReplyError`."""
+    said = without_thinking(reply)
+    values = values_in(said)
+    found = [named for value in values for named in _named(value)]
+    if not found and not any(isinstance(value, dict | list) or value is None for value in values):
+        found = [Identified(name) for name in _in_prose(said)]
+    if not found:
+        if any(_says_none(value) for value in values):
+            return None
+        raise ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
+    for named in found:
+        _check(named.object)
+    if len({_plain(named.object) for named in found}) > 1:
+        raise ReplyError(f"several objects are named ({', '.join(n.object for n in found)}); name the one that moves")
+    return found[-1]
+
+
+def _named(value: object) -> Iterator[Identified]:
+    if isinstance(value, list):
+        for part in cast("list[object]", value):
+            yield from _named(part) if isinstance(part, dict) else _as_words(part)
+    fields = fields_of(value)
+    name = first_of(fields, *_NAMES)
+    if isinstance(name, dict):
+        yield from _named(name)
+    elif name is not None:
+        names = cast("list[object]", name) if isinstance(name, list) else [name]
+        for each in names:
+            for named in _as_words(each):
+                yield Identified(named.object, _others(fields, named.object), _kind(fields), _sentence(fields))
+
+
+def _as_words(value: object) -> Iterator[Identified]:
+    name = text_of(value)
+    if name.lower() not in _NONE:
+        yield Identified(name)
+
+
+def _says_none(value: object) -> bool:
+    if value is None or value == []:
+        return True
+    fields = fields_of(value)
+    name = first_of(fields, *_NAMES)
+    return any(known in fields for known in _NAMES) and (name in (None, []) or text_of(name).lower() in _NONE)
+
+
+def _in_prose(said: str) -> list[str]:
+    """A name told in words: behind "the moving object is", or the whole reply if it is nothing but a phrase."""
+    told = [_unquoted(found["name"]) for found in _SAID.finditer(said)]
+    if told:
+        return told[-1:]
+    phrase = _unquoted(said)
+    return [phrase] if "\n" not in said and len(phrase.split()) <= 12 and not re.search(r"[.!?:;]", phrase) else []
+
+
+def _unquoted(text: str) -> str:
+    return text.strip().strip("*\"'`.[]{} ").strip()
+
+
+def _check(name: str) -> None:
+    if len(name) > MAX_OBJECT:
+        raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
+    if _LETTERED.match(name) or (len(name.split()) <= 3 and _is_answer(name)):
+        raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
+    if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
+        raise ReplyError(f"'{name}' names no object; say in words what moves")
+
+
+def _is_answer(name: str) -> bool:
+    plain = re.sub(r"[^\w\s]", " ", name.lower()).split()
+    return " ".join(plain) in {"yes", "no", "not sure", "unsure", "true", "false", "unknown", "maybe"}
+
+
+def _others(fields: dict[str, Any], mover: str) -> tuple[str, ...]:
+    held = fields.get("others")
+    names = [text_of(each)[:MAX_OBJECT] for each in cast("list[object]", held)] if isinstance(held, list) else []
+    kept = [name for name in names if name.lower() not in _NONE and _plain(name) != _plain(mover)]
+    return tuple(dict.fromkeys(kept))[:MAX_OTHERS]
+
+
+def _kind(fields: dict[str, Any]) -> MotionKind | None:
+    told = text_of(fields.get("kind")).lower()
+    return next((kind for kind in KINDS if kind == told), None)
+
+
+def _sentence(fields: dict[str, Any]) -> str | None:
+    told = text_of(fields.get("sentence"))
+    return told if 8 <= len(told) <= MAX_SENTENCE else None
+
+
+def _plain(name: str) -> str:
+    kept = [word for word in re.findall(r"\w+", name.lower()) if word not in {"the", "a", "an"}]
+    return " ".join(kept)

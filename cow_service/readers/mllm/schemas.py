@@ -1,0 +1,42 @@
+"""JSON schemas of replies, in the few forms that every server with structured output takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cow_service.readers.coordinates import View
+
+Schema = dict[str, Any]
+
+
+def object_of(**properties: Schema) -> Schema:
+    """An object with exactly these fields, in this order: reasoning comes first."""
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+    }
+
+
+def words(longest: int) -> Schema:
+    """Text of at most so many characters."""
+    return {"type": "string", "maxLength": longest}
+
+
+def one_of(*values: str) -> Schema:
+    """One of some words."""
+    return {"type": "string", "enum": list(values)}
+
+
+def nullable(schema: Schema) -> Schema:
+    """That, or null."""
+    return {"anyOf": [schema, {"type": "null"}]}
+
+
+def numbers(view: View, count: int) -> Schema:
+    """`count` coordinates as the view's family writes them."""
+    units = view.coordinates.units
+    highest = max(view.seen) if units == "pixels" else {"thousandths": 1000, "fractions": 1}[units]
+    number = {"type": "number" if units == "fractions" else "integer", "minimum": 0, "maximum": highest}
+    return {"type": "array", "items": number, "minItems": count, "maxItems": count}

@@ -1,0 +1,163 @@
+"""An OpenAI-compatible server on loopback that says what a test tells it to, word for word, or fails as told."""
+
+from __future__ import annotations
+
+import base64
+import json
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Reply = Callable[["_Handler"], None]
+
+
+@dataclass
+class MllmServer:
+    """What it was asked so far, and what it says next: `script` in order, its last entry for ever."""
+
+    address: str = ""
+    script: list[str | Reply] = field(default_factory=list)
+    asked: list[dict[str, Any]] = field(default_factory=list)
+    at_once: int = 0
+    most_at_once: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def say(self, *script: str | Reply) -> None:
+        """Starts a new script."""
+        with self.lock:
+            self.script, self.asked = list(script), []
+            self.at_once = self.most_at_once = 0
+
+    def next(self) -> str | Reply:
+        return self.script.pop(0) if len(self.script) > 1 else self.script[0]
+
+    def text(self, call: int) -> str:
+        """All words of a call, in order."""
+        return "\n".join(part for message in self.asked[call]["messages"] for part in _texts(message["content"]))
+
+    def images(self, call: int) -> list[NDArray[np.uint8]]:
+        """The pictures of a call, RGB, in order."""
+        parts = [p for m in self.asked[call]["messages"] if isinstance(m["content"], list) for p in m["content"]]
+        urls = [part["image_url"]["url"] for part in parts if part["type"] == "image_url"]
+        data = [np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8) for url in urls]
+        return [np.asarray(cv2.imdecode(each, cv2.IMREAD_COLOR)[..., ::-1]) for each in data]
+
+
+def _texts(content: Any) -> list[str]:
+    if isinstance(content, str):
+        return [content]
+    return [part["text"] for part in content if part["type"] == "text"]
+
+
+def completion(text: str | None, finish_reason: str = "stop") -> dict[str, Any]:
+    return {
+        "id": "x",
+        "object": "chat.completion",
+        "created": 1,
+        "model": "scripted",
+        "choices": [{"index": 0, "finish_reason": finish_reason, "message": {"role": "assistant", "content": text}}],
+        "usage": {"prompt_tokens": 100, "completion_tokens": 10, "total_tokens": 110},
+    }
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_state: MllmServer
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+    def do_POST(self) -> None:
+        state = self.server_state
+        body = json.loads(self.rfile.read(int(self.headers["content-length"])))
+        with state.lock:
+            state.asked.append(body | {"authorization": self.headers.get("authorization")})
+            state.at_once += 1  # only what waits counts itself out again
+            state.most_at_once = max(state.most_at_once, state.at_once)
+            reply = state.next()
+        if callable(reply):
+            reply(self)
+        else:
+            self.send(200, completion(reply))
+
+    def send(self, status: int, body: object, headers: dict[str, str] | None = None, length: int | None = None) -> None:
+        data = body if isinstance(body, bytes) else json.dumps(body).encode()
+        self.send_response(status)
+        sent = {"content-type": "application/json", "content-length": str(len(data) if length is None else length)}
+        for name, value in (sent | (headers or {})).items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(data)
+
+
+def status(code: int, **headers: str) -> Reply:
+    """An error of that status."""
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    return lambda handler: handler.send(code, {"error": {"message": "no", "type": "error"}}, named)
+
+
+def raw(body: bytes, content_type: str = "application/json") -> Reply:
+    """Status 200 with any bytes."""
+    return lambda handler: handler.send(200, body, {"content-type": content_type})
+
+
+def shaped(body: object) -> Reply:
+    """Status 200 with any JSON."""
+    return lambda handler: handler.send(200, body)
+
+
+def finished(text: str | None, reason: str) -> Reply:
+    return lambda handler: handler.send(200, completion(text, reason))
+
+
+def slow(seconds: float, text: str = "{}") -> Reply:
+    def reply(handler: _Handler) -> None:
+        time.sleep(seconds)
+        with handler.server_state.lock:  # before the reply: who gets it may ask again at once
+            handler.server_state.at_once -= 1
+        with suppress(OSError):  # the caller may have given up
+            handler.send(200, completion(text))
+
+    return reply
+
+
+def half(handler: _Handler) -> None:
+    """Fewer bytes than were announced."""
+    handler.send(200, json.dumps(completion("x")).encode()[:60], length=4000)
+    handler.close_connection = True
+
+
+def dropped(handler: _Handler) -> None:
+    """The connection is reset without a word."""
+    handler.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    handler.connection.close()
+    handler.close_connection = True
+
+
+class _Quiet(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        pass  # callers that give up are what some tests are about
+
+
+@contextmanager
+def mllm_server() -> Iterator[MllmServer]:
+    """Serves until the block ends."""
+    state = MllmServer()
+    handler = type("Handler", (_Handler,), {"server_state": state})
+    with _Quiet(("127.0.0.1", 0), handler) as server:
+        state.address = f"http://127.0.0.1:{server.server_port}/v1"
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        yield state
+        server.shutdown()
