@@ -6,7 +6,7 @@ import collections.abc
 import time
 import uuid
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -48,6 +48,7 @@ class Backends:
     reader: Callable[[], Reader]
     generator: Callable[[], Generator]
     artifacts: ArtifactStore
+    elsewhere: Callable[[], AbstractContextManager[None]] = nullcontext  # around waits for a multimodal LLM
 
 
 @dataclass
@@ -88,6 +89,7 @@ class _Eyes:
                 stages=_needed(self.request),
                 seed=self.request.seed,
                 still_wanted=lambda: self.progress(self.used[-1], 0.0),
+                elsewhere=self.backends.elsewhere,
             )
             self._look = self.backends.reader().look(self.scene, asked)
         return self._look

@@ -5,6 +5,9 @@ from __future__ import annotations
 import base64
 import binascii
 import re
+from collections.abc import Generator as Steps
+from contextlib import contextmanager
+from threading import BoundedSemaphore
 
 from cow_service.artifacts import ArtifactStore
 from cow_service.errors import (
@@ -34,10 +37,14 @@ def _ignore(stage: str, done: float) -> None:
 
 
 class Service:
-    """Everything a server or a command line needs, made once. Safe to use from several threads."""
+    """Everything a server or a command line needs, made once. Safe to use from several threads.
+
+    `COW_CONCURRENCY` of them compute at the same time; whoever waits for a multimodal LLM lets another one compute.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
+        self._slots = BoundedSemaphore(settings.concurrency)
         self.artifacts = ArtifactStore(settings.data_dir / "artifacts")
         self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable, settings)
         self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable, settings)
@@ -66,7 +73,8 @@ class Service:
         Raises any `CowError` of its stages.
         """
         backends = self._backends(request)
-        return simulate(request, image or self._image(request.image), backends, progress)
+        with self._slots:
+            return simulate(request, image or self._image(request.image), backends, progress)
 
     def answer(self, request: AnswerRequest, progress: Progress = _ignore, image: DecodedImage | None = None) -> Answer:
         """One answer, start to end; `image` is that of the request where it was decoded before.
@@ -74,7 +82,8 @@ class Service:
         Raises any `CowError` that leaves no answer.
         """
         backends = self._backends(request)
-        return answer(request, image or self._image(request.image), backends, progress)
+        with self._slots:
+            return answer(request, image or self._image(request.image), backends, progress)
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
@@ -110,7 +119,17 @@ class Service:
             reader=lambda: self._reader(reader),
             generator=lambda: self._generator(generator),
             artifacts=self.artifacts,
+            elsewhere=self._elsewhere,
         )
+
+    @contextmanager
+    def _elsewhere(self) -> Steps[None]:
+        """Leaves the slot to others while somebody else computes for us."""
+        self._slots.release()
+        try:
+            yield
+        finally:
+            self._slots.acquire()
 
     def _reader(self, name: str) -> Reader:
         _check_modules(name, ReaderUnavailable)

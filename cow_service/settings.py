@@ -70,7 +70,7 @@ class Settings(BaseSettings):
         pattern=r"^(auto|cpu|cuda(:\d+)?)$",
         description="Where video models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU.",
     )
-    concurrency: int = Field(default=2, ge=1, le=256, description="Simulations computed at the same time; others wait.")
+    concurrency: int = Field(default=2, ge=1, le=256, description="Requests computed at the same time; others wait.")
 
     @property
     def weights_dir(self) -> Path:

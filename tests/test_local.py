@@ -108,7 +108,9 @@ async def say(
     parameters = ModelRequestParameters()
     if schema is not None:
         parameters = ModelRequestParameters(output_mode="native", output_object=OutputObjectDefinition(schema))
-    return await model.request(messages, ModelSettings(**rest), parameters)
+    # The toy's manifest wants chance; a test wants it only where it says so.
+    calm = ModelSettings(temperature=0.0) if model.model_name == NAME else ModelSettings()
+    return await model.request(messages, calm | ModelSettings(**rest), parameters)
 
 
 def text(response: ModelResponse) -> str:

@@ -439,6 +439,20 @@ def test_calls_at_the_same_time_are_limited(mllm: MllmServer, make) -> None:
     assert mllm.most_at_once == 3
 
 
+def test_who_waits_for_the_model_lets_others_compute(mllm: MllmServer, make) -> None:
+    mllm.say(say.slow(0.5, '{"answer": "B"}'))
+    service = make(concurrency=1)
+
+    async def calls() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(create_app(service))
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
+            body = QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}
+            return await asyncio.gather(*(client.post("/answer", json=body) for _ in range(6)))
+
+    assert [response.json()["answer"] for response in asyncio.run(calls())] == ["B"] * 6
+    assert mllm.most_at_once > 1
+
+
 # Geometry checks the reader
 
 

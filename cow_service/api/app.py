@@ -43,7 +43,8 @@ def create_app(service: Service) -> FastAPI:
     )
     app.add_middleware(BodyLimit, megabytes=service.settings.max_body_mb)
     install_problem_handlers(app)
-    limiter = CapacityLimiter(service.settings.concurrency)
+    # More threads than may compute: those that wait for a multimodal LLM only wait.
+    limiter = CapacityLimiter(service.settings.concurrency + service.settings.mllm_concurrency)
     working = (simulate_routes(service, limiter), answer_routes(service, limiter))
     for router in (*working, artifact_routes(service), health_routes(service)):
         app.include_router(router)

@@ -38,7 +38,7 @@ FAILURES = (
 
 
 def simulate_routes(service: Service, limiter: CapacityLimiter) -> APIRouter:
-    """The operation, bound to a service. Computation runs in threads, as many at a time as `limiter` lets."""
+    """The operation, bound to a service. It runs in threads, as many at a time as `limiter` lets."""
     router = APIRouter()
 
     @router.post(

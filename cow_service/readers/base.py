@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -35,6 +36,7 @@ class Asked:
     stages: frozenset[str]
     seed: int
     still_wanted: Callable[[], None]  # called while the reader waits for others; raises `Canceled`
+    elsewhere: Callable[[], AbstractContextManager[None]] = nullcontext  # around such waits: others may compute
 
 
 @dataclass(frozen=True)

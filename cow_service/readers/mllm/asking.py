@@ -10,13 +10,14 @@ from typing import Any, Generic, TypeVar, cast
 
 import anyio
 from pydantic_ai import Agent, BinaryContent, ModelRetry, RunContext, TextOutput
-from pydantic_ai.exceptions import ContentFilterError, ModelAPIError, UnexpectedModelBehavior
+from pydantic_ai.exceptions import AgentRunError, ContentFilterError, ModelAPIError, UserError
 from pydantic_ai.messages import UserContent
 from pydantic_ai.models.concurrency import ConcurrencyLimitedModel
 from pydantic_ai.settings import ModelSettings
 from pydantic_ai.usage import RunUsage
 
 from cow_service.errors import CowError, MllmBadReply, MllmUnavailable
+from cow_service.readers.base import Asked
 from cow_service.readers.mllm.loop import Loop
 from cow_service.readers.mllm.patience import OneTry, Patient, why
 from cow_service.readers.mllm.pictures import MEDIA_TYPE
@@ -64,6 +65,33 @@ class Tally:
             self.prompts[prompt] = version
 
 
+class _Attempt:
+    """What happens while one question is asked: its calls and tokens, and what was wrong with the last reply."""
+
+    def __init__(self, read: Callable[[str], Any]) -> None:
+        self._read = read
+        self.used = RunUsage()
+        self.calls = 0
+        self.fault: tuple[str, str] | None = None  # the reason, and the reply
+
+    @property
+    def usage(self) -> Usage:
+        """Calls and tokens, whatever came of them."""
+        return Usage(calls=self.calls, input_tokens=self.used.input_tokens, output_tokens=self.used.output_tokens)
+
+    def count(self) -> None:
+        """One more call."""
+        self.calls += 1
+
+    def read(self, reply: str) -> Any:
+        """The value of a reply; one that cannot be used has the model asked again, with the reason."""
+        try:
+            return self._read(reply)
+        except ReplyError as error:
+            self.fault = str(error), reply
+            raise ModelRetry(f"That cannot be used: {error}.") from error
+
+
 class Asker:
     """Asks one model; from several threads at once, `COW_MLLM_CONCURRENCY` calls at a time."""
 
@@ -87,73 +115,74 @@ class Asker:
         """Closes its connections; it can ask no more."""
         self._loop.close()
 
-    def ask(self, question: Question[T], tally: Tally, still_wanted: Callable[[], None]) -> T:
-        """The reply, read. Raises `MllmBadReply`, `MllmUnavailable`, and what `still_wanted` raises."""
-        told = self.ask_all([question], tally, still_wanted)[0]
+    def ask(self, question: Question[T], tally: Tally, asked: Asked) -> T:
+        """The reply, read. Raises `MllmBadReply`, `MllmUnavailable`, and what `asked.still_wanted` raises."""
+        told = self.ask_all([question], tally, asked)[0]
         if isinstance(told, CowError):
             raise told
         return told
 
-    def ask_all(
-        self, questions: Sequence[Question[T]], tally: Tally, still_wanted: Callable[[], None]
-    ) -> list[T | CowError]:
+    def ask_all(self, questions: Sequence[Question[T]], tally: Tally, asked: Asked) -> list[T | CowError]:
         """All replies at the same time, each read, or the error that it came to. Raises what `still_wanted` raises."""
         futures = [self._loop.submit(self._ask(each, tally)) for each in questions]
         try:
-            waiting = set(futures)
-            while waiting:
-                still_wanted()
-                waiting = concurrent.futures.wait(waiting, POLL).not_done
+            with asked.elsewhere():
+                waiting = set(futures)
+                while waiting:
+                    asked.still_wanted()
+                    waiting = concurrent.futures.wait(waiting, POLL).not_done
         finally:
             for future in futures:
                 future.cancel()  # nothing happens to one that is done
         return [future.result() for future in futures]
 
     async def _ask(self, question: Question[T], tally: Tally) -> T | CowError:
-        prompt = load_prompt(question.prompt)
-        used, calls, faults = RunUsage(), [0], cast("list[tuple[str, str]]", [])
-
-        def count() -> None:
-            calls[0] += 1
-
-        def read(reply: str) -> T:
-            try:
-                return question.read(reply)
-            except ReplyError as error:
-                faults.append((str(error), reply))
-                raise ModelRetry(f"That cannot be used: {error}.") from error
-
-        native = self.served.family.structured_output == "native"
-        model = Patient(self._model, self._budget, question.schema if native else None, count)
+        """The reply, read, or the error that asking came to: one failed vote must not lose the others."""
+        prompt, attempt = load_prompt(question.prompt), _Attempt(question.read)
+        schema = question.schema if self.served.holds_to_schema else None
+        model = Patient(self._model, self._budget, schema, attempt.count)
         images = [BinaryContent(image, media_type=MEDIA_TYPE) for image in question.images]
         content: list[UserContent] = [*images, prompt.render(**question.inputs)]
         try:
             with anyio.fail_after(self._budget):
                 run = await self._agent.run(
-                    content, model=model, deps=read, model_settings=self._settings(question), usage=used
+                    content,
+                    model=model,
+                    deps=attempt.read,
+                    model_settings=self._settings(question),
+                    usage=attempt.used,
                 )
                 return cast("T", run.output)
         except CowError as error:  # of a model that runs in this process
             return error
-        except ContentFilterError:
-            return MllmBadReply(f"{self._name} refused to look at this: its content filter held the reply back.")
-        except ModelAPIError as error:
-            return MllmUnavailable(f"{self._name} could not be asked ({calls[0]} tries): {why(error)}.")
-        except TimeoutError:
-            told = "" if model.failed is None else f": {why(model.failed)}"
-            spent = f"{self._budget:g} s (COW_MLLM_BUDGET) and {calls[0]} tries"
-            return MllmUnavailable(f"{self._name} gave no usable reply within {spent}{told}.")
-        except UnexpectedModelBehavior:
-            reason, reply = faults[-1] if faults else ("it was empty", "")
-            excerpt = " ".join(reply.split())[:160]
-            return MllmBadReply(
-                f"{self._name} was asked {calls[0]} times ({question.prompt}) and gave no reply that can be used. "
-                f"Of the last one, '{excerpt}': {reason}."
-            )
+        except (AgentRunError, UserError, TimeoutError) as error:
+            return self._error(question, attempt, model.failed, error)
         finally:
-            spent = Usage(calls=calls[0], input_tokens=used.input_tokens, output_tokens=used.output_tokens)
-            tally.add(question.prompt, prompt.version, spent)
+            tally.add(question.prompt, prompt.version, attempt.usage)
             tally.add("looking", self._looking, Usage())
+
+    def _error(
+        self, question: Question[Any], attempt: _Attempt, failed: ModelAPIError | None, error: Exception
+    ) -> CowError:
+        """What asking came to, as ours. `failed` is by what the last try over the network failed."""
+        tries = f"{attempt.calls} {'try' if attempt.calls == 1 else 'tries'}"
+        if isinstance(error, UserError):  # what pydantic-ai will not send to this model
+            return MllmUnavailable(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}")
+        if isinstance(error, ContentFilterError):
+            return MllmBadReply(f"{self._name} refused to look at this: its content filter held the reply back.")
+        if isinstance(error, TimeoutError):
+            told = "" if failed is None else f": {why(failed)}"
+            return MllmUnavailable(
+                f"{self._name} gave no usable reply within {self._budget:g} s (COW_MLLM_BUDGET) and {tries}{told}."
+            )
+        if isinstance(error, ModelAPIError):
+            return MllmUnavailable(f"{self._name} could not be asked ({tries}): {why(error)}.")
+        reason, reply = attempt.fault or ("it was empty", "")
+        excerpt = " ".join(reply.split())[:160]
+        return MllmBadReply(
+            f"{self._name} was asked {attempt.calls} times ({question.prompt}) and gave no reply that can be used. "
+            f"Of the last one, '{excerpt}': {reason}."
+        )
 
     @property
     def _name(self) -> str:
@@ -177,5 +206,5 @@ class Asker:
 
 
 def _read(context: RunContext[Any], reply: str) -> Any:
-    """Hands a reply to the reading of its own question."""
+    """Hands a reply to the question that it answers."""
     return context.deps(reply)

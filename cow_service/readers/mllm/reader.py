@@ -77,7 +77,7 @@ class MllmLook:
 
         Raises `ObjectNotFound`, `MllmBadReply`, `MllmUnavailable`.
         """
-        identified = self._reader.asker.ask(self._questions.identify(), self._tally, self._asked.still_wanted)
+        identified = self._reader.asker.ask(self._questions.identify(), self._tally, self._asked)
         if identified is None:
             raise ObjectNotFound(f"{self._who} sees nothing in the image that the question could move. {GIVE_PLACE}")
         self._identified = identified
@@ -111,7 +111,7 @@ class MllmLook:
     ) -> tuple[AnswerReading, ...]:
         """One call per vote, all at the same time. Raises `MllmBadReply`, `MllmUnavailable` where all of them fail."""
         asked = self._questions.answers(options, imagined, votes)
-        told = self._reader.asker.ask_all(asked, self._tally, self._asked.still_wanted)
+        told = self._reader.asker.ask_all(asked, self._tally, self._asked)
         readings = tuple(each for each in told if not isinstance(each, CowError))
         if not readings:
             raise next(each for each in told if isinstance(each, CowError))
@@ -131,11 +131,10 @@ class MllmLook:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once."""
         moves = "motion" in self._asked.stages
         wants_direction = moves and self._kind in DIRECTED
-        asker, tally, still_wanted = self._reader.asker, self._tally, self._asked.still_wanted
         where = [self._questions.locate(name, bbox, others, wants_direction)] if bbox is None or wants_direction else []
         scale = [self._questions.scale(name)] if moves and self._kind in FALLING else []
         asked: list[Question[Any]] = [*where, *scale]
-        told = asker.ask_all(asked, tally, still_wanted)
+        told = self._reader.asker.ask_all(asked, self._tally, self._asked)
         if scale:
             scaled = told.pop()
             if isinstance(scaled, Scaled | CowError):

@@ -30,6 +30,12 @@ class Served:
     manifest: Manifest
     family: Family
 
+    @property
+    def holds_to_schema(self) -> bool:
+        """Whether a JSON schema can be sent along: the family's servers take one, and so does this way of asking."""
+        native = self.family.structured_output == "native"
+        return native and bool(self.model.profile.get("supports_json_schema_output", False))
+
 
 def described(settings: Settings) -> tuple[Manifest, str | None, str]:
     """The manifest that COW_MLLM means, the provider (null for one's own server) and the name as it is served.
