@@ -16,7 +16,7 @@ from rich.table import Table
 
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.images import DecodedImage
-from cow_service.records import BackendInfo, Models, Simulation
+from cow_service.records import ENCOUNTERS_UNKNOWN, BackendInfo, Models, Simulation
 from cow_service.requests import SimulateRequest, Stage
 from cow_service.service import Service
 
@@ -185,12 +185,11 @@ def _told(simulation: Simulation) -> dict[Stage, str]:
     if motion.depth:
         way += " and towards the camera" if motion.depth < 0 else " and away from the camera"
     met = ", ".join(f"{e.kind} {e.object} at {e.first_frame / trajectory.fps:.1f} s" for e in trajectory.encounters)
-    computed = not any("encounters were not computed" in warning for warning in simulation.warnings)
     video = f", {simulation.video.num_frames}-frame video" if simulation.video else ""
     return {
         "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
         "motion": f"{motion.kind}{way}, {motion.speed:.0f} px/s, from {motion.cue}",
-        "trajectory": met or ("meets nothing" if computed else "encounters were not computed"),
+        "trajectory": met or ("meets nothing" if simulation.encounters_known else ENCOUNTERS_UNKNOWN),
         "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
     }
 

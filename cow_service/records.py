@@ -201,6 +201,9 @@ class GeneratorInfo(Record):
     options: dict[str, bool | int | float | str] = Field(default_factory=dict)
 
 
+ENCOUNTERS_UNKNOWN = "encounters were not computed"  # part of the warning that says so
+
+
 class Simulation(Record):
     """The whole way from image and question to frames: what `POST /simulate` returns."""
 
@@ -220,6 +223,11 @@ class Simulation(Record):
     usage: Usage = Usage()
     timings: dict[str, float] = Field(description="Seconds per stage.")
     warnings: tuple[str, ...] = ()
+
+    @property
+    def encounters_known(self) -> bool:
+        """Whether an empty list of encounters means that nothing is met."""
+        return not any(ENCOUNTERS_UNKNOWN in warning for warning in self.warnings)
 
 
 class AnswerOption(Record):

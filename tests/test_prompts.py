@@ -53,6 +53,7 @@ SAMPLES: dict[str, object] = {
     "options": read_choices("", ["Yes", "No"]),
     "sentence": "The ball moves.",
     "times": "0.06 s",
+    "encounters_known": True,
     "encounters": ("touches the vase, 0.5 s in",),
 }
 

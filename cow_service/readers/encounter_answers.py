@@ -54,7 +54,7 @@ class Asked:
 
 def decided_by(simulation: Simulation, asked: Asked) -> bool | None:
     """Whether what is asked happens, by the encounters of a simulation; None where they cannot tell."""
-    if any("encounters were not computed" in warning for warning in simulation.warnings):
+    if not simulation.encounters_known:
         return None
     encounters = simulation.trajectory.encounters
     if asked.target is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from cow_service.records import Grounding
+from cow_service.records import ENCOUNTERS_UNKNOWN, Grounding
 from cow_service.requests import SimulateRequest
 from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
@@ -31,7 +31,7 @@ def _no_surroundings(scene: Scene, obstacles: Sequence[Obstacle]) -> str | None:
     if scene.regions or obstacles:
         return None
     return (
-        "The surroundings could not be separated into objects, so encounters were not computed: "
+        f"The surroundings could not be separated into objects, so {ENCOUNTERS_UNKNOWN}: "
         "an empty list does not mean that nothing is hit."
     )
 

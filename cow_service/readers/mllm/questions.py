@@ -120,7 +120,8 @@ def _hypothesis(imagined: Imagined) -> dict[str, object]:
     simulation = imagined.simulation
     times = ", ".join(f"{frame.time:.2f} s" for frame in simulation.frames)
     met = tuple(_met(encounter, simulation.trajectory.fps) for encounter in simulation.trajectory.encounters)
-    return {"sentence": simulation.motion.sentence, "times": times, "encounters": met}
+    known = simulation.encounters_known
+    return {"sentence": simulation.motion.sentence, "times": times, "encounters": met, "encounters_known": known}
 
 
 def _met(encounter: Encounter, fps: float) -> str:
