@@ -8,6 +8,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from cow_service.cli_options import HINTS
 from cow_service.console import (
     console_for,
     make_folder,
@@ -42,6 +43,9 @@ def run_answer(service: Service, image: Path, body: dict[str, Any], out: Path | 
         console.print(f"[dim]reasoning[/]: {escape(answer.reasoning)}")
     simulated = () if answer.simulation is None else answer.simulation.warnings
     tell_warnings(console, (*simulated, *answer.warnings))
+    for code, hint in HINTS.items():
+        if any(f" {code}: " in warning for warning in answer.warnings):
+            console.print(hint)
     if out is not None:
         console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
 

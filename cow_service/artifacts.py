@@ -95,7 +95,9 @@ class ArtifactStore:
         with _storage_errors():
             stored = self._find(sha256)
         if stored is None:
-            raise ArtifactNotFound(f"No artifact has the SHA-256 {sha256}: run the simulation that made it again.")
+            raise ArtifactNotFound(
+                f"No artifact has the SHA-256 {sha256}: send the image again, or run the simulation that made it."
+            )
         return stored
 
     def read(self, sha256: str) -> bytes:

@@ -16,12 +16,6 @@ from cow_service import __version__, models_cli, tracks_cli
 from cow_service import cli_options as options
 from cow_service.errors import CowError
 
-HINTS = {  # how the command line says what an error's remedy asks for
-    "cannot-ground": "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME).",
-    "object-not-found": "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME).",
-    "cannot-read-direction": "Here: --direction DX,DY.",
-}
-
 # Notes that these libraries print when they are imported, such as on optional packages, are not for our users.
 QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
 
@@ -240,8 +234,8 @@ def _errors_told() -> Generator[None]:
     except CowError as error:
         typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
         typer.echo(error.detail, err=True)
-        if error.code in HINTS:
-            typer.echo(HINTS[error.code], err=True)
+        if error.code in options.HINTS:
+            typer.echo(options.HINTS[error.code], err=True)
         for field in error.errors:
             typer.echo(f"  {field.pointer}: {field.detail}", err=True)
         raise typer.Exit(1) from error

@@ -8,6 +8,12 @@ from typing import Annotated
 
 import typer
 
+HINTS = {  # how the command line says what an error's remedy asks for
+    "cannot-ground": "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME).",
+    "object-not-found": "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME).",
+    "cannot-read-direction": "Here: --direction DX,DY.",
+}
+
 
 class Policy(StrEnum):
     """Which frames to keep as pictures."""

@@ -172,7 +172,7 @@ class MllmBadReply(CowError):
 
 
 class MllmUnavailable(CowError):
-    """The multimodal LLM could not be reached."""
+    """The multimodal LLM could not be asked."""
 
     code, status = "mllm-unavailable", 503
 

@@ -134,7 +134,7 @@ def answer(request: AnswerRequest, image: DecodedImage, backends: Backends, prog
     with clock.stage("answering"):
         look = eyes.look_for("answering")
         imagined = None if simulation is None else answering.frames_of(simulation, backends.artifacts)
-        verdict = answering.answer(look, options, imagined, request.votes)
+        verdict, notes = answering.answer(look, options, imagined, request.votes)
         compared = None
         if request.baseline:
             compared = verdict if imagined is None else answering.baseline(look, options, request.votes)
@@ -153,7 +153,7 @@ def answer(request: AnswerRequest, image: DecodedImage, backends: Backends, prog
         reader=eyes.info("grounding", "motion", "answering"),
         usage=eyes.usage,
         timings=clock.timings,
-        warnings=(*warnings, *answering.split(verdict, request.votes)),
+        warnings=(*warnings, *notes),
     )
 
 

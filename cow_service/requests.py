@@ -203,6 +203,8 @@ class SimulateRequest(Record):
 class AnswerRequest(SimulateRequest):
     """As a simulation, and how to answer from it."""
 
+    video: bool = Field(default=False, description="Whether to make the mp4 of the whole clip, too.")
+
     imagine: Literal["always", "never"] = Field(
         default="always", description="never: answer from the image alone, without a simulation."
     )

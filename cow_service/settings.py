@@ -18,7 +18,7 @@ class SettingsError(Exception):
 class Settings(BaseSettings):
     """What a server or a command line run may be told."""
 
-    model_config = SettingsConfigDict(env_prefix="COW_", frozen=True, extra="ignore")
+    model_config = SettingsConfigDict(env_prefix="COW_", env_ignore_empty=True, frozen=True, extra="ignore")
 
     data_dir: Path = Field(
         default_factory=lambda: user_data_path("cow", appauthor=False),
@@ -61,14 +61,14 @@ class Settings(BaseSettings):
     )
     checkpoints: dict[str, Path] = Field(
         default_factory=dict,
-        description="Transformer checkpoints (a folder or one safetensors file) to use instead of those that "
-        "`cow models pull` brings, by generator, as JSON.",
+        description="Checkpoints of your own (a folder, or one safetensors file of a transformer) to use instead of "
+        "what `cow models pull` brings, by name of the generator or multimodal LLM, as JSON.",
     )
     profile: str = Field(default="exact", description="How video models run: a profile of their manifest.")
     device: str = Field(
         default="auto",
         pattern=r"^(auto|cpu|cuda(:\d+)?)$",
-        description="Where video models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU.",
+        description="Where models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU.",
     )
     concurrency: int = Field(default=2, ge=1, le=256, description="Requests computed at the same time; others wait.")
 
@@ -89,6 +89,14 @@ class Settings(BaseSettings):
         return ("transformer", "base") if (checkpoint / "vae").is_dir() else ("transformer",)
 
 
+def _told(item: Any) -> str:
+    """One bad setting. A key or an address may hold a secret, and is not repeated."""
+    name = str(item["loc"][0])
+    if name == "mllm_base_url":
+        return "COW_MLLM_BASE_URL must begin with http:// or https://"
+    return f"COW_{name.upper()}={item['input']!r}: {item['msg']}"
+
+
 def load_settings(**overrides: Any) -> Settings:
     """Settings from the environment, with overrides that are not None. Raises `SettingsError` for a bad value."""
     try:
@@ -97,7 +105,5 @@ def load_settings(**overrides: Any) -> Settings:
         field = str(error).split('"')[1:2]
         raise SettingsError(f"Bad settings: COW_{''.join(field).upper()} is not JSON.") from error
     except ValidationError as error:
-        told = "; ".join(
-            f"COW_{str(item['loc'][0]).upper()}={item['input']!r}: {item['msg']}" for item in error.errors()
-        )
+        told = "; ".join(_told(item) for item in error.errors() if item["type"] != "default_factory_not_called")
         raise SettingsError(f"Bad settings: {told}.") from error

@@ -22,6 +22,8 @@ import mllm_server as say
 import pytest
 from conftest import ROOT, example
 from drawn import DrawnArrow, angle_between, ball, block, floor
+from hypothesis import given
+from hypothesis import strategies as st
 from mllm_server import MllmServer
 
 from cow_service.api.app import create_app
@@ -29,7 +31,13 @@ from cow_service.errors import ReaderUnavailable
 from cow_service.images import encode_png
 from cow_service.manifests import load_families
 from cow_service.readers.base import Asked
+from cow_service.readers.choices import read_choices
+from cow_service.readers.coordinates import View
+from cow_service.readers.mllm.choose import read_answer
+from cow_service.readers.mllm.identify import read_identified
+from cow_service.readers.mllm.locate import read_located
 from cow_service.readers.mllm.serving import manifest_for
+from cow_service.readers.replies import ReplyError, values_in
 from cow_service.records import Grounding
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -46,8 +54,7 @@ MANIFESTS = {
     "generic": "generic",
     "llava-onevision-1.5": "llava-onevision-1.5-8b",
 }
-SHARED_CASES = json.loads(SHARED.read_text()) if SHARED.exists() else []
-CASES = json.loads(OWN.read_text()) + [pytest.param(case, marks=pytest.mark.slow) for case in SHARED_CASES]
+CASES = json.loads(OWN.read_text()) + (json.loads(SHARED.read_text()) if SHARED.exists() else [])
 OPTIONS = "If the toy car moves forward, will it hit the vase? (A) Yes (B) No (C) Not sure"
 QUICK = {"video": False, "num_frames": 5, "frames": {"indices": [0], "max_side": 64}}
 IDENTIFIED = (
@@ -139,6 +146,44 @@ def asked(case: dict[str, Any], mllm: MllmServer, service: Service) -> dict[str,
     }
 
 
+def read(case: dict[str, Any]) -> dict[str, Any]:
+    """What the reading of a case's stage makes of it by itself, in the terms of `expect`."""
+    view = View(*case["image"], tuple(case["sent"]), load_families()[case["family"]].coordinates)
+    stage, raw = case["stage"], case["raw"]
+    try:
+        if stage == "identify":
+            named = read_identified(raw)
+            return {"error": "object-not-found"} if named is None else {"object": named.object}
+        if stage == "answer":
+            reading = read_answer(raw, read_choices(OPTIONS, None))
+            return {"answer": reading.answer, "not_sure": reading.not_sure}
+        found = read_located(raw, view, "the toy car", (), stage == "locate", stage == "direction")
+    except ReplyError:
+        return {"error": "mllm-bad-reply"}
+    if found is None:
+        return {"error": "object-not-found"}
+    if found.line is None:
+        return {"bbox": found.bbox, "point": found.point}
+    if found.line.ends is None:
+        return {"error": "cannot-read-direction"} if found.line.camera is None else {"camera": found.line.camera}
+    (x0, y0), (x1, y1) = found.line.ends
+    length = math.hypot(x1 - x0, y1 - y0)
+    return {"direction": ((x1 - x0) / length, (y1 - y0) / length), "cue": found.line.cue}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['stage']}-{case['family']}-{case['id']}")
+def test_every_reply_is_understood(case) -> None:
+    told, expect = read(case), case["expect"]
+    for key, value in expect.items():
+        if key in ("bbox", "point"):
+            assert told[key] == pytest.approx(value, abs=1)
+        elif key == "direction" and "camera" not in told:
+            assert told[key] == pytest.approx(value, abs=0.01)
+        elif "camera" not in told:
+            assert told[key] == value
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['stage']}-{case['family']}-{case['id']}")
 def test_every_reply_is_read_right_or_refused(case, mllm: MllmServer, make) -> None:
     told = asked(case, mllm, make(MANIFESTS[case["family"]]))
@@ -249,7 +294,7 @@ def test_failures_without_end_are_typed_and_bounded(reply, code: str, told: str,
 
 @pytest.mark.parametrize(
     ("status", "told"),
-    [(401, "COW_MLLM_API_KEY"), (403, "COW_MLLM_API_KEY"), (404, "no such model"), (400, "status 400")],
+    [(401, "COW_MLLM_API_KEY"), (403, "COW_MLLM_API_KEY"), (404, "COW_MLLM_MODEL"), (400, "status 400")],
 )
 def test_what_cannot_pass_is_not_repeated(status: int, told: str, mllm: MllmServer, make) -> None:
     mllm.say(say.status(status))
@@ -293,6 +338,30 @@ def test_a_caller_who_leaves_is_not_waited_for(mllm: MllmServer, make) -> None:
     while any(thread.name.startswith("AnyIO worker") for thread in threading.enumerate()):
         assert time.monotonic() - started < 3
         time.sleep(0.05)
+
+
+def test_closing_while_a_call_waits_is_a_typed_error(mllm: MllmServer, tmp_path: Path) -> None:
+    mllm.say(say.slow(3))
+    service = Service(Settings(data_dir=tmp_path, mllm="qwen3-vl-8b", mllm_base_url=mllm.address))
+    closing = threading.Timer(0.7, service.close)
+    closing.start()
+    problem = post(service, "/answer", image=blank(64, 64), question=OPTIONS, imagine="never")
+    closing.join()
+    assert problem["problem"] == "mllm-unavailable"
+    assert "stopping" in problem["detail"]
+
+
+@pytest.mark.parametrize("noise", ["[" * 20_000, "{ " * 9_000, '{"a": "' * 2_500, "blah { " * 2_500, '["\\' * 5_000])
+def test_no_reply_takes_long_to_look_through(noise: str) -> None:
+    started = time.monotonic()
+    assert values_in(noise) == ()
+    assert time.monotonic() - started < 5  # a bound against a search that grows with the square, not a figure
+
+
+@given(st.text(alphabet="{}[]\"'\\,:0aA().<>|", max_size=60))
+def test_no_reply_breaks_the_reading(text: str) -> None:
+    for stage in ("identify", "locate", "direction", "answer"):
+        read({"stage": stage, "raw": text, "family": "qwen3-vl", "image": [320, 180], "sent": [320, 180]})
 
 
 # Re-asks, prompts, provenance
@@ -608,10 +677,12 @@ def test_a_failed_simulation_does_not_lose_the_answer(failure: str, mllm: MllmSe
 
 def test_options_of_the_request_come_before_those_of_the_text(mllm: MllmServer, make) -> None:
     mllm.say('{"answer": "D"}')
-    options = ["the vase", "(B) the mug", "nothing", "Cannot be determined"]
+    options = ["the vase", "the mug", "nothing", "Cannot be determined"]
     told = post(make(), "/answer", image=blank(64, 64), question=OPTIONS, options=options, imagine="never")
     assert [(o["letter"], o["text"]) for o in told["options"]][1] == ("B", "the mug")
     assert (told["answer"], told["option"], told["not_sure"]) == ("D", "Cannot be determined", True)
+    assert "(A) the vase" in mllm.text(0)
+    assert "Yes" not in mllm.text(0)
 
 
 def test_an_open_question_has_an_answer_in_words(mllm: MllmServer, make) -> None:

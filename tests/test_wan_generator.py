@@ -379,7 +379,7 @@ def test_what_each_pass_is_conditioned_on(toys: Service, name: str) -> None:
 
 
 def test_a_checkpoint_for_a_model_that_takes_none(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="COW_CHECKPOINTS for 'tiny-ati': only for ati, .*wan-move"):
+    with pytest.raises(SettingsError, match=r"COW_CHECKPOINTS for 'tiny-ati': only for ati, .*wan-move"):
         Service(Settings(data_dir=tmp_path, checkpoints={"tiny-ati": tmp_path}))
 
 

@@ -21,6 +21,8 @@ from cow_service.records import Simulation
 from cow_service.service import Service
 from cow_service.settings import Settings
 
+pytestmark = pytest.mark.slow
+
 BALL = example("ball-and-mug")
 
 

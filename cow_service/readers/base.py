@@ -80,6 +80,7 @@ class AnswerReading:
     answer: str | None  # null where it is not sure and no option says so
     not_sure: bool
     reasoning: str = ""  # empty where the reader does not reason in words
+    notes: tuple[str, ...] = ()  # what the answer rests on or lacks, in whole sentences: warnings for the caller
 
 
 class Look(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from cow_service.readers.sentences import split_options
+from cow_service.readers.listed_options import split_options
 from cow_service.records import AnswerOption
 
 _NOT_SURE = re.compile(
@@ -18,11 +18,20 @@ _NOT_SURE = re.compile(
 
 def read_choices(question: str, given: Sequence[str] | None) -> tuple[AnswerOption, ...]:
     """The options of the request, lettered A, B, C..., else those that the question lists; empty where it is open."""
-    if given:
-        lettered = [(chr(ord("A") + place), _unlettered(text, place)) for place, text in enumerate(given)]
-    else:
-        lettered = list(split_options(question)[0])
-    return tuple(AnswerOption(letter=letter, text=text) for letter, text in lettered)
+    if not given:
+        return tuple(AnswerOption(letter=letter, text=text) for letter, text in split_options(question)[0])
+    plain_texts = [" ".join(text.split()) for text in given]
+    bare = [_unlettered(text, place) for place, text in enumerate(plain_texts)]
+    # Letters are taken off where every option has its own: "A. M." may be a text.
+    texts = bare if all(a != b for a, b in zip(bare, plain_texts, strict=True)) else plain_texts
+    return tuple(AnswerOption(letter=chr(ord("A") + place), text=text) for place, text in enumerate(texts))
+
+
+def question_without(question: str, options: Sequence[AnswerOption]) -> str:
+    """The question for these options: without those that it lists itself where they are others."""
+    listed, rest = split_options(question)
+    same = [(option.letter, plain(option.text)) for option in options] == [(a, plain(text)) for a, text in listed]
+    return question if same or not listed or not options else " ".join(rest.replace(" . ", " ").split())
 
 
 def says_not_sure(text: str) -> bool:
@@ -31,9 +40,8 @@ def says_not_sure(text: str) -> bool:
 
 
 def not_sure_option(options: Sequence[AnswerOption]) -> AnswerOption | None:
-    """The option that says so, where there is exactly one."""
-    unsure = [option for option in options if says_not_sure(option.text)]
-    return unsure[0] if len(unsure) == 1 else None
+    """The first option that says so, if any."""
+    return next((option for option in options if says_not_sure(option.text)), None)
 
 
 def option_saying(options: Sequence[AnswerOption], text: str) -> AnswerOption | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -21,7 +21,10 @@ OVERSHOOT = 0.02  # of the image's side: so far outside a place is cut off at th
 LEAST_SIDE = 1.0  # px of the upright image: a narrower box has no area
 LEAST_LENGTH = 2.0  # px of the upright image between the ends of a direction
 MAX_RATIO = 200  # of the sides: what rounds sides to multiples takes no narrower image
-_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+NUMBER = r"[-+]?(?:\d{1,12}(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,2})?"
+_GAP = r"[\s\[\](){},;]"
+_NUMBERS = re.compile(rf"{_GAP}*{NUMBER}(?:{_GAP}+{NUMBER})*{_GAP}*")
+HUGE = 1e9  # no coordinate is that large
 _NAMED = (  # objects instead of lists; the names decide then, not the family's order
     ("x0", "y0", "x1", "y1"),
     ("x1", "y1", "x2", "y2"),
@@ -29,6 +32,8 @@ _NAMED = (  # objects instead of lists; the names decide then, not the family's 
     ("x_min", "y_min", "x_max", "y_max"),
     ("left", "top", "right", "bottom"),
 )
+_SIZED = (("x", "y", "width", "height"), ("x", "y", "w", "h"), ("left", "top", "width", "height"))
+_CORNERS = (("top_left", "bottom_right"), ("start", "end"), ("from", "to"), ("tail", "tip"), ("tail", "head"))
 
 
 def size_seen(width: int, height: int, rule: ImageSize) -> tuple[int, int]:
@@ -121,8 +126,9 @@ class View:
 
     def _pairs(self, written: object, count: int, what: str) -> list[tuple[float, float]]:
         """(x, y) pairs in the family's units."""
-        named = _by_name(written, count)
-        numbers = _numbers(written) if named is None else named
+        meant = _corners(written) if count == 2 else written
+        named = _by_name(meant, count)
+        numbers = _numbers(meant) if named is None else named
         if len(numbers) != 2 * count:
             raise ReplyError(f"{what} is {2 * count} numbers, not {_shown(written)}")
         pairs = list(zip(numbers[::2], numbers[1::2], strict=True))
@@ -132,15 +138,22 @@ class View:
 def _numbers(written: object) -> list[float]:
     """The finite numbers that were written, lists inside lists unfolded; none where anything else is among them."""
     if isinstance(written, str):
-        words = _NUMBER.sub(" ", written).strip()
-        return [float(found) for found in _NUMBER.findall(written)] if not re.search(r"\w", words) else []
+        return [float(found) for found in re.findall(NUMBER, written)] if _NUMBERS.fullmatch(written) else []
     if isinstance(written, bool) or not isinstance(written, int | float | list | tuple):
         return []
     if isinstance(written, int | float):
-        return [float(written)] if math.isfinite(written) else []
+        return [float(written)] if abs(written) < HUGE else []  # NaN is not less than anything
     held = cast("Sequence[Any]", written)
     parts = [_numbers(part) for part in held]
     return [number for part in parts for number in part] if all(parts) else []
+
+
+def _corners(written: object) -> object:
+    """The two points of an object such as {"start": ..., "end": ...}; anything else as it is."""
+    if isinstance(written, dict):
+        held = {str(name).lower(): value for name, value in cast("dict[object, Any]", written).items()}
+        return next(([held[a], held[b]] for a, b in _CORNERS if a in held and b in held), written)
+    return written
 
 
 def _by_name(written: object, count: int) -> list[float] | None:
@@ -151,10 +164,19 @@ def _by_name(written: object, count: int) -> list[float] | None:
     if not isinstance(written, dict):
         return None
     held = {str(name).lower(): value for name, value in cast("dict[object, Any]", written).items()}
+    for x, y, width, height in _SIZED if count == 2 else ():
+        if {x, y, width, height} <= set(held):
+            left, top, wide, high = ((_numbers(held[name]) or [math.nan])[0] for name in (x, y, width, height))
+            return [left, top, left + wide, top + high]
     for names in (("x", "y"),) if count == 1 else _NAMED:
         if set(names) <= set(held):
             return [number for name in names for number in _numbers(held[name])]
     return None
+
+
+def names_corners(fields: Mapping[str, Any]) -> bool:
+    """Whether an object is itself a box, its corners or edges by name."""
+    return any(set(names) <= set(fields) for names in (*_NAMED, *_SIZED, _CORNERS[0]))
 
 
 def _shown(written: object) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 from cow_service import __version__
@@ -65,8 +66,11 @@ class EmbeddedLook:
     ) -> tuple[AnswerReading, ...]:
         """What geometry decides, the same for every vote; not sure where it does not. It gives no reasoning."""
         simulation = None if imagined is None else imagined.simulation
-        happens = judge(self._scene, self._question, self._grounded, simulation)
-        return (choose_option(options, happens),) * votes
+        judgement = judge(self._scene, self._question, self._grounded, simulation)
+        reading = choose_option(options, judgement.happens)
+        again = ("The embedded reader gives the same answer every time: more votes say no more.",) if votes > 1 else ()
+        notes = tuple(note for note in (judgement.why, *reading.notes, *again) if note)
+        return (replace(reading, notes=notes),) * votes
 
     def ground(self) -> GroundingReading:
         """The region that fits the mover's words; `CannotGround` where none or several do."""

@@ -12,11 +12,12 @@ from typing import Literal
 
 from cow_service.readers import lexicon as lex
 from cow_service.readers.base import AnswerReading
-from cow_service.readers.choices import not_sure_option, plain
+from cow_service.readers.choices import not_sure_option, plain, says_not_sure
 from cow_service.readers.chunks import items
 from cow_service.readers.clauses import SENTENCE_END, is_vague
+from cow_service.readers.listed_options import split_options
 from cow_service.readers.phrases import Item, ObjectPhrase, flatten
-from cow_service.readers.sentences import Question, split_options
+from cow_service.readers.sentences import Question
 from cow_service.records import AnswerOption, EncounterKind, LocatedObject, Simulation
 
 Relation = Literal["touches", "covers", "covered"]  # the mover does it to the other thing, or has it done to it
@@ -27,12 +28,19 @@ _KINDS: dict[Relation, frozenset[EncounterKind]] = {
     "covered": frozenset(("occluded-by",)),
 }
 _AUXILIARIES = lex.words("will would does do did is are could can shall might may")
+_OPENERS = frozenset({",", ".", "?", ";", ":", "then", "and", ")", "(", "—", "–"})
 _BE = lex.words("be been being get gets getting become becomes is are")
-_UNDECIDED = lex.words(
-    "not n't never no neither nor avoid avoids miss misses without before after first last second third again or than",
-    "visible seen see unless until only both all every each either how why when where which what who whose many stop",
-    "also still instead except nothing none",
+# Nothing but these may stand beside subject, verb and object: any other word may turn the question round.
+_HARMLESS = lex.words(
+    "into onto on upon in with against to at of by behind front it its they the a an any some ever eventually then",
+    "actually directly and or , while moving during along its",
+) - {"and", "or"}
+_TIMES = lex.words("moment point time times way path motion movement course trajectory future end clip video")
+_COUNTING = lex.words(
+    "two three four five both all every each another other several many twice once exactly least most",
 )
+# Toppling, stopping and wrapping are more than touching or hiding.
+_MORE = lex.words("knock block cover crash smash overlap meet reach")
 _VANISH = lex.words("disappear vanish")
 _ANYTHING = lex.words("anything something object objects thing things obstacle obstacles")
 _COMES_DOWN = lex.words("fall drop tumble come end stop rest")
@@ -79,10 +87,12 @@ def choose_option(options: Sequence[AnswerOption], happens: bool | None) -> Answ
     if happens is not None:
         if not options:
             return AnswerReading("Yes" if happens else "No", False)
-        said = {word: [o for o in options if o != unsure and _begins(o, word)] for word in ("yes", "no")}
+        said = {word: [o for o in options if not says_not_sure(o.text) and _begins(o, word)] for word in ("yes", "no")}
         chosen = said["yes" if happens else "no"]
         if all(len(found) == 1 for found in said.values()):
             return AnswerReading(chosen[0].letter, False)
+        told = (f"What is asked {'happens' if happens else 'does not happen'}, but the options are not yes and no.",)
+        return AnswerReading(None if unsure is None else unsure.letter, True, notes=told)
     return AnswerReading(None if unsure is None else unsure.letter, True)
 
 
@@ -97,12 +107,48 @@ def read_asked(question: Question) -> Asked | None:
     if len(starts) != 1:
         return None
     clause = _to_its_end(found[starts[0] :])
-    before = [item.key for item in found[max(0, starts[0] - 1) : starts[0]]]
-    if not _UNDECIDED.isdisjoint([*before, *flatten(clause)]):
-        return None
+    before = found[starts[0] - 1].key if starts[0] else ","
     subject, rest = clause[1], clause[2:]
+    if before not in _OPENERS or not _is_plain(rest):
+        return None
     is_mover = subject.key in lex.MOVER_PRONOUNS or _means(subject.phrase, question.mover)
+    if not is_mover and not _done_by_mover(rest, question):
+        return None
+    rest = [item for item in rest if not _is_time(item)]
+    if any(_is_contact(item) or item.key == "contact" for item in rest):
+        return _contact(rest) if is_mover else None
     return _relation(rest, subject.phrase, is_mover)
+
+
+def _is_plain(rest: Sequence[Item]) -> bool:
+    """Whether a clause holds one verb, one thing at the most, and beside them only words that change nothing."""
+    nouns = _TIMES | {"contact", "collision"}
+    verbs = [item for item in rest if item.key in lex.VERBS and item.key not in _BE | nouns]
+    things = [item for item in rest if item.phrase is not None and not _is_time(item) and not _is_contact(item)]
+    known = lex.VERBS.keys() | _BE | _HARMLESS | _ANYTHING | nouns | {"make", "makes"}
+    words = [item.key for item in rest if item.phrase is None]
+    counted = not _COUNTING.isdisjoint(flatten(rest)) or any(i.phrase and _counts(i.phrase) for i in things)
+    return len(verbs) <= 1 and len(things) <= 1 and not counted and all(word in known for word in words)
+
+
+def _counts(phrase: ObjectPhrase) -> bool:
+    """Whether a phrase is about how many: "2 cubes", but not "cube 2"."""
+    return phrase.text.split()[0].isdecimal()
+
+
+def _is_time(item: Item) -> bool:
+    """ "at some moment", "on its way"."""
+    return item.phrase is not None and item.phrase.head in _TIMES
+
+
+def _is_contact(item: Item) -> bool:
+    return item.phrase is not None and item.phrase.head in {"contact", "collision"}
+
+
+def _done_by_mover(rest: Sequence[Item], question: Question) -> bool:
+    """Whether something else is said to be hit or hidden by nobody in particular, or by the mover."""
+    agents = [item for at, item in enumerate(rest) if item.phrase is not None and at and rest[at - 1].key == "by"]
+    return all(_means(agent.phrase, question.mover) for agent in agents)
 
 
 def _to_its_end(found: Sequence[Item]) -> Sequence[Item]:
@@ -133,7 +179,8 @@ def _relation(rest: Sequence[Item], subject: ObjectPhrase | None, is_mover: bool
     if not is_mover:
         return None
     if passive:
-        return _any_or_named("covered", rest[at:], optional=True) if verb.lemma in lex.OCCLUDE else None
+        hidden = verb.lemma in lex.OCCLUDE - _MORE
+        return _any_or_named("covered", rest[at:], optional=True) if hidden else None
     relation = _doing(verb.lemma, [item.key for item in rest[at:]])
     if relation is None:
         return _contact(rest)
@@ -142,6 +189,8 @@ def _relation(rest: Sequence[Item], subject: ObjectPhrase | None, is_mover: bool
 
 def _done(lemma: str) -> Relation | None:
     """What the mover does to something of which it is said that it is hit, or hidden."""
+    if lemma in _MORE:
+        return None
     if lemma in lex.OCCLUDE:
         return "covers"
     return "touches" if lemma in lex.TOUCH else None
@@ -149,6 +198,8 @@ def _done(lemma: str) -> Relation | None:
 
 def _doing(lemma: str, words: Sequence[str]) -> Relation | None:
     """What the mover does, by its verb and the words behind it."""
+    if lemma in _MORE:
+        return None
     if lemma in _VANISH or "behind" in words:
         return "covered"
     if lemma in lex.OCCLUDE or "front" in words:
@@ -167,10 +218,10 @@ def _any_or_named(relation: Relation, rest: Sequence[Item], *, optional: bool) -
 
 def _contact(rest: Sequence[Item]) -> Asked | None:
     """ "make contact with the vase", "be in collision with it"."""
-    words = flatten(rest)
-    if {"contact", "collision", "impact"}.isdisjoint(words):
+    made = {"make", "makes", "come", "comes", "be", "get", "gets"} & {item.key for item in rest}
+    if not made or not any(_is_contact(item) or item.key == "contact" for item in rest):
         return None
-    objects = [item for item in rest if item.phrase is not None and {"contact", "collision"}.isdisjoint(item.words)]
+    objects = [item for item in rest if item.phrase is not None and not _is_contact(item)]
     return _named("touches", objects[-1] if objects else None)
 
 

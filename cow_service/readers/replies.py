@@ -13,9 +13,12 @@ from typing import Any, cast
 
 from json_repair import repair_json
 
-MAX_LENGTH = 200_000  # characters; a longer reply is not looked through
+MAX_LENGTH = 20_000  # characters behind the thinking; a longer reply is not looked through
 _FENCE = re.compile(r"```[\w+-]*[ \t]*\n?(.*?)```", re.DOTALL)
+_THOUGHT = re.compile(r"</(?:think|thinking|thought|reasoning|seed:think)>|◁/think▷|<\|channel\|>final<\|message\|>")
+_THINKING = re.compile(r"<(?:think|thinking|thought|seed:think)>|◁think▷|<\|channel\|>analysis")
 _OPENING = {"{": "}", "[": "]"}
+_NOTHING = frozenset({"", "none", "null", "n/a", "not found", "nothing"})
 _BEFORE_STRING = frozenset("{[,:(")
 _AFTER_STRING = frozenset("}],:)")
 
@@ -26,14 +29,14 @@ class ReplyError(Exception):
 
 def without_thinking(text: str) -> str:
     """The reply behind its thinking. Raises `ReplyError` where there is nothing else, or far too much."""
-    if len(text) > MAX_LENGTH:
-        raise ReplyError(f"the reply has {len(text)} characters; answer in a few sentences")
-    head, closed, tail = text.rpartition("</think>")
-    if not closed and "<think>" in text:
+    ends = list(_THOUGHT.finditer(text))
+    if not ends and _THINKING.search(text):
         raise ReplyError("the reply ended while it was still thinking; think less and give the JSON object")
-    said = (tail if closed else head + tail).strip()
+    said = (text[ends[-1].end() :] if ends else text).strip()
     if not said:
         raise ReplyError("the reply is empty; give the JSON object")
+    if len(said) > MAX_LENGTH:
+        raise ReplyError(f"the reply has {len(said)} characters; answer in a few sentences")
     return said
 
 
@@ -60,6 +63,17 @@ def fields_of(value: object) -> dict[str, Any]:
 def first_of(fields: dict[str, Any], *names: str) -> Any:
     """The value of the first of some fields that is there; None where none is."""
     return next((fields[name] for name in names if name in fields), None)
+
+
+def is_none(value: object) -> bool:
+    """Whether a field says that there is nothing: null, an empty list, or a word for it."""
+    return value is None or value == [] or (isinstance(value, str) and value.strip().lower() in _NOTHING)
+
+
+def truth_of(value: object) -> bool | None:
+    """A field that should hold true or false, also as a word; None where it holds neither."""
+    words = {"true": True, "yes": True, "false": False, "no": False}
+    return value if isinstance(value, bool) else words.get(value.strip().lower()) if isinstance(value, str) else None
 
 
 def text_of(value: object) -> str:
@@ -105,42 +119,35 @@ def _repaired(span: str) -> object:
 
 
 def _spans(text: str) -> Iterator[str]:
-    """Outermost bracketed parts of a text whose brackets close, strings inside them left alone."""
-    at = 0
-    while at < len(text):
-        if text[at] in _OPENING and (end := _closing(text, at)):
-            yield text[at:end]
-            at = end
-        else:
-            at += 1
+    """Outermost bracketed parts of a text, strings inside them left alone; up to the first that does not close.
 
-
-def _closing(text: str, start: int) -> int:
-    """One past the bracket that closes the one at `start`; 0 where none does."""
+    What stands inside a bracket that never closes may be half of what was meant. One pass: a reply may be nothing but
+    opening brackets.
+    """
     waiting: list[str] = []
-    quote = ""
-    at = start
-    while at < len(text):
-        char = text[at]
-        if quote:
-            if char == "\\":
-                at += 1
-            elif char == quote and _neighbour(text, at, 1) in _AFTER_STRING:
+    start, quote, skipped = 0, "", False
+    for at, char in enumerate(text):
+        if skipped:
+            skipped = False
+        elif quote:
+            skipped = char == "\\"
+            if char == quote and _next(text, at) in _AFTER_STRING:
                 quote = ""
-        elif char in "\"'" and _neighbour(text, at, -1) in _BEFORE_STRING:
+        elif waiting and char in "\"'" and _previous(text, at) in _BEFORE_STRING:
             quote = char
         elif char in _OPENING:
+            start = start if waiting else at
             waiting.append(_OPENING[char])
         elif waiting and char == waiting[-1]:
             waiting.pop()
             if not waiting:
-                return at + 1
-        at += 1
-    return 0
+                yield text[start : at + 1]
 
 
-def _neighbour(text: str, at: int, step: int) -> str:
-    at += step
-    while 0 <= at < len(text) and text[at].isspace():
-        at += step
-    return text[at] if 0 <= at < len(text) else ""
+def _next(text: str, at: int) -> str:
+    """The next character that is no space; only a few are looked at."""
+    return text[at + 1 : at + 40].lstrip()[:1]
+
+
+def _previous(text: str, at: int) -> str:
+    return text[max(0, at - 40) : at].rstrip()[-1:]

@@ -5,7 +5,6 @@ No model and no list of nouns: verbs and function words are closed lists, the no
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -14,18 +13,16 @@ from cow_service.readers import lexicon as lex
 from cow_service.readers.arrow_words import read_arrow
 from cow_service.readers.chunks import items
 from cow_service.readers.clauses import SENTENCE_END, Reading, clause_end, is_passive, is_vague, read_clauses
+from cow_service.readers.listed_options import Options, split_options
 from cow_service.readers.motion_words import MotionWords, read_motion
 from cow_service.readers.phrases import Item, ObjectPhrase, flatten, key_at, phrase_at
 
 Asks = Literal["touches", "occludes", "lands", "other"]
-Options = tuple[tuple[str, str], ...]
 
-_MARKER = re.compile(r"[(\[]([A-Za-z])[)\]]\s?[:.]?|\b([A-Z])[.):](?=\s)")
 _UNSEEN = lex.words("visible invisible unseen hidden seen sight occlusion")
 _MEETING = lex.words("collision contact impact")
 _COMES_DOWN = lex.words("fall drop tumble plunge come stop rest end")
 _ONTO = lex.words("on onto upon in into inside")
-_OPTION_END = re.compile(r"\n|[.?!;](?=\s|$)")
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
 )
@@ -80,36 +77,6 @@ def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:
     """The first mention of the mover where it is worded more fully: "the white pawn ... if the pawn moves"."""
     fuller = {item.phrase for item in before if item.phrase and item.phrase != mover and _repeats(mover, item.phrase)}
     return fuller.pop() if len(fuller) == 1 else mover
-
-
-def split_options(question: str) -> tuple[Options, str]:
-    """The lettered options of a question, and the question without them."""
-    chain: list[re.Match[str]] = []
-    best: list[re.Match[str]] = []
-    for marker in _MARKER.finditer(question):
-        letter = (marker[1] or marker[2]).upper()
-        if letter == "A":
-            chain = [marker]
-        elif chain and ord(letter) == ord("A") + len(chain):
-            chain.append(marker)
-        if len(chain) > max(1, len(best)):
-            best = list(chain)
-    if not best:
-        return (), question
-    ends = [marker.start() for marker in best[1:]]
-    closing = _OPTION_END.search(question, best[-1].end() + 1)
-    ends.append(closing.start() if closing else len(question))
-    texts = [question[marker.end() : end] for marker, end in zip(best, ends, strict=True)]
-    letters = [(marker[1] or marker[2]).upper() for marker in best]
-    body = question[: best[0].start()] + " . " + question[ends[-1] :]
-    return tuple(zip(letters, map(_option_text, texts), strict=True)), body
-
-
-def _option_text(text: str) -> str:
-    words = " ".join(text.split()).rstrip(" ,;.")
-    for joint in (" or", " and"):
-        words = words.removesuffix(joint).rstrip(" ,;.")
-    return words
 
 
 def _without_instructions(found: list[Item]) -> list[Item]:

@@ -14,8 +14,10 @@ from cow_service.records import AnswerOption, Simulation, Verdict
 NOT_SURE = "not sure"  # the name of that vote where no option says so
 
 
-def answer(look: Look, options: Sequence[AnswerOption], imagined: Imagined | None, votes: int) -> Verdict:
-    """The most frequent of `votes` answers; of several equally frequent ones the first that was given.
+def answer(
+    look: Look, options: Sequence[AnswerOption], imagined: Imagined | None, votes: int
+) -> tuple[Verdict, tuple[str, ...]]:
+    """The most frequent of `votes` answers, of several equally frequent ones the first that was given; and warnings.
 
     Raises what the reader raises where it gives none at all.
     """
@@ -24,19 +26,20 @@ def answer(look: Look, options: Sequence[AnswerOption], imagined: Imagined | Non
     most = max(counted.values())
     winner = next(reading for reading in readings if counted[_named(reading)] == most)
     option = next((option.text for option in options if option.letter == winner.answer), None)
-    return Verdict(
+    verdict = Verdict(
         answer=winner.answer,
         option=option,
         not_sure=winner.not_sure,
         reasoning=winner.reasoning,
         votes=dict(counted),
     )
+    return verdict, (*winner.notes, *_split(verdict, votes))
 
 
 def baseline(look: Look, options: Sequence[AnswerOption], votes: int) -> Verdict | CowError:
     """The answer from the image alone, for comparison, or the error that it came to."""
     try:
-        return answer(look, options, None, votes)
+        return answer(look, options, None, votes)[0]
     except MllmBadReply as error:
         return error
 
@@ -46,7 +49,7 @@ def frames_of(simulation: Simulation, artifacts: ArtifactStore) -> Imagined:
     return Imagined(simulation, tuple(decode_own(artifacts.read(frame.sha256)) for frame in simulation.frames))
 
 
-def split(verdict: Verdict, votes: int) -> tuple[str, ...]:
+def _split(verdict: Verdict, votes: int) -> tuple[str, ...]:
     """What a caller should know of the votes, in whole sentences; empty where there is nothing to say."""
     found: list[str] = []
     lost = votes - sum(verdict.votes.values())

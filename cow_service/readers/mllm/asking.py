@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from threading import Lock
@@ -30,6 +31,9 @@ from cow_service.settings import Settings
 
 REASKS = 2  # times that a model is told what was wrong with its reply
 POLL = 0.2  # seconds between looks at whether the caller still waits
+
+_UNFORESEEN = (ArithmeticError, LookupError, TypeError, ValueError, RecursionError)
+_log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -90,6 +94,10 @@ class _Attempt:
         except ReplyError as error:
             self.fault = str(error), reply
             raise ModelRetry(f"That cannot be used: {error}.") from error
+        except _UNFORESEEN as error:  # in whatever a model may write, and no reason to lose the other votes
+            _log.warning("a reply could not be read", exc_info=error)
+            self.fault = "it could not be read", reply
+            raise ModelRetry("That cannot be read. Reply with the JSON object alone.") from error
 
 
 class Asker:
@@ -124,6 +132,8 @@ class Asker:
 
     def ask_all(self, questions: Sequence[Question[T]], tally: Tally, asked: Asked) -> list[T | CowError]:
         """All replies at the same time, each read, or the error that it came to. Raises what `still_wanted` raises."""
+        if self._loop.is_closed:
+            raise self._closed()
         futures = [self._loop.submit(self._ask(each, tally)) for each in questions]
         try:
             with asked.elsewhere():
@@ -134,7 +144,7 @@ class Asker:
         finally:
             for future in futures:
                 future.cancel()  # nothing happens to one that is done
-        return [future.result() for future in futures]
+        return [self._closed() if future.cancelled() else future.result() for future in futures]
 
     async def _ask(self, question: Question[T], tally: Tally) -> T | CowError:
         """The reply, read, or the error that asking came to: one failed vote must not lose the others."""
@@ -156,33 +166,36 @@ class Asker:
         except CowError as error:  # of a model that runs in this process
             return error
         except (AgentRunError, UserError, TimeoutError) as error:
-            return self._error(question, attempt, model.failed, error)
+            return self._error(question, attempt, model, error)
         finally:
             tally.add(question.prompt, prompt.version, attempt.usage)
             tally.add("looking", self._looking, Usage())
 
-    def _error(
-        self, question: Question[Any], attempt: _Attempt, failed: ModelAPIError | None, error: Exception
-    ) -> CowError:
-        """What asking came to, as ours. `failed` is by what the last try over the network failed."""
+    def _error(self, question: Question[Any], attempt: _Attempt, model: Patient, error: Exception) -> CowError:
+        """What asking came to, as ours."""
         tries = f"{attempt.calls} {'try' if attempt.calls == 1 else 'tries'}"
         if isinstance(error, UserError):  # what pydantic-ai will not send to this model
             return MllmUnavailable(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}")
         if isinstance(error, ContentFilterError):
             return MllmBadReply(f"{self._name} refused to look at this: its content filter held the reply back.")
         if isinstance(error, TimeoutError):
-            told = "" if failed is None else f": {why(failed)}"
+            told = "" if model.failed is None else f": {why(model.failed)}"
             return MllmUnavailable(
                 f"{self._name} gave no usable reply within {self._budget:g} s (COW_MLLM_BUDGET) and {tries}{told}."
             )
         if isinstance(error, ModelAPIError):
             return MllmUnavailable(f"{self._name} could not be asked ({tries}): {why(error)}.")
         reason, reply = attempt.fault or ("it was empty", "")
+        if model.cut:
+            reason += ", and it was cut off: it has no more room than `max_tokens` of the model's manifest"
         excerpt = " ".join(reply.split())[:160]
         return MllmBadReply(
             f"{self._name} was asked {attempt.calls} times ({question.prompt}) and gave no reply that can be used. "
             f"Of the last one, '{excerpt}': {reason}."
         )
+
+    def _closed(self) -> MllmUnavailable:
+        return MllmUnavailable(f"{self._name} is asked no more: this server is stopping.")
 
     @property
     def _name(self) -> str:

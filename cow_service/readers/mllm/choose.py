@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.choices import not_sure_option, option_saying, plain, says_not_sure
+from cow_service.readers.mllm.prose import MARKS, announced, is_broken_json, lines_of
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
-from cow_service.readers.replies import ReplyError, fields_of, first_of, text_of, values_in, without_thinking
+from cow_service.readers.replies import ReplyError, fields_of, first_of, is_none, text_of, values_in, without_thinking
 from cow_service.records import AnswerOption
 
 MAX_ANSWER = 400  # characters of an open answer
 MAX_REASONING = 4000  # characters that are kept
+UNSURE_WORDS = 6  # an open answer that says "not sure" in more words says something besides
 _KEYS = ("answer", "final_answer", "choice", "option", "letter")
 _REASONING_KEYS = ("reasoning", "reason", "explanation", "rationale", "thought", "thoughts")
 _LETTER = re.compile(
     r"(?:option\s+|choice\s+)?[(\[]?(?P<letter>[A-Za-z])[)\]]?\s*[.:)\-]?\s*(?P<text>.*)", re.DOTALL | re.IGNORECASE
 )
-_TOLD = re.compile(
-    r"(?:<answer>|\b(?:final\s+)?answer\b[\s*_\"'`]*(?:is|:|=)[\s*_\"'`]*)(?P<said>[^\n<}]*)", re.IGNORECASE
-)
-_BOXED = re.compile(r"\\boxed\{(?:\\text\{)?([^{}]*)\}*")
-_MARKS = "*_`\"'“” \t."
 
 
 def schema(options: Sequence[AnswerOption], reasoning_length: int) -> Schema:
@@ -36,47 +34,89 @@ def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
     """The answer that a reply gives. Raises `ReplyError` where it gives none of the options, or more than one."""
     said = without_thinking(reply)
     values = values_in(said)
-    told = [(answer, reasoning) for value in values for answer, reasoning in _answers(value)]
-    if not told:
-        told = [(answer, "" if answer == said else said) for answer in _in_prose(said)]
-    if not told:
+    fields = [found for value in values for found in _objects(value)]
+    if any(key in found for found in fields for key in _KEYS):
+        readings = [reading for found in fields for reading in _in_fields(found, options)]
+    else:
+        readings = _in_prose(said, options)
+    if not readings:
         raise ReplyError(f"`answer` is missing; {_remedy(options)}")
-    readings = [_read(answer, reasoning[:MAX_REASONING], options) for answer, reasoning in told]
     if len({(reading.answer, reading.not_sure) for reading in readings}) > 1:
         raise ReplyError(f"several answers are given; {_remedy(options)}")
     return readings[-1]
 
 
-def _answers(value: object) -> Iterator[tuple[object, str]]:
+def _objects(value: object) -> Iterator[dict[str, Any]]:
     if isinstance(value, list):
         for part in cast("list[object]", value):
-            if isinstance(part, dict):
-                yield from _answers(part)
-    fields = fields_of(value)
-    if any(key in fields for key in _KEYS):
-        yield first_of(fields, *_KEYS), text_of(first_of(fields, *_REASONING_KEYS))
+            yield from _objects(part)
+    elif isinstance(value, dict):
+        yield fields_of(cast("object", value))
 
 
-def _in_prose(said: str) -> list[str]:
-    """Answers that are announced as such in a text; else the whole text where it is one short line."""
-    boxed = [found[1].strip(_MARKS) for found in _BOXED.finditer(said)]
-    if boxed:
-        return boxed
-    told = [found["said"].strip(_MARKS) for found in _TOLD.finditer(said)]
-    told = [answer for answer in told if answer]
+def _in_fields(fields: dict[str, Any], options: Sequence[AnswerOption]) -> Iterator[AnswerReading]:
+    """A reading of every field that answers; those beside the first must not say otherwise."""
+    reasoning = text_of(first_of(fields, *_REASONING_KEYS))[:MAX_REASONING]
+    present = [fields[key] for key in _KEYS if key in fields]
+    for place, answer in enumerate(present):
+        if place == 0 or not is_none(answer):
+            yield _read(_unwrapped(answer), reasoning, options)
+
+
+def _unwrapped(answer: Any) -> Any:
+    """What stands in a list of one, or in an object."""
+    if isinstance(answer, list) and len(cast("list[object]", answer)) == 1:
+        return cast("list[object]", answer)[0]
+    if isinstance(answer, dict):
+        return first_of(fields_of(cast("object", answer)), *_KEYS, "text")
+    return answer
+
+
+def _in_prose(said: str, options: Sequence[AnswerOption]) -> list[AnswerReading]:
+    """Answers that are announced as such in a text; else its first or last line, where that is one."""
+    if is_broken_json(said):
+        return []
+    told = announced(said)
+    lines = lines_of(said)
+    if options:
+        found = [option for each in told if (option := _option(each, options))]
+        if not found and not told:
+            found = [option for line in lines if (option := _option(line, options))]
+        if not found and told:
+            raise ReplyError(f"the answer '{told[-1][:80]}' is none of the options; {_remedy(options)}")
+        return [_of(option, "" if said == option.letter else said[:MAX_REASONING]) for option in found]
     if told:
-        return told
-    return [said] if "\n" not in said and len(said.split()) <= 8 and not said.startswith(("{", "[")) else []
+        return [_read_open(answer, said[:MAX_REASONING]) for answer in told]
+    return [_read_open(said, "")] if len(lines) == 1 and not said.startswith(("{", "[")) else []
 
 
 def _read(answer: Any, reasoning: str, options: Sequence[AnswerOption]) -> AnswerReading:
     if not options:
         return _read_open(answer, reasoning)
-    text = text_of(answer).strip(_MARKS)
-    option = option_saying(options, text) or _lettered(text, options)
+    text = text_of(answer)
+    option = _option(text, options)
+    if option is None and text:
+        told = [found for each in announced(text) if (found := _option(each, options))]
+        option = told[0] if len({found.letter for found in told}) == 1 else None
     if option is None:
         raise ReplyError(f"the answer '{str(answer)[:80]}' is none of the options; {_remedy(options)}")
-    return AnswerReading(option.letter, option == not_sure_option(options), reasoning)
+    return _of(option, reasoning)
+
+
+def _of(option: AnswerOption, reasoning: str) -> AnswerReading:
+    return AnswerReading(option.letter, says_not_sure(option.text), reasoning)
+
+
+def _option(said: str, options: Sequence[AnswerOption]) -> AnswerOption | None:
+    """The option that a short text means: by its letter, by its own words, or because neither is sure."""
+    text = said.strip(MARKS)
+    found = _lettered(text, options) or option_saying(options, text)
+    if found is not None:
+        return found
+    begun = [o for o in options if re.match(rf"{re.escape(o.text)}\s*[,.;:!]\s", text, re.IGNORECASE)]
+    if len(begun) == 1 and not says_not_sure(text):
+        return begun[0]
+    return not_sure_option(options) if says_not_sure(text) and len(text.split()) <= UNSURE_WORDS else None
 
 
 def _lettered(text: str, options: Sequence[AnswerOption]) -> AnswerOption | None:
@@ -85,17 +125,23 @@ def _lettered(text: str, options: Sequence[AnswerOption]) -> AnswerOption | None
     if found is None:
         return None
     option = next((option for option in options if option.letter == found["letter"].upper()), None)
-    rest, own = plain(found["text"]), "" if option is None else plain(option.text)
-    return option if not rest or rest == own else None
+    rest = found["text"].strip(MARKS + ")")
+    same = option is not None and (rest == option.text or plain(rest) == plain(option.text) != "")
+    return option if not rest or same else None
 
 
 def _read_open(answer: Any, reasoning: str) -> AnswerReading:
-    text = text_of(answer)[:MAX_ANSWER]
-    if isinstance(answer, int | float) and not isinstance(answer, bool):
-        text = f"{answer:g}"
     if isinstance(answer, bool):
-        text = "Yes" if answer else "No"
-    if answer is None or plain(text) in {"", "null", "none"} or says_not_sure(text):
+        answer = "Yes" if answer else "No"
+    if isinstance(answer, int | float):
+        if not -1e15 < answer < 1e15 or math.isnan(answer):
+            raise ReplyError(f"the answer is no usable number; {_remedy(())}")
+        answer = f"{answer:g}"
+    if isinstance(answer, list):
+        answer = ", ".join(text_of(part) for part in cast("list[object]", answer))
+    text = text_of(answer)[:MAX_ANSWER].strip()
+    unsure = says_not_sure(text) and len(text.split()) <= UNSURE_WORDS
+    if plain(text) in {"", "null"} or unsure:
         return AnswerReading(None, True, reasoning)
     return AnswerReading(text, False, reasoning)
 

@@ -7,16 +7,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast, get_args
 
+from cow_service.readers.mllm.prose import is_broken_json, names_nothing
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
-from cow_service.readers.replies import ReplyError, fields_of, first_of, text_of, values_in, without_thinking
+from cow_service.readers.replies import ReplyError, fields_of, first_of, is_none, text_of, values_in, without_thinking
 from cow_service.records import MotionKind
 
 MAX_OBJECT = 120  # characters
 MAX_OTHERS = 4
 MAX_SENTENCE = 240  # characters
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
-_NAMES = ("object", "moving_object", "mover", "object_name", "final_result", "result", "target", "answer")
-_NONE = frozenset({"", "none", "null", "n/a", "not found", "nothing"})
+_NAMES = ("object", "moving_object", "mover", "object_name", "final_result", "result")
+_INNER = ("name", "label", "object", "description")  # of an object that is an object itself
+_SENTENCE = re.compile(r"\b(?:I|am|is|are|was|were|will|would|has|have|does|do)\b")
 _LETTERED = re.compile(r"\W*[(\[]?[A-Za-z][)\].:](\s|$)|\W*[A-Za-z]\W*$")
 _SAID = re.compile(
     r"(?:final result|(?:moving )?object|mover|(?:object|thing) that moves)[*\"'`]*\s*(?:is|:|=)\s*(?P<name>[^\n]+)",
@@ -69,36 +71,37 @@ def _named(value: object) -> Iterator[Identified]:
             yield from _named(part) if isinstance(part, dict) else _as_words(part)
     fields = fields_of(value)
     name = first_of(fields, *_NAMES)
-    if isinstance(name, dict):
-        yield from _named(name)
-    elif name is not None:
-        names = cast("list[object]", name) if isinstance(name, list) else [name]
-        for each in names:
-            for named in _as_words(each):
-                yield Identified(named.object, _others(fields, named.object), _kind(fields), _sentence(fields))
+    names = cast("list[object]", name) if isinstance(name, list) else [name]
+    for each in names:
+        inner = fields_of(each)
+        if any(key in inner for key in _NAMES) and "kind" in inner:  # the whole reply, under a heading
+            yield from _named(each)
+            continue
+        for named in _as_words(first_of(inner, *_INNER) if inner else each):
+            yield Identified(named.object, _others(fields, named.object), _kind(fields), _sentence(fields))
 
 
 def _as_words(value: object) -> Iterator[Identified]:
-    name = text_of(value)
-    if name.lower() not in _NONE:
-        yield Identified(name)
+    if not is_none(value) and text_of(value):
+        yield Identified(text_of(value))
 
 
 def _says_none(value: object) -> bool:
-    if value is None or value == []:
-        return True
     fields = fields_of(value)
-    name = first_of(fields, *_NAMES)
-    return any(known in fields for known in _NAMES) and (name in (None, []) or text_of(name).lower() in _NONE)
+    key = next((key for key in _NAMES if key in fields), None)
+    return is_none(value) if key is None else is_none(fields[key])
 
 
 def _in_prose(said: str) -> list[str]:
     """A name told in words: behind "the moving object is", or the whole reply if it is nothing but a phrase."""
+    if is_broken_json(said):
+        return []
     told = [_unquoted(found["name"]) for found in _SAID.finditer(said)]
     if told:
         return told[-1:]
     phrase = _unquoted(said)
-    return [phrase] if "\n" not in said and len(phrase.split()) <= 12 and not re.search(r"[.!?:;]", phrase) else []
+    plain = "\n" not in said and len(phrase.split()) <= 12 and not re.search(r"[.!?:;{}\[\]]", phrase)
+    return [phrase] if plain and not _SENTENCE.search(phrase) else []
 
 
 def _unquoted(text: str) -> str:
@@ -110,6 +113,8 @@ def _check(name: str) -> None:
         raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
     if _LETTERED.match(name) or (len(name.split()) <= 3 and _is_answer(name)):
         raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
+    if names_nothing(name):
+        raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
     if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
         raise ReplyError(f"'{name}' names no object; say in words what moves")
 
@@ -121,8 +126,10 @@ def _is_answer(name: str) -> bool:
 
 def _others(fields: dict[str, Any], mover: str) -> tuple[str, ...]:
     held = fields.get("others")
-    names = [text_of(each)[:MAX_OBJECT] for each in cast("list[object]", held)] if isinstance(held, list) else []
-    kept = [name for name in names if name.lower() not in _NONE and _plain(name) != _plain(mover)]
+    parts = cast("list[object]", held) if isinstance(held, list) else [held]
+    inner = [first_of(fields_of(part), *_INNER) if isinstance(part, dict) else part for part in parts]
+    names = [text_of(each)[:MAX_OBJECT] for each in inner if not is_none(each)]
+    kept = [name for name in names if name and _plain(name) != _plain(mover)]
     return tuple(dict.fromkeys(kept))[:MAX_OTHERS]
 
 

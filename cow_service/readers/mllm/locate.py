@@ -2,52 +2,19 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, cast
 
 from cow_service.readers.coordinates import View
 from cow_service.readers.mllm.identify import MAX_OTHERS
+from cow_service.readers.mllm.lines import Line, line_in
+from cow_service.readers.mllm.places import Place, chosen, places_in, same_words, tagged_places
 from cow_service.readers.mllm.schemas import Schema, nullable, numbers, object_of, one_of, words
-from cow_service.readers.replies import ReplyError, fields_of, first_of, text_of, values_in, without_thinking
-from cow_service.records import BBox, Cue, LocatedObject, Point
+from cow_service.readers.replies import ReplyError, fields_of, is_none, values_in, without_thinking
+from cow_service.records import BBox, LocatedObject, Point
 
-CameraSense = Literal["towards", "away"]
 CUES = ("arrow", "trail", "text", "orientation", "none")
 MAX_LABEL = 120  # characters
-
-_BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
-_POINT_KEYS = ("point_2d", "point", "center", "centre", "point2d")
-_DIRECTION_KEYS = ("direction", "motion_direction", "line", "vector")
-_LABEL_KEYS = ("label", "object", "name", "class")
-_ENDS = (("start", "end"), ("from", "to"), ("tail", "tip"), ("tail", "head"))
-_CUE_WORDS: tuple[tuple[str, Cue], ...] = (
-    ("arrow", "arrow"),
-    ("trail", "trail"),
-    ("ghost", "trail"),
-    ("orient", "orientation"),
-    ("front", "orientation"),
-    ("facing", "orientation"),
-    ("text", "text"),
-    ("question", "text"),
-    ("word", "text"),
-    ("gravity", "gravity"),
-)
-_PAIR = r"\(\s*(-?[\d.]+)\s*,\s*(-?[\d.]+)\s*\)"
-_BOX_TAG = re.compile(rf"<(?:\|box_start\||box)>\s*{_PAIR}\s*,?\s*{_PAIR}\s*<(?:\|box_end\||/box)>")
-_POINT_TAG = re.compile(rf"<(?:\|point_start\||point)>\s*{_PAIR}\s*<(?:\|point_end\||/point)>")
-_DETERMINERS = frozenset({"the", "a", "an", "this", "that"})
-
-
-@dataclass(frozen=True)
-class Line:
-    """Which way the object moves, as far as the reply tells: `ends` in px of the upright image, or null."""
-
-    ends: tuple[Point, Point] | None
-    cue: Cue | None
-    along_arrow: bool | None
-    camera: CameraSense | None
 
 
 @dataclass(frozen=True)
@@ -63,13 +30,6 @@ class Located:
     cut_off: bool = False  # the box reached over the image's edge
     others: tuple[LocatedObject, ...] = ()
     line: Line | None = None
-
-
-@dataclass(frozen=True)
-class _Place:
-    label: str
-    box: Any
-    point: Any
 
 
 def schema(view: View, others: bool, wants_box: bool, wants_direction: bool, reasoning_length: int) -> Schema:
@@ -97,86 +57,34 @@ def read_located(
     """What a reply says of the object `wanted`; None where it says that it does not see it. Raises `ReplyError`."""
     said = without_thinking(reply)
     values = values_in(said)
-    line = _line(values, view) if wants_direction else None
-    if not wants_box:
+    place = _place(values, said, view, wanted) if wants_box else None
+    if wants_box and place is None:
+        return None
+    line = line_in(values, said, view) if wants_direction else None
+    if place is None:
         return Located(line=line)
-    places = [place for value in values for place in _places(value, view)] or list(_tagged(said))
+    found = _others(values, view, others)
+    if not is_none(place.box):
+        return Located(view.bbox(place.box), None, place.label, view.overshoots(place.box), found, line)
+    return Located(None, view.point(place.point), place.label, False, found, line)
+
+
+def _place(values: Sequence[object], said: str, view: View, wanted: str) -> Place | None:
+    """The place that the reply gives for the object; None where it says that it does not see it."""
+    places = [place for value in values for place in places_in(value, view)] or list(tagged_places(said))
     if not places:
-        if any(value in (None, []) for value in values):
+        if any(is_none(value) for value in values):
             return None
         raise ReplyError(f"`{view.coordinates.box}` is missing; give the box of '{wanted}', or null if it is not there")
-    place = _chosen(places, wanted)
-    if place.box in (None, []) and place.point in (None, []):
-        return None
-    if place.box not in (None, []):
-        bbox, cut_off = view.bbox(place.box), view.overshoots(place.box)
-        return Located(bbox, None, place.label, cut_off, _others(values, view, others), line)
-    return Located(None, view.point(place.point), place.label, False, _others(values, view, others), line)
-
-
-def same_words(one: str, other: str) -> bool:
-    """Whether two names are the same but for articles, case and punctuation."""
-    return _words(one) == _words(other)
-
-
-def shares_words(one: str, other: str) -> bool:
-    """Whether two names have a word in common."""
-    return bool(set(_words(one)) & set(_words(other)))
-
-
-def _places(value: object, view: View) -> Iterator[_Place]:
-    if isinstance(value, list):
-        held = cast("list[object]", value)
-        if held and all(_is_number(part) for part in held):
-            yield _Place("", held, None) if len(held) == 4 else _Place("", None, held)
-        for part in held:
-            if isinstance(part, dict | list):
-                yield from _places(part, view)
-    fields = fields_of(value)
-    boxes, points = (view.coordinates.box, *_BOX_KEYS), (view.coordinates.point, *_POINT_KEYS)
-    if any(key in fields for key in (*boxes, *points)):
-        label = next((told for key in _LABEL_KEYS if (told := text_of(fields.get(key)))), "")
-        yield _Place(label, first_of(fields, *boxes), first_of(fields, *points))
-        return
-    for name, held in fields.items():
-        if isinstance(held, dict | list) and name not in {"others", *_DIRECTION_KEYS}:
-            yield from _places(held, view)
-
-
-def _tagged(said: str) -> Iterator[_Place]:
-    """Places between tags, as some families write them in prose; else bare pairs of numbers in brackets."""
-    for found in _BOX_TAG.finditer(said):
-        yield _Place("", [float(number) for number in found.groups()], None)
-    for found in _POINT_TAG.finditer(said):
-        yield _Place("", None, [float(number) for number in found.groups()])
-    if "<" not in said:
-        pairs = [[float(x), float(y)] for x, y in re.findall(_PAIR, said)]
-        if len(pairs) == 2:
-            yield _Place("", pairs, None)
-        elif len(pairs) == 1:
-            yield _Place("", None, pairs[0])
-
-
-def _chosen(places: Sequence[_Place], wanted: str) -> _Place:
-    """The place that is meant: the only one, or the one whose label says so."""
-    distinct = list({repr((place.box, place.point)): place for place in places}.values())
-    if len(distinct) == 1:
-        return distinct[0]
-    named = [place for place in distinct if same_words(place.label, wanted)]
-    if not named:
-        shared = [len(set(_words(place.label)) & set(_words(wanted))) for place in distinct]
-        named = [place for place, count in zip(distinct, shared, strict=True) if count == max(shared) > 0]
-    if len(named) != 1:
-        labels = ", ".join(f"'{place.label}'" for place in distinct)
-        raise ReplyError(f"{len(distinct)} places are given ({labels}); give one box, that of '{wanted}'")
-    return named[0]
+    place = chosen(places, wanted)
+    return None if is_none(place.box) and is_none(place.point) else place
 
 
 def _others(values: Sequence[object], view: View, wanted: Sequence[str]) -> tuple[LocatedObject, ...]:
     """Boxes of the other objects that were asked for; one that cannot be read is left out."""
     found: dict[str, LocatedObject] = {}
     for value in values:
-        for place in _places(fields_of(value).get("others"), view):
+        for place in places_in(fields_of(value).get("others"), view):
             name = next((name for name in wanted if same_words(name, place.label)), None)
             if name is not None and place.box is not None:
                 try:
@@ -184,56 +92,3 @@ def _others(values: Sequence[object], view: View, wanted: Sequence[str]) -> tupl
                 except ReplyError:
                     continue  # the mover matters more than asking for this again
     return tuple(found.values())
-
-
-def _line(values: Sequence[object], view: View) -> Line:
-    lines = [line for value in values for line in _lines(value, view)]
-    if not lines:
-        raise ReplyError("`direction` is missing; give two points on the line of the motion, or null")
-    if any(line != lines[0] for line in lines):
-        raise ReplyError("several directions are given; give one")
-    return lines[0]
-
-
-def _lines(value: object, view: View) -> Iterator[Line]:
-    if isinstance(value, list):
-        held = cast("list[object]", value)
-        if len(held) == 4 and all(_is_number(part) for part in held):
-            yield Line(view.ends(held), None, None, None)
-        elif held and all(isinstance(part, dict) for part in held):
-            for part in held:
-                yield from _lines(part, view)
-    fields = fields_of(value)
-    key = next((key for key in _DIRECTION_KEYS if key in fields), None)
-    if key is not None:
-        told = text_of(fields.get("cue")).lower()
-        cue: Cue | None = next((cue for word, cue in _CUE_WORDS if word in told), None)
-        along, camera = fields.get("along_arrow"), text_of(fields.get("camera")).lower()
-        yield Line(
-            ends=None if told == "none" and not fields[key] else _ends(fields[key], view),
-            cue=cue,
-            along_arrow=along if isinstance(along, bool) else None,
-            camera="towards" if "toward" in camera else "away" if "away" in camera else None,
-        )
-
-
-def _ends(written: object, view: View) -> tuple[Point, Point] | None:
-    if written is None or written == []:
-        return None
-    fields = fields_of(written)
-    for first, second in _ENDS:
-        if first in fields and second in fields:
-            return view.ends([fields[first], fields[second]])
-    if isinstance(written, str) and not re.search(r"\d", written):
-        if written.strip().lower() in {"", "none", "null", "unknown", "n/a"}:
-            return None
-        raise ReplyError(f"`direction` is given in words ('{written[:40]}'); give two points as four numbers")
-    return view.ends(written)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _words(name: str) -> list[str]:
-    return [word for word in re.findall(r"\w+", name.lower()) if word not in _DETERMINERS]

@@ -22,8 +22,14 @@ class Loop:
         self._model = model
         self._loop = asyncio.new_event_loop()
         self._thread = Thread(target=self._loop.run_forever, name="mllm", daemon=True)
+        self._closing = False
         self._thread.start()
         self.submit(self._model.__aenter__()).result()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether nothing can be submitted any more."""
+        return self._closing
 
     def submit(self, work: Coroutine[Any, Any, T]) -> concurrent.futures.Future[T]:
         """Starts a coroutine; its future may be cancelled."""
@@ -31,8 +37,9 @@ class Loop:
 
     def close(self) -> None:
         """Gives up what is running, closes the connections and ends the thread. Once is enough, twice does no harm."""
-        if self._loop.is_closed():
+        if self._closing:
             return
+        self._closing = True
         concurrent.futures.wait([self.submit(self._end())], PATIENCE)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(PATIENCE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from http import HTTPStatus
 
 import anyio
 from pydantic_ai.exceptions import (
@@ -12,6 +13,7 @@ from pydantic_ai.exceptions import (
     ContentFilterError,
     ModelAPIError,
     ModelAuthenticationError,
+    ModelConnectionError,
     ModelContextWindowExceededError,
     ModelHTTPError,
     ModelNotFoundError,
@@ -25,21 +27,33 @@ from pydantic_ai.models import Model, ModelRequestParameters
 from pydantic_ai.models.wrapper import WrapperModel
 from pydantic_ai.output import OutputObjectDefinition
 from pydantic_ai.settings import ModelSettings
-from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, stop_before_delay, wait_random_exponential
+from tenacity import (
+    AsyncRetrying,
+    RetryCallState,
+    retry_if_exception,
+    stop_before_delay,
+    wait_random_exponential,
+)
+from tenacity.stop import stop_base
 
-from cow_service.errors import CowError
 from cow_service.readers.mllm.schemas import Schema
 
 FIRST_WAIT, LONGEST_WAIT = 0.5, 20.0  # seconds before a retry, where the server names no time
+UNREACHED = 10.0  # seconds after which an address that takes no connection is given up: a restart takes longer anyway
 # Asking again does not help with these.
 _FINAL = (ModelRequestRejectedError, ModelQuotaExceededError)
+_PASSING = (HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.CONFLICT, HTTPStatus.TOO_EARLY, HTTPStatus.TOO_MANY_REQUESTS)
 _WHY: tuple[tuple[type[ModelAPIError], str], ...] = (
     (ModelAuthenticationError, "it refused the key; set COW_MLLM_API_KEY, or the provider's own variable"),
-    (ModelNotFoundError, "there is no such model; check COW_MLLM, COW_MLLM_MODEL and COW_MLLM_BASE_URL"),
+    (ModelNotFoundError, "there is no model of that name; COW_MLLM_MODEL says under which name it is served there"),
     (ModelContextWindowExceededError, "the images and the question are more than it takes; send fewer frames"),
     (ModelQuotaExceededError, "the account's quota is used up"),
     (ModelRateLimitError, "it takes no more requests for now (429); lower COW_MLLM_CONCURRENCY, or try later"),
     (ModelTimeoutError, "it did not reply in time; COW_MLLM_TIMEOUT says how long to wait"),
+    (
+        ModelConnectionError,
+        "it could not be reached, or broke off; check that it runs, and COW_MLLM_BASE_URL",
+    ),
 )
 # What pydantic-ai's and the providers' code raises over a reply that is not shaped as it should be.
 _MISSHAPEN = (IndexError, KeyError, TypeError, AttributeError, ValueError)
@@ -79,6 +93,7 @@ class Patient(WrapperModel):
         self._schema = schema
         self._count = count
         self.failed: ModelAPIError | None = None  # by what the last try failed
+        self.cut = False  # whether the last reply ended because it was too long
 
     async def request(
         self,
@@ -91,14 +106,15 @@ class Patient(WrapperModel):
         if self._schema is not None:
             # The text is read by our own tolerant rules all the same: a server may ignore the schema.
             asked = replace(asked, output_mode="native", output_object=OutputObjectDefinition(self._schema, "reply"))
-        tries = AsyncRetrying(
-            retry=retry_if_exception(_may_pass), wait=_wait, stop=stop_before_delay(self._budget), reraise=True
-        )
+        stop = stop_before_delay(self._budget) | _Unreached()
+        tries = AsyncRetrying(retry=retry_if_exception(_may_pass), wait=_wait, stop=stop, reraise=True)
         async for attempt in tries:
             with attempt:
                 self._count()
                 try:
-                    return await super().request(messages, model_settings, asked)
+                    response = await super().request(messages, model_settings, asked)
+                    self.cut = response.finish_reason == "length"
+                    return response
                 except ModelAPIError as error:
                     self.failed = error
                     raise
@@ -112,11 +128,22 @@ def why(error: ModelAPIError) -> str:
         return told
     if isinstance(error, ModelHTTPError):
         return f"it answered with status {error.status_code}"
-    return "it could not be reached, or its reply could not be read; check that it runs, and COW_MLLM_BASE_URL"
+    return "its reply could not be read; check that COW_MLLM_BASE_URL is that of an OpenAI-compatible server"
 
 
 def _may_pass(error: BaseException) -> bool:
-    return isinstance(error, ModelAPIError) and not isinstance(error, (*_FINAL, CowError))
+    if isinstance(error, ModelHTTPError) and error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
+        return error.status_code in _PASSING
+    return isinstance(error, ModelAPIError) and not isinstance(error, _FINAL)
+
+
+class _Unreached(stop_base):
+    """Whether nobody has taken a connection for a while."""
+
+    def __call__(self, retry_state: RetryCallState) -> bool:
+        error = retry_state.outcome.exception() if retry_state.outcome else None
+        unreached = isinstance(error, ModelConnectionError) and error.phase == "connect"
+        return unreached and (retry_state.seconds_since_start or 0.0) > UNREACHED
 
 
 def _wait(state: RetryCallState) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from cow_service.readers.base import AnswerReading, Asked, Imagined
+from cow_service.readers.choices import question_without
 from cow_service.readers.coordinates import View
 from cow_service.readers.mllm import choose, identify, locate, scale
 from cow_service.readers.mllm.asking import Question
@@ -98,7 +99,8 @@ class Questions:
         self, options: Sequence[AnswerOption], imagined: Imagined | None, votes: int
     ) -> list[Question[AnswerReading]]:
         """The answer, asked for `votes` times: the image first, then the frames, and what they would meet as text."""
-        question: dict[str, object] = {"question": self._asked.question, "options": tuple(options)}
+        asked = question_without(self._asked.question, options)
+        question: dict[str, object] = {"question": asked, "options": tuple(options)}
         frames = () if imagined is None else imagined.frames
         pictures = (self._image, *(encode(f, view_of(f, self._served.family).seen) for f in frames))
         return [

@@ -14,7 +14,9 @@ from cow_service.readers.base import AnswerReading, Asked, GroundingReading, Ima
 from cow_service.readers.geometry import doubt_box, follow_arrow
 from cow_service.readers.mllm.asking import Asker, Question, Tally
 from cow_service.readers.mllm.identify import Identified
-from cow_service.readers.mllm.locate import Line, Located, shares_words
+from cow_service.readers.mllm.lines import Line
+from cow_service.readers.mllm.locate import Located
+from cow_service.readers.mllm.places import shares_words
 from cow_service.readers.mllm.questions import Questions
 from cow_service.readers.mllm.scale import Scaled
 from cow_service.readers.mllm.serving import UNKNOWN, serve
@@ -160,10 +162,10 @@ class MllmLook:
         served = self._reader.asker.served
         if served.manifest.name != UNKNOWN:
             return ()
-        return (
-            f"No manifest describes '{served.name}': coordinates were asked for as fractions, and a model that is used "
-            "to another convention may have given others.",
-        )
+        taken = "coordinates were asked for as fractions, and a model that is used to others may have given those"
+        if served.family.name != UNKNOWN:
+            taken = f"by its name it was taken for one of the family '{served.family.name}'"
+        return (f"No manifest describes '{served.name}': {taken}.",)
 
     def _with_scale(self, reading: MotionReading) -> MotionReading:
         if isinstance(self._scaled, Scaled):

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 from cow_service.readers.coordinates import View
 from cow_service.readers.mllm.schemas import Schema, nullable, numbers, object_of, one_of, words
-from cow_service.readers.replies import ReplyError, fields_of, text_of, values_in, without_thinking
+from cow_service.readers.replies import ReplyError, fields_of, first_of, is_none, text_of, values_in, without_thinking
 from cow_service.records import MetresPerPixel, Vector
 
 DOWN: dict[str, Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}
+_SIDES = {side: side for side in DOWN} | {"down": "bottom", "below": "bottom", "up": "top", "above": "top"}
 METRES = (0.001, 1000.0)  # lengths outside this are no lengths of things in a picture
 LEAST_SPAN = 4.0  # px: measuring less is guessing
 
@@ -39,16 +40,38 @@ def read_scaled(reply: str, view: View) -> Scaled:
     objects = [fields for value in values_in(without_thinking(reply)) if "ends" in (fields := fields_of(value))]
     if not objects:
         raise ReplyError("`ends` and `metres` are missing; give both, or null for both")
-    fields = objects[-1]
-    down = DOWN.get(text_of(fields.get("down")).lower(), DOWN["bottom"])
-    metres, ends = fields.get("metres"), fields.get("ends")
-    if metres is None or ends is None:
+    if len(objects) > 1:
+        raise ReplyError("several references are given; give one")
+    fields = objects[0]
+    down = _down(fields.get("down"))
+    metres, ends = _metres(first_of(fields, "metres", "meters", "length")), fields.get("ends")
+    if metres is None or is_none(ends):
         return Scaled(None, down)
-    if isinstance(metres, bool) or not isinstance(metres, int | float) or not METRES[0] <= metres <= METRES[1]:
-        raise ReplyError(f"`metres` is {metres!r}; give the length in metres as a number from 0.001 to 1000")
     span = math.dist(*view.ends(ends))
     if span < LEAST_SPAN:
         raise ReplyError("`ends` are too close to measure by; take a longer thing")
     reference = text_of(fields.get("reference"))[:200] or "an object of known size"
     note = f"{reference}: {metres:g} m over {span:.0f} px"
     return Scaled(MetresPerPixel(value=metres / span, source="reference", note=note), down)
+
+
+def _down(told: object) -> Vector:
+    if is_none(told):
+        return DOWN["bottom"]
+    side = _SIDES.get(text_of(told).lower().removesuffix(" side"))
+    if side is None:
+        raise ReplyError(f"`down` is {told!r}; give the side of the image to which things fall: {', '.join(DOWN)}")
+    return DOWN[side]
+
+
+def _metres(told: object) -> float | None:
+    """A length in metres, also as text."""
+    if is_none(told):
+        return None
+    try:
+        metres = float(told) if isinstance(told, int | float | str) and not isinstance(told, bool) else math.nan
+    except (ValueError, OverflowError):
+        metres = math.nan
+    if not METRES[0] <= metres <= METRES[1]:
+        raise ReplyError(f"`metres` is {str(told)[:40]}; give the length in metres as a number from 0.001 to 1000")
+    return metres

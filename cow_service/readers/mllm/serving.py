@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -54,8 +55,9 @@ def described(settings: Settings) -> tuple[Manifest, str | None, str]:
         return manifest, manifest.provider, settings.mllm_model or manifest.model or asked
     provider, colon, model = asked.partition(":")
     if not (colon and provider and model):
-        names = ", ".join(manifests)
-        raise ReaderUnavailable(f"COW_MLLM={asked!r} is no manifest and not provider:model. Manifests: {names}.")
+        close = get_close_matches(asked, manifests, n=3, cutoff=0.5)
+        names = f"Did you mean {' or '.join(close)}?" if close else f"Manifests: {', '.join(manifests)}."
+        raise ReaderUnavailable(f"COW_MLLM={asked!r} is no manifest and not provider:model. {names}")
     return manifest_for(model), provider, settings.mllm_model or model
 
 
@@ -75,10 +77,20 @@ def manifest_for(model: str) -> Manifest:
     return manifests[UNKNOWN]
 
 
+def family_of(manifest: Manifest, served: str) -> Family:
+    """The family of a model; of one that only the generic manifest fits, the one that its name speaks of, if any."""
+    families = load_families()
+    if manifest.name == UNKNOWN:
+        plain = served.lower()
+        named = (f for f in families.values() if any(fnmatchcase(plain, pattern) for pattern in f.also))
+        return next(named, families[UNKNOWN])
+    return families[manifest.family or UNKNOWN]
+
+
 def serve(settings: Settings) -> Served:
     """The model of the settings, ready to be asked; nothing is sent. Raises `ReaderUnavailable`."""
     manifest, provider, name = described(settings)
-    family = load_families()[manifest.family or UNKNOWN]
+    family = family_of(manifest, name)
     key = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
     own_protocol = settings.mllm is not None and settings.mllm.startswith(tuple(f"{p}:" for p in OWN_PROTOCOL))
     if settings.mllm_base_url is None and provider is None:
@@ -92,6 +104,10 @@ def serve(settings: Settings) -> Served:
         model = infer_model(f"{provider}:{name}", provider_factory=_factory(settings.mllm_base_url, key))
     except (UserError, ValueError, ImportError) as error:
         told = str(error).splitlines()[0]
+        if "api" in told.lower() and "key" in told.lower():
+            told = "it needs a key: set COW_MLLM_API_KEY, or the provider's own variable."
+        elif "provider" in told.lower():
+            told = f"there is no provider {provider!r}. Take openai, anthropic, google, mistral, groq, openrouter..."
         raise ReaderUnavailable(f"COW_MLLM={settings.mllm!r} cannot be used: {told}") from error
     return Served(model, name, manifest, family)
 

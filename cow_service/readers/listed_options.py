@@ -1,0 +1,75 @@
+"""The lettered options that a question lists, (A) Yes, (B) No, and the question without them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+Options = tuple[tuple[str, str], ...]
+
+_MARKER = re.compile(
+    r"[(\[]([A-Za-z])[)\]]\s?[:.]?|\b([A-Z])[.):）](?=[\s*])|(?:(?<=\n)|^)[ \t]*([a-z])[.)](?=\s)", re.ASCII
+)
+_OPTION_END = re.compile(r"\n|[.?!;](?=\s|$)")
+_WORDS = re.compile(r"[\w+−±-]")
+_ASKS = re.compile(r"(?:will|would|does|do|is|are|can|could) ", re.IGNORECASE)
+_EDGES = " ,;.*-•–"
+
+
+def split_options(question: str) -> tuple[Options, str]:
+    """The lettered options of a question, and the question without them.
+
+    Letters that follow one another from A may also name things ("car (A) hits car (B)"): a list has texts that differ
+    and none that asks; of several such lists the longest counts, and of those the last.
+    """
+    best: tuple[list[re.Match[str]], int, Options] | None = None
+    for chain in _chains(question):
+        end = _end(question, chain)
+        options = _read(question, chain, end)
+        if options and (best is None or len(options) >= len(best[2])):
+            best = chain, end, options
+    if best is None:
+        return (), question
+    chain, end, options = best
+    return options, question[: chain[0].start()] + " . " + question[end:]
+
+
+def _chains(question: str) -> list[list[re.Match[str]]]:
+    """Runs of markers A, B, C..., two or more."""
+    chains: list[list[re.Match[str]]] = []
+    for marker in _MARKER.finditer(question):
+        letter = _letter(marker)
+        if letter == "A":
+            chains.append([marker])
+        elif chains and ord(letter) == ord("A") + len(chains[-1]):
+            chains[-1].append(marker)
+    return [chain for chain in chains if len(chain) > 1]
+
+
+def _letter(marker: re.Match[str]) -> str:
+    return next(group for group in marker.groups() if group).upper()
+
+
+def _end(question: str, chain: Sequence[re.Match[str]]) -> int:
+    """Where the last option ends: at its line's or its sentence's end."""
+    closing = _OPTION_END.search(question, min(chain[-1].end() + 1, len(question)))
+    return closing.start() if closing else len(question)
+
+
+def _read(question: str, chain: Sequence[re.Match[str]], end: int) -> Options:
+    """The options of a chain; empty where its parts are no options."""
+    ends = [*(marker.start() for marker in chain[1:]), end]
+    spans = [question[marker.end() : stop] for marker, stop in zip(chain, ends, strict=True)]
+    texts = [_text(span) for span in spans]
+    listed = all(_WORDS.search(text) for text in texts) and len({text.lower() for text in texts}) == len(texts)
+    asks = any(
+        "?" in span or _MARKER.search(text) or _ASKS.match(text) for span, text in zip(spans, texts, strict=True)
+    )
+    return tuple((_letter(m), text) for m, text in zip(chain, texts, strict=True)) if listed and not asks else ()
+
+
+def _text(span: str) -> str:
+    words = " ".join(span.split()).strip(_EDGES)
+    for joint in (" or", " and"):
+        words = words.removesuffix(joint).rstrip(_EDGES)
+    return words
