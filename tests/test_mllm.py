@@ -321,22 +321,25 @@ def test_the_wait_that_a_server_asks_for_is_kept(mllm: MllmServer, make) -> None
 
 
 def test_a_caller_who_leaves_is_not_waited_for(mllm: MllmServer, make) -> None:
-    mllm.say(say.slow(4))
+    mllm.say(say.slow(8))
     service = make(mllm_timeout=30)
+    service.check()  # its own thread is there from now on
 
     async def leave() -> None:
         transport = httpx.ASGITransport(create_app(service))
         async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
             body = QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}
             task = asyncio.create_task(client.post("/answer", json=body))
-            await asyncio.sleep(1)
+            await asyncio.sleep(0.5)
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
 
+    before = set(threading.enumerate())
     asyncio.run(leave())
     started = time.monotonic()
-    while any(thread.name.startswith("AnyIO worker") for thread in threading.enumerate()):
-        assert time.monotonic() - started < 3
+    new = {thread for thread in threading.enumerate() if thread not in before and thread.name.startswith("AnyIO")}
+    while any(thread.is_alive() for thread in new):
+        assert time.monotonic() - started < 6, "the thread waits for the reply"
         time.sleep(0.05)
 
 
