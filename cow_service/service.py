@@ -20,7 +20,7 @@ from cow_service.errors import (
 )
 from cow_service.generators.base import Generator
 from cow_service.images import DecodedImage, decode
-from cow_service.manifests import load_manifests
+from cow_service.manifests import find_manifest, load_manifests
 from cow_service.pipeline import Backends, Progress, answer, simulate
 from cow_service.plugins import Registry
 from cow_service.readers.base import Reader
@@ -29,6 +29,7 @@ from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUr
 from cow_service.settings import Settings, SettingsError
 from cow_service.weights import ready
 
+OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
 _DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)
 
 
@@ -54,10 +55,10 @@ class Service:
         ):
             if name not in names:
                 raise SettingsError(f"Bad settings: {setting}={name!r}: there are only {', '.join(names) or 'none'}.")
-        parts = {"transformer", "weights"}
-        loadable = [name for name, manifest in load_manifests().items() if parts & manifest.sources.keys()]
         for name in settings.checkpoints:
-            if name not in loadable:
+            manifest = find_manifest(name)
+            if manifest is None or not OWN_PARTS & manifest.sources.keys():
+                loadable = [name for name, each in load_manifests().items() if OWN_PARTS & each.sources.keys()]
                 raise SettingsError(f"Bad settings: COW_CHECKPOINTS for {name!r}: only for {', '.join(loadable)}.")
 
     def keep_image(self, data: bytes) -> tuple[Artifact, DecodedImage]:
@@ -153,7 +154,7 @@ class Service:
         return name
 
     def _describe(self, door: str, name: str) -> BackendInfo:
-        manifest = load_manifests().get(name)
+        manifest = find_manifest(name)
         default = name == (self.settings.reader if door == "reader" else self.settings.generator)
         if manifest is None:
             return BackendInfo(name=name, default=default, ready=None, summary="Registered by another package.")
@@ -177,7 +178,7 @@ class Service:
 
 def _check_modules(name: str, unavailable: type[CowError]) -> None:
     """Raises `unavailable`, with the command that helps, where a backend's modules are not installed."""
-    manifest = load_manifests().get(name)
+    manifest = find_manifest(name)
     if manifest is not None and (missing := manifest.missing_modules()):
         raise unavailable(
             f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"

@@ -364,7 +364,13 @@ def test_no_reply_takes_long_to_look_through(noise: str) -> None:
 @given(st.text(alphabet="{}[]\"'\\,:0aA().<>|", max_size=60))
 def test_no_reply_breaks_the_reading(text: str) -> None:
     for stage in ("identify", "locate", "direction", "answer"):
-        read({"stage": stage, "raw": text, "family": "qwen3-vl", "image": [320, 180], "sent": [320, 180]})
+        told = read({"stage": stage, "raw": text, "family": "qwen3-vl", "image": [320, 180], "sent": [320, 180]})
+        if "error" not in told:
+            assert told.get("answer") in {None, "A", "B", "C"}
+            assert told.get("object") != ""
+            x0, y0, x1, y1 = told.get("bbox") or (0, 0, 320, 180)
+            assert 0 <= x0 < x1 <= 320
+            assert 0 <= y0 < y1 <= 180
 
 
 # Re-asks, prompts, provenance

@@ -41,6 +41,7 @@ _COUNTING = lex.words(
 )
 # Toppling, stopping and wrapping are more than touching or hiding.
 _MORE = lex.words("knock block cover crash smash overlap meet reach")
+_MAKING = lex.words("make makes come comes be get gets")  # contact; it can also be lost
 _VANISH = lex.words("disappear vanish")
 _ANYTHING = lex.words("anything something object objects thing things obstacle obstacles")
 _COMES_DOWN = lex.words("fall drop tumble come end stop rest")
@@ -170,7 +171,7 @@ def _means(phrase: ObjectPhrase | None, mover: ObjectPhrase | None) -> bool:
 def _relation(rest: Sequence[Item], subject: ObjectPhrase | None, is_mover: bool) -> Asked | None:
     at = next((at for at, item in enumerate(rest) if item.key in lex.VERBS and item.key not in _BE), None)
     if at is None:
-        return _contact(rest) if is_mover else None
+        return None
     verb = lex.VERBS[rest[at].key]
     passive = verb.form != "ing" and any(item.key in _BE for item in rest[:at])
     if passive and not is_mover:
@@ -183,7 +184,7 @@ def _relation(rest: Sequence[Item], subject: ObjectPhrase | None, is_mover: bool
         return _any_or_named("covered", rest[at:], optional=True) if hidden else None
     relation = _doing(verb.lemma, [item.key for item in rest[at:]])
     if relation is None:
-        return _contact(rest)
+        return None
     return _any_or_named(relation, rest[at:], optional=verb.lemma in _VANISH)
 
 
@@ -218,8 +219,7 @@ def _any_or_named(relation: Relation, rest: Sequence[Item], *, optional: bool) -
 
 def _contact(rest: Sequence[Item]) -> Asked | None:
     """ "make contact with the vase", "be in collision with it"."""
-    made = {"make", "makes", "come", "comes", "be", "get", "gets"} & {item.key for item in rest}
-    if not made or not any(_is_contact(item) or item.key == "contact" for item in rest):
+    if _MAKING.isdisjoint(item.key for item in rest):
         return None
     objects = [item for item in rest if item.phrase is not None and not _is_contact(item)]
     return _named("touches", objects[-1] if objects else None)
