@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +62,7 @@ class ArtifactStore:
         with _storage_errors():
             known = self._find(sha256)
             if known is not None:
+                os.utime(known.path)  # somebody needs it now: it is not one of those that nobody has asked for lately
                 return known.artifact
             target = self._target(sha256, extension)
             with _temporary_beside(target) as temporary:
@@ -99,6 +100,28 @@ class ArtifactStore:
                 f"No artifact has the SHA-256 {sha256}: send the image again, or run the simulation that made it."
             )
         return stored
+
+    def touch(self, sha256: str) -> None:
+        """Says that an artifact is needed now. Raises as `get` does."""
+        path = self.get(sha256).path
+        with _storage_errors():
+            os.utime(path)
+
+    def delete(self, sha256: str, untouched_since: float) -> bool:
+        """Removes an artifact unless somebody needed it after that time (seconds since 1970); says whether it did."""
+        with _storage_errors():
+            stored = self._find(sha256)
+            if stored is None or stored.path.stat().st_mtime > untouched_since:
+                return False
+            stored.path.unlink(missing_ok=True)
+        return True
+
+    def untouched_since(self, moment: float) -> Iterator[str]:
+        """Artifacts that nobody needed after that time (seconds since 1970)."""
+        with _storage_errors():
+            for path in self._folder.glob("[0-9a-f][0-9a-f]/*.*"):
+                if _DIGEST.fullmatch(path.stem) and path.stat().st_mtime <= moment:
+                    yield path.stem
 
     def read(self, sha256: str) -> bytes:
         """The bytes of an artifact. Raises as `get` does."""

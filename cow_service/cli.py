@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from cow_service import __version__, models_cli, tracks_cli
+from cow_service import __version__, keys_cli, models_cli, tracks_cli
 from cow_service import cli_options as options
 from cow_service.errors import CowError
 
 # Notes that these libraries print when they are imported, such as on optional packages, are not for our users.
 QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
-
-GRACE = 10  # seconds that requests in progress are given when the server stops
 
 if TYPE_CHECKING:
     from cow_service.service import Service
@@ -176,18 +174,15 @@ def serve(
     """Start the server."""
     with _errors_told():
         service = _service(host=host, port=port)
-        service.check()  # what cannot serve the default request should not start
-        import uvicorn  # noqa: PLC0415
+        from cow_service import logs, tracing  # noqa: PLC0415
 
-        from cow_service.api.app import create_app  # noqa: PLC0415
+        logs.set_up(service.settings)
+        tracing.start()
+        from cow_service.api.layers import tell_if_open  # noqa: PLC0415
+        from cow_service.serving import run_server  # noqa: PLC0415
 
-        uvicorn.run(
-            create_app(service),
-            host=service.settings.host,
-            port=service.settings.port,
-            log_level="info",
-            timeout_graceful_shutdown=GRACE,
-        )
+        tell_if_open(service.settings)
+        run_server(service)
 
 
 @app.command()
@@ -210,8 +205,9 @@ def openapi() -> None:
         import yaml  # noqa: PLC0415
 
         from cow_service.api.app import create_app  # noqa: PLC0415
+        from cow_service.jobs.engine import Engine  # noqa: PLC0415
 
-        document = create_app(_service()).openapi()
+        document = create_app(Engine(_service())).openapi()
         typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
 
 
@@ -252,6 +248,7 @@ class _Told(TyperGroup):
             return super().invoke(ctx)
 
 
+app.add_typer(keys_cli.app, name="keys", cls=_Told)
 app.add_typer(models_cli.app, name="models", cls=_Told)
 app.add_typer(tracks_cli.app, name="tracks", cls=_Told)
 

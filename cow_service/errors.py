@@ -5,14 +5,19 @@
     │   └── MalformedBody          malformed-body           400
     ├── NotFound                   not-found                404
     ├── MethodNotAllowed           method-not-allowed       405
+    ├── Unauthorized               unauthorized             401
+    ├── OriginNotAllowed           origin-not-allowed       403
+    ├── RateLimited                rate-limited             429
     ├── ArtifactNotFound           artifact-not-found       404
     ├── RangeNotSatisfiable        range-not-satisfiable    416
     ├── BodyTooLarge               body-too-large           413
+    ├── BodyTooSlow                body-too-slow            408
     ├── BodyTypeUnsupported        body-type-unsupported    415
     ├── ImageTooLarge              image-too-large          413
     ├── ImageUnreadable            image-unreadable         422
     ├── ImageTypeUnsupported       image-type-unsupported   415
     ├── ImageUrlNotAllowed         image-url-not-allowed    422
+    ├── ImageUrlUnreachable        image-url-unreachable    422
     ├── CannotGround               cannot-ground            422
     │   └── ObjectNotFound         object-not-found         422
     ├── CannotReadDirection        cannot-read-direction    422
@@ -23,6 +28,12 @@
     │   ├── WeightsUnavailable     weights-unavailable      503
     │   └── CheckpointInvalid      checkpoint-invalid       503
     ├── GeneratorOutOfMemory       generator-out-of-memory  503
+    ├── JobNotFound                job-not-found            404
+    ├── IdempotencyKeyReused       idempotency-key-reused   422
+    ├── WebhookNotAllowed          webhook-not-allowed      422
+    ├── QueueFull                  queue-full               503
+    ├── NotReady                   not-ready                503
+    ├── ShuttingDown               shutting-down            503
     ├── Canceled                   canceled                 409
     ├── StorageUnavailable         storage-unavailable      503
     └── InternalError              internal-error           500
@@ -35,6 +46,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+MAX_DETAIL = 2000  # characters
+MAX_FIELDS = 50  # of one error
+MAX_KEY = 80  # characters
+
 
 @dataclass(frozen=True)
 class FieldError:
@@ -45,8 +60,13 @@ class FieldError:
 
 
 def pointer_part(part: int | str) -> str:
-    """One step of a JSON Pointer, escaped (RFC 6901)."""
-    return str(part).replace("~", "~0").replace("/", "~1")
+    """One step of a JSON Pointer, escaped (RFC 6901); a key of more than `MAX_KEY` characters is cut."""
+    return shortened(str(part), MAX_KEY).replace("~", "~0").replace("/", "~1")
+
+
+def shortened(text: str, most: int) -> str:
+    """The text, or its first `most` characters and how many there are: what callers send may be megabytes long."""
+    return text if len(text) <= most else f"{text[:most]}... ({len(text)} characters)"
 
 
 class CowError(Exception):
@@ -58,9 +78,9 @@ class CowError(Exception):
     def __init__(
         self, detail: str, *, errors: tuple[FieldError, ...] = (), headers: dict[str, str] | None = None
     ) -> None:
-        super().__init__(detail)
-        self.detail = detail
-        self.errors = errors
+        self.detail = shortened(detail, MAX_DETAIL)
+        super().__init__(self.detail)
+        self.errors = errors[:MAX_FIELDS]
         self.headers = headers or {}  # of the HTTP response, where the error calls for some
 
     @property
@@ -93,6 +113,24 @@ class MethodNotAllowed(CowError):
     code, status = "method-not-allowed", 405
 
 
+class Unauthorized(CowError):
+    """The request has no valid key."""
+
+    code, status = "unauthorized", 401
+
+
+class OriginNotAllowed(CowError):
+    """A web page from there may not use the server."""
+
+    code, status = "origin-not-allowed", 403
+
+
+class RateLimited(CowError):
+    """Too many requests came in too short a time."""
+
+    code, status = "rate-limited", 429
+
+
 class ArtifactNotFound(CowError):
     """No artifact has that digest."""
 
@@ -109,6 +147,12 @@ class BodyTooLarge(CowError):
     """The body is larger than the server takes."""
 
     code, status = "body-too-large", 413
+
+
+class BodyTooSlow(CowError):
+    """The body did not arrive in time."""
+
+    code, status = "body-too-slow", 408
 
 
 class BodyTypeUnsupported(CowError):
@@ -136,9 +180,15 @@ class ImageTypeUnsupported(CowError):
 
 
 class ImageUrlNotAllowed(CowError):
-    """Images by URL are not allowed here."""
+    """The image may not be fetched from that URL."""
 
     code, status = "image-url-not-allowed", 422
+
+
+class ImageUrlUnreachable(CowError):
+    """The image could not be fetched from its URL."""
+
+    code, status = "image-url-unreachable", 422
 
 
 class CannotGround(CowError):
@@ -201,6 +251,42 @@ class GeneratorOutOfMemory(CowError):
     code, status = "generator-out-of-memory", 503
 
 
+class JobNotFound(CowError):
+    """There is no such job."""
+
+    code, status = "job-not-found", 404
+
+
+class IdempotencyKeyReused(CowError):
+    """The idempotency key belongs to another request."""
+
+    code, status = "idempotency-key-reused", 422
+
+
+class WebhookNotAllowed(CowError):
+    """The server does not call that webhook."""
+
+    code, status = "webhook-not-allowed", 422
+
+
+class QueueFull(CowError):
+    """The queue is full."""
+
+    code, status = "queue-full", 503
+
+
+class NotReady(CowError):
+    """The server is not ready yet."""
+
+    code, status = "not-ready", 503
+
+
+class ShuttingDown(CowError):
+    """The server is stopping."""
+
+    code, status = "shutting-down", 503
+
+
 class Canceled(CowError):
     """The work was canceled."""
 
@@ -217,3 +303,11 @@ class InternalError(CowError):
     """The server met an error of its own."""
 
     code, status = "internal-error", 500
+
+
+def kinds(base: type[CowError] = CowError) -> dict[str, type[CowError]]:
+    """Every kind of error by its code."""
+    found = {base.code: base}
+    for kind in base.__subclasses__():
+        found |= kinds(kind)
+    return found | {InternalError.code: InternalError}

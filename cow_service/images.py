@@ -16,13 +16,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import Image
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from cow_service.errors import ImageTooLarge, ImageTypeUnsupported, ImageUnreadable, InternalError
+from cow_service.image_files import LeanFile, OverfullError, lean_jpeg, lean_png, orientation_of
 from cow_service.records import ImageInfo
 
 MAX_IMAGE_MEGAPIXELS_DEFAULT = 25.0  # millions of pixels
@@ -36,6 +37,9 @@ _OPENERS: dict[str, Callable[[io.BytesIO], ImageFile]] = {
     "JPEG": JpegImageFile,
     "WebP": WebPImageFile,
 }
+
+# A WebP file's blocks are handed out as they are, never decoded or joined.
+_LEAN: dict[str, Callable[[bytes], LeanFile]] = {"PNG": lean_png, "JPEG": lean_jpeg}
 
 # What pillow raises on damaged files. Its warnings are raised only where the host made warnings errors.
 _PILLOW_ERRORS = (
@@ -105,7 +109,8 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     """Decode one PNG, JPEG or WebP file, told by its content, to upright 8-bit RGB.
 
     The EXIF orientation is applied, transparency is laid on white, and 16 bits become 8. Colours are taken as sRGB: an
-    embedded ICC profile is ignored. The size is read from the header and refused before any pixel is decoded.
+    embedded ICC profile is ignored. The size is read from the header and refused before any pixel is decoded; text,
+    profiles and other blocks beside the pixels are not decoded at all.
 
     Raises `ImageTypeUnsupported` for other types and for animations, `ImageTooLarge` above `max_megapixels` (millions
     of pixels), and `ImageUnreadable` for damaged files and for sides under `MIN_SIDE` px.
@@ -113,6 +118,8 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     kind = _kind(data)
     try:
         pixels = _decode_as(kind, data, max_megapixels)
+    except OverfullError as error:
+        raise ImageUnreadable(f"The image is {error}: save it anew with another program and send that.") from error
     except _PILLOW_ERRORS as error:
         raise _damaged(kind, data) from error
     height, width = pixels.shape[:2]
@@ -203,12 +210,13 @@ def _decode_as(kind: str, data: bytes, max_megapixels: float) -> NDArray[np.uint
     if kind == "WebP":
         # Opening a WebP file allocates its whole canvas, so that its size has to be known before.
         _check_size(*_webp_size(data), max_megapixels)
-    with _OPENERS[kind](io.BytesIO(data)) as image:
+    lean = _LEAN[kind](data) if kind in _LEAN else LeanFile(data)
+    with _OPENERS[kind](io.BytesIO(lean.data)) as image:
         _check_size(image.width, image.height, max_megapixels)
         _check_still(kind, image)
         rgb = _to_rgb(image)
-        # Only now: in a PNG file the EXIF block may come after the pixels.
-        turn = _UPRIGHT.get(image.getexif().get(ExifTags.Base.Orientation, 1))
+        orientation = orientation_of(image.info.get("exif", b"")) if kind == "WebP" else lean.orientation
+    turn = _UPRIGHT.get(orientation)
     return np.array(rgb if turn is None else rgb.transpose(turn), dtype=np.uint8)
 
 

@@ -66,6 +66,10 @@ class Registry(Generic[Backend]):
                 self._made[name] = self._make(name, point)
             return self._made[name]
 
+    def is_made(self, name: str) -> bool:
+        """Whether the backend of that name is at hand."""
+        return name in self._made
+
     def close(self) -> None:
         """Closes the backends that were made and can be closed; each is made anew when it is asked for again."""
         with self._guard:

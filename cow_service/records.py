@@ -189,6 +189,13 @@ class Usage(Record):
             output_tokens=self.output_tokens + other.output_tokens,
         )
 
+    def __sub__(self, earlier: Usage) -> Usage:
+        return Usage(
+            calls=self.calls - earlier.calls,
+            input_tokens=self.input_tokens - earlier.input_tokens,
+            output_tokens=self.output_tokens - earlier.output_tokens,
+        )
+
 
 class GeneratorInfo(Record):
     """Who made the frames, and what would have to be the same to make them again."""
@@ -222,6 +229,9 @@ class Simulation(Record):
     reader: ReaderInfo
     usage: Usage = Usage()
     timings: dict[str, float] = Field(description="Seconds per stage.")
+    reused: tuple[str, ...] = Field(
+        default=(), description="Stages whose result was found again: an earlier request had asked for the same."
+    )
     warnings: tuple[str, ...] = ()
 
     @property
@@ -265,6 +275,9 @@ class Answer(Verdict):
     reader: ReaderInfo
     usage: Usage = Field(description="Of everything together: simulation, votes and baseline.")
     timings: dict[str, float] = Field(description="Seconds per stage.")
+    reused: tuple[str, ...] = Field(
+        default=(), description="Stages whose result was found again: an earlier request had asked for the same."
+    )
     warnings: tuple[str, ...] = ()
 
 
@@ -294,3 +307,47 @@ class Models(Record):
     readers: tuple[BackendInfo, ...]
     generators: tuple[BackendInfo, ...]
     mllms: tuple[str, ...] = Field(default=(), description="Manifests of multimodal LLMs: what `COW_MLLM` may name.")
+
+
+class ProblemField(BaseModel):
+    """One invalid field."""
+
+    pointer: str = Field(description="JSON Pointer (RFC 6901) into the request.")
+    detail: str
+
+
+class Problem(BaseModel):
+    """Why a request failed (RFC 9457)."""
+
+    type: str = Field(description="Stable URI; its last segment is the code.")
+    title: str = Field(description="The kind of error, the same for every occurrence.")
+    status: int
+    detail: str = Field(description="What was wrong, with the value, and what to do.")
+    errors: list[ProblemField] = Field(default_factory=list[ProblemField])
+
+
+JobKind = Literal["simulate", "answer"]
+JobStatus = Literal["queued", "running", "succeeded", "failed", "canceled"]
+TERMINAL: tuple[JobStatus, ...] = ("succeeded", "failed", "canceled")
+
+
+class Job(Record):
+    """A request that was accepted. Once its status is succeeded, failed or canceled it never changes again."""
+
+    id: str
+    kind: JobKind
+    status: JobStatus
+    stage: str | None = Field(default=None, description="The stage that it is in, or was in when it ended.")
+    progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
+    created_at: str = Field(description="RFC 3339, UTC.")
+    finished_at: str | None = Field(default=None, description="RFC 3339, UTC.")
+    generator: str = Field(description="Who makes its frames.")
+    result: Simulation | Answer | None = Field(default=None, description="Of a succeeded job, but not in lists.")
+    problem: Problem | None = Field(default=None, description="Of a failed job.")
+
+
+class JobPage(Record):
+    """Some jobs, newest first."""
+
+    jobs: tuple[Job, ...]
+    next: str | None = Field(default=None, description="`cursor` of the page after this one; null on the last.")

@@ -2,17 +2,50 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from cow_service.records import BBox, FramePolicy, MotionKind, Point, Record, Sha256, Vector
 
 MAX_FRAMES = 481
 MAX_TRACKS = 1024
 MAX_TRACK_POINTS = 262_144  # of all tracks together
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+MAX_NAME = 100  # characters of a backend's name
+MAX_OPTION_LEVELS = 8
+
+
+def _number(value: Any) -> Any:
+    """Numbers only: `true` is not 1 and "81" is not 81, but 81.0 is 81."""
+    if isinstance(value, bool | str):
+        raise ValueError(f"must be a number, without quotes, got {json.dumps(value)[:40]}")
+    return value
+
+
+def _writable(text: str) -> str:
+    """Text that every database and file can hold."""
+    if "\0" in text:
+        raise ValueError(f"holds the character NUL (U+0000) at position {text.index(chr(0))}; leave it out")
+    return text
+
+
+def _says_something(text: str) -> str:
+    """Text with at least one character to be seen: zero-width and control characters are none."""
+    if not any(character.isprintable() and not character.isspace() for character in text):
+        raise ValueError(f"is empty: it holds only {len(text)} blank or invisible characters")
+    return text
+
+
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # strict: no strings, no booleans
+Whole = Annotated[int, BeforeValidator(_number)]
+Flag = Annotated[bool, Field(strict=True)]
+Words = Annotated[str, AfterValidator(_writable), AfterValidator(_says_something)]
+Name = Annotated[str, Field(max_length=MAX_NAME)]
+# Of a long list the first wrong element is told: the others would fill the memory.
+Points = Annotated[tuple[tuple[Finite, Finite], ...], Field(fail_fast=True)]
+Flags = Annotated[tuple[Flag, ...], Field(fail_fast=True)]
 
 
 class ImageArtifact(Record):
@@ -33,7 +66,7 @@ ImageRef = Annotated[str, Field(description="data:image/png;base64,... (PNG, JPE
 class GroundingRequest(Record):
     """Skips stage 1: the object's box, or a point on it, from which the box is cut."""
 
-    object: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    object: Annotated[Words, Field(min_length=1, max_length=200)] | None = None
     bbox: tuple[Finite, Finite, Finite, Finite] | None = Field(default=None, description="[x0, y0, x1, y1], px.")
     point: tuple[Finite, Finite] | None = Field(default=None, description="[x, y], px.")
 
@@ -59,11 +92,11 @@ class MotionRequest(Record):
         default=None,
         description="[dx, dy] in the image, any length but zero; not needed for a fall or a static object.",
     )
-    depth: float = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
-    speed: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False)] | None = Field(
+    depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
+    speed: Annotated[Finite, Field(ge=0, le=100_000)] | None = Field(
         default=None, description="px/s; by default 0.26 image widths per second."
     )
-    metres_per_pixel: Annotated[float, Field(ge=1e-6, le=1000, allow_inf_nan=False)] | None = Field(
+    metres_per_pixel: Annotated[Finite, Field(ge=1e-6, le=1000)] | None = Field(
         default=None, description="By default the image is taken to be 3 m wide at the object."
     )
 
@@ -88,23 +121,23 @@ class MotionRequest(Record):
 class TrajectoryRequest(Record):
     """Skips stage 3: where the object's centre is, at `fps`. After the last point it stays there."""
 
-    points: tuple[tuple[Finite, Finite], ...] = Field(min_length=2, max_length=4096, description="[[x, y], ...], px.")
-    fps: float = Field(default=16, gt=0, le=240)
-    visible: tuple[bool, ...] | None = Field(
+    points: Points = Field(min_length=2, max_length=4096, description="[[x, y], ...], px.")
+    fps: Finite = Field(default=16, gt=0, le=240)
+    visible: Flags | None = Field(
         default=None, max_length=4096, description="Per point inside the image: the object can be seen there."
     )
-    tracks: tuple[tuple[tuple[Finite, Finite], ...], ...] | None = Field(
+    tracks: Annotated[tuple[Points, ...], Field(fail_fast=True)] | None = Field(
         default=None,
         min_length=1,
         max_length=MAX_TRACKS,
         description="Paths of several points of the object, each like `points`. By default points in its mask.",
     )
-    tracks_visible: tuple[tuple[bool, ...], ...] | None = Field(
+    tracks_visible: Annotated[tuple[Flags, ...], Field(fail_fast=True)] | None = Field(
         default=None,
         max_length=MAX_TRACKS,
         description="Per track and point: it can be seen. By default inside the image.",
     )
-    anchors: tuple[tuple[Finite, Finite], ...] | None = Field(
+    anchors: Points | None = Field(
         default=None,
         max_length=MAX_TRACKS,
         description="Points that stay where they are. By default spread over the image.",
@@ -152,11 +185,11 @@ class FramesRequest(Record):
         description="initial: frames 1, 3, 5, ...; uniform: evenly over the clip; "
         "events: at encounters and on the way.",
     )
-    count: int = Field(default=3, ge=1, le=64)
-    indices: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
+    count: Whole = Field(default=3, ge=1, le=64)
+    indices: tuple[Annotated[Whole, Field(ge=0)], ...] | None = Field(
         default=None, min_length=1, max_length=MAX_FRAMES, description="Exactly these frames; overrides the policy."
     )
-    max_side: Annotated[int, Field(ge=16, le=8192)] | None = Field(
+    max_side: Annotated[Whole, Field(ge=16, le=8192)] | None = Field(
         default=512, description="Longest side of the pictures, px; null for the clip's own size."
     )
 
@@ -165,8 +198,8 @@ class SimulateRequest(Record):
     """One image and one what-if question; everything else has a default."""
 
     image: ImageRef
-    question: str = Field(min_length=1, max_length=4000)
-    options: tuple[Annotated[str, Field(min_length=1, max_length=400)], ...] | None = Field(
+    question: Words = Field(min_length=1, max_length=4000)
+    options: tuple[Annotated[Words, Field(min_length=1, max_length=400)], ...] | None = Field(
         default=None,
         max_length=26,
         description="Answers to choose from, lettered A, B, C...; by default those that the question lists. "
@@ -175,41 +208,57 @@ class SimulateRequest(Record):
     grounding: GroundingRequest | None = None
     motion: MotionRequest | None = None
     trajectory: TrajectoryRequest | None = None
-    reader: str | None = Field(default=None, description="By default the server's.")
-    generator: str | None = Field(default=None, description="By default the server's.")
-    num_frames: int = Field(default=81, ge=2, le=MAX_FRAMES)
-    fps: float = Field(default=16, ge=1, le=60)
-    seed: int = Field(default=0, ge=0, le=2**32 - 1)
-    video: bool = Field(default=True, description="Whether to make the mp4 of the whole clip.")
+    reader: Name | None = Field(default=None, description="By default the server's.")
+    generator: Name | None = Field(default=None, description="By default the server's.")
+    num_frames: Whole = Field(default=81, ge=2, le=MAX_FRAMES)
+    fps: Finite = Field(default=16, ge=1, le=60)
+    seed: Whole = Field(default=0, ge=0, le=2**32 - 1)
+    video: Flag = Field(default=True, description="Whether to make the mp4 of the whole clip.")
     frames: FramesRequest = FramesRequest()
     generator_options: dict[str, Any] = Field(default_factory=dict, description="As the generator defines them.")
+    webhook: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=2048,
+        description="URL to call when the job has ended, signed as Standard Webhooks says; off unless the server has a "
+        "secret for it.",
+    )
 
     @field_validator("options")
     @classmethod
     def _differ(cls, options: tuple[str, ...] | None) -> tuple[str, ...] | None:
         plain = [" ".join(option.lower().split()) for option in options or ()]
-        if len(plain) == 1 or len(set(plain)) < len(plain) or "" in plain:
+        if len(plain) == 1 or len(set(plain)) < len(plain):
             raise ValueError(f"options must be two or more different texts, got {list(options or ())}")
         return options or None
 
-    @field_validator("question")
+    @field_validator("generator_options")
     @classmethod
-    def _says_something(cls, question: str) -> str:
-        if not question.strip():
-            raise ValueError("the question is empty")
-        return question
+    def _plain_values(cls, options: dict[str, Any]) -> dict[str, Any]:
+        level: list[Any] = [*options, *options.values()]
+        for _ in range(MAX_OPTION_LEVELS):
+            if any(isinstance(value, float) and not math.isfinite(value) for value in level):
+                raise ValueError("holds a number that is not finite")
+            for text in (value for value in level if isinstance(value, str)):
+                _writable(text)
+            below = [value for value in level if isinstance(value, dict | list)]
+            keys = [key for value in below if isinstance(value, dict) for key in value]
+            level = keys + [part for value in below for part in (value.values() if isinstance(value, dict) else value)]
+        if level:
+            raise ValueError(f"is nested deeper than {MAX_OPTION_LEVELS} levels")
+        return options
 
 
 class AnswerRequest(SimulateRequest):
     """As a simulation, and how to answer from it."""
 
-    video: bool = Field(default=False, description="Whether to make the mp4 of the whole clip, too.")
+    video: Flag = Field(default=False, description="Whether to make the mp4 of the whole clip, too.")
 
     imagine: Literal["always", "never"] = Field(
         default="always", description="never: answer from the image alone, without a simulation."
     )
-    baseline: bool = Field(default=False, description="Answer without frames, too, for comparison.")
-    votes: int = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer is taken.")
+    baseline: Flag = Field(default=False, description="Answer without frames, too, for comparison.")
+    votes: Whole = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer is taken.")
 
 
 Stage = Literal["grounding", "motion", "trajectory", "generation", "answering"]

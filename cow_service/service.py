@@ -7,34 +7,37 @@ import binascii
 import re
 from collections.abc import Generator as Steps
 from contextlib import contextmanager
-from threading import BoundedSemaphore
+from functools import partial
+from threading import BoundedSemaphore, Lock
 
 from cow_service.artifacts import ArtifactStore
+from cow_service.checkpoints import Checkpoints, keep_nothing
 from cow_service.errors import (
     CowError,
     FieldError,
     GeneratorUnavailable,
-    ImageUrlNotAllowed,
+    ImageTypeUnsupported,
     InvalidRequest,
     ReaderUnavailable,
 )
 from cow_service.generators.base import Generator
+from cow_service.image_urls import ImageUrls
 from cow_service.images import DecodedImage, decode
 from cow_service.manifests import find_manifest, load_manifests
-from cow_service.pipeline import Backends, Progress, answer, simulate
+from cow_service.metrics import Metrics
+from cow_service.pipeline import Backends, Progress, Stamp, StillWanted, answer, ignore_progress, simulate
 from cow_service.plugins import Registry
 from cow_service.readers.base import Reader
 from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulation
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, SimulateRequest
 from cow_service.settings import Settings, SettingsError
-from cow_service.weights import ready
+from cow_service.stages.options import check_frames, read_options
+from cow_service.weights import ready, weights_identity
 
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
+_OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)
 _DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)
-
-
-def _ignore(stage: str, done: float) -> None:
-    """Nobody listens."""
+TURN = 0.2  # seconds between looks at whether somebody who waits for a generator is still wanted
 
 
 class Service:
@@ -46,6 +49,10 @@ class Service:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self._slots = BoundedSemaphore(settings.concurrency)
+        self._turns: dict[str, BoundedSemaphore] = {}  # of generators that take only so many clips at the same time
+        self._guard = Lock()
+        self.metrics = Metrics()
+        self._image_urls = ImageUrls(settings)
         self.artifacts = ArtifactStore(settings.data_dir / "artifacts")
         self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable, settings)
         self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable, settings)
@@ -67,7 +74,12 @@ class Service:
         return self.artifacts.put(data, image.media_type), image
 
     def simulate(
-        self, request: SimulateRequest, progress: Progress = _ignore, image: DecodedImage | None = None
+        self,
+        request: SimulateRequest,
+        progress: Progress = ignore_progress,
+        image: DecodedImage | None = None,
+        checkpoints: Checkpoints = keep_nothing,
+        stamp: Stamp | None = None,
     ) -> Simulation:
         """One simulation, start to end; `image` is that of the request where it was decoded before.
 
@@ -75,16 +87,41 @@ class Service:
         """
         backends = self._backends(request)
         with self._slots:
-            return simulate(request, image or self._image(request.image), backends, progress)
+            image = image or self.image_of(request.image)[1]
+            return simulate(request, image, backends, progress, checkpoints, stamp)
 
-    def answer(self, request: AnswerRequest, progress: Progress = _ignore, image: DecodedImage | None = None) -> Answer:
+    def answer(
+        self,
+        request: AnswerRequest,
+        progress: Progress = ignore_progress,
+        image: DecodedImage | None = None,
+        checkpoints: Checkpoints = keep_nothing,
+        stamp: Stamp | None = None,
+    ) -> Answer:
         """One answer, start to end; `image` is that of the request where it was decoded before.
 
         Raises any `CowError` that leaves no answer.
         """
         backends = self._backends(request)
         with self._slots:
-            return answer(request, image or self._image(request.image), backends, progress)
+            image = image or self.image_of(request.image)[1]
+            return answer(request, image, backends, progress, checkpoints, stamp)
+
+    def precheck(self, request: SimulateRequest) -> str:
+        """Says at once what is wrong with a request as far as that costs nothing; returns its generator's name.
+
+        Raises `InvalidRequest` for backends that nobody has and for options that the generator does not take, and
+        `ReaderUnavailable` or `GeneratorUnavailable` where their modules are not installed.
+        """
+        reader = self._known("reader", request.reader or self.settings.reader, self.readers)
+        name = self._known("generator", request.generator or self.settings.generator, self.generators)
+        _check_modules(reader, ReaderUnavailable)
+        _check_modules(name, GeneratorUnavailable)
+        if self.generators.is_made(name) or name == self.settings.generator:
+            generator = self.generators.get(name)
+            read_options(generator, request.generator_options)
+            check_frames(generator, request)
+        return name
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
@@ -120,11 +157,34 @@ class Service:
             reader=lambda: self._reader(reader),
             generator=lambda: self._generator(generator),
             artifacts=self.artifacts,
-            elsewhere=self._elsewhere,
+            weights=self._weights(generator),
+            elsewhere=self.elsewhere,
+            rendering=partial(self._rendering, generator),
         )
 
+    def _weights(self, name: str) -> str:
+        manifest = find_manifest(name)
+        return "" if manifest is None else weights_identity(manifest, self.settings)
+
     @contextmanager
-    def _elsewhere(self) -> Steps[None]:
+    def _rendering(self, name: str, still_wanted: StillWanted) -> Steps[None]:
+        """Holds a generator's turn. While waiting for it, and while it works, the slot is left to others."""
+        at_once = self.settings.generator_concurrency.get(name, self._generator(name).concurrency)
+        if at_once is None:
+            yield
+            return
+        with self._guard:
+            turns = self._turns.setdefault(name, BoundedSemaphore(at_once))
+        with self.elsewhere():
+            while not turns.acquire(timeout=TURN):
+                still_wanted()
+            try:
+                yield
+            finally:
+                turns.release()
+
+    @contextmanager
+    def elsewhere(self) -> Steps[None]:
         """Leaves the slot to others while somebody else computes for us."""
         self._slots.release()
         try:
@@ -140,12 +200,19 @@ class Service:
         _check_modules(name, GeneratorUnavailable)
         return self.generators.get(name)
 
-    def _image(self, ref: ImageRef) -> DecodedImage:
-        if isinstance(ref, ImageUrl) or (isinstance(ref, str) and ref[:8].lower().startswith(("http://", "https://"))):
-            raise ImageUrlNotAllowed("This server fetches no images. Send the image as a data URL or as a file part.")
+    def image_of(self, ref: ImageRef) -> tuple[str, DecodedImage]:
+        """The image that a request means: its SHA-256 as kept here, and its pixels.
+
+        Raises `ArtifactNotFound`, `ImageUrlNotAllowed`, and what `keep_image` raises.
+        """
+        if isinstance(ref, ImageUrl) or (isinstance(ref, str) and _OTHER_URL.match(ref[:256])):
+            artifact, image = self.keep_image(self._image_urls.fetch(ref.url if isinstance(ref, ImageUrl) else ref))
+            return artifact.sha256, image
         if isinstance(ref, ImageArtifact):
-            return decode(self.artifacts.read(ref.artifact), max_megapixels=self.settings.max_image_megapixels)
-        return self.keep_image(decode_data_url(ref))[1]
+            data = self.artifacts.read(ref.artifact)
+            return ref.artifact, decode(data, max_megapixels=self.settings.max_image_megapixels)
+        artifact, image = self.keep_image(decode_data_url(ref))
+        return artifact.sha256, image
 
     def _known(self, door: str, name: str, registry: Registry[Reader] | Registry[Generator]) -> str:
         if name not in registry.names():
@@ -186,14 +253,26 @@ def _check_modules(name: str, unavailable: type[CowError]) -> None:
 
 
 def decode_data_url(url: str) -> bytes:
-    """The bytes of a base64 data URL. Raises `InvalidRequest` pointing at `/image`."""
+    """The bytes of a base64 data URL; blanks and line ends in it are skipped.
+
+    Raises `InvalidRequest` pointing at `/image`, and `ImageTypeUnsupported` where it declares something else.
+    """
     head = _DATA_URL.match(url[:256])
     if head is None or head["base64"] is None:
         raise _bad_image("`image` must be a data URL with base64: data:image/png;base64,...")
+    declared = head["type"].lower()
+    if not declared.startswith("image/") and declared not in ("", "application/octet-stream"):
+        # Of the image types, what the bytes are counts, and not what they are declared to be.
+        raise ImageTypeUnsupported(
+            f"The data URL of `image` declares {declared[:80]}: send image/png, image/jpeg or image/webp."
+        )
     try:
-        return base64.b64decode(url[head.end() :], validate=True)
+        # Tools that write base64 break it into lines.
+        return base64.b64decode("".join(url[head.end() :].split()), validate=True)
     except (binascii.Error, ValueError) as error:
-        raise _bad_image(f"The base64 of `image` cannot be decoded: {error}.") from error
+        raise _bad_image(
+            f"The base64 of `image` cannot be decoded ({error}): encode the file's bytes in the standard alphabet."
+        ) from error
 
 
 def _bad_image(detail: str) -> CowError:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from platformdirs import user_data_path
-from pydantic import Field, SecretStr, ValidationError
+from pydantic import Field, SecretStr, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from pydantic_settings import SettingsError as UnreadableSetting
+
+KEY_NAME = r"^[A-Za-z0-9._-]{1,64}$"
+KEY_HASH = r"^sha256:[0-9a-f]{64}$"
+ORIGIN = r"^(\*|[a-z][a-z0-9+.-]*://[^/\s?#@A-Z]+)$"  # as browsers write it: lower case, no path
 
 
 class SettingsError(Exception):
@@ -56,6 +60,14 @@ class Settings(BaseSettings):
     max_body_mb: float = Field(
         default=32, gt=0, le=4096, allow_inf_nan=False, description="Largest request body taken, in MB (10^6 bytes)."
     )
+    allow_image_urls: tuple[str, ...] = Field(
+        default=(),
+        description="Hosts from which images given by URL are fetched, as JSON: names, name:port, *.name for all below "
+        "it, * for every public host; none by default.",
+    )
+    body_timeout: float = Field(
+        default=30, gt=0, le=3600, allow_inf_nan=False, description="Longest wait for a whole request body, seconds."
+    )
     models_dir: Path | None = Field(
         default=None, description="Folder for weights; by default the folder `models` of the data folder."
     )
@@ -71,6 +83,71 @@ class Settings(BaseSettings):
         description="Where models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU.",
     )
     concurrency: int = Field(default=2, ge=1, le=256, description="Requests computed at the same time; others wait.")
+    generator_concurrency: dict[str, Annotated[int, Field(ge=1, le=256)]] = Field(
+        default_factory=dict,
+        description="Clips that a generator makes at the same time, by its name, as JSON; by default 1 of a video "
+        "model, and of others as many as COW_CONCURRENCY.",
+    )
+
+    api_keys: dict[Annotated[str, Field(pattern=KEY_NAME)], Annotated[str, Field(pattern=KEY_HASH)]] = Field(
+        default_factory=dict,
+        description="Who may call, as JSON: name to the hash of its key, as `cow keys new NAME` prints them; by "
+        "default whoever reaches the server.",
+    )
+    rate_limit: int | None = Field(
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description="Requests a minute with one key, or from one address where there are no keys.",
+    )
+    cors_origins: tuple[Annotated[str, Field(pattern=ORIGIN)], ...] = Field(
+        default=(),
+        description="Origins of web pages that may use the server, as JSON, such as https://app.example.org; * for "
+        "all of them where keys are set.",
+    )
+    log_format: Literal["text", "json"] = Field(default="text", description="How the server's logs are written.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="The least important messages that the server logs."
+    )
+
+    @field_validator("api_keys")
+    @classmethod
+    def _different(cls, hashes: dict[str, str]) -> dict[str, str]:
+        if len(set(hashes.values())) < len(hashes):
+            raise ValueError("two names have the same key")
+        return hashes
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _not_everybody(cls, origins: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if "*" in origins and not info.data.get("api_keys"):
+            raise ValueError("* would let every web page use a server without keys; set COW_API_KEYS")
+        return origins
+
+    database_url: SecretStr | None = Field(
+        default=None,
+        description="Job database: sqlite:///FILE or postgresql://USER:PASSWORD@HOST/NAME; by default a file in the "
+        "data folder.",
+    )
+    queue_limit: int = Field(
+        default=1000, ge=1, le=1_000_000, description="Jobs that wait or run; more are refused with queue-full."
+    )
+    job_retention_hours: float = Field(
+        default=168, gt=0, le=87_600, allow_inf_nan=False, description="Age at which finished jobs are removed, hours."
+    )
+    shutdown_grace: float = Field(
+        default=10,
+        ge=0,
+        le=3600,
+        allow_inf_nan=False,
+        description="Seconds that running jobs are given when the server stops; what is not done then goes on at the "
+        "next start.",
+    )
+    webhook_secret: SecretStr | None = Field(
+        default=None,
+        pattern=r"^whsec_[A-Za-z0-9+/]+={0,2}$",
+        description="Secret that signs webhooks (Standard Webhooks, whsec_...); without it none are called.",
+    )
 
     @property
     def weights_dir(self) -> Path:
@@ -94,6 +171,12 @@ def _told(item: Any) -> str:
     name = str(item["loc"][0])
     if name == "mllm_base_url":
         return "COW_MLLM_BASE_URL must begin with http:// or https://"
+    if name == "api_keys":
+        return (
+            'COW_API_KEYS must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes '
+            '("sha256:" and 64 hexadecimal digits), a different one for each; it takes no plain keys. '
+            "`cow keys new NAME` makes both"
+        )
     return f"COW_{name.upper()}={item['input']!r}: {item['msg']}"
 
 

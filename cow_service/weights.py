@@ -22,6 +22,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from cow_service.errors import WeightsUnavailable
 from cow_service.manifests import Manifest, Source
 from cow_service.records import Record
+from cow_service.settings import Settings
 
 LOCK_NAME = "cow.lock.json"
 
@@ -129,6 +130,19 @@ def ready(manifest: Manifest, weights_dir: Path, without: Container[str] = ()) -
         return not any(check(source, weights_dir, digests=False) for source in sources)
     except WeightsUnavailable:
         return False
+
+
+def weights_identity(manifest: Manifest, settings: Settings) -> str:
+    """What tells these weights from others: revisions of what was pulled, names, sizes and times of one's own files."""
+    own = settings.checkpoints.get(manifest.name)
+    told: list[object] = []
+    if own is not None:
+        files = [own] if own.is_file() else sorted(path for path in own.rglob("*") if path.is_file())
+        told += [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    for part, source in sorted(manifest.sources.items()):
+        lock = read_lock(settings.weights_dir, source.repository)
+        told.append((part, None if lock is None else lock.revision))
+    return hashlib.sha256(repr(told).encode()).hexdigest()
 
 
 def read_lock(weights_dir: Path, repository: str) -> Lock | None:

@@ -11,10 +11,10 @@ import httpx
 import pytest
 import yaml
 from conftest import ROOT
+from engines import app_for
 from fastapi import FastAPI
 
 from cow_service import errors
-from cow_service.api.app import create_app
 from cow_service.api.problems import problem_of
 from cow_service.errors import CowError, FieldError
 from cow_service.plugins import Registry
@@ -38,12 +38,12 @@ def get(app: FastAPI, path: str) -> httpx.Response:
 
 @pytest.fixture
 def document(service: Service) -> dict:
-    return create_app(service).openapi()
+    return app_for(service).openapi()
 
 
 def test_openapi_yaml_is_what_the_app_serves(service: Service, document: dict) -> None:
     assert yaml.safe_load((ROOT / "openapi.yaml").read_text()) == document, "run `make openapi`"
-    assert get(create_app(service), "/openapi.json").json() == document
+    assert get(app_for(service), "/openapi.json").json() == document
 
 
 def test_every_reference_leads_somewhere(document: dict) -> None:
@@ -107,7 +107,7 @@ def test_an_unforeseen_error_is_a_problem_without_a_trace(service: Service, monk
         raise RuntimeError("secret /home/path")
 
     monkeypatch.setattr(service, "check", fail)
-    response = get(create_app(service), "/readyz")
+    response = get(app_for(service), "/readyz")
     assert response.status_code == 500
     assert response.headers["content-type"] == "application/problem+json"
     assert "secret" not in response.text
@@ -115,7 +115,7 @@ def test_an_unforeseen_error_is_a_problem_without_a_trace(service: Service, monk
 
 def test_an_unready_service_says_why(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    response = get(create_app(Service(Settings(data_dir=tmp_path / "file"))), "/readyz")
+    response = get(app_for(Service(Settings(data_dir=tmp_path / "file"))), "/readyz")
     assert response.status_code == 503
     assert response.json()["type"].endswith("storage-unavailable")
     assert response.headers["retry-after"]

@@ -7,6 +7,7 @@ import base64
 import pytest
 import schemathesis
 from drawn import ball, block, floor, png_bytes
+from engines import app_for
 from hypothesis import HealthCheck, given, settings
 from schemathesis import GenerationMode
 from schemathesis.checks import not_a_server_error
@@ -16,7 +17,6 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from cow_service.api.app import create_app
 from cow_service.service import Service
 from cow_service.settings import Settings
 
@@ -39,7 +39,7 @@ CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance,
 @pytest.fixture(scope="module")
 def contract(tmp_path_factory: pytest.TempPathFactory):
     service = Service(Settings(data_dir=tmp_path_factory.mktemp("data")))
-    return schemathesis.openapi.from_asgi("/openapi.json", create_app(service))
+    return schemathesis.openapi.from_asgi("/openapi.json", app_for(service))
 
 
 @pytest.mark.parametrize(

@@ -22,11 +22,11 @@ import mllm_server as say
 import pytest
 from conftest import ROOT, example
 from drawn import DrawnArrow, angle_between, ball, block, floor
+from engines import FRESH, app_for
 from hypothesis import given
 from hypothesis import strategies as st
 from mllm_server import MllmServer
 
-from cow_service.api.app import create_app
 from cow_service.errors import ReaderUnavailable
 from cow_service.images import encode_png
 from cow_service.manifests import load_families
@@ -97,9 +97,11 @@ def data_url(image: bytes) -> str:
 def post(service: Service, path: str, **body: Any) -> dict[str, Any]:
     """What the application answers; a problem as its code alone, with its status and detail."""
 
+    app = app_for(service)
+
     async def call() -> httpx.Response:
-        transport = httpx.ASGITransport(create_app(service))
-        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60, headers=FRESH) as client:
             return await client.post(path, json=QUICK | body)
 
     response = asyncio.run(call())
@@ -325,9 +327,11 @@ def test_a_caller_who_leaves_is_not_waited_for(mllm: MllmServer, make) -> None:
     service = make(mllm_timeout=30)
     service.check()  # its own thread is there from now on
 
+    app = app_for(service)
+
     async def leave() -> None:
-        transport = httpx.ASGITransport(create_app(service))
-        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60, headers=FRESH) as client:
             body = QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}
             task = asyncio.create_task(client.post("/answer", json=body))
             await asyncio.sleep(0.5)
@@ -521,9 +525,11 @@ def test_who_waits_for_the_model_lets_others_compute(mllm: MllmServer, make) -> 
     mllm.say(say.slow(0.5, '{"answer": "B"}'))
     service = make(concurrency=1)
 
+    app = app_for(service)
+
     async def calls() -> list[httpx.Response]:
-        transport = httpx.ASGITransport(create_app(service))
-        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60, headers=FRESH) as client:
             body = QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}
             return await asyncio.gather(*(client.post("/answer", json=body) for _ in range(6)))
 

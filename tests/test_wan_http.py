@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 from conftest import example
+from engines import app_for
 from test_cli import cow
 
-from cow_service.api.app import create_app
 from cow_service.generators.wan.generator import WanGenerator
 from cow_service.records import Simulation
 from cow_service.service import Service
@@ -68,6 +68,8 @@ def test_a_caller_who_goes_away_ends_the_work(tmp_path: Path) -> None:
     passes: list[int] = []
     sent = json.dumps(body(video=False, generator_options={"steps": 100})).encode()
 
+    app = app_for(service)
+
     async def call() -> None:
         loop, gone = asyncio.get_running_loop(), asyncio.Event()
 
@@ -92,7 +94,7 @@ def test_a_caller_who_goes_away_ends_the_work(tmp_path: Path) -> None:
             "raw_path": b"/simulate", "query_string": b"", "root_path": "", "scheme": "http", "server": ("test", 80),
             "headers": [(b"content-type", b"application/json")],
         }  # fmt: skip
-        await create_app(service)(scope, receive, send)
+        await app(scope, receive, send)
 
     asyncio.run(call())
     assert 1 <= len(passes) < 100  # of 200

@@ -6,33 +6,46 @@ from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from typing import Any
 
-from anyio import CapacityLimiter, to_thread
+from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from cow_service import __version__
+from cow_service import __version__, tracing
 from cow_service.api.answer import answer_routes
 from cow_service.api.artifacts import artifact_routes
+from cow_service.api.events import event_routes
 from cow_service.api.health import health_routes
+from cow_service.api.jobs import job_routes
+from cow_service.api.layers import LayeredApp, document_layers, install_layers
 from cow_service.api.limits import BodyLimit
-from cow_service.api.problems import Problem, install_problem_handlers
+from cow_service.api.metrics import metrics_routes
+from cow_service.api.problems import install_problem_handlers
 from cow_service.api.simulate import simulate_routes
+from cow_service.api.submitting import Submitting
+from cow_service.jobs.engine import Engine
+from cow_service.readiness import Readiness
+from cow_service.records import Problem
 from cow_service.requests import AnswerRequest, SimulateRequest
-from cow_service.service import Service
 
 SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out."
 DROPPED = ("HTTPValidationError", "ValidationError")  # the framework's error shapes, which no operation returns
 
 
-def create_app(service: Service) -> FastAPI:
-    """The application for a service. It holds no state of its own."""
+def create_app(engine: Engine, readiness: Readiness | None = None) -> FastAPI:
+    """The application for an engine that runs, or that the app starts when it begins. It holds no state of its own."""
+    service = engine.service
+    readiness = readiness or Readiness(service)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
+        if not engine.runs:
+            await to_thread.run_sync(engine.start)
         yield
+        await to_thread.run_sync(engine.close)
         await to_thread.run_sync(service.close)
+        await to_thread.run_sync(tracing.stop)
 
-    app = FastAPI(
+    app = LayeredApp(
         title="COW",
         version=__version__,
         summary=SUMMARY,
@@ -41,12 +54,21 @@ def create_app(service: Service) -> FastAPI:
         redirect_slashes=False,
         lifespan=lifespan,
     )
-    app.add_middleware(BodyLimit, megabytes=service.settings.max_body_mb)
+    app.add_middleware(
+        BodyLimit, megabytes=service.settings.max_body_mb, seconds=service.settings.body_timeout
+    )
     install_problem_handlers(app)
-    # More threads than may compute: those that wait for a multimodal LLM only wait.
-    limiter = CapacityLimiter(service.settings.concurrency + service.settings.mllm_concurrency)
-    working = (simulate_routes(service, limiter), answer_routes(service, limiter))
-    for router in (*working, artifact_routes(service), health_routes(service)):
+    install_layers(app, service.settings, service.metrics)
+    submitting = Submitting(engine)
+    for router in (
+        simulate_routes(submitting),
+        answer_routes(submitting),
+        job_routes(engine),
+        event_routes(engine),
+        artifact_routes(engine),
+        health_routes(engine, readiness),
+        metrics_routes(service.metrics),
+    ):
         app.include_router(router)
     app.openapi = lambda: _openapi(app)
     return app
@@ -65,6 +87,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             for operation in operations.values():
                 if "HTTPValidationError" in str(operation["responses"].get("422")):
                     del operation["responses"]["422"]
+        document_layers(document)
         for name in DROPPED:
             schemas.pop(name, None)
         document["components"]["schemas"] = dict(sorted(schemas.items()))

@@ -11,13 +11,17 @@ from starlette.requests import Request
 from cow_service import errors
 from cow_service.api.problems import documented
 from cow_service.api.ranges import is_honoured
-from cow_service.service import Service
+from cow_service.api.submitting import owner_of
+from cow_service.jobs.engine import Engine
 
 FOREVER = "public, max-age=31536000, immutable"
 
 
-def artifact_routes(service: Service) -> APIRouter:
-    """The operation, bound to a service. Bytes never change under their digest, so caches may keep them."""
+def artifact_routes(engine: Engine) -> APIRouter:
+    """The operation, bound to an engine, which knows whose they are.
+
+    Bytes never change under their digest, so caches may keep them.
+    """
     router = APIRouter()
 
     @router.head("/artifacts/{sha256}", include_in_schema=False)
@@ -41,9 +45,15 @@ def artifact_routes(service: Service) -> APIRouter:
         sha256: Annotated[str, Path(description="64 lower-case hexadecimal digits.")], request: Request
     ) -> Response:
         """Images, frames and videos that the service keeps. The ETag is the digest."""
-        stored = service.artifacts.get(sha256)
+        owner = owner_of(request)
+        engine.may_read(sha256, owner)
+        stored = engine.service.artifacts.get(sha256)
         etag = f'"{sha256}"'
-        headers = {"ETag": etag, "Cache-Control": FOREVER, "X-Content-Type-Options": "nosniff"}
+        headers = {
+            "ETag": etag,
+            "Cache-Control": FOREVER if owner is None else FOREVER.replace("public", "private"),
+            "X-Content-Type-Options": "nosniff",
+        }
         known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
         if etag in known or "*" in known:
             return Response(status_code=304, headers=headers)

@@ -9,8 +9,9 @@ from pydantic import BaseModel
 
 from cow_service import errors
 from cow_service.api.problems import documented
+from cow_service.jobs.engine import Engine
+from cow_service.readiness import Readiness
 from cow_service.records import Models
-from cow_service.service import Service
 
 
 class Health(BaseModel):
@@ -19,8 +20,8 @@ class Health(BaseModel):
     status: Literal["ok"] = "ok"
 
 
-def health_routes(service: Service) -> APIRouter:
-    """Probes and the list of backends, bound to a service."""
+def health_routes(engine: Engine, readiness: Readiness) -> APIRouter:
+    """Probes and the list of backends, bound to an engine and what it needs."""
     router = APIRouter()
 
     @router.get("/livez", operation_id="livez", tags=["health"], summary="The process answers")
@@ -33,16 +34,25 @@ def health_routes(service: Service) -> APIRouter:
         operation_id="readyz",
         tags=["health"],
         summary="The default request can be served",
-        responses=documented(errors.StorageUnavailable, errors.ReaderUnavailable, errors.GeneratorUnavailable),
+        responses=documented(
+            errors.NotReady,
+            errors.ShuttingDown,
+            errors.StorageUnavailable,
+            errors.ReaderUnavailable,
+            errors.GeneratorUnavailable,
+        ),
     )
     def readyz() -> Health:
-        """Checks that the data folder can be written and that the default reader and generator load."""
-        service.check()
+        """Checks that the database answers, that the data folder can be written and has room, and that the default
+        reader and generator are loaded.
+        """
+        readiness.check()
+        engine.check()
         return Health()
 
     @router.get("/models", operation_id="models", tags=["models"], summary="Readers and generators")
     def models() -> Models:
         """What each is, what it needs, and whether it is ready."""
-        return service.models()
+        return engine.service.models()
 
     return router

@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-import json
+from collections import Counter
+from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from fastapi import Request
 from pydantic import ValidationError
+from python_multipart.multipart import parse_options_header
 from starlette.datastructures import FormData, UploadFile
-from starlette.exceptions import HTTPException
+from starlette.formparsers import MultiPartException, MultiPartParser
 
+from cow_service.api.json_body import read_object
 from cow_service.api.problems import invalid
-from cow_service.errors import BodyTypeUnsupported, FieldError, InvalidRequest, MalformedBody
+from cow_service.errors import (
+    BodyTypeUnsupported,
+    FieldError,
+    InvalidRequest,
+    MalformedBody,
+    pointer_part,
+    shortened,
+)
 from cow_service.images import DecodedImage
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
+
+FORM_FIELDS = ("image", "question", "request")
+SHOWN_CHARACTERS = 80  # of what the caller sent
 
 Body = TypeVar("Body", bound=SimulateRequest)
 
@@ -52,9 +65,18 @@ class Posted:
 
 
 async def receive(request: Request) -> Posted:
-    """Takes the body in. Raises `BodyTypeUnsupported`, `BodyTooLarge`, and for a form also `MalformedBody`."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    """Takes the body in.
+
+    Raises `BodyTypeUnsupported`, `BodyTooLarge`, `BodyTooSlow`, and for a form also `MalformedBody`.
+    """
+    raw_type, parameters = parse_options_header(request.headers.get("content-type", ""))
+    media_type = raw_type.decode("latin-1")[:SHOWN_CHARACTERS]
     if media_type == "multipart/form-data":
+        charset = parameters.get(b"charset", b"utf-8").decode("latin-1").lower()
+        if charset not in ("utf-8", "utf8", "us-ascii", "ascii"):
+            raise BodyTypeUnsupported(
+                f"The form has the character set '{charset[:SHOWN_CHARACTERS]}': send UTF-8, and name no other."
+            )
         return await _receive_form(request)
     if media_type == "application/json" or media_type.endswith("+json"):
         return Posted(json=await request.body())
@@ -67,8 +89,8 @@ def check(posted: Posted, model: type[Body], service: Service) -> tuple[Body, De
     """The checked request, and the image of a form, kept and decoded. This computes: not for the event loop."""
     try:
         if posted.json is not None:
-            return model.model_validate_json(posted.json), None
-        given = _object(posted.request)
+            return model.model_validate(read_object(posted.json, "The body")), None
+        given = read_object(posted.request, "The form field `request`")
         twice = [name for name in ("image", "question") if name in given and getattr(posted, name) is not None]
         if twice:
             detail = "stands in the form and in its field `request`; give it once"
@@ -87,18 +109,39 @@ def check(posted: Posted, model: type[Body], service: Service) -> tuple[Body, De
         raise invalid(error) from error
 
 
+class _FormParser(MultiPartParser):
+    """Knows whether the form's last boundary came: what is cut off before it must not count as left out."""
+
+    ended = False
+
+    def on_end(self) -> None:
+        self.ended = True
+
+
 async def _receive_form(request: Request) -> Posted:
     try:
-        form = await request.form(max_files=3, max_fields=8)
-    except (HTTPException, ValueError) as error:  # starlette turns its own parser errors into HTTP ones
-        told = error.detail if isinstance(error, HTTPException) else error
+        async with aclosing(request.stream()) as stream:
+            parser = _FormParser(request.headers, stream, max_files=3, max_fields=8)
+            form = await parser.parse()
+    except (MultiPartException, ValueError) as error:
+        told = error.message if isinstance(error, MultiPartException) else error
         raise MalformedBody(f"The multipart body could not be read: {told} Send an `image` file part.") from error
     try:
-        unknown = sorted(set(form.keys()) - {"image", "question", "request"})
+        if not parser.ended:
+            raise MalformedBody("The multipart body ends before its last boundary: send it whole.")
+        unknown = sorted(set(form.keys()) - set(FORM_FIELDS))
         if unknown:
+            named = ", ".join(shortened(name, SHOWN_CHARACTERS) for name in unknown)
             raise InvalidRequest(
-                f"The form has fields that nothing reads: {', '.join(unknown)}. Put them into `request` as JSON.",
-                errors=tuple(FieldError(f"/{name}", "not a form field") for name in unknown),
+                f"The form has fields that nothing reads: {named}. Put them into `request` as JSON.",
+                errors=tuple(FieldError(f"/{pointer_part(name)}", "not a form field") for name in unknown),
+            )
+        twice = [name for name, times in Counter(name for name, _ in form.multi_items()).items() if times > 1]
+        if twice:
+            detail = "stands in the form more than once; give it once"
+            raise InvalidRequest(
+                f"{' and '.join(f'`{name}`' for name in twice)} {detail}.",
+                errors=tuple(FieldError(f"/{name}", detail) for name in twice),
             )
         image = form.get("image")
         if image is not None and not isinstance(image, UploadFile):
@@ -118,15 +161,4 @@ def _text(form: FormData, name: str) -> str | None:
     if isinstance(value, UploadFile):
         detail = f"`{name}` must be a plain field, not a file."
         raise InvalidRequest(detail, errors=(FieldError(f"/{name}", detail),))
-    return value
-
-
-def _object(text: str) -> dict[str, Any]:
-    """The JSON object of the form field `request`."""
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise MalformedBody(f"The form field `request` is not JSON: {error}.") from error
-    if not isinstance(value, dict):
-        raise MalformedBody(f"The form field `request` must be a JSON object, got {type(value).__name__}.")
     return value

@@ -1,44 +1,83 @@
-"""Refuses a body that is larger than the server takes, as soon as that is known, also without a Content-Length."""
+"""Refuses a body that is too large, as soon as that is known, also without a Content-Length, or too slow."""
 
 from __future__ import annotations
+
+import asyncio
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cow_service.api.problems import respond
-from cow_service.errors import BodyTooLarge
+from cow_service.errors import BodyTooLarge, BodyTooSlow, CowError, MalformedBody
 
 
 class BodyLimit:
-    """ASGI middleware: counts the body's bytes as they come."""
+    """ASGI middleware: counts the body's bytes, and the seconds from the request's headers to the body's end.
 
-    def __init__(self, app: ASGIApp, megabytes: float) -> None:
+    How long the headers take is the HTTP server's matter, uvicorn's: the app hears of a request once they are in.
+    """
+
+    def __init__(self, app: ASGIApp, megabytes: float, seconds: float) -> None:
         self.app = app
         self.megabytes = megabytes
+        self.seconds = seconds
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on; past the limit the app gets `BodyTooLarge` where it reads the body."""
+        """Passes the request on; past a limit the app gets `BodyTooLarge` or `BodyTooSlow` where it reads the body."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
         limit = int(self.megabytes * 1_000_000)
-        announced = next((value for name, value in scope["headers"] if name == b"content-length"), b"")
-        if announced.isdigit() and int(announced) > limit:
-            await respond(self._error())(scope, receive, send)
+        if (refusal := self._refused(scope, limit)) is not None:
+            await respond(refusal)(scope, receive, send)
             return
+        deadline = asyncio.get_running_loop().time() + self.seconds
         seen = 0
+        waiting = True  # for more of the body, which the app still wants
 
         async def counted() -> Message:
-            nonlocal seen
-            message = await receive()
+            nonlocal seen, waiting
+            if not waiting:
+                return await receive()
+            try:
+                async with asyncio.timeout_at(deadline):
+                    message = await receive()
+            except TimeoutError as error:
+                raise self._too_slow(seen) from error
+            waiting = bool(message.get("more_body", False))
             seen += len(message.get("body", b""))
             if seen > limit:
-                raise self._error()
+                raise self._too_large()
             return message
 
-        await self.app(scope, counted, send)
+        async def answered(message: Message) -> None:
+            nonlocal waiting
+            waiting = False  # an app that answers without the whole body must not be disturbed by the rest of it
+            await send(message)
 
-    def _error(self) -> BodyTooLarge:
+        await self.app(scope, counted, answered)
+
+    def _refused(self, scope: Scope, limit: int) -> CowError | None:
+        """What the headers alone show to be wrong."""
+        headers = dict(scope["headers"])
+        announced = headers.get(b"content-length", b"")
+        if announced and b"transfer-encoding" in headers:
+            # Servers and proxies differ on which of the two counts (RFC 9112, section 6.1): the next request could be
+            # smuggled in this one's body.
+            return MalformedBody(
+                "The request has both Content-Length and Transfer-Encoding: send one of them.",
+                headers={"Connection": "close"},
+            )
+        return self._too_large() if announced.isdigit() and int(announced) > limit else None
+
+    def _too_large(self) -> BodyTooLarge:
         return BodyTooLarge(
             f"The body is larger than {self.megabytes:g} MB. Send a smaller image, or raise COW_MAX_BODY_MB on the "
             "server."
+        )
+
+    def _too_slow(self, seen: int) -> BodyTooSlow:
+        return BodyTooSlow(
+            f"Of the body {seen} bytes came in {self.seconds:g} s, and not its end. Send it at once, or raise "
+            "COW_BODY_TIMEOUT on the server.",
+            headers={"Connection": "close"},
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from http import HTTPStatus
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
@@ -22,37 +23,14 @@ from cow_service.errors import (
     MethodNotAllowed,
     NotFound,
     pointer_part,
+    shortened,
 )
+from cow_service.problems import problem_of
 
-TYPE_PREFIX = "urn:cow:problem:"  # a name, not an address: README.md explains every code
 MEDIA_TYPE = "application/problem+json"
+SHOWN_CHARACTERS = 80  # of what the caller sent
 
 log = logging.getLogger("cow_service")
-
-
-class ProblemField(BaseModel):
-    """One invalid field."""
-
-    pointer: str = Field(description="JSON Pointer (RFC 6901) into the request.")
-    detail: str
-
-
-class Problem(BaseModel):
-    """Why a request failed (RFC 9457)."""
-
-    type: str = Field(description="Stable URI; its last segment is the code.")
-    title: str = Field(description="The kind of error, the same for every occurrence.")
-    status: int
-    detail: str = Field(description="What was wrong, with the value, and what to do.")
-    errors: list[ProblemField] = Field(default_factory=list[ProblemField])
-
-
-def problem_of(error: CowError) -> Problem:
-    """The problem that a `CowError` is on the wire."""
-    fields = [ProblemField(pointer=field.pointer, detail=field.detail) for field in error.errors]
-    return Problem(
-        type=TYPE_PREFIX + error.code, title=error.title, status=error.status, detail=error.detail, errors=fields
-    )
 
 
 def invalid(error: ValidationError | RequestValidationError) -> InvalidRequest:
@@ -62,7 +40,7 @@ def invalid(error: ValidationError | RequestValidationError) -> InvalidRequest:
         return MalformedBody(f"The body is no JSON object: {error.errors()[0]['msg']}.")
     for item in error.errors():
         pointer = "".join("/" + pointer_part(part) for part in _location(item["loc"]))
-        fields.setdefault(pointer, FieldError(pointer, str(item["msg"]).removeprefix("Value error, ")))
+        fields.setdefault(pointer, FieldError(pointer, _told(str(item["msg"]), item["input"])))
     told = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in list(fields.values())[:5])
     return InvalidRequest(f"{told}. See /openapi.json for what the request may hold.", errors=tuple(fields.values()))
 
@@ -120,12 +98,27 @@ def documented(*errors: type[CowError]) -> dict[int | str, dict[str, Any]]:
 
 def _translated(error: HTTPException, request: Request) -> CowError:
     if error.status_code == HTTPStatus.NOT_FOUND:
-        return NotFound(f"Nothing is served at {request.url.path}. GET /openapi.json lists what is.")
+        return NotFound(f"Nothing is served at {_path(request)}. GET /openapi.json lists what is.")
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-        return MethodNotAllowed(f"{request.url.path} does not take {request.method}.")
+        return MethodNotAllowed(f"{_path(request)} does not take {request.method}.")
     if HTTPStatus.BAD_REQUEST <= error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
         return MalformedBody(f"{error.detail}.")
     return InternalError(f"{error.detail}.")
+
+
+def _path(request: Request) -> str:
+    return shortened(request.url.path, SHOWN_CHARACTERS)
+
+
+def _told(message: str, value: Any) -> str:
+    """A validator's message with the value; the house's own messages name it where it helps."""
+    ours = message.removeprefix("Value error, ")
+    if ours != message or not isinstance(value, str | int | float):
+        return ours
+    told = message.partition(", got ")[0]  # a kind of number, in place of the number
+    if isinstance(value, str) and len(value) > SHOWN_CHARACTERS:
+        return f"{told}, got {len(value)} characters"
+    return f"{told}, got {shortened(json.dumps(value), SHOWN_CHARACTERS)}"
 
 
 def _location(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:

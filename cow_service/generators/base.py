@@ -32,6 +32,7 @@ class Generator(Protocol):
     """Makes the frames of a clip."""
 
     options_model: type[BaseModel]  # what `generator_options` of a request may hold
+    concurrency: int | None  # clips at the same time; None where a clip is computed like everything else
 
     def describe(self, shot: Shot) -> GeneratorInfo:
         """Who would make this clip, and what would have to be the same to make it again."""

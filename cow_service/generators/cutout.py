@@ -53,6 +53,7 @@ class CutoutGenerator:
     """Milliseconds per frame, no weights. It moves a picture: it does not turn, light or break things."""
 
     options_model = CutoutOptions
+    concurrency = None
 
     def describe(self, shot: Shot) -> GeneratorInfo:
         """The same image, trajectory and version give the same frames; the seed changes nothing."""

@@ -37,6 +37,7 @@ class Asked:
     seed: int
     still_wanted: Callable[[], None]  # called while the reader waits for others; raises `Canceled`
     elsewhere: Callable[[], AbstractContextManager[None]] = nullcontext  # around such waits: others may compute
+    recalled: Grounding | None = None  # stage 1, where it was read before and this look is not asked for it
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,9 @@ class Look(Protocol):
 
 class Reader(Protocol):
     """Reads images for questions. Safe to use from several threads at once."""
+
+    fingerprint: str
+    """All that decides what it reads, besides what it is asked: model, revision, prompts, options."""
 
     def look(self, scene: Scene, asked: Asked) -> Look:
         """Begins to read an image for a question. Nothing is read yet."""

@@ -36,9 +36,11 @@ GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pix
 class EmbeddedReader:
     """Colour and noun of the mover, words and arrows for its direction, encounters for the answer."""
 
+    fingerprint = f"embedded {__version__}"
+
     def look(self, scene: Scene, asked: Asked) -> EmbeddedLook:
         """Begins to read an image for a question."""
-        return EmbeddedLook(scene, asked.question)
+        return EmbeddedLook(scene, asked.question, asked.recalled)
 
 
 class EmbeddedLook:
@@ -47,10 +49,12 @@ class EmbeddedLook:
     source: Source = "embedded"
     usage = Usage()  # it asks nobody
 
-    def __init__(self, scene: Scene, question: str) -> None:
+    def __init__(self, scene: Scene, question: str, recalled: Grounding | None) -> None:
         self._scene = scene
         self._text = question
         self._grounded: GroundingReading | None = None
+        if recalled is not None and recalled.source == self.source:
+            self._grounded = GroundingReading(recalled.object, recalled.bbox, others=recalled.others)
 
     @property
     def info(self) -> ReaderInfo:

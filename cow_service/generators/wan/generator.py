@@ -64,6 +64,7 @@ class WanGenerator:
     """Wan2.1 image-to-video, conditioned on tracks. One clip at a time on its device; others wait."""
 
     options_model = WanOptions
+    concurrency = 1
 
     def __init__(self, model: Model) -> None:
         self._model = model

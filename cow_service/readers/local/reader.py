@@ -8,6 +8,7 @@ from cow_service.readers.mllm.asking import Asker
 from cow_service.readers.mllm.reader import MllmReader
 from cow_service.readers.mllm.serving import Served, described
 from cow_service.settings import Settings
+from cow_service.weights import weights_identity
 
 
 def create(settings: Settings) -> MllmReader:
@@ -15,4 +16,4 @@ def create(settings: Settings) -> MllmReader:
     model = load_local(settings)
     manifest, _, _ = described(settings)
     served = Served(model, manifest.name, manifest, load_families()[manifest.family or ""])
-    return MllmReader("local", Asker(served, settings))
+    return MllmReader("local", Asker(served, settings), weights_identity(manifest, settings))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
+from cow_service import __version__
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
 from cow_service.readers import sentences
@@ -21,6 +23,7 @@ from cow_service.readers.mllm.questions import Questions
 from cow_service.readers.mllm.scale import Scaled
 from cow_service.readers.mllm.serving import UNKNOWN, serve
 from cow_service.records import AnswerOption, BBox, Cue, Grounding, MotionKind, ReaderInfo, Source, Usage
+from cow_service.resources import prompt_names, read_prompt_text
 from cow_service.settings import Settings
 from cow_service.vision.scene import Scene
 
@@ -34,9 +37,21 @@ GIVE_PLACE = "Say where it is with `grounding.point` [x, y] or `grounding.bbox` 
 class MllmReader:
     """Asks one model for everything. It keeps its connections, and nothing of what it saw."""
 
-    def __init__(self, name: str, asker: Asker) -> None:
+    def __init__(self, name: str, asker: Asker, origin: str = "") -> None:
         self.name = name
         self.asker = asker
+        self._origin = origin  # which server, or which weights
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """The model, where it is served from, how its family is asked, and the words of all prompts."""
+        served = self.asker.served
+        prompts = "".join(read_prompt_text(name) for name in prompt_names())
+        told = (
+            __version__, self.name, served.name, self._origin,
+            served.manifest.model_dump_json(), served.family.model_dump_json(), prompts,
+        )  # fmt: skip
+        return hashlib.sha256("\n".join(told).encode()).hexdigest()
 
     def look(self, scene: Scene, asked: Asked) -> MllmLook:
         """Begins to read an image for a question. Nothing is sent yet."""
@@ -96,11 +111,14 @@ class MllmLook:
         )
 
     def read_motion(self, grounding: Grounding) -> MotionReading:
-        """No call where `ground` asked already; one where the place came with the request.
+        """No call where `ground` asked already; one where the place came with the request, two where it was recalled.
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
         """
         if grounding.source == "request":
+            self._locate(grounding.object, grounding.bbox, ())
+        elif self._identified is None:  # the place was read by another look: it stays, the words are asked for again
+            self._identified = self._reader.asker.ask(self._questions.identify(), self._tally, self._asked)
             self._locate(grounding.object, grounding.bbox, ())
         sentence = None if self._identified is None else self._identified.sentence
         reading = MotionReading(self._kind, None, "text", sentence=sentence)
@@ -197,4 +215,4 @@ class MllmLook:
 
 def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable` where COW_MLLM cannot be used."""
-    return MllmReader("mllm", Asker(serve(settings), settings))
+    return MllmReader("mllm", Asker(serve(settings), settings), settings.mllm_base_url or "")

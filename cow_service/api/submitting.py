@@ -1,0 +1,174 @@
+"""From a request to its job, and from the job to the response: at once, after a while, or when it has ended."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from http import HTTPStatus
+
+from anyio import CapacityLimiter, to_thread
+from fastapi import Request, Response
+
+from cow_service import context
+from cow_service.api.intake import Body, Posted, check, receive
+from cow_service.api.preferences import Preferences, preferences_of
+from cow_service.errors import Canceled, CowError, JobNotFound
+from cow_service.jobs.engine import Engine, new_job_id
+from cow_service.jobs.live import Waiting
+from cow_service.jobs.orders import Order
+from cow_service.jobs.reports import Found
+from cow_service.pipeline import now
+from cow_service.records import TERMINAL, JobKind
+from cow_service.requests import ImageArtifact
+
+LOOK = 3.0  # seconds between looks at the database: another process may have run the job
+AT_ONCE = 4  # bodies that are decoded at the same time
+RETRY_AFTER = {"Retry-After": "1"}
+
+
+def owner_of(request: Request) -> str | None:
+    """Whose key the request came with; None where the server has no keys."""
+    owner: str | None = request.scope.get("state", {}).get("owner")
+    return owner
+
+
+@dataclass
+class Submitting:
+    """Takes requests of one kind after the other to the engine. Bodies are decoded in threads."""
+
+    engine: Engine
+
+    def __post_init__(self) -> None:
+        self._limiter = CapacityLimiter(AT_ONCE)
+
+    async def run(self, request: Request, kind: JobKind, model: type[Body]) -> Response:
+        """The job's result, or the job itself where the caller does not want to wait so long.
+
+        Raises what is wrong with the request, and what the job fails with.
+        """
+        prefer, owner = preferences_of(request.headers), owner_of(request)
+        if prefer.key is None:
+            self.engine.check_room()  # before the body: whoever is refused is told at once
+        posted = await receive(request)
+        job_id = new_job_id(owner, prefer.key)
+        with self.engine.live.waiting(job_id) as waiting:
+            order = _Asked(kind, owner, prefer, job_id)
+            is_new = await to_thread.run_sync(self._submit, posted, model, order, limiter=self._limiter)
+            if prefer.respond_async and not prefer.wait:
+                return await self._accepted(job_id, owner, prefer)
+            async with _left(request) as left:
+                return await self._awaited(order, waiting, left, is_new)
+
+    def _submit(self, posted: Posted, model: type[Body], asked: _Asked) -> bool:
+        service = self.engine.service
+        body, image = check(posted, model, service)
+        if isinstance(body.image, ImageArtifact):
+            self.engine.may_read(body.image.artifact, asked.owner if image is None else None)
+        generator = service.precheck(body)
+        if body.webhook is not None:
+            self.engine.webhooks.check(body.webhook)
+        sha256 = None
+        if image is None:
+            sha256, image = service.image_of(body.image)
+        kept = ImageArtifact(artifact=sha256 or image.info.sha256)
+        asks = body.model_copy(update={"image": kept, "webhook": None})
+        trace = context.trace.get()
+        order = Order(
+            kind=asked.kind,
+            request=asks.model_dump(mode="json", exclude_defaults=True),
+            created_at=now(),
+            fresh=asked.prefer.fresh,
+            webhook=body.webhook,
+            request_id=context.request_id.get(),
+            traceparent=None if trace is None else trace.traceparent,
+        )
+        return self.engine.submit(order, generator, asked.owner, asked.prefer.key, image, asked.job_id)
+
+    async def _accepted(self, job_id: str, owner: str | None, prefer: Preferences) -> Response:
+        def settled() -> Found:
+            self.engine.database.settle()  # nobody is told of a job that a loss of power could take back
+            return self.engine.find(job_id, owner)
+
+        found = await to_thread.run_sync(settled)
+        headers = {"Location": f"/jobs/{job_id}", "Preference-Applied": prefer.applied, **RETRY_AFTER}
+        return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers)
+
+    async def _awaited(self, asked: _Asked, waiting: Waiting, left: asyncio.Event, is_new: bool) -> Response:
+        """The response once the job has ended or the caller has waited long enough.
+
+        A caller who leaves ends a job that nobody else can know of.
+        """
+        loop, engine, prefer = asyncio.get_running_loop(), self.engine, asked.prefer
+        until = None if prefer.wait is None else loop.time() + prefer.wait
+        gone = asyncio.ensure_future(left.wait())
+        look = not is_new
+        try:
+            while not waiting.settled.done():
+                if look:
+                    found = await to_thread.run_sync(engine.find, asked.job_id, asked.owner)
+                    if found.job.status in TERMINAL:
+                        break
+                look = True
+                rest = LOOK if until is None else min(LOOK, until - loop.time())
+                if rest <= 0:
+                    return await self._accepted(asked.job_id, asked.owner, prefer)
+                await asyncio.wait({waiting.settled, gone}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
+                if gone.done() and not waiting.settled.done():
+                    if is_new and prefer == Preferences(fresh=prefer.fresh):
+                        await to_thread.run_sync(engine.cancel, asked.job_id, asked.owner)
+                    raise Canceled("The caller went away before the work was done.")
+        finally:
+            gone.cancel()
+        if waiting.settled.done():
+            outcome = waiting.settled.result()
+            if isinstance(outcome, CowError):
+                raise outcome
+            if outcome is not None:
+                return json_response(outcome)
+        return await to_thread.run_sync(self._ended, asked)
+
+    def _ended(self, asked: _Asked) -> Response:
+        """The response of a job whose end only the database tells."""
+        try:
+            found = self.engine.find(asked.job_id, asked.owner)
+        except JobNotFound as error:
+            raise Canceled("The job was deleted before it was done.") from error
+        if found.error is not None:
+            raise found.error
+        if found.result is None:
+            raise Canceled("The job was canceled before it was done.")
+        return json_response(found.result)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """Who asks for which job, and how they want to be answered."""
+
+    kind: JobKind
+    owner: str | None
+    prefer: Preferences
+    job_id: str
+
+
+def json_response(body: str, status: int = HTTPStatus.OK, headers: dict[str, str] | None = None) -> Response:
+    """A record as it is kept: the framework would check its thousands of numbers once more."""
+    return Response(body, status, headers, media_type="application/json")
+
+
+@asynccontextmanager
+async def _left(request: Request) -> AsyncGenerator[asyncio.Event]:
+    """Tells when the caller has closed the connection."""
+    left = asyncio.Event()
+
+    async def watch() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass  # an empty rest of the body
+        left.set()
+
+    task = asyncio.create_task(watch())
+    try:
+        yield left
+    finally:
+        task.cancel()

@@ -1,0 +1,192 @@
+"""The job database: SQLite in the data folder, or PostgreSQL by COW_DATABASE_URL. DBOS keeps its tables beside ours.
+
+`cow_stage_results` holds what stages came to, by the digest of what decided it. `cow_holds` says which job needs which
+artifact: an artifact that no job holds may go.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
+from pathlib import Path
+
+import sqlalchemy as sa
+from sqlalchemy import event
+from sqlalchemy.exc import SQLAlchemyError
+
+from cow_service.errors import StorageUnavailable
+from cow_service.settings import Settings, SettingsError
+
+BUSY_MS = 30_000  # how long SQLite waits for another writer
+AT_ONCE = 500  # ids in one statement
+
+_metadata = sa.MetaData()
+_results = sa.Table(
+    "cow_stage_results",
+    _metadata,
+    sa.Column("key", sa.String(64), primary_key=True),
+    sa.Column("job_id", sa.String(64), nullable=False, index=True),
+    sa.Column("stage", sa.String(32), nullable=False),
+    sa.Column("result", sa.Text, nullable=False),
+    sa.Column("created_at", sa.Float, nullable=False),
+)
+_holds = sa.Table(
+    "cow_holds",
+    _metadata,
+    sa.Column("sha256", sa.String(64), primary_key=True),
+    sa.Column("job_id", sa.String(64), primary_key=True, index=True),
+)
+_FIND = sa.text("SELECT job_id, result FROM cow_stage_results WHERE key = :key")
+# A result that lost its artifacts is made anew, and replaces the one that was there.
+_KEEP = sa.text(
+    "INSERT INTO cow_stage_results (key, job_id, stage, result, created_at) VALUES (:key, :job, :stage, :result, :at) "
+    "ON CONFLICT (key) DO UPDATE SET job_id = excluded.job_id, result = excluded.result, "
+    "created_at = excluded.created_at"
+)
+_HOLD = sa.text("INSERT INTO cow_holds (sha256, job_id) VALUES (:sha256, :job) ON CONFLICT DO NOTHING")
+
+
+class Database:
+    """One engine for DBOS and for our own tables. Every method raises `StorageUnavailable` where it cannot be used."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.url, self.file = _address(settings)
+        self.engine = _engine(self.url, self.file is not None)
+
+    def create_tables(self) -> None:
+        """Makes our tables where they are missing, and the folder of a file."""
+        if self.file is not None:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+        with database_errors():
+            _metadata.create_all(self.engine)
+
+    def check(self) -> None:
+        """Asks the database for something."""
+        with database_errors(), self.engine.connect() as connection:
+            connection.execute(sa.text("SELECT 1"))
+
+    def close(self) -> None:
+        """Lets go of its connections."""
+        self.engine.dispose()
+
+    def settle(self) -> None:
+        """What was committed is on the disk when this returns, and outlives a loss of power, too."""
+        if self.file is None:
+            return  # PostgreSQL does that with every commit
+        log = self.file.with_name(self.file.name + "-wal")
+        try:
+            descriptor = os.open(log if log.exists() else self.file, os.O_RDWR)
+        except OSError as error:
+            raise StorageUnavailable("The job database cannot be written to the disk.") from error
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def find(self, key: str) -> tuple[str, str] | None:
+        """The job that came to a stage's result, and the result as JSON."""
+        with database_errors(), self.engine.connect() as connection:
+            row = connection.execute(_FIND, {"key": key}).first()
+        return None if row is None else (row[0], row[1])
+
+    def keep(self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str]) -> None:
+        """Keeps a stage's result, and holds its artifacts for the job."""
+        with database_errors(), self.engine.begin() as connection:
+            kept = {"key": key, "job": job, "stage": stage, "result": result, "at": time.time()}
+            connection.execute(_KEEP, kept)
+            _hold(connection, job, artifacts)
+
+    def hold(self, job: str, artifacts: Iterable[str]) -> None:
+        """Holds artifacts for a job."""
+        with database_errors(), self.engine.begin() as connection:
+            _hold(connection, job, artifacts)
+
+    def forget(self, jobs: list[str]) -> list[str]:
+        """Removes what was kept for some jobs; returns the artifacts that no job holds any more."""
+        loose: set[str] = set()
+        with database_errors(), self.engine.begin() as connection:
+            for some in _parts(jobs):
+                mine = sa.select(_holds.c.sha256).where(_holds.c.job_id.in_(some)).distinct()
+                loose |= set(connection.execute(mine).scalars())
+                connection.execute(sa.delete(_holds).where(_holds.c.job_id.in_(some)))
+                connection.execute(sa.delete(_results).where(_results.c.job_id.in_(some)))
+        return [sha256 for sha256 in loose if sha256 not in self.held(loose)]
+
+    def held(self, artifacts: Iterable[str]) -> set[str]:
+        """Those of some artifacts that a job holds."""
+        found: set[str] = set()
+        with database_errors(), self.engine.connect() as connection:
+            for some in _parts(list(artifacts)):
+                found |= set(connection.execute(sa.select(_holds.c.sha256).where(_holds.c.sha256.in_(some))).scalars())
+        return found
+
+    def holds(self, job: str, sha256: str) -> bool:
+        """Whether a job holds an artifact."""
+        with database_errors(), self.engine.connect() as connection:
+            query = sa.select(_holds.c.job_id).where(_holds.c.sha256 == sha256, _holds.c.job_id == job)
+            return connection.execute(query).first() is not None
+
+    def holders(self, sha256: str) -> list[str]:
+        """The jobs that hold an artifact."""
+        with database_errors(), self.engine.connect() as connection:
+            return list(connection.execute(sa.select(_holds.c.job_id).where(_holds.c.sha256 == sha256)).scalars())
+
+    def jobs(self) -> list[str]:
+        """The jobs for which something is kept."""
+        with database_errors(), self.engine.connect() as connection:
+            both = sa.union(sa.select(_holds.c.job_id), sa.select(_results.c.job_id))
+            return list(connection.execute(both).scalars())
+
+
+@contextmanager
+def database_errors() -> Generator[None]:
+    """What the database raises, as `StorageUnavailable`. Its own words may hold addresses, and are left out."""
+    try:
+        yield
+    except SQLAlchemyError as error:
+        raise StorageUnavailable(
+            f"The job database cannot be used ({type(error).__name__}): see COW_DATABASE_URL, and the disk it is on."
+        ) from error
+
+
+def _hold(connection: sa.Connection, job: str, artifacts: Iterable[str]) -> None:
+    rows = [{"sha256": sha256, "job": job} for sha256 in dict.fromkeys(artifacts)]
+    if rows:
+        connection.execute(_HOLD, rows)
+
+
+def _parts(values: list[str]) -> Iterable[list[str]]:
+    return (values[i : i + AT_ONCE] for i in range(0, len(values), AT_ONCE))
+
+
+def _address(settings: Settings) -> tuple[str, Path | None]:
+    """The URL, and the file where it is SQLite. Raises `SettingsError` without repeating it: it may hold a password."""
+    told = None if settings.database_url is None else settings.database_url.get_secret_value()
+    if told is None:
+        file = settings.data_dir / "jobs.sqlite3"
+        return f"sqlite:///{file}", file
+    try:
+        url = sa.make_url(told)
+    except SQLAlchemyError as error:
+        raise SettingsError("Bad settings: COW_DATABASE_URL is no database URL.") from error
+    if url.get_backend_name() == "sqlite" and url.database:
+        return told, Path(url.database)
+    if url.get_backend_name() in ("postgresql", "postgres"):
+        return url.set(drivername="postgresql+psycopg").render_as_string(hide_password=False), None
+    raise SettingsError("Bad settings: COW_DATABASE_URL must be sqlite:///FILE or postgresql://USER@HOST/DATABASE.")
+
+
+def _engine(url: str, is_file: bool) -> sa.Engine:
+    if not is_file:
+        return sa.create_engine(url, pool_size=16, max_overflow=32, pool_pre_ping=True)
+    engine = sa.create_engine(url, pool_size=16, max_overflow=32)
+
+    @event.listens_for(engine, "connect")
+    def prepare(connection: object, _: object) -> None:  # pyright: ignore[reportUnusedFunction]
+        connection.isolation_level = "IMMEDIATE"  # type: ignore[attr-defined] # writers wait instead of failing
+        for pragma in ("journal_mode=WAL", "synchronous=NORMAL", f"busy_timeout={BUSY_MS}", "foreign_keys=ON"):
+            connection.execute(f"PRAGMA {pragma}")  # type: ignore[attr-defined]
+
+    return engine

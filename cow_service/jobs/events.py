@@ -1,0 +1,73 @@
+"""The life of a job as a stream of events, each with a number that is the same however often it is read.
+
+Numbers come from what the database keeps: 1 queued, 2 running, then one for each stage that is done, 100 for the end.
+Progress in between is told without a number: it is not repeated to whoever comes back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator
+from dataclasses import dataclass
+
+from anyio import to_thread
+
+from cow_service.errors import JobNotFound
+from cow_service.jobs import reports
+from cow_service.jobs.engine import Engine
+from cow_service.jobs.reports import Found
+from cow_service.records import TERMINAL, Job
+
+QUEUED, RUNNING, FIRST_STAGE, END = 1, 2, 3, 100
+LOOK = 1.0  # seconds between looks at the database: another process may run the job
+
+
+@dataclass(frozen=True)
+class Event:
+    """One thing that happened to a job; `number` is None for progress."""
+
+    name: str  # queued, running, stage, progress, succeeded, failed, canceled, deleted
+    number: int | None
+    job: Job | None
+
+
+async def follow(engine: Engine, job_id: str, owner: str | None, after: int) -> AsyncGenerator[Event]:
+    """The events of a job after a number, until its end. Raises `JobNotFound` where there is none to begin with."""
+    found = await to_thread.run_sync(engine.find, job_id, owner)
+    sent, told = after, (None, 0.0)
+    with engine.live.waiting(job_id) as waiting:
+        while True:
+            waiting.changed.clear()
+            for event in await to_thread.run_sync(_durable, found):
+                if event.number is not None and event.number > sent:
+                    sent = event.number
+                    yield event
+            if found.job.status in TERMINAL:
+                return
+            now = (found.job.stage, found.job.progress)
+            if now != told and found.job.status == "running":
+                told = now
+                yield Event("progress", None, found.job)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(waiting.changed.wait(), LOOK)
+            try:
+                found = await to_thread.run_sync(engine.find, job_id, owner)
+            except JobNotFound:
+                yield Event("deleted", END, None)
+                return
+
+
+def _durable(found: Found) -> list[Event]:
+    """What has happened to a job so far, by number."""
+    job = found.job
+    events = [Event("queued", QUEUED, job.model_copy(update={"status": "queued", "progress": 0.0, "stage": None}))]
+    stages = reports.finished_stages(job.id)
+    if job.status == "running" or stages or job.status in ("succeeded", "failed"):
+        events.append(Event("running", RUNNING, job.model_copy(update={"status": "running", "problem": None})))
+    for place, stage in enumerate(stages):
+        done = job.model_copy(update={"status": "running", "stage": stage, "problem": None})
+        events.append(Event("stage", FIRST_STAGE + place, done))
+    if job.status in TERMINAL:
+        events.append(Event(job.status, END, job))
+    return events

@@ -1,0 +1,33 @@
+"""What a job is told to do: JSON values, kept by the job database from the moment that the request is accepted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from cow_service.checkpoints import digest_of
+from cow_service.records import JobKind, Record
+from cow_service.requests import AnswerRequest, SimulateRequest
+
+
+class Order(Record):
+    """One accepted request. Its image is an artifact: no order holds bytes."""
+
+    kind: JobKind
+    request: dict[str, Any]
+    created_at: str = Field(description="RFC 3339, UTC.")
+    fresh: bool = Field(default=False, description="Take no results of other jobs.")
+    webhook: str | None = Field(default=None, description="URL to call when the job has ended.")
+    request_id: str | None = None
+    traceparent: str | None = None
+
+    @property
+    def digest(self) -> str:
+        """The same for requests that ask for the same."""
+        return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
+
+    def parsed(self) -> SimulateRequest | AnswerRequest:
+        """The request, as it was checked when it came."""
+        model = AnswerRequest if self.kind == "answer" else SimulateRequest
+        return model.model_validate(self.request)

@@ -1,0 +1,37 @@
+"""How the job database keeps values: as JSON, never as pickles, so that reading it runs no code."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from dbos import Serializer
+
+from cow_service.errors import CowError, FieldError, InternalError, kinds
+
+_ERROR = "cow_error"
+
+
+class JsonSerializer(Serializer):
+    """JSON values as they are; a `CowError` as its code, detail and fields."""
+
+    def name(self) -> str:
+        """The name that the database keeps beside each value."""
+        return "cow_json"
+
+    def serialize(self, data: Any) -> str:
+        """One value as JSON text. What is no `CowError` is kept as an internal error, without its words."""
+        if isinstance(data, BaseException):
+            error = data if isinstance(data, CowError) else InternalError("The job met an error that nobody foresaw.")
+            fields = [{"pointer": field.pointer, "detail": field.detail} for field in error.errors]
+            data = {_ERROR: {"code": error.code, "detail": error.detail, "errors": fields}}
+        return json.dumps(data, separators=(",", ":"))
+
+    def deserialize(self, serialized_data: str) -> Any:
+        """The value of a JSON text, errors as exceptions."""
+        value = json.loads(serialized_data)
+        if not isinstance(value, dict) or set(value) != {_ERROR}:
+            return value
+        kept = value[_ERROR]
+        kind = kinds().get(kept["code"], InternalError)  # one of a later version may not be known here
+        return kind(kept["detail"], errors=tuple(FieldError(**field) for field in kept["errors"]))

@@ -1,0 +1,133 @@
+"""What an engine does now and then: tells ends, sees cancellations by others, takes over from the dead, tidies up."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from datetime import UTC, datetime, timedelta
+
+from dbos import DBOS
+from dbos import error as dbos_error
+from sqlalchemy.exc import SQLAlchemyError
+
+from cow_service.errors import CowError
+from cow_service.jobs import reports
+from cow_service.jobs.executors import Executors
+from cow_service.jobs.ledger import Ledger
+
+SETTLE = 0.005  # seconds between looks at whether the database has the end of a job
+SETTLING = 30.0  # seconds after which nobody looks any more
+LOOK = 1.0  # seconds between looks at jobs that run here
+RECOUNT = 10.0  # seconds
+TIDY = 600.0  # seconds
+GRACE = 3600.0  # seconds that an artifact is kept without a job: somebody may be about to send it with one
+AT_ONCE = 200  # jobs removed in one go
+
+log = logging.getLogger("cow_service")
+
+
+class Upkeep:
+    """Two threads beside an engine's own."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self._settling: dict[str, float] = {}
+        self._new = threading.Event()
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def start(self, executors: Executors) -> None:
+        """Starts the threads."""
+        self._stop.clear()
+        for work, name in ((self._settle_all, "cow-settle"), (lambda: self._keep_up(executors), "cow-upkeep")):
+            thread = threading.Thread(target=work, name=name, daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def stop(self) -> None:
+        """Ends the threads."""
+        self._stop.set()
+        self._new.set()
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+
+    def settle(self, job_id: str) -> None:
+        """Has the end of a job told as soon as the database has it."""
+        self._settling[job_id] = time.monotonic() + SETTLING
+        self._new.set()
+
+    def tidy(self) -> None:
+        """Removes jobs that ended long ago, and artifacts that no job holds."""
+        ledger = self._ledger
+        before = datetime.now(UTC) - timedelta(hours=ledger.service.settings.job_retention_hours)
+        while jobs := reports.ended_before(before, AT_ONCE):
+            ledger.remove(jobs, before.timestamp())
+        kept = ledger.database.jobs()
+        for start in range(0, len(kept), AT_ONCE):  # of jobs that were deleted while they ran
+            some = kept[start : start + AT_ONCE]
+            if gone := [job for job in some if job not in reports.existing(some)]:
+                ledger.database.forget(gone)
+        moment = time.time() - GRACE
+        loose = list(ledger.service.artifacts.untouched_since(moment))
+        held = ledger.database.held(loose)
+        removed = sum(ledger.service.artifacts.delete(one, moment) for one in loose if one not in held)
+        if removed:
+            log.info("removed %d artifacts that no job holds", removed)
+
+    def _settle_all(self) -> None:
+        while self._new.wait() and not self._stop.is_set():
+            self._new.clear()
+            while self._settling and not self._stop.wait(SETTLE):
+                self._guarded(self._settle_some)
+
+    def _settle_some(self) -> None:
+        now = time.monotonic()
+        for job_id, until in list(self._settling.items()):
+            found = reports.find(job_id, self._ledger.live, full=False)
+            if found is None or found.ended is not None:
+                self._ledger.ended(job_id, None)
+            elif now < until:
+                continue
+            del self._settling[job_id]
+
+    def _keep_up(self, executors: Executors) -> None:
+        counted, tidied = time.monotonic(), 0.0
+        self._guarded(lambda: self._take_over(executors))
+        while not self._stop.wait(LOOK):
+            now = time.monotonic()
+            self._guarded(self._see_cancellations)
+            if now - counted > RECOUNT:
+                counted = now
+                self._guarded(lambda: self._take_over(executors))
+                self._guarded(self._ledger.recount)
+            if now - tidied > TIDY or not tidied:
+                tidied = now
+                self._guarded(self.tidy)
+
+    def _see_cancellations(self) -> None:
+        """Another process may have canceled or deleted a job that runs here."""
+        for job_id in self._ledger.live.jobs():
+            found = reports.find(job_id, self._ledger.live, full=False)
+            if found is None or found.job.status == "canceled":
+                self._ledger.live.end(job_id)
+
+    def _take_over(self, executors: Executors) -> None:
+        """Has the jobs that were under way in processes that have ended begin again, in any that runs."""
+        for name, lock in executors.dead():
+            try:
+                left = DBOS.list_workflows(executor_id=name, status="PENDING", load_input=False, load_output=False)
+                for one in left:
+                    log.info("taking over job %s", one.workflow_id)
+                    DBOS.resume_workflow(one.workflow_id)
+            finally:
+                lock.release()
+
+    def _guarded(self, work: object) -> None:
+        """Upkeep goes on when the database does not answer for a while."""
+        assert callable(work)
+        try:
+            work()
+        except (CowError, dbos_error.DBOSException, SQLAlchemyError) as error:
+            log.warning("upkeep: %s", getattr(error, "detail", type(error).__name__))

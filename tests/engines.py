@@ -1,0 +1,39 @@
+"""One running engine for all tests of this process: DBOS is one per process, and starting it for each test is slow."""
+
+from __future__ import annotations
+
+import atexit
+import tempfile
+from functools import cache
+from pathlib import Path
+
+from fastapi import FastAPI
+
+from cow_service.api.app import create_app
+from cow_service.jobs.engine import Engine
+from cow_service.service import Service
+from cow_service.settings import Settings
+
+FRESH = {"Cache-Control": "no-cache"}  # for requests that must not find what another test came to
+
+
+@cache
+def running_engine() -> Engine:
+    """The engine, with a database of its own."""
+    folder = tempfile.TemporaryDirectory(prefix="cow-tests-")
+    engine = Engine(Service(Settings(data_dir=Path(folder.name), shutdown_grace=0)))
+    engine.start()
+
+    def end() -> None:
+        engine.close()
+        folder.cleanup()
+
+    atexit.register(end)
+    return engine
+
+
+def app_for(service: Service) -> FastAPI:
+    """An application whose jobs are this service's from now on. Only one service is at work at a time."""
+    engine = running_engine()
+    engine.use(service)
+    return create_app(engine)

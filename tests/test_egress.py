@@ -1,0 +1,797 @@
+"""Outgoing HTTP: what strangers name cannot reach inside, hold the server up, or fill its memory."""
+
+from __future__ import annotations
+
+import datetime
+import gzip
+import inspect
+import ipaddress
+import itertools
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import httpcore
+import httpx
+import idna
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cow_service.egress import TRANSLATED, Egress, EgressError, NotAllowed, Unreachable, _told, look_up
+from cow_service.errors import ImageUrlNotAllowed, ImageUrlUnreachable
+from cow_service.hosts import HostList, host_name, is_public
+from cow_service.image_urls import ImageUrls
+from cow_service.settings import Settings, SettingsError, load_settings
+
+MOST = 100_000  # bytes
+BODY = b"not really an image" * 50
+
+
+class Site(ThreadingHTTPServer):
+    """A server on loopback that answers as told, by path, and remembers what it was asked."""
+
+    daemon_threads = True
+
+    def __init__(self, tls: ssl.SSLContext | None = None) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.port = self.server_address[1]
+        self.pages: dict[str, Callable[[Handler], None]] = {"/image": lambda page: page.answer(BODY)}
+        self.asked: list[tuple[str, str, dict[str, str], bytes]] = []
+        self.tls = tls
+
+    def finish_request(self, request: socket.socket, client_address: object) -> None:
+        try:
+            if self.tls is not None:
+                with self.tls.wrap_socket(request, server_side=True) as secured:
+                    super().finish_request(secured, client_address)
+            else:
+                super().finish_request(request, client_address)
+        except OSError:
+            return  # who asked has gone, as it should
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Site
+
+    def do_GET(self) -> None:
+        length = int(self.headers.get("content-length", 0))
+        body = self.rfile.read(length) if length < 1_000_000 else b""
+        self.server.asked.append((self.command, self.path, dict(self.headers.items()), body))
+        self.server.pages[self.path](self)
+
+    do_POST = do_GET
+
+    def answer(self, body: bytes, status: int = 200, **headers: str) -> None:
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name.replace("_", "-"), value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def write(self, raw: bytes) -> None:
+        self.wfile.write(raw)
+
+    def drip(self, start: bytes, piece: bytes, pause: float) -> None:
+        """A raw answer that goes on and on."""
+        self.wfile.write(start)
+        for _ in range(int(20 / max(pause, 1e-4))):
+            self.wfile.write(piece)
+            time.sleep(pause)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def running(site: Site) -> Iterator[Site]:
+    thread = threading.Thread(target=site.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    yield site
+    site.shutdown()
+    thread.join()
+    site.server_close()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Site]:
+    yield from running(Site())
+
+
+@pytest.fixture
+def site(server: Site) -> Site:
+    server.asked.clear()
+    return server
+
+
+def names(**more: str) -> Callable[[str, int], list[str]]:
+    known = {"images.test": "127.0.0.1"} | {name.replace("_", "."): ips for name, ips in more.items()}
+    return lambda host, port: known[host].split()
+
+
+def egress(site: Site, *, hosts: tuple[str, ...] = ("images.test",), **told: object) -> Egress:
+    """Takes 127.0.0.1 for a public address, and no other."""
+    told = {"resolve": names(), "permitted": lambda ip: ip == "127.0.0.1", "seconds": 5.0} | told
+    return Egress([f"{host}:{site.port}" for host in hosts], **told)
+
+
+def url(site: Site, path: str = "/image", host: str = "images.test") -> str:
+    return f"http://{host}:{site.port}{path}"
+
+
+# What comes back
+
+
+def test_a_body_is_fetched(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")  # nobody is there: it would fail if it were asked
+    assert egress(site).fetch(url(site), MOST) == BODY
+    assert egress(site).fetch(url(site, host="IMAGES.test."), len(BODY)) == BODY
+    method, path, headers, _ = site.asked[1]
+    assert (method, path) == ("GET", "/image")
+    headers = {name.lower(): value for name, value in headers.items()}
+    assert headers["host"] == f"images.test:{site.port}"
+    assert headers["accept-encoding"] == "identity"
+    assert set(headers) == {"host", "accept-encoding", "user-agent", "connection"}
+
+
+def test_path_and_query_arrive_as_they_were(site: Site) -> None:
+    site.pages["/a%20b%2Fc?x=1&y=%00"] = lambda page: page.answer(b"yes")
+    assert egress(site).fetch(url(site, "/a b%2Fc?x=1&y=%00#part"), MOST) == b"yes"
+
+
+@pytest.mark.parametrize("status", [204, 206, 304, 400, 404, 500])
+def test_only_200_is_good(site: Site, status: int) -> None:
+    site.pages["/status"] = lambda page: page.answer(b"", status)
+    with pytest.raises(Unreachable, match=f"HTTP {status}"):
+        egress(site).fetch(url(site, "/status"), MOST)
+
+
+def test_a_body_that_is_too_long(site: Site) -> None:
+    site.pages["/endless"] = lambda page: page.drip(b"HTTP/1.1 200 OK\r\n\r\n", b"x" * 65536, 0)
+    site.pages["/chunks"] = lambda page: page.drip(
+        b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n", b"8000\r\n" + b"x" * 0x8000 + b"\r\n", 0
+    )
+    site.pages["/honest"] = lambda page: page.drip(b"HTTP/1.1 200 OK\r\ncontent-length: 100001\r\n\r\n", b"", 0.1)
+    for path in ("/endless", "/chunks", "/honest"):
+        with pytest.raises(Unreachable, match="larger than 100000 bytes"):
+            egress(site).fetch(url(site, path), MOST)
+
+
+def test_a_length_that_lies(site: Site) -> None:
+    site.pages["/more"] = lambda page: page.answer(b"x" * MOST * 4, content_length="10")
+    site.pages["/fewer"] = lambda page: page.answer(b"x" * 10, content_length="50")
+    site.pages["/not"] = lambda page: page.answer(b"x" * 10, content_length="ten")
+    site.pages["/two"] = lambda page: page.write(b"HTTP/1.1 200 OK\r\ncontent-length: 1\r\ncontent-length: 2\r\n\r\n")
+    assert egress(site).fetch(url(site, "/more"), MOST) == b"x" * 10
+    for path in ("/fewer", "/not", "/two"):
+        with pytest.raises(Unreachable, match="broke off"):
+            egress(site).fetch(url(site, path), MOST)
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "br", "identity, gzip", "nonsense"])
+def test_nothing_is_decompressed(site: Site, encoding: str) -> None:
+    bomb = gzip.compress(bytes(10_000_000))
+    site.pages["/bomb"] = lambda page: page.answer(bomb, content_encoding=encoding)
+    with pytest.raises(Unreachable, match="compressed"):
+        egress(site).fetch(url(site, "/bomb"), MOST)
+    site.pages["/transfer"] = lambda page: page.answer(bomb, transfer_encoding="gzip, chunked")
+    with pytest.raises(Unreachable, match="HTTP"):
+        egress(site).fetch(url(site, "/transfer"), MOST)
+
+
+@pytest.mark.parametrize(
+    ("start", "piece"),
+    [
+        (b"", b"H"),
+        (b"HTTP/1.1 200 OK\r\nx: ", b"y"),
+        (b"", b"HTTP/1.1 100 Continue\r\n\r\n"),
+        (b"HTTP/1.1 200 OK\r\ncontent-length: 500\r\n\r\n", b"x"),
+        (b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n", b"1\r\nx\r\n"),
+    ],
+)
+def test_a_server_that_dawdles_is_left(site: Site, start: bytes, piece: bytes) -> None:
+    site.pages["/slow"] = lambda page: page.drip(start, piece, 0.05)
+    began = time.monotonic()
+    with pytest.raises(Unreachable):
+        egress(site, seconds=0.3).fetch(url(site, "/slow"), MOST)
+    assert time.monotonic() - began < 1
+
+
+def test_one_clock_for_name_and_redirects_together(site: Site) -> None:
+    def slowly(host: str, port: int) -> list[str]:
+        time.sleep(0.15)
+        return ["127.0.0.1"]
+
+    site.pages["/again"] = lambda page: page.answer(b"", 302, location="/again")
+    began = time.monotonic()
+    with pytest.raises(Unreachable, match="too long"):
+        egress(site, seconds=0.4, resolve=slowly).fetch(url(site, "/again"), MOST)
+    with pytest.raises(Unreachable, match="too long"):
+        egress(site, seconds=0.1, resolve=lambda *_: time.sleep(0.5) or []).fetch(url(site), MOST)
+    assert time.monotonic() - began < 0.9
+
+
+def test_a_receiver_that_takes_no_bytes_is_left(site: Site) -> None:
+    def sip(page: Handler) -> None:
+        for _ in range(400):
+            page.connection.recv(65536)
+            time.sleep(0.004)
+
+    site.pages["/sips"] = sip
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        for port, path in ((deaf.getsockname()[1], "/"), (site.port, "/sips")):
+            way = Egress([f"images.test:{port}"], seconds=0.3, resolve=names(), permitted=lambda ip: True)
+            began = time.monotonic()
+            with pytest.raises(Unreachable, match="too long"):
+                way.post(f"http://images.test:{port}{path}", bytes(40_000_000), {})
+            assert time.monotonic() - began < 1
+
+
+def test_nobody_there(site: Site) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with pytest.raises(Unreachable, match="takes no connections"):
+        Egress(None, resolve=names(), permitted=lambda ip: True).fetch(f"http://images.test:{port}/", MOST)
+
+    def unknown(host: str, port: int) -> list[str]:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    with pytest.raises(Unreachable, match="not known"):
+        egress(site, resolve=unknown).fetch(url(site), MOST)
+    with pytest.raises(Unreachable, match="no address"):
+        egress(site, resolve=lambda *_: []).fetch(url(site), MOST)
+
+
+@pytest.mark.parametrize(
+    "raw", [b"", b"SSH-2.0-OpenSSH_9.6\r\n", b"\x15\x03\x01\x00\x02\x02\x28", b"HTTP/1.1 abc\r\n\r\n"]
+)
+def test_no_http(site: Site, raw: bytes) -> None:
+    site.pages["/raw"] = lambda page: page.write(raw)
+    with pytest.raises(Unreachable, match="does not speak HTTP"):
+        egress(site).fetch(url(site, "/raw"), MOST)
+
+
+def test_headers_without_an_end(site: Site) -> None:
+    site.pages["/headers"] = lambda page: page.drip(b"HTTP/1.1 200 OK\r\n", b"a: " + b"b" * 9000 + b"\r\n", 0)
+    with pytest.raises(Unreachable, match="does not speak HTTP"):
+        egress(site).fetch(url(site, "/headers"), MOST)
+
+
+# What is not asked at all
+
+
+@pytest.fixture
+def unconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a connection was made")
+
+    monkeypatch.setattr(socket, "create_connection", refuse)
+
+
+LOCAL = {"localhost": ["127.0.0.1", "::1"], "localhost.localdomain": ["127.0.0.1"], "ip6-loopback": ["::1"]}
+
+
+def resolve_here(host: str, port: int) -> list[str]:
+    """Names of this machine, and every notation of addresses that the system reads; asks no name server."""
+    if host in LOCAL:
+        return LOCAL[host]
+    return [str(found[4][0]) for found in socket.getaddrinfo(host, port, flags=socket.AI_NUMERICHOST)]
+
+
+@pytest.mark.usefixtures("unconnected")
+@pytest.mark.parametrize(
+    "bad",
+    [
+        "",
+        "image.png",
+        "//example.org/image.png",
+        "file:///etc/passwd",
+        "FILE://localhost/etc/passwd",
+        "ftp://example.org/image.png",
+        "gopher://127.0.0.1:6379/_FLUSHALL",
+        "data:image/png;base64,AAAA",
+        "javascript:alert(1)",
+        "http:",
+        "http://",
+        "http:///image.png",
+        "https://:443/",
+        "http:127.0.0.1/",
+        "http://user@example.org/",
+        "http://user:hunter2@example.org/",
+        "http://example.org@127.0.0.1/",
+        "http://example.org\\@127.0.0.1/",
+        "http://127.0.0.1\\@example.org/",
+        "http://127.0.0.1#@example.org/",
+        "http://localhost/",
+        "http://localhost./",
+        "http://LOCALHOST/",
+        "http://ip6-loopback/",
+        "http://localhost.localdomain/",
+        "http://127.0.0.1/",
+        "http://127.0.0.1./",
+        "http://127.0.0.1../",
+        "http://127.0.0.1:80/",
+        "http://127.255.255.254/",
+        "http://10.1.2.3/",
+        "http://172.16.0.1/",
+        "http://172.31.255.255/",
+        "http://192.168.1.1/",
+        "http://169.254.169.254/latest/meta-data/",
+        "http://168.63.129.16/machine",
+        "http://192.0.0.192/opc/v2/",
+        "http://100.64.0.1/",
+        "http://100.100.100.200/",
+        "http://0.0.0.0/",
+        "http://0/",
+        "http://192.0.2.1/",
+        "http://198.18.0.1/",
+        "http://198.51.100.1/",
+        "http://203.0.113.1/",
+        "http://224.0.0.1/",
+        "http://240.0.0.1/",
+        "http://255.255.255.255/",
+        "http://2130706433/",
+        "http://0x7f000001/",
+        "http://0x7F.1/",
+        "http://0177.0.0.1/",
+        "http://017700000001/",
+        "http://127.1/",
+        "http://127.0.1/",
+        "http://00000177.0x0.0.1/",
+        "http://0x/",
+        "http://１２７.0.0.1/",
+        "http://127。0。0。1/",
+        "http://①②⑦.0.0.1/",
+        "http://%31%32%37.0.0.1/",
+        "http://loc%61lhost/",
+        "http://[::1]/",
+        "http://[::]/",
+        "http://[::1%25lo]/",
+        "http://[::ffff:127.0.0.1]/",
+        "http://[::ffff:7f00:1]/",
+        "http://[::127.0.0.1]/",
+        "http://[::ffff:0:127.0.0.1]/",
+        "http://[64:ff9b::7f00:1]/",
+        "http://[64:ff9b::169.254.169.254]/",
+        "http://[64:ff9b:1::7f00:1]/",
+        "http://[2002:7f00:1::1]/",
+        "http://[2001:0:7f00:1::1]/",
+        "http://[2606:4700::1%25lo]/",
+        "http://[fe80::1]/",
+        "http://[fe80::1%25eth0]/",
+        "http://[fc00::1]/",
+        "http://[fd00:ec2::254]/",
+        "http://[fec0::1]/",
+        "http://[ff02::1]/",
+        "http://[2001:db8::1]/",
+        "http://[3fff::1]/",
+        "http://[100::1]/",
+        "http://[::1/",
+        "http://[127.0.0.1]/",
+        "http://-a.example/",
+        "http://a..example/",
+        "http://" + "a" * 64 + ".example/",
+        "http://" + "a." * 130 + "example/",
+        "http://exa mple.org/",
+        "http://example.org:0/",
+        "http://example.org:65536/",
+        "http://example.org:x/",
+        "http://example.org:-1/",
+        "http://example.org/" + "a" * 5000,
+        "http://example.org/\r\nx: y",
+        "http://\x00example.org/",
+        "http://xn--a-ecp.ru\u200f/",
+    ],
+)
+def test_refused(bad: str) -> None:
+    for hosts in (["*"], None):
+        way = Egress(hosts, resolve=resolve_here)
+        with pytest.raises(NotAllowed) as refused:
+            way.fetch(bad, MOST)
+        told = str(refused.value)
+        assert told.endswith(".")
+        assert len(told) < 400
+        assert "hunter2" not in told
+        with pytest.raises(NotAllowed):
+            way.post(bad, b"{}", {})
+
+
+@pytest.mark.usefixtures("unconnected")
+def test_the_address_behind_a_name_is_not_told() -> None:
+    inside = Egress(["*"], resolve=lambda *_: ["10.9.8.7"])
+    with pytest.raises(NotAllowed, match=r"'intranet\.example', whose address is not a public one") as refused:
+        inside.fetch("http://intranet.example/", MOST)
+    assert "10.9" not in str(refused.value)
+
+
+@pytest.mark.usefixtures("unconnected")
+@pytest.mark.parametrize(
+    "answer", [["8.8.8.8", "127.0.0.1"], ["::1", "8.8.8.8"], ["8.8.8.8", "fe80::1%lo"], ["", "8.8.8.8"]]
+)
+def test_every_address_of_a_name_must_be_permitted(answer: list[str]) -> None:
+    with pytest.raises(NotAllowed):
+        Egress(None, resolve=lambda *_: answer).fetch("http://mixed.example/", MOST)
+
+
+def test_a_name_that_changes_is_asked_once_and_held_to(site: Site) -> None:
+    answers = iter(["127.0.0.1", "127.0.0.9", "169.254.169.254"])
+    asked: list[str] = []
+
+    def rebinding(host: str, port: int) -> list[str]:
+        asked.append(host)
+        return [next(answers)]
+
+    way = egress(site, resolve=rebinding)
+    assert way.fetch(url(site), MOST) == BODY
+    assert asked == ["images.test"]
+    site.pages["/once-more"] = lambda page: page.answer(b"", 302, location="/image")
+    with pytest.raises(NotAllowed):
+        way.fetch(url(site, "/once-more"), MOST)
+    assert len(site.asked) == 1
+
+
+def test_the_next_address_is_taken_where_one_does_not_answer(site: Site) -> None:
+    """Nobody listens on IPv6 there."""
+    way = egress(site, resolve=lambda *_: ["::1", "127.0.0.1"], permitted=lambda ip: True)
+    assert way.fetch(url(site), MOST) == BODY
+
+
+PRIVATE = ("127.0.0.0/8", "10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "100.64.0.0/10")
+REFUSED = (*PRIVATE, "0.0.0.0/8", "224.0.0.0/4", "240.0.0.0/4", "192.0.2.0/24", "198.18.0.0/15", "192.0.0.0/24")
+ADDRESSES = st.sampled_from(REFUSED).flatmap(lambda network: st.ip_addresses(v=4, network=network))
+BASES = st.sampled_from(("{}", "0x{:x}", "0X{:X}", "0{:o}", "0x000{:x}", "00{:o}"))
+
+
+@st.composite
+def notations(draw: st.DrawFn) -> str:
+    """An address that must not be reached, in any notation that inet_aton reads: 1 to 4 parts, each in any base."""
+    number = int(draw(ADDRESSES))
+    parts = draw(st.integers(1, 4))
+    values = [number >> (24 - 8 * place) & 0xFF for place in range(parts - 1)]
+    values.append(number & (1 << (8 * (5 - parts))) - 1)
+    text = draw(st.sampled_from("...。．")).join(draw(BASES).format(value) for value in values)
+    return text + draw(st.sampled_from(("", ".", "")))
+
+
+@given(notations(), st.sampled_from(("", ":80", ":443")))
+def test_no_notation_of_a_private_address_gets_through(text: str, port: str) -> None:
+    for hosts in (["*"], None):
+        with pytest.raises(NotAllowed):
+            Egress(hosts, resolve=look_up).fetch(f"http://{text}{port}/", MOST)
+    plain = text.replace("。", ".").replace("．", ".").removesuffix(".")
+    # The second wall, if such a text were taken for a name: what the system makes of it is not public either.
+    assert not any(is_public(ip) for ip in resolve_here(plain, 80))
+
+
+@given(ADDRESSES)
+def test_no_private_address_inside_another_is_public(inner: ipaddress.IPv4Address) -> None:
+    number = int(inner)
+    assert not is_public(str(inner))
+    for outer in (number, 0xFFFF << 32 | number, 0x64FF9B << 96 | number, 0x2002 << 112 | number << 80 | 1):
+        assert not is_public(str(ipaddress.IPv6Address(outer)))
+
+
+@given(st.ip_addresses(v=4) | st.ip_addresses(v=6, network="2000::/3"))
+def test_public_is_never_more_than_python_holds_global(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> None:
+    if is_public(str(address)):
+        kinds = ("private", "loopback", "link_local", "multicast", "unspecified", "reserved")
+        assert not [kind for kind in kinds if getattr(address, f"is_{kind}")]
+
+
+@pytest.mark.parametrize(
+    "ip",
+    ["8.8.8.8", "1.1.1.1", "172.32.0.1", "100.128.0.1", "2606:4700:4700::1111", "64:ff9b::808:808", "::ffff:8.8.8.8"],
+)
+def test_public_addresses_are_public(ip: str) -> None:
+    assert is_public(ip)
+
+
+# Who is on the list
+
+
+@pytest.mark.parametrize(
+    ("entry", "yes", "no"),
+    [
+        (
+            "example.org",
+            ["example.org:80", "example.org:443"],
+            ["example.org:8080", "a.example.org:80", "xample.org:80"],
+        ),
+        ("EXAMPLE.org.", ["example.org:443"], ["example.org.evil.test:443"]),
+        ("example.org:8443", ["example.org:8443"], ["example.org:443"]),
+        ("example.org:80", ["example.org:80"], ["example.org:443"]),
+        (
+            "*.example.org",
+            ["a.example.org:80", "a.b.example.org:443"],
+            ["example.org:80", "aexample.org:80", "a.example.org:81"],
+        ),
+        ("*", ["example.org:80", "8.8.8.8:443"], ["example.org:25"]),
+        ("*:8080", ["example.org:8080"], ["example.org:80"]),
+        ("bücher.example", ["xn--bcher-kva.example:443"], ["bucher.example:443"]),
+        ("8.8.8.8", ["8.8.8.8:80"], ["8.8.8.80:80"]),
+        ("[2606:4700::0001]:81", ["2606:4700::1:81"], ["2606:4700::1:80"]),
+    ],
+)
+def test_entries_of_the_list(entry: str, yes: list[str], no: list[str]) -> None:
+    hosts = HostList([entry])
+    for wanted, texts in ((True, yes), (False, no)):
+        for text in texts:
+            host, _, port = text.rpartition(":")
+            assert hosts.has(host, int(port)) == wanted, text
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        "",
+        "https://example.org",
+        "example.org/images",
+        "user@example.org",
+        "*.",
+        "a.*.org",
+        "**",
+        "*example.org",
+        "*.1",
+        "2130706433",
+        "example.org:0",
+        "example.org:99999",
+        "example.org:x",
+        "exa mple.org",
+        "[::1",
+        "-.org",
+    ],
+)
+def test_entries_that_are_none(entry: str) -> None:
+    with pytest.raises(ValueError, match="is none of"):
+        HostList([entry])
+    with pytest.raises(SettingsError, match="COW_ALLOW_IMAGE_URLS"):
+        ImageUrls(Settings(allow_image_urls=(entry,)))
+
+
+@pytest.mark.usefixtures("unconnected")
+def test_hosts_that_are_not_listed_are_not_even_looked_up() -> None:
+    def never(host: str, port: int) -> list[str]:
+        raise AssertionError(host)
+
+    with pytest.raises(NotAllowed, match=r"'evil\.test' at port 443, which is not on this server's list"):
+        Egress(["images.test"], resolve=never).fetch("https://evil.test/images.test", MOST)
+    with pytest.raises(NotAllowed, match="at port 22"):
+        Egress(["*"], resolve=never).fetch("http://images.test:22/", MOST)
+
+
+@given(st.text(max_size=20))
+def test_a_host_name_is_plain_or_none(text: str) -> None:
+    name = host_name(text)
+    assert name is None or host_name(name) == name
+    assert name is None or set(name) <= set("abcdefghijklmnopqrstuvwxyz0123456789-_.:")
+
+
+# Redirects
+
+
+def redirect(site: Site, path: str, where: str, status: int = 302) -> str:
+    site.pages[path] = lambda page: page.answer(b"moved", status, location=where)
+    return url(site, path)
+
+
+@pytest.mark.parametrize("status", [301, 302, 303, 307, 308])
+def test_redirects_are_followed(site: Site, status: int) -> None:
+    redirect(site, "/2", "image", status)
+    redirect(site, "/1", f"//images.test:{site.port}/2", status)
+    assert egress(site).fetch(redirect(site, "/0", url(site, "/1"), status), MOST) == BODY
+    assert [path for _, path, _, _ in site.asked] == ["/0", "/1", "/2", "/image"]
+
+
+def test_redirects_end(site: Site) -> None:
+    with pytest.raises(Unreachable, match="more than 3 redirects"):
+        egress(site).fetch(redirect(site, "/loop", "/loop"), MOST)
+    assert len(site.asked) == 4
+    site.pages["/nowhere"] = lambda page: page.answer(b"", 302)
+    with pytest.raises(Unreachable, match="HTTP 302"):
+        egress(site).fetch(url(site, "/nowhere"), MOST)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "file:///etc/passwd",
+        "ftp://images.test/image",
+        "data:image/png;base64,AAAA",
+        "http://user@images.test:{port}/image",
+        "http://127.0.0.2:{port}/image",
+        "http://[::1]:{port}/image",
+        "http://2130706433:{port}/image",
+        "http://localhost:{port}/image",
+        "http://evil.test:{port}/image",
+        "http://images.test/image",
+        "http://[::1",
+        "http://images.test:{port}:80/",
+        "//evil.test:{port}/image",
+    ],
+)
+def test_every_hop_is_checked(site: Site, where: str) -> None:
+    hosts = ("images.test", "localhost", "127.0.0.2", "[::1]")
+    way = egress(site, hosts=hosts, resolve=names(localhost="127.0.0.3", evil_test="127.0.0.1"))
+    with pytest.raises(NotAllowed, match=r"^A redirect"):
+        way.fetch(redirect(site, "/away", where.format(port=site.port)), MOST)
+    assert [path for _, path, _, _ in site.asked] == ["/away"]
+
+
+def test_a_location_that_is_no_text(site: Site) -> None:
+    site.pages["/bytes"] = lambda page: page.write(b"HTTP/1.1 302 Found\r\nlocation: /\xff\xfe\r\n\r\n")
+    with pytest.raises(EgressError, match="cannot be sent"):
+        egress(site).fetch(url(site, "/bytes"), MOST)
+
+
+# Posts
+
+
+def test_a_post_says_the_status(site: Site) -> None:
+    site.pages["/hook"] = lambda page: page.answer(b"x" * 1000, 202)
+    headers = {"Content-Type": "application/json", "X-Signature": "abc", "Host": "evil.test", "Content-Length": "7"}
+    assert egress(site).post(url(site, "/hook"), b'{"id": 1}', headers) == 202
+    method, path, got, body = site.asked[0]
+    assert (method, path, body) == ("POST", "/hook", b'{"id": 1}')
+    got = {name.lower(): value for name, value in got.items()}
+    assert got["host"] == f"images.test:{site.port}"
+    assert got["content-type"] == "application/json"
+    assert got["x-signature"] == "abc"
+    assert got["content-length"] == "9"
+
+
+def test_a_post_follows_nothing_and_reads_nothing(site: Site) -> None:
+    assert egress(site).post(redirect(site, "/moved", "http://127.0.0.1/", 307), b"", {}) == 307
+    site.pages["/endless"] = lambda page: page.drip(b"HTTP/1.1 500 No\r\n\r\n", b"x" * 65536, 0)
+    assert egress(site).post(url(site, "/endless"), b"", {}) == 500
+    assert len(site.asked) == 2
+
+
+@pytest.mark.parametrize("headers", [{"x": "a\r\ny: b"}, {"x\r\n": "a"}, {"x": "ü"}])
+def test_headers_that_cannot_be_sent(site: Site, headers: dict[str, str]) -> None:
+    with pytest.raises(NotAllowed):
+        egress(site).post(url(site), b"", headers)
+    assert not site.asked
+
+
+@pytest.mark.usefixtures("unconnected")
+def test_a_url_can_be_checked_before_it_is_asked() -> None:
+    def never(host: str, port: int) -> list[str]:
+        raise AssertionError(host)
+
+    way = Egress(None, resolve=never)
+    way.check("https://hooks.example.org:8443/job?x=1")
+    way.check("https://8.8.8.8/")
+    for bad in (
+        "hooks.example.org",
+        "ftp://hooks.example.org/",
+        "http://10.0.0.1/",
+        "http://[::1]/",
+        "http://a:b@c.org/",
+    ):
+        with pytest.raises(NotAllowed):
+            way.check(bad)
+
+
+# TLS
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of images.test alone, signed by itself."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "images.test")])
+    now = datetime.datetime.now(datetime.UTC)
+    made = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName("images.test")]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    plain = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    path = tmp_path_factory.mktemp("tls") / "images.test.pem"
+    path.write_bytes(key.private_bytes(*plain) + made.public_bytes(serialization.Encoding.PEM))
+    return path
+
+
+@pytest.fixture(scope="module")
+def secure(certificate: Path) -> Iterator[Site]:
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    tls.load_cert_chain(certificate)
+    yield from running(Site(tls))
+
+
+def test_tls_is_of_the_name_although_the_address_is_asked(secure: Site, certificate: Path) -> None:
+    trusting = ssl.create_default_context(cafile=str(certificate))
+    way = egress(secure, hosts=("images.test", "other.test"), resolve=names(other_test="127.0.0.1"), tls=trusting)
+    assert way.fetch(url(secure).replace("http:", "https:"), MOST) == BODY
+    assert secure.asked[-1][2]["host"] == f"images.test:{secure.port}"
+    with pytest.raises(Unreachable, match=r"certificate of 'other\.test'"):
+        way.fetch(url(secure, host="other.test").replace("http:", "https:"), MOST)
+    with pytest.raises(Unreachable, match="certificate"):
+        egress(secure).fetch(url(secure).replace("http:", "https:"), MOST)
+    assert len(secure.asked) == 1
+
+
+def test_no_tls_where_it_is_wanted(site: Site) -> None:
+    with pytest.raises(Unreachable, match="No TLS connection"):
+        egress(site).fetch(url(site).replace("http:", "https:"), MOST)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        way = Egress(None, seconds=0.3, resolve=names(), permitted=lambda ip: True)
+        began = time.monotonic()
+        with pytest.raises(Unreachable, match="too long"):
+            way.fetch(f"https://images.test:{port}/", MOST)
+        assert time.monotonic() - began < 1
+
+
+# The table
+
+
+def raised_by(module: object) -> list[type[Exception]]:
+    found = inspect.getmembers(module, inspect.isclass)
+    return [kind for name, kind in found if issubclass(kind, Exception) and not name.startswith("_")]
+
+
+FOREIGN = {
+    *raised_by(httpcore),
+    *raised_by(socket),
+    *raised_by(ssl),
+    *raised_by(idna),
+    *(kind for kind in OSError.__subclasses__() if kind.__module__ == "builtins"),
+    *(UnicodeEncodeError, UnicodeDecodeError, OSError, TimeoutError, httpx.InvalidURL),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(FOREIGN, key=lambda kind: f"{kind.__module__}.{kind.__name__}"))
+def test_every_foreign_exception_is_translated(kind: type[Exception]) -> None:
+    arguments = {UnicodeEncodeError: ("ascii", "ü", 0, 1, "no"), UnicodeDecodeError: ("ascii", b"\xff", 0, 1, "no")}
+    with pytest.raises(EgressError, match=r"images\.test.*\.$"), _told("images.test"):
+        raise kind(*arguments.get(kind, ("secret 10.0.0.1",)))
+
+
+def test_no_row_of_the_table_is_hidden_by_one_above() -> None:
+    for (above, *_), (below, *_) in itertools.combinations(TRANSLATED, 2):
+        assert not issubclass(below, above), f"{below} is never reached"
+
+
+def test_faults_of_our_own_are_not_hidden() -> None:
+    with pytest.raises(KeyError), _told("images.test"):
+        raise KeyError("x")
+
+
+# Images
+
+
+def test_images_by_url_are_off_by_default() -> None:
+    with pytest.raises(ImageUrlNotAllowed, match="fetches no images"):
+        ImageUrls(Settings()).fetch("https://images.test/1.png")
+
+
+def test_images_are_fetched_up_to_the_size_of_a_body(site: Site) -> None:
+    urls = ImageUrls(Settings(max_body_mb=len(BODY) / 1e6), egress(site))
+    assert urls.fetch(url(site)) == BODY
+    urls = ImageUrls(Settings(max_body_mb=(len(BODY) - 1) / 1e6), egress(site))
+    with pytest.raises(ImageUrlUnreachable, match=f"larger than {len(BODY) - 1} bytes. Or send the image itself"):
+        urls.fetch(url(site))
+    with pytest.raises(ImageUrlNotAllowed, match=r"not on this server's list\. Or send the image itself"):
+        urls.fetch("https://evil.test/")
+
+
+def test_the_setting_is_a_json_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COW_ALLOW_IMAGE_URLS", '["*.images.test"]')
+    settings = load_settings()
+    assert settings.allow_image_urls == ("*.images.test",)
+    with pytest.raises(ImageUrlNotAllowed, match=r"'images\.test' at port 443"):
+        ImageUrls(settings).fetch("https://images.test/")
+    monkeypatch.setenv("COW_ALLOW_IMAGE_URLS", "images.test")
+    with pytest.raises(SettingsError, match="COW_ALLOW_IMAGE_URLS"):
+        load_settings()

@@ -1,0 +1,473 @@
+"""What the operator sees: ids on responses and in logs, metrics, and traces that a collector takes."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from fastapi.responses import StreamingResponse
+from otlp import Collector, value
+from prometheus_client.parser import text_string_to_metric_families
+from starlette.types import Message
+
+from cow_service import context, logs, tracing
+from cow_service.api.app import create_app
+from cow_service.api.origins import Origins
+from cow_service.context import TraceContext, parse_traceparent
+from cow_service.jobs.engine import Engine
+from cow_service.keys import hash_of
+from cow_service.metrics import Metrics
+from cow_service.service import Service
+from cow_service.settings import Settings, SettingsError
+
+TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
+PARENT = f"00-{TRACE}-{SPAN}-01"
+SHA = "0" * 64
+
+
+def ask(app: FastAPI, *requests: tuple[str, str] | tuple[str, str, dict[str, str]]) -> list[httpx.Response]:
+    async def run() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=20) as http:
+            return [await http.request(method, path, headers=dict(*headers)) for method, path, *headers in requests]
+
+    return asyncio.run(run())
+
+
+@pytest.fixture
+def app(service: Service) -> FastAPI:
+    return create_app(Engine(service))
+
+
+# --- ids ---
+
+
+@pytest.mark.parametrize("given", ["a", "Req_1.2-3", "x" * 128])
+def test_a_request_id_is_kept(app: FastAPI, given: str) -> None:
+    for response in ask(app, ("GET", "/livez", {"X-Request-Id": given}), ("GET", "/x", {"X-Request-Id": given})):
+        assert response.headers["x-request-id"] == given
+
+
+@pytest.mark.parametrize("given", ["", "a b", "x" * 129, "a\tb", "<a>", "ä"])
+def test_a_request_id_that_could_harm_a_log_is_replaced(app: FastAPI, given: str) -> None:
+    sent = {"X-Request-Id": given.encode("latin-1")}
+    first, second = ask(app, ("GET", "/livez", sent), ("GET", "/livez"))  # type: ignore[arg-type]
+    assert re.fullmatch("[0-9a-f]{32}", first.headers["x-request-id"])
+    assert first.headers["x-request-id"] != second.headers["x-request-id"]
+
+
+def test_a_trace_goes_on_or_begins(app: FastAPI) -> None:
+    known, other, none = ask(
+        app,
+        ("GET", "/livez", {"traceparent": PARENT}),
+        ("GET", "/livez", {"traceparent": f"00-{'0' * 32}-{SPAN}-01"}),
+        ("GET", "/livez"),
+    )
+    here = parse_traceparent(known.headers["traceparent"])
+    assert here is not None
+    assert (here.trace_id, here.sampled) == (TRACE, True)
+    assert here.span_id != SPAN
+    for response in (other, none):
+        begun = parse_traceparent(response.headers["traceparent"])
+        assert begun is not None
+        assert begun.trace_id not in (TRACE, "0" * 32)
+
+
+@pytest.mark.parametrize(
+    ("header", "valid"),
+    [
+        (PARENT, True),
+        (f"00-{TRACE}-{SPAN}-00", True),
+        (f"01-{TRACE}-{SPAN}-01-more", True),
+        (f"00-{TRACE}-{SPAN}-01-more", False),
+        (f"ff-{TRACE}-{SPAN}-01", False),
+        (f"00-{'0' * 32}-{SPAN}-01", False),
+        (f"00-{TRACE}-{'0' * 16}-01", False),
+        (f"00-{TRACE.upper()}-{SPAN}-01", False),
+        (f"00-{TRACE[1:]}-{SPAN}-01", False),
+        ("", False),
+        ("nonsense", False),
+    ],
+)
+def test_which_traceparents_are_valid(header: str, valid: bool) -> None:
+    found = parse_traceparent(header)
+    assert (found is not None) == valid
+    if found is not None:
+        assert (found.trace_id, found.span_id) == (TRACE, SPAN)
+        assert parse_traceparent(found.traceparent) == found
+
+
+def test_faults_carry_the_ids_too(
+    service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("secret")
+
+    app = create_app(Engine(service))
+    monkeypatch.setattr(service, "models", fail)
+    in_route = ask(app, ("GET", "/models", {"X-Request-Id": "one"}))[0]
+    monkeypatch.setattr(Origins, "_refusal", fail)
+    in_layer = ask(app, ("GET", "/livez", {"X-Request-Id": "two"}))[0]
+    for response, given in ((in_route, "one"), (in_layer, "two")):
+        assert response.status_code == 500
+        assert response.json()["type"] == "urn:cow:problem:internal-error"
+        assert response.headers["x-request-id"] == given
+        assert response.headers["x-content-type-options"] == "nosniff"
+        assert parse_traceparent(response.headers["traceparent"])
+        assert "secret" not in response.text
+    assert len([record for record in caplog.records if record.exc_info]) == 2
+
+
+def test_an_answer_that_breaks_off_is_not_taken_for_whole(service: Service) -> None:
+    app = create_app(Engine(service))
+
+    @app.get("/broken")
+    async def broken() -> StreamingResponse:
+        async def parts() -> object:
+            yield b"half"
+            raise ValueError("gone")
+
+        return StreamingResponse(parts())
+
+    sent: list[Message] = []
+
+    async def receive() -> Message:
+        return await asyncio.Future()  # the caller stays
+
+    async def send(message: Message) -> None:
+        sent.append(message)
+
+    scope = {"type": "http", "method": "GET", "path": "/broken", "headers": [], "query_string": b"", "root_path": ""}
+    with pytest.raises(ValueError, match="gone"):
+        asyncio.run(app(scope, receive, send))
+    assert sent[-1].get("more_body")
+
+
+def test_ids_are_there_for_as_long_as_the_block_runs() -> None:
+    trace = TraceContext(TRACE, SPAN)
+    with context.bound(request="r", trace_context=trace), context.bound(job="j"):
+        assert context.ids() == {"request_id": "r", "job_id": "j", "trace_id": TRACE, "span_id": SPAN}
+    assert context.ids() == {}
+
+
+# --- metrics ---
+
+
+def samples(metrics: Metrics | str) -> dict[tuple[str, tuple[str, ...]], float]:
+    """Values by name and label values, in the order of the label names."""
+    text = metrics if isinstance(metrics, str) else metrics.exposition().decode()
+    return {
+        (sample.name, tuple(sample.labels[name] for name in sorted(sample.labels))): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def test_requests_are_counted_by_the_template_of_their_route(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, api_keys={"alice": hash_of("cow_alice")}, rate_limit=4)
+    app = create_app(Engine(Service(settings)))
+    key = {"Authorization": "Bearer cow_alice"}
+    ask(
+        app,
+        ("GET", "/livez"),
+        ("GET", "/jobs/a_1", key),
+        ("GET", "/jobs/a_2", key),
+        ("GET", "/jobs/a_1"),
+        ("GET", "/nowhere/42", key),
+        ("BREW", "/livez"),
+    )
+    response, late = ask(app, ("GET", "/metrics", key), ("GET", "/jobs/a_1", key))
+    assert late.status_code == 429
+    assert response.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+    seen = samples(response.text)
+    for labels, number in {
+        ("GET", "/livez", "200"): 1,
+        ("GET", "/jobs/{id}", "422"): 2,
+        ("GET", "/jobs/{id}", "401"): 1,
+        ("GET", "unmatched", "404"): 1,
+        ("other", "/livez", "401"): 1,
+    }.items():
+        assert seen["cow_http_requests_total", labels] == number
+    assert seen["cow_http_request_seconds_count", ("/jobs/{id}",)] == 3
+    assert "/jobs/a" not in response.text
+    assert "nowhere" not in response.text
+    assert ask(app, ("GET", "/metrics"))[0].status_code == 401
+    if sys.platform == "linux":
+        assert seen["process_resident_memory_bytes", ()] > 0
+
+
+def test_apps_count_for_themselves(tmp_path: Path) -> None:
+    first, second = (Service(Settings(data_dir=tmp_path)) for _ in range(2))
+    app, _ = create_app(Engine(first)), create_app(Engine(second))
+    ask(app, ("GET", "/livez"))
+    assert ("cow_http_requests_total", ("GET", "/livez", "200")) in samples(first.metrics)
+    assert ("cow_http_requests_total", ("GET", "/livez", "200")) not in samples(second.metrics)
+
+
+def test_stages_jobs_and_queues(caplog: pytest.LogCaptureFixture) -> None:
+    metrics = Metrics()
+    metrics.stage("grounding", 0.2)
+    metrics.job("simulate", "failed")
+    metrics.stage_cache("generation", hit=True)
+    metrics.stage_cache("generation", hit=False)
+    metrics.queue_depth = lambda: {("ati", "queued"): 3, ("ati", "running"): 1}
+    seen = samples(metrics)
+    assert seen["cow_stage_seconds_sum", ("grounding",)] == pytest.approx(0.2)
+    assert seen["cow_jobs_total", ("simulate", "failed")] == 1
+    assert seen["cow_stage_cache_total", ("hit", "generation")] == 1
+    assert seen["cow_stage_cache_total", ("miss", "generation")] == 1
+    assert seen["cow_queue_depth", ("ati", "queued")] == 3
+
+    def fail() -> dict[tuple[str, str], int]:
+        raise OSError("the database is gone")
+
+    metrics.queue_depth = fail
+    assert ("cow_jobs_total", ("simulate", "failed")) in samples(metrics)
+    assert "the database is gone" in caplog.text
+
+
+def test_gpu_memory_is_told_where_the_process_uses_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    used = SimpleNamespace(
+        is_available=lambda: True,
+        is_initialized=lambda: True,
+        device_count=lambda: 1,
+        memory_allocated=lambda _: 10,
+        memory_reserved=lambda _: 20,
+        get_device_properties=lambda _: SimpleNamespace(total_memory=30),
+    )
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=used))
+    seen = samples(Metrics())
+    kinds = {"allocated": 10, "reserved": 20, "total": 30}
+    assert {kind: seen["cow_gpu_memory_bytes", ("cuda:0", kind)] for kind in kinds} == kinds
+    used.is_initialized = lambda: False
+    assert not [name for name, _ in samples(Metrics()) if name == "cow_gpu_memory_bytes"]
+
+
+# --- logs ---
+
+
+@pytest.fixture
+def written() -> Iterator[SimpleNamespace]:
+    """Logs set up on two texts; what was set up before comes back."""
+    names = ("", "uvicorn", "uvicorn.error", "cow_service", logs.ACCESS, "dbos")
+    loggers = [logging.getLogger(name) for name in names]
+    before = [(each.handlers, each.level, each.propagate, each.filters) for each in loggers]
+    streams = SimpleNamespace(out=io.StringIO(), err=io.StringIO())
+
+    def set_up(**settings: str) -> None:
+        logs.set_up(Settings(**settings), out=streams.out, err=streams.err)
+
+    streams.set_up = set_up
+    yield streams
+    logging.captureWarnings(False)
+    for logger, (handlers, level, propagate, filters) in zip(loggers, before, strict=True):
+        logger.handlers, logger.propagate, logger.filters = handlers, propagate, filters
+        logger.setLevel(level)
+
+
+def test_text_is_one_line_a_record(written: SimpleNamespace) -> None:
+    written.set_up()
+    with context.bound(request="r1", job="j1"):
+        logging.getLogger("cow_service").info("a %s", "b\nINFO forged")
+        logging.getLogger("cow_service").debug("too little")
+    logging.getLogger("uvicorn.error").info("Uvicorn running on %s", "http://127.0.0.1:8000")
+    try:
+        raise ValueError("why")
+    except ValueError:
+        logging.getLogger("cow_service").exception("failed")
+    first, second, third, *trace = written.err.getvalue().splitlines()
+    assert re.fullmatch(
+        r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO cow_service: a b\\nINFO forged request_id=r1 job_id=j1", first
+    )
+    assert second.endswith("INFO uvicorn: Uvicorn running on http://127.0.0.1:8000")
+    assert third.endswith("ERROR cow_service: failed")
+    assert trace[-1] == "ValueError: why"
+
+
+def test_json_is_one_object_a_line(written: SimpleNamespace) -> None:
+    written.set_up(log_format="json", log_level="debug")
+    with context.bound(request="r1", job="j1", trace_context=TraceContext(TRACE, SPAN)):
+        logging.getLogger("cow_service.jobs").debug("ü\n", extra={"path": Path("/x"), "n": 1, "message_": None})
+    try:
+        raise ValueError("why")
+    except ValueError:
+        logging.getLogger("somebody.else").exception("failed")
+    first, second = (json.loads(line) for line in written.err.getvalue().splitlines())
+    ids = {"request_id": "r1", "job_id": "j1", "trace_id": TRACE, "span_id": SPAN}
+    told = {"level": "debug", "logger": "cow_service.jobs", "message": "ü\n", "path": "/x", "n": 1}
+    assert first == ids | told | {"time": first["time"]}
+    assert first["time"].endswith("Z")
+    assert datetime.fromisoformat(first["time"]).utcoffset().total_seconds() == 0
+    assert second["exception"].endswith("ValueError: why")
+    assert set(second) == {"time", "level", "logger", "message", "exception"}
+
+
+def test_the_job_engine_speaks_through_our_handler(written: SimpleNamespace) -> None:
+    written.set_up()
+    written.set_up()  # once more changes nothing
+    engine = logging.getLogger("dbos")
+    engine.error("Exception encountered in background workflow:", exc_info=ValueError("why"))
+    engine.info("Initializing")
+    engine.warning("Something to know")
+    assert len(written.err.getvalue().splitlines()) == 1
+    assert written.err.getvalue().endswith("WARNING dbos: Something to know\n")
+
+
+# --- a real server, with everything on ---
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A `cow serve` that logs JSON and exports traces: its answers, its log, and what the collector took."""
+    data = tmp_path_factory.mktemp("telemetry")
+    with Collector() as collector:
+        environment = os.environ | {
+            "COW_DATA_DIR": str(data),
+            "COW_LOG_FORMAT": "json",
+            "COW_API_KEYS": json.dumps({"alice": hash_of("cow_alice")}),
+            "OTEL_EXPORTER_OTLP_ENDPOINT": collector.address,
+            "OTEL_RESOURCE_ATTRIBUTES": "deployment.environment=test",
+        }
+        command = [sys.executable, "-m", "cow_service.cli", "serve", "--port", "0"]
+        with subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stderr is not None
+            started: list[str] = []
+            while "running on" not in (line := process.stderr.readline()):
+                assert line, started
+                started.append(line)
+            started.append(line)
+            address = json.loads(line)["message"].split("running on ")[1].split()[0]
+            with httpx.Client(base_url=address, headers={"Authorization": "Bearer cow_alice"}) as http:
+                answers = [
+                    http.get("/models", headers={"X-Request-Id": "first", "traceparent": PARENT}),
+                    http.get(f"/artifacts/{SHA}?secret=1", headers={"X-Request-Id": "second"}),
+                    http.get("/livez", headers={"traceparent": PARENT[:-2] + "00"}),
+                    httpx.get(address + "/models"),
+                ]
+            process.terminate()
+            out, err = process.communicate(timeout=20)
+    return SimpleNamespace(answers=answers, out=out, err="".join(started) + err, collector=collector)
+
+
+def test_every_line_of_a_json_log_is_json(run: SimpleNamespace) -> None:
+    lines = [json.loads(line) for line in run.err.splitlines()]
+    assert {"uvicorn.error"} <= {line["logger"] for line in lines}
+    assert "Application shutdown complete." in [line["message"] for line in lines]
+
+
+def test_one_access_line_a_request_with_its_ids(run: SimpleNamespace) -> None:
+    lines = [json.loads(line) for line in run.out.splitlines()]
+    assert [(line["path"], line["status"], line.get("owner")) for line in lines] == [
+        ("/models", 200, "alice"),
+        (f"/artifacts/{SHA}", 404, "alice"),
+        ("/livez", 200, None),
+        ("/models", 401, None),
+    ]
+    for line, answer in zip(lines, run.answers, strict=True):
+        assert line["logger"] == "cow_service.access"
+        assert line["method"] == "GET"
+        assert line["milliseconds"] >= 0
+        assert line["request_id"] == answer.headers["x-request-id"]
+        assert (line["trace_id"], line["span_id"]) == tuple(answer.headers["traceparent"].split("-")[1:3])
+    assert "secret" not in run.out
+    assert "cow_alice" not in run.out + run.err
+
+
+def test_a_collector_takes_a_span_for_each_request(run: SimpleNamespace) -> None:
+    assert run.collector.paths == {"/v1/traces"}
+    assert run.collector.resources[0]["service.name"] == "cow"
+    assert run.collector.resources[0]["deployment.environment"] == "test"
+    spans = {span.span_id.hex(): span for span in run.collector.spans}
+    here = [parse_traceparent(answer.headers["traceparent"]) for answer in run.answers]
+    assert set(spans) == {each.span_id for each in here if each.sampled}  # not the one that its caller left out
+    first, second, refused = (spans[each.span_id] for each in (here[0], here[1], here[3]))
+    assert (first.trace_id.hex(), first.parent_span_id.hex(), first.name) == (TRACE, SPAN, "GET /models")
+    assert first.kind == first.SPAN_KIND_SERVER
+    assert not second.parent_span_id
+    attributes = {each.key: value(each.value) for each in second.attributes}
+    assert attributes == {
+        "http.request.method": "GET",
+        "http.response.status_code": 404,
+        "http.route": "/artifacts/{sha256}",
+        "url.path": f"/artifacts/{SHA}",
+        "cow.owner": "alice",
+    }
+    assert refused.name == "GET /models"
+
+
+# --- traces ---
+
+
+def test_spans_nest_and_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Collector() as collector:
+        environment = {"OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": collector.address + "/here"}
+        monkeypatch.setenv(*next(iter(environment.items())))
+        assert tracing.start(environment)
+        try:
+            with tracing.request_span("GET", parse_traceparent(PARENT)) as request:
+                with tracing.span("stage", **{"cow.stage": "grounding", "cow.none": None}):
+                    inner = context.trace.get()
+                assert context.trace.get() == request
+                tracing.describe("GET /x", failed=True, status=500)
+            with tracing.span("job", parent=request.traceparent):
+                job = context.trace.get()
+            with pytest.raises(KeyError), tracing.span("fails"):
+                raise KeyError("k")
+        finally:
+            tracing.stop()
+        assert not tracing.start({})
+    spans = {span.name: span for span in collector.spans}
+    assert collector.paths == {"/here"}
+    assert set(spans) == {"GET /x", "stage", "job", "fails"}
+    assert spans["stage"].parent_span_id == spans["GET /x"].span_id == spans["job"].parent_span_id
+    assert {span.trace_id.hex() for name, span in spans.items() if name != "fails"} == {TRACE}
+    assert (inner.span_id, job.span_id) == (spans["stage"].span_id.hex(), spans["job"].span_id.hex())
+    assert {each.key: value(each.value) for each in spans["stage"].attributes} == {"cow.stage": "grounding"}
+    assert spans["GET /x"].status.code == spans["fails"].status.code == 2
+
+
+def test_without_a_collector_nothing_is_imported() -> None:
+    code = (
+        "import sys; from cow_service import tracing, context; assert not tracing.start({})\n"
+        "with tracing.request_span('GET', None), tracing.span('x', a=1): tracing.describe('y', failed=False)\n"
+        "assert context.trace.get() is None\n"
+        "print([m for m in sys.modules if m.startswith('opentelemetry')])"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("environment", "told"),
+    [
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "collector:4318"}, "OTEL_EXPORTER_OTLP_ENDPOINT must begin with http"),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c", "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"}, "http/protobuf only"),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c"}, r'pip install "cow-service\[otel\]"'),
+    ],
+)
+def test_traces_that_cannot_be_sent_stop_the_start(
+    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], told: str
+) -> None:
+    monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
+    with pytest.raises(SettingsError, match=told):
+        tracing.start(environment)
+
+
+@pytest.mark.parametrize("off", [{"OTEL_SDK_DISABLED": "true"}, {"OTEL_TRACES_EXPORTER": "none"}])
+def test_the_standard_switches_turn_traces_off(off: dict[str, str]) -> None:
+    assert not tracing.start({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:9"} | off)
