@@ -8,7 +8,7 @@ import re
 from collections.abc import Generator as Steps
 from contextlib import contextmanager
 from functools import partial
-from threading import BoundedSemaphore, Lock
+from threading import Lock
 
 from cow_service.artifacts import ArtifactStore
 from cow_service.checkpoints import Checkpoints, keep_nothing
@@ -32,12 +32,16 @@ from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulatio
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, SimulateRequest
 from cow_service.settings import Settings, SettingsError
 from cow_service.stages.options import check_frames, read_options
+from cow_service.turns import Turns
 from cow_service.weights import ready, weights_identity
 
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
 _OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)
 _DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)
-TURN = 0.2  # seconds between looks at whether somebody who waits for a generator is still wanted
+
+
+def always_wanted() -> None:
+    """Nobody ends it."""
 
 
 class Service:
@@ -48,8 +52,8 @@ class Service:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._slots = BoundedSemaphore(settings.concurrency)
-        self._turns: dict[str, BoundedSemaphore] = {}  # of generators that take only so many clips at the same time
+        self.slots = Turns(settings.concurrency)  # who computes
+        self._turns: dict[str, Turns] = {}  # of generators that take only so many clips at the same time
         self._guard = Lock()
         self.metrics = Metrics()
         self._image_urls = ImageUrls(settings)
@@ -80,13 +84,15 @@ class Service:
         image: DecodedImage | None = None,
         checkpoints: Checkpoints = keep_nothing,
         stamp: Stamp | None = None,
+        still_wanted: StillWanted = always_wanted,
     ) -> Simulation:
         """One simulation, start to end; `image` is that of the request where it was decoded before.
 
-        Raises any `CowError` of its stages.
+        Who asked first computes first; `still_wanted` may end the wait. Raises any `CowError` of its stages.
         """
-        backends = self._backends(request)
-        with self._slots:
+        stamp = stamp or Stamp()
+        backends = self._backends(request, stamp.created_at)
+        with self.slots.held(stamp.created_at, still_wanted):
             image = image or self.image_of(request.image)[1]
             return simulate(request, image, backends, progress, checkpoints, stamp)
 
@@ -97,13 +103,15 @@ class Service:
         image: DecodedImage | None = None,
         checkpoints: Checkpoints = keep_nothing,
         stamp: Stamp | None = None,
+        still_wanted: StillWanted = always_wanted,
     ) -> Answer:
         """One answer, start to end; `image` is that of the request where it was decoded before.
 
-        Raises any `CowError` that leaves no answer.
+        Who asked first computes first; `still_wanted` may end the wait. Raises any `CowError` that leaves no answer.
         """
-        backends = self._backends(request)
-        with self._slots:
+        stamp = stamp or Stamp()
+        backends = self._backends(request, stamp.created_at)
+        with self.slots.held(stamp.created_at, still_wanted):
             image = image or self.image_of(request.image)[1]
             return answer(request, image, backends, progress, checkpoints, stamp)
 
@@ -148,7 +156,7 @@ class Service:
         self._reader(self.settings.reader)
         self._generator(self.settings.generator)
 
-    def _backends(self, request: SimulateRequest) -> Backends:
+    def _backends(self, request: SimulateRequest, rank: str) -> Backends:
         """Who does the work of a request. Raises `InvalidRequest` for a name that nobody has."""
         reader = self._known("reader", request.reader or self.settings.reader, self.readers)
         generator = self._known("generator", request.generator or self.settings.generator, self.generators)
@@ -158,8 +166,8 @@ class Service:
             generator=lambda: self._generator(generator),
             artifacts=self.artifacts,
             weights=self._weights(generator),
-            elsewhere=self.elsewhere,
-            rendering=partial(self._rendering, generator),
+            elsewhere=partial(self.slots.left, rank),
+            rendering=partial(self._rendering, generator, rank),
         )
 
     def _weights(self, name: str) -> str:
@@ -167,30 +175,16 @@ class Service:
         return "" if manifest is None else weights_identity(manifest, self.settings)
 
     @contextmanager
-    def _rendering(self, name: str, still_wanted: StillWanted) -> Steps[None]:
+    def _rendering(self, name: str, rank: str, still_wanted: StillWanted) -> Steps[None]:
         """Holds a generator's turn. While waiting for it, and while it works, the slot is left to others."""
-        at_once = self.settings.generator_concurrency.get(name, self._generator(name).concurrency)
+        at_once = self.settings.generator_concurrency.get(name, getattr(self._generator(name), "concurrency", None))
         if at_once is None:
             yield
             return
         with self._guard:
-            turns = self._turns.setdefault(name, BoundedSemaphore(at_once))
-        with self.elsewhere():
-            while not turns.acquire(timeout=TURN):
-                still_wanted()
-            try:
-                yield
-            finally:
-                turns.release()
-
-    @contextmanager
-    def elsewhere(self) -> Steps[None]:
-        """Leaves the slot to others while somebody else computes for us."""
-        self._slots.release()
-        try:
+            turns = self._turns.setdefault(name, Turns(at_once))
+        with self.slots.left(rank), turns.held(rank, still_wanted):
             yield
-        finally:
-            self._slots.acquire()
 
     def _reader(self, name: str) -> Reader:
         _check_modules(name, ReaderUnavailable)

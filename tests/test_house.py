@@ -25,6 +25,7 @@ FLOORS: dict[str, int] = {
     "metrics": 2,
     "tracing": 2,
     "keys": 2,
+    "turns": 1,
     "image_files": 1,
     "hosts": 1,
     "pinned": 1,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import AwareDatetime
 
 from cow_service import errors
 from cow_service.api.problems import documented
@@ -32,8 +32,8 @@ def job_routes(engine: Engine) -> APIRouter:
         request: Request,
         status: Annotated[list[JobStatus] | None, Query(description="May be repeated.")] = None,
         kind: Annotated[JobKind | None, Query()] = None,
-        created_after: Annotated[datetime | None, Query(description="RFC 3339; included.")] = None,
-        created_before: Annotated[datetime | None, Query(description="RFC 3339; included.")] = None,
+        created_after: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
+        created_before: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
         cursor: Annotated[str | None, Query(max_length=40_000, description="`next` of the page before.")] = None,
     ) -> JobPage:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeVar
 
 from dbos import DBOS
@@ -14,14 +15,14 @@ from dbos import DBOS
 from cow_service.checkpoints import digest_of
 from cow_service.errors import ArtifactNotFound, Canceled
 from cow_service.jobs.database import Database
-from cow_service.metrics import Metrics
 from cow_service.records import Record
 from cow_service.requests import Stage
 from cow_service.service import Service
 
 POLL = 0.1  # seconds between looks at whether somebody who waits for the same work is still wanted
-# Computed in milliseconds from its inputs alone, and never differently: a step would cost more than it saves.
-PURE: tuple[Stage, ...] = ("trajectory",)
+# Stages that are steps of the workflow: those that ask others or take long. What any stage comes to is kept the moment
+# it is there, and found after a crash, so that nothing is done again; a step on top takes 3 ms, longer than the rest.
+STEPS: tuple[Stage, ...] = ("grounding", "generation", "answering")
 
 Result = TypeVar("Result", bound=Record)
 _SHA256 = re.compile(r'"sha256":"([0-9a-f]{64})"')
@@ -39,14 +40,16 @@ class Flights:
     _held: dict[str, tuple[threading.Lock, int]] = field(default_factory=dict[str, tuple[threading.Lock, int]])
 
     @contextmanager
-    def alone_with(self, key: str, service: Service, still_wanted: Callable[[], None]) -> Generator[None]:
+    def alone_with(
+        self, key: str, elsewhere: Callable[[], AbstractContextManager[None]], still_wanted: Callable[[], None]
+    ) -> Generator[None]:
         """Holds a key. Whoever waits for it lets others compute."""
         with self._lock:
             lock, users = self._held.get(key, (threading.Lock(), 0))
             self._held[key] = (lock, users + 1)
         try:
             if not lock.acquire(blocking=False):
-                with service.elsewhere():
+                with elsewhere():
                     while not lock.acquire(timeout=POLL):
                         still_wanted()
             try:
@@ -66,12 +69,13 @@ class JobCheckpoints:
     """The `Checkpoints` of one job."""
 
     job: str
+    image: str  # its SHA-256
+    rank: str  # of the job among those that want to compute
     fresh: bool  # nothing of other jobs is taken
     service: Service
     database: Database
-    metrics: Metrics
     flights: Flights
-    still_wanted: Callable[[Stage], None]
+    still_wanted: Callable[[], None]
 
     def __call__(
         self, stage: Stage, inputs: Mapping[str, Any] | None, model: type[Result], compute: Callable[[], Result]
@@ -88,7 +92,7 @@ class JobCheckpoints:
                 raise Left from error
             return [key, made[0][1]]
 
-        if stage in PURE:
+        if stage not in STEPS:
             step()
             return made[0]
         key, reused = DBOS.run_step({"name": stage}, step)
@@ -99,20 +103,21 @@ class JobCheckpoints:
         return (self._keep(stage, key, compute()) if kept is None else kept[0]), bool(reused)
 
     def _made(self, stage: Stage, key: str, model: type[Result], compute: Callable[[], Result]) -> tuple[Result, bool]:
-        with self.flights.alone_with(key, self.service, lambda: self.still_wanted(stage)):
+        elsewhere = partial(self.service.slots.left, self.rank)
+        with self.flights.alone_with(key, elsewhere, self.still_wanted):
             kept = self._kept(key, model)
             if kept is not None:
                 result, job, artifacts = kept
-                self.metrics.stage_cache(stage, hit=job != self.job)
+                self.service.metrics.stage_cache(stage, hit=job != self.job)
                 if job != self.job:
-                    self.database.hold(self.job, artifacts)
+                    self.database.hold(self.job, [self.image, *artifacts])
                 return result, job != self.job
-            self.metrics.stage_cache(stage, hit=False)
+            self.service.metrics.stage_cache(stage, hit=False)
             return self._keep(stage, key, compute()), False
 
     def _keep(self, stage: Stage, key: str, result: Result) -> Result:
         text = result.model_dump_json()
-        self.database.keep(key, self.job, stage, text, artifacts_of(text))
+        self.database.keep(key, self.job, stage, text, [self.image, *artifacts_of(text)])
         return result
 
     def _kept(self, key: str, model: type[Result]) -> tuple[Result, str, list[str]] | None:

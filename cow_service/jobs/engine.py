@@ -67,6 +67,8 @@ class Engine:
         self._stopping = False
         self._queues: set[str] = set()
         self._followed: set[str] = set()  # jobs whose end a thread waits for
+        self._keyed, self._canceling = threading.Lock(), threading.Lock()
+        self._grace: threading.Timer | None = None  # until running jobs are handed back
         self.webhooks = Webhooks(service.settings)
         self._upkeep = Upkeep(self.ledger)
         self._threads: ThreadPoolExecutor | None = None
@@ -127,8 +129,15 @@ class Engine:
         self._upkeep.start(self._executors)
 
     def drain(self) -> None:
-        """Takes no more orders, and tells whoever waits for a job that nobody works on."""
-        self._stopping = True
+        """Takes no more orders, and tells whoever waits for a job that nobody works on.
+
+        From now on running jobs have the time that the settings say: then those who wait for them are told as well.
+        """
+        if not self._stopping:
+            self._stopping = True
+            self._grace = threading.Timer(self.service.settings.shutdown_grace, self._hand_back)
+            self._grace.daemon = True
+            self._grace.start()
         running = set(self.live.jobs())
         for job_id in self.live.waited_for():
             if job_id not in running:
@@ -138,12 +147,11 @@ class Engine:
         """Gives running jobs the time that the settings say, then lets go of all: what is not done goes on later."""
         self.drain()
         self._upkeep.stop()
-        grace = self.service.settings.shutdown_grace if self.live.jobs() else 0
-        hand_back = threading.Timer(grace, self._hand_back)
-        hand_back.start()
+        grace = self.service.settings.shutdown_grace
         # Nothing is taken from the queues from here on; it looks once a second whether the work is done.
         DBOS.destroy(workflow_completion_timeout_sec=int(grace + LEFT_OVER) if self.live.jobs() else 0)
-        hand_back.cancel()
+        if self._grace is not None:
+            self._grace.cancel()
         self._hand_back()
         if self._threads is not None:
             self._threads.shutdown(wait=True, cancel_futures=True)
@@ -176,24 +184,31 @@ class Engine:
         `key` is the caller's idempotency key: the same key and order come to the same job. Raises
         `IdempotencyKeyReused`, `QueueFull`, `ShuttingDown`, `StorageUnavailable`.
         """
-        with self.ledger.guard:  # one at a time: what is checked is still true when the job is in
-            if key is not None and self._known(job_id, order):
+        if key is None:
+            self._submit(order, generator, owner, image, job_id)
+            return True
+        with self._keyed:  # one at a time: what is checked is still true when the job is in
+            if self._known(job_id, order):
                 return False
+            self._submit(order, generator, owner, image, job_id)
+            return self._known(job_id, order)  # another process may have been faster with the same key
+
+    def _submit(self, order: Order, generator: str, owner: str | None, image: DecodedImage, job_id: str) -> None:
+        with self.ledger.guard:  # as above
             self.check_room()
             at_once = self.ledger.of(generator) < self.room
             self.ledger.count(job_id, generator)
         try:
-            # Before the job: its image must not go while nobody has begun with it.
-            self.database.hold(job_id, [image.info.sha256])
             if at_once:
                 self.live.lend(job_id, image)
                 self._start(job_id, order, owner, generator)
             else:
+                # Before the job: its image must not go while it waits. One that starts is held by its first stage.
+                self.database.hold(job_id, [image.info.sha256])
                 self._enqueue(job_id, order, owner, generator)
         except BaseException:
             self.ledger.count(job_id, None)
             raise
-        return True
 
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> Found:
         """A job of an owner. Raises `JobNotFound`, also for a job of somebody else."""
@@ -208,17 +223,20 @@ class Engine:
 
     def cancel(self, job_id: str, owner: str | None) -> Found:
         """Ends a job unless it has ended; whoever works on it stops at the next step."""
-        found = self.find(job_id, owner, full=False)
-        if found.job.status in TERMINAL:
-            return self.find(job_id, owner)
-        with database_errors():
-            DBOS.cancel_workflow(job_id)
+        with self._canceling:  # one at a time: an end does not change
+            found = self.find(job_id, owner, full=False)
+            if found.job.status in TERMINAL:
+                return self.find(job_id, owner)
+            with database_errors():
+                DBOS.cancel_workflow(job_id)
         self.live.end(job_id)
         self.ledger.ended(job_id, None)
         found = self.find(job_id, owner)
         if found.job.status == "canceled":
             self.service.metrics.job(found.job.kind, "canceled")
-            self.webhooks.job_ended(job_id, self._order(job_id).webhook)
+            order = self._order(job_id)
+            if order is not None:
+                self.webhooks.job_ended(job_id, order.webhook)
         return found
 
     def delete(self, job_id: str, owner: str | None) -> None:
@@ -233,8 +251,7 @@ class Engine:
         if owner is None:
             return
         holders = self.database.holders(sha256)
-        found = DBOS.list_workflows(workflow_ids=holders, user=owner, load_input=False, load_output=False)
-        if not holders or not found:
+        if not holders or not reports.existing(holders, owner):
             raise ArtifactNotFound(f"No artifact of yours has the SHA-256 {sha256[:64]}.")
 
     def left(self, job_id: str) -> None:
@@ -242,19 +259,17 @@ class Engine:
         if job_id not in self._followed and not self._stopping:
             self._upkeep.settle(job_id)
 
-    def _order(self, job_id: str) -> Order:
+    def _order(self, job_id: str) -> Order | None:
         with database_errors():
             known = DBOS.get_workflow_status(job_id)
-        assert known is not None
-        return _order_of(known)
+        return None if known is None else _order_of(known)
 
     def _known(self, job_id: str, order: Order) -> bool:
         """Whether the job of an idempotency key is there. Raises `IdempotencyKeyReused` for another order."""
-        with database_errors():
-            known = DBOS.get_workflow_status(job_id)
+        known = self._order(job_id)
         if known is None:
             return False
-        if _order_of(known).digest != order.digest:
+        if known.digest != order.digest:
             raise IdempotencyKeyReused(
                 "This Idempotency-Key came with another request before. Give every request a key of its own."
             )
@@ -286,7 +301,16 @@ class Engine:
                 return  # handed back: it goes on after the next start
         finally:
             self._followed.discard(job_id)
-        self.ledger.ended(job_id, outcome)
+        # After a deletion the same key may have come to the same id again: that job has not ended.
+        if outcome is not None or self._has_ended(job_id):
+            self.ledger.ended(job_id, outcome)
+
+    def _has_ended(self, job_id: str) -> bool:
+        try:
+            found = reports.find(job_id, self.live, full=False)
+        except CowError:
+            return False  # the count is set right later, and whoever waits looks for themselves
+        return found is None or found.ended is not None
 
     def _enqueue(self, job_id: str, order: Order, owner: str | None, generator: str) -> None:
         """Puts a job into the queue of its generator."""

@@ -16,6 +16,7 @@ from anyio import to_thread
 from cow_service.errors import JobNotFound
 from cow_service.jobs import reports
 from cow_service.jobs.engine import Engine
+from cow_service.jobs.live import share_done
 from cow_service.jobs.reports import Found
 from cow_service.records import TERMINAL, Job
 
@@ -61,12 +62,15 @@ async def follow(engine: Engine, job_id: str, owner: str | None, after: int) -> 
 def _durable(found: Found) -> list[Event]:
     """What has happened to a job so far, by number."""
     job = found.job
-    events = [Event("queued", QUEUED, job.model_copy(update={"status": "queued", "progress": 0.0, "stage": None}))]
+    begun = job.model_copy(
+        update={"status": "running", "progress": 0.0, "stage": None, "problem": None, "finished_at": None}
+    )
+    events = [Event("queued", QUEUED, begun.model_copy(update={"status": "queued"}))]
     stages = reports.finished_stages(job.id)
     if job.status == "running" or stages or job.status in ("succeeded", "failed"):
-        events.append(Event("running", RUNNING, job.model_copy(update={"status": "running", "problem": None})))
+        events.append(Event("running", RUNNING, begun))
     for place, stage in enumerate(stages):
-        done = job.model_copy(update={"status": "running", "stage": stage, "problem": None})
+        done = begun.model_copy(update={"stage": stage, "progress": share_done(job.kind, stage, 1.0)})
         events.append(Event("stage", FIRST_STAGE + place, done))
     if job.status in TERMINAL:
         events.append(Event(job.status, END, job))

@@ -10,6 +10,7 @@ from cow_service.errors import CowError
 from cow_service.jobs import reports
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.live import Live
+from cow_service.jobs.webhooks import attempts_of
 from cow_service.service import Service
 
 
@@ -72,6 +73,6 @@ class Ledger:
     def remove(self, jobs: list[str], untouched_since: float) -> None:
         """Removes jobs that have ended, and those of their artifacts that nobody has needed since."""
         with database_errors():
-            DBOS.delete_workflows(jobs)
+            DBOS.delete_workflows([*jobs, *(attempt for job_id in jobs for attempt in attempts_of(job_id))])
         for sha256 in self.database.forget(jobs):
             self.service.artifacts.delete(sha256, untouched_since + 1)

@@ -24,6 +24,11 @@ class Running:
     done: float = 0.0  # of the stage
     ended: threading.Event = field(default_factory=threading.Event)  # somebody wants it to end
 
+    def check(self) -> None:
+        """Raises `Canceled` where somebody wants it to end."""
+        if self.ended.is_set():
+            raise Canceled("The job was canceled.")
+
 
 @dataclass
 class Waiting:
@@ -67,14 +72,9 @@ class Live:
                 if self._running.get(job) is one:
                     del self._running[job]
 
-    def progress(self, job: str, stage: Stage, done: float) -> None:
-        """A job got so far. Raises `Canceled` where somebody wants it to end."""
-        with self._lock:
-            one = self._running.get(job)
-        if one is None:
-            return
-        if one.ended.is_set():
-            raise Canceled("The job was canceled.")
+    def progress(self, job: str, one: Running, stage: Stage, done: float) -> None:
+        """The work on a job got so far. Raises `Canceled` where somebody wants it to end."""
+        one.check()
         if stage != one.stage or done > one.done:
             one.stage, one.done = stage, done
             self._wake(job)

@@ -27,6 +27,11 @@ class Order(Record):
         """The same for requests that ask for the same."""
         return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
 
+    @property
+    def image(self) -> str:
+        """SHA-256 of the image."""
+        return str(self.request["image"]["artifact"])
+
     def parsed(self) -> SimulateRequest | AnswerRequest:
         """The request, as it was checked when it came."""
         model = AnswerRequest if self.kind == "answer" else SimulateRequest

@@ -6,7 +6,7 @@ import base64
 import binascii
 import json
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, cast, get_args
 
 from dbos import DBOS, WorkflowStatus
@@ -30,6 +30,10 @@ STATUS: dict[str, JobStatus] = {
 }
 OPEN = ["ENQUEUED", "DELAYED", "PENDING"]
 ENDED = [name for name in STATUS if name not in OPEN]
+AT_ONCE = 200  # jobs asked for together, where some of them may not fit
+LATE = timedelta(seconds=30)  # that the database may have a job later than it came: as long as writers wait
+EPOCH = datetime.fromtimestamp(0, UTC)
+HALF = timedelta(microseconds=500)  # milliseconds as floating point come out a little too small
 
 
 @dataclass(frozen=True)
@@ -70,25 +74,46 @@ def find(job_id: str, live: Live, *, full: bool = True) -> Found | None:
 def page(owner: str | None, filters: Filters, live: Live) -> JobPage:
     """Jobs of an owner, newest first; of everybody where there are no owners. Raises `InvalidRequest` for a cursor."""
     before, seen = _read_cursor(filters.cursor)
-    if filters.created_before is not None:
-        before = min(before or filters.created_before, filters.created_before)
+    after, latest = filters.created_after, filters.created_before
+    if latest is not None and latest < datetime.now(UTC):
+        before = min(before or latest + LATE, latest + LATE)
+    jobs: list[Job] = []
+    while True:
+        most = max(filters.limit, AT_ONCE) if after or latest else filters.limit
+        rest = [one for one in _listed(owner, filters, before, most + len(seen) + 1) if one.workflow_id not in seen]
+        taken = 0
+        for one in rest[:most]:
+            taken += 1
+            job = _found(one, live).job
+            came = datetime.fromisoformat(job.created_at)
+            if (after is None or after <= came) and (latest is None or came <= latest):
+                jobs.append(job)
+            if len(jobs) == filters.limit:
+                break
+        more = len(rest) > taken
+        if not more or len(jobs) == filters.limit:
+            break
+        before, seen = _place(rest[:taken], seen, before)
+    jobs.sort(key=lambda job: job.created_at, reverse=True)
+    return JobPage(jobs=tuple(jobs), next=_cursor(*_place(rest[:taken], seen, before)) if more else None)
+
+
+def _listed(owner: str | None, filters: Filters, before: datetime | None, limit: int) -> list[WorkflowStatus]:
+    """Jobs by the times of the database, which may be those of the whole second."""
+    after = filters.created_after
     wanted = [name for name, status in STATUS.items() if status in filters.status]
     with database_errors():
-        found = DBOS.list_workflows(
+        return DBOS.list_workflows(
             name=[filters.kind] if filters.kind else list(KINDS),
             status=wanted or None,
             user=owner,
-            start_time=None if filters.created_after is None else filters.created_after.isoformat(),
-            end_time=None if before is None else before.isoformat(),
+            start_time=None if after is None or after < EPOCH else after.replace(microsecond=0).isoformat(),
+            end_time=None if before is None else (max(before, EPOCH) + HALF).isoformat(),
             sort_desc=True,
-            limit=filters.limit + len(seen) + 1,
+            limit=limit,
             load_input=False,
             load_output=False,
         )
-    rest = [one for one in found if one.workflow_id not in seen]
-    shown, more = rest[: filters.limit], len(rest) > filters.limit
-    jobs = tuple(sorted((_found(one, live).job for one in shown), key=lambda job: job.created_at, reverse=True))
-    return JobPage(jobs=jobs, next=_cursor(shown, seen, before) if more else None)
 
 
 def open_jobs() -> dict[str, str]:
@@ -108,10 +133,10 @@ def ended_before(moment: datetime, limit: int) -> list[str]:
     return [one.workflow_id for one in found]
 
 
-def existing(jobs: list[str]) -> set[str]:
-    """Those of some jobs that the database knows."""
+def existing(jobs: list[str], owner: str | None = None) -> set[str]:
+    """Those of some jobs that the database knows, of an owner where one is given."""
     with database_errors():
-        found = DBOS.list_workflows(workflow_ids=jobs, load_input=False, load_output=False)
+        found = DBOS.list_workflows(workflow_ids=jobs, user=owner, load_input=False, load_output=False)
     return {one.workflow_id for one in found}
 
 
@@ -133,14 +158,16 @@ def _found(status: WorkflowStatus, live: Live) -> Found:
     if told == "running" and (running is None or running.stage is None):
         told = "queued"  # it was taken from the queue, but nobody works on it yet
     error = _error(status) if told == "failed" else None
+    created = (status.attributes or {}).get(CREATED) or _time(status.created_at)
     job = Job(
         id=status.workflow_id,
         kind=kind,
         status=told,
         stage=stage,
         progress=progress,
-        created_at=(status.attributes or {}).get(CREATED) or _time(status.created_at),
-        finished_at=None if status.completed_at is None else _time(status.completed_at),
+        created_at=created,
+        # Times in SQLite may be whole seconds, and before the job came.
+        finished_at=None if status.completed_at is None else max(_time(status.completed_at), created),
         generator=(status.attributes or {}).get(GENERATOR, ""),
         problem=None if error is None else problem_of(error),
     )
@@ -160,13 +187,21 @@ def _time(milliseconds: int | None) -> str:
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def _cursor(shown: list[WorkflowStatus], seen: set[str], before: datetime | None) -> str:
-    """Where the next page begins: the time of the last job, and the jobs of that very time that were shown."""
-    last = shown[-1].created_at or 0
-    same = {one.workflow_id for one in shown if one.created_at == last}
-    if before is not None and last == round(before.timestamp() * 1000):
+def _place(taken: list[WorkflowStatus], seen: set[str], before: datetime | None) -> tuple[datetime, set[str]]:
+    """Where it goes on: the time of the last job, and the jobs of that very time that were taken."""
+    last = taken[-1].created_at or 0
+    same = {one.workflow_id for one in taken if one.created_at == last}
+    if before is not None and last == _milliseconds(before):
         same |= seen
-    told = json.dumps([last, sorted(same)], separators=(",", ":"))
+    return EPOCH + timedelta(milliseconds=last), same
+
+
+def _milliseconds(moment: datetime) -> int:
+    return (moment - EPOCH) // timedelta(milliseconds=1)
+
+
+def _cursor(before: datetime, seen: set[str]) -> str:
+    told = json.dumps([_milliseconds(before), sorted(seen)], separators=(",", ":"))
     return base64.urlsafe_b64encode(told.encode()).decode().rstrip("=")
 
 
@@ -175,7 +210,7 @@ def _read_cursor(cursor: str | None) -> tuple[datetime | None, set[str]]:
         return None, set()
     try:
         moment, seen = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
-        return datetime.fromtimestamp(int(moment) / 1000, UTC), {str(one) for one in list(seen)}
+        return EPOCH + timedelta(milliseconds=int(moment)), {str(one) for one in list(seen)}
     except (ValueError, TypeError, OverflowError, OSError, binascii.Error, RecursionError) as error:
         detail = "is none that this server gave out"
         raise InvalidRequest(f"`cursor` {detail}.", errors=(FieldError("/cursor", detail),)) from error

@@ -13,6 +13,7 @@ from cow_service.errors import Canceled, CowError, InternalError
 from cow_service.jobs import reports
 from cow_service.jobs.checkpoints import Flights, JobCheckpoints, Left
 from cow_service.jobs.ledger import Ledger
+from cow_service.jobs.live import Running
 from cow_service.jobs.orders import Order
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.pipeline import Stamp
@@ -44,9 +45,9 @@ class Worker:
             with (
                 bound(request=told.request_id, job=job_id, trace_context=trace),
                 tracing.span(f"job {told.kind}", parent=told.traceparent, job_id=job_id),
-                self._ledger.live.running(job_id),
+                self._ledger.live.running(job_id) as running,
             ):
-                return self._outcome(job_id, told)
+                return self._outcome(job_id, told, running)
         finally:
             self._left(job_id)
 
@@ -61,10 +62,10 @@ class Worker:
                 return
             time.sleep(WAIT)
 
-    def _outcome(self, job_id: str, order: Order) -> str:
+    def _outcome(self, job_id: str, order: Order, running: Running) -> str:
         metrics = self._ledger.service.metrics
         try:
-            result = self._result(job_id, order)
+            result = self._result(job_id, order, running)
         except Canceled as error:
             raise Left from error
         except CowError as error:
@@ -84,20 +85,24 @@ class Worker:
         self._webhooks.job_ended(job_id, order.webhook)
         return result.model_dump_json()
 
-    def _result(self, job_id: str, order: Order) -> Simulation | Answer:
+    def _result(self, job_id: str, order: Order, running: Running) -> Simulation | Answer:
         ledger = self._ledger
-        progress: Callable[[Stage, float], None] = lambda stage, done: ledger.live.progress(job_id, stage, done)  # noqa: E731
-        kept = JobCheckpoints(
-            job_id,
-            order.fresh,
-            ledger.service,
-            ledger.database,
-            ledger.service.metrics,
-            self._flights,
-            lambda stage: progress(stage, 0.0),
-        )
+
+        def progress(stage: Stage, done: float) -> None:
+            ledger.live.progress(job_id, running, stage, done)
+
         request, image = order.parsed(), ledger.live.image(job_id)
+        kept = JobCheckpoints(
+            job=job_id,
+            image=order.image,
+            rank=order.created_at,
+            fresh=order.fresh,
+            service=ledger.service,
+            database=ledger.database,
+            flights=self._flights,
+            still_wanted=running.check,
+        )
         stamp = Stamp(job_id, order.created_at)
         if isinstance(request, AnswerRequest):
-            return ledger.service.answer(request, progress, image, kept, stamp)
-        return ledger.service.simulate(request, progress, image, kept, stamp)
+            return ledger.service.answer(request, progress, image, kept, stamp, running.check)
+        return ledger.service.simulate(request, progress, image, kept, stamp, running.check)

@@ -93,7 +93,7 @@ class Upkeep:
             del self._settling[job_id]
 
     def _keep_up(self, executors: Executors) -> None:
-        counted, tidied = time.monotonic(), 0.0
+        counted = tidied = time.monotonic()  # jobs that were cut off take hold of their artifacts before anybody tidies
         self._guarded(lambda: self._take_over(executors))
         while not self._stop.wait(LOOK):
             now = time.monotonic()
@@ -102,7 +102,7 @@ class Upkeep:
                 counted = now
                 self._guarded(lambda: self._take_over(executors))
                 self._guarded(self._ledger.recount)
-            if now - tidied > TIDY or not tidied:
+            if now - tidied > TIDY:
                 tidied = now
                 self._guarded(self.tidy)
 

@@ -101,7 +101,7 @@ class Webhooks:
             if not self._registered:
                 DBOS.register_queue(QUEUE, worker_concurrency=AT_ONCE, polling_interval_sec=POLL)
                 self._registered = True
-            with SetWorkflowID(f"{job_id}.webhook.{attempt}"), SetEnqueueOptions(delay_seconds=delay):
+            with SetWorkflowID(attempts_of(job_id)[attempt - 1]), SetEnqueueOptions(delay_seconds=delay):
                 DBOS.enqueue_workflow(QUEUE, workflows.webhook, job_id, url, attempt)
 
     def _headers(self, message: str, body: bytes) -> dict[str, str]:
@@ -113,6 +113,11 @@ class Webhooks:
             "webhook-timestamp": moment,
             "webhook-signature": sign(self._secret.get_secret_value(), message, moment, body),
         }
+
+
+def attempts_of(job_id: str) -> list[str]:
+    """The ids of all workflows that may tell of a job's end."""
+    return [f"{job_id}.webhook.{attempt}" for attempt in range(1, len(WAITS) + 2)]
 
 
 def sign(secret: str, message: str, moment: str, body: bytes) -> str:

@@ -1,0 +1,200 @@
+"""Real servers in processes of their own, each with its own settings and data: to be stopped, killed, started again."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx
+from drawn import ball, block, floor, png_bytes
+
+SLOW_GENERATOR = Path(__file__).resolve().parents[1] / "benchmarks" / "slow_generator"
+PATIENCE = 60.0  # seconds for anything that must come about
+TERMINAL = ("succeeded", "failed", "canceled")
+ASYNC = {"Prefer": "respond-async"}
+QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
+
+Value = TypeVar("Value")
+
+
+def picture(shift: int = 0) -> bytes:
+    """A small scene as PNG; every shift is another one."""
+    image = ball(floor(240, 160), (60 + shift, 80), 18, (210, 20, 20))
+    return png_bytes(block(image, (170, 60, 205, 98), (50, 80, 200)))
+
+
+def data_url(image: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(image).decode()
+
+
+IMAGE = picture()
+# The request gives what the reader would have to find: jobs are about order, not about pictures.
+BODY: dict[str, Any] = {
+    "image": data_url(IMAGE),
+    "question": QUESTION,
+    "grounding": {"point": [60, 80]},
+    "motion": {"direction": [1, 0]},
+    "num_frames": 5,
+    "video": False,
+    "frames": {"count": 1},
+}
+
+
+def slow(seconds: float, seed: int = 0, **others: Any) -> dict[str, Any]:
+    """A request that takes so long, in at least 40 steps, after each of which it can be ended."""
+    options = {"generator": "slow", "generator_options": {"seconds": seconds}, "frames": {"count": 40}}
+    return {**BODY, **options, "num_frames": 80, "seed": seed, **others}
+
+
+class Served:
+    """A data folder, and the server on it that lives just now. Ends it with the `with` block."""
+
+    def __init__(self, folder: Path, code: str | None = None, log: str = "log", **settings: str) -> None:
+        self.data = folder / "data"
+        self.journal = folder / "journal"
+        self.journal.touch()
+        self._log_file = folder / log
+        own = {
+            "COW_DATA_DIR": str(self.data),
+            "COW_PORT": "0",
+            "COW_HOST": "127.0.0.1",
+            "PYTHONPATH": str(SLOW_GENERATOR),
+            "SLOW_JOURNAL": str(self.journal),
+        }
+        self._environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
+        self._environment |= own | settings
+        self._command = (
+            [sys.executable, "-m", "cow_service.cli", "serve"] if code is None else [sys.executable, "-c", code]
+        )
+        self.process: subprocess.Popen[bytes] | None = None
+        self.http = httpx.Client()
+
+    def __enter__(self) -> Served:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    def start(self) -> None:
+        """Starts a server, and waits until it is ready."""
+        said = self._log_file.stat().st_size if self._log_file.exists() else 0
+        with self._log_file.open("ab") as log:
+            self.process = subprocess.Popen(self._command, env=self._environment, stdout=log, stderr=log)
+
+        def address() -> str | None:
+            assert self.process is not None
+            assert self.process.poll() is None, self.log()
+            found = re.search(r"running on (http://\S+)", self.log()[said:])
+            return found and found[1]
+
+        self.http = httpx.Client(base_url=eventually(address), timeout=PATIENCE)
+        eventually(lambda: self.http.get("/readyz").status_code == 200)
+
+    def log(self) -> str:
+        return self._log_file.read_text(errors="replace")
+
+    def kill(self) -> None:
+        """Ends it as a loss of power would."""
+        self.http.close()
+        if self.process is not None:
+            self.process.send_signal(signal.SIGKILL)
+            self.process.wait()
+
+    def ask_to_stop(self) -> None:
+        assert self.process is not None
+        self.process.terminate()
+
+    def stop(self) -> int:
+        """Ends it in peace; returns its exit code."""
+        assert self.process is not None
+        self.ask_to_stop()
+        code = self.process.wait(PATIENCE)
+        self.http.close()
+        return code
+
+    @property
+    def host_and_port(self) -> tuple[str, int]:
+        return self.http.base_url.host, self.http.base_url.port or 80
+
+    def submit(self, body: dict[str, Any], path: str = "/simulate", **headers: str) -> dict[str, Any]:
+        """An accepted job."""
+        response = self.http.post(path, json=body, headers=ASYNC | headers)
+        assert response.status_code == 202, response.text
+        return response.json()
+
+    def job(self, job_id: str) -> dict[str, Any]:
+        response = self.http.get(f"/jobs/{job_id}")
+        assert response.status_code == 200, response.text
+        return response.json()
+
+    def until(self, job_id: str, *statuses: str) -> dict[str, Any]:
+        """The job, once it has one of these statuses."""
+        return eventually(lambda: job if (job := self.job(job_id))["status"] in statuses else None)
+
+    def ended(self, job_id: str) -> dict[str, Any]:
+        return self.until(job_id, *TERMINAL)
+
+    def rendering(self, job_id: str) -> dict[str, Any]:
+        """The job, once its clip is in the making."""
+
+        def looked() -> dict[str, Any] | None:
+            job = self.job(job_id)
+            assert job["status"] not in TERMINAL, job
+            return job if job["stage"] == "generation" else None
+
+        return eventually(looked)
+
+    def clips(self) -> list[int]:
+        """Seeds of the slow clips that were begun, one for each time."""
+        return [int(line) for line in self.journal.read_text().split()]
+
+
+def eventually(look: Callable[[], Value | None], patience: float = PATIENCE) -> Value:
+    """What `look` finds, asked again and again until it finds something."""
+    until = time.monotonic() + patience
+    while True:
+        found = look()
+        if found:
+            return found
+        assert time.monotonic() < until, f"not within {patience:g} s"
+        time.sleep(0.02)
+
+
+def problem(response: httpx.Response, status: int, code: str) -> dict[str, Any]:
+    """The problem that a response tells."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    told = response.json()
+    assert told["type"] == f"urn:cow:problem:{code}", told
+    assert told["detail"]
+    return told
+
+
+def plain(result: dict[str, Any]) -> dict[str, Any]:
+    """A result without what differs between two that are the same."""
+    return {name: value for name, value in result.items() if name not in ("id", "created_at", "timings", "reused")}
+
+
+def events_of(response: httpx.Response) -> list[dict[str, Any]]:
+    """The server-sent events of a response, to its end: `event`, `id` where there is one, `data` as JSON."""
+    return [parsed(block) for block in read_blocks(response) if not block.startswith(":")]
+
+
+def read_blocks(response: httpx.Response) -> list[str]:
+    response.read()
+    return [block for block in response.text.split("\n\n") if block.strip()]
+
+
+def parsed(block: str) -> dict[str, Any]:
+    fields = dict(line.split(": ", 1) for line in block.split("\n"))
+    return {**fields, "data": json.loads(fields["data"])}

@@ -1,0 +1,39 @@
+"""A server that is killed again and again loses nothing that it acknowledged, and does nothing twice."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+from postgres import postgres_server
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+from crash import Report, crash  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+JOBS, KILLS = 200, 20
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database(request: pytest.FixtureRequest) -> Iterator[str | None]:
+    if request.param == "sqlite":
+        yield None
+        return
+    with postgres_server() as url:
+        yield url
+
+
+def test_nothing_acknowledged_is_lost(database: str | None, tmp_path: Path) -> None:
+    report: Report = crash(JOBS, KILLS, database, seed=20, folder=tmp_path)
+    assert report.acknowledged == JOBS
+    assert report.outcomes == {"succeeded": JOBS}
+    assert report.lost == report.wrong_results == []
+    assert report.redone == [], "clips that the database held were made again"
+    assert report.begun_twice > 0, "no kill cut off a clip: the test shows nothing"
+    assert report.corrupt == report.missing == []
+    assert len(report.back_at_work_s) >= KILLS // 2
+    assert max(report.back_at_work_s) <= 5, report.back_at_work_s
