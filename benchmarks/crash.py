@@ -62,14 +62,14 @@ class Report:
 class Ground:
     """A data folder, a database, and the server on them that lives just now."""
 
-    def __init__(self, folder: Path, database: str | None) -> None:
+    def __init__(self, folder: Path, database: str | None, queue_limit: int = 100_000) -> None:
         self.folder = folder
         self.journal = folder / "journal"
         self.journal.touch()
         self.url = database or f"sqlite:///{folder / 'data' / 'jobs.sqlite3'}"
         own = {
             "COW_DATA_DIR": str(folder / "data"),
-            "COW_QUEUE_LIMIT": "100000",
+            "COW_QUEUE_LIMIT": str(queue_limit),
             "PYTHONPATH": str(Path(__file__).parent / "slow_generator"),
             "SLOW_JOURNAL": str(self.journal),
         }

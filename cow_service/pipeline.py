@@ -30,7 +30,7 @@ from cow_service.checkpoints import (
 from cow_service.drawing import draw_overlay
 from cow_service.errors import Canceled, CowError, InvalidRequest, MllmUnavailable, ReaderUnavailable
 from cow_service.generators.base import Generator, Shot
-from cow_service.images import DecodedImage, encode_png
+from cow_service.images import DecodedImage, decode_own, encode_png
 from cow_service.looking import Eyes, place_of
 from cow_service.readers.base import Reader
 from cow_service.readers.choices import read_choices
@@ -229,6 +229,8 @@ def _simulate(
         grounding = grounded.grounding
         eyes.note("grounding", grounded.reading, reused="grounding" in run.reused)
         eyes.recalled = grounding
+        if (mask := grounding.mask) is not None:
+            scene.recall(grounding.bbox, lambda: decode_own(backends.artifacts.read(mask.sha256))[..., 0] > 0)
 
     def read_way() -> Moved:
         before = eyes.used

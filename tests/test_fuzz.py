@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import base64
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import schemathesis
-from drawn import ball, block, floor, png_bytes
+from conftest import ROOT, Server
 from engines import app_for
+from fuzz_hooks import GIVEN
 from hypothesis import HealthCheck, given, settings
 from schemathesis import GenerationMode
 from schemathesis.checks import not_a_server_error
@@ -21,18 +25,6 @@ from cow_service.service import Service
 from cow_service.settings import Settings
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
-PICTURE = png_bytes(block(ball(floor(200, 150), (60, 75), 20, (210, 20, 20)), (130, 60, 170, 100), (50, 80, 200)))
-IMAGE = "data:image/png;base64," + base64.b64encode(PICTURE).decode()
-# What random text cannot be: a picture, a place in it, and backends that exist.
-GIVEN = {
-    "image": IMAGE,
-    "grounding": {"point": [60, 75]},
-    "motion": {"direction": [1, 0]},
-    "trajectory": None,
-    "reader": "embedded",
-    "generator": "cutout",
-    "generator_options": {},
-}
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 
 
@@ -50,7 +42,15 @@ def contract(tmp_path_factory: pytest.TempPathFactory):
         ("POST", "/answer", GenerationMode.POSITIVE),
         ("POST", "/answer", GenerationMode.NEGATIVE),
         ("GET", "/artifacts/{sha256}", GenerationMode.POSITIVE),
+        ("GET", "/jobs", GenerationMode.POSITIVE),
+        ("GET", "/jobs", GenerationMode.NEGATIVE),
+        ("GET", "/jobs/{id}", GenerationMode.POSITIVE),
+        ("GET", "/jobs/{id}", GenerationMode.NEGATIVE),
+        ("GET", "/jobs/{id}/events", GenerationMode.POSITIVE),
+        ("POST", "/jobs/{id}/cancel", GenerationMode.POSITIVE),
+        ("DELETE", "/jobs/{id}", GenerationMode.POSITIVE),
         ("GET", "/models", GenerationMode.POSITIVE),
+        ("GET", "/metrics", GenerationMode.POSITIVE),
         ("GET", "/livez", GenerationMode.POSITIVE),
         ("GET", "/readyz", GenerationMode.POSITIVE),
     ],
@@ -67,9 +67,27 @@ def test_every_answer_is_in_the_contract(contract, method: str, path: str, mode:
 
     reached: set[int] = set()
     check()
-    if (method, mode) == ("POST", GenerationMode.POSITIVE):
+    if (path, mode) in (("/simulate", GenerationMode.POSITIVE), ("/answer", GenerationMode.POSITIVE)):
         assert 200 in reached, "no generated request got past the checks"
 
 
+def test_a_real_server_keeps_the_contract(server: Server) -> None:
+    """Examples, coverage of every constraint, fuzzing, and chains of calls along the links of `openapi.yaml`."""
+    command = [
+        str(Path(sys.executable).with_name("schemathesis")), "run", str(ROOT / "openapi.yaml"), "--url", server.address,
+        "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", "8", "--seed", "1",
+        "--suppress-health-check", "all", "--max-time", "200",
+        "--checks", ",".join(check.__name__ for check in CHECKS), "--request-timeout", "60",
+        "--no-color", "--no-shrink",
+        "--generation-database", "none", "--continue-on-failure", "--report-dir", str(server.data / "fuzz"),
+    ]  # fmt: skip
+    hooks = os.environ | {"SCHEMATHESIS_HOOKS": "fuzz_hooks", "PYTHONPATH": str(Path(__file__).parent)}
+    told = subprocess.run(command, env=hooks, cwd=ROOT, capture_output=True, text=True, check=False, timeout=280)
+    assert told.returncode == 0, told.stdout[-6000:] + told.stderr[-2000:]
+    assert "Stateful" in told.stdout
+
+
 def test_the_contract_has_no_other_operations(contract) -> None:
-    assert set(contract) == {"/simulate", "/answer", "/artifacts/{sha256}", "/models", "/livez", "/readyz"}
+    jobs = {"/jobs", "/jobs/{id}", "/jobs/{id}/events", "/jobs/{id}/cancel"}
+    others = {"/artifacts/{sha256}", "/models", "/livez", "/readyz", "/metrics"}
+    assert set(contract) == {"/simulate", "/answer"} | jobs | others

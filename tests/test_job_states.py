@@ -132,5 +132,5 @@ class Jobs(RuleBasedStateMachine):
 
 
 TestJobs = Jobs.TestCase
-TestJobs.settings = settings(max_examples=6, stateful_step_count=12, suppress_health_check=list(HealthCheck))
+TestJobs.settings = settings(max_examples=4, stateful_step_count=10, suppress_health_check=list(HealthCheck))
 TestJobs.pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]

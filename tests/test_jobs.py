@@ -9,7 +9,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, suppress
 from datetime import datetime, timedelta
 from typing import Any
 from uuid import uuid4
@@ -738,6 +738,17 @@ def test_another_seed_is_another_clip_only(served: Served) -> None:
     assert other["generator"]["seed"] == 61
 
 
+def test_a_clip_is_the_same_whether_its_object_was_found_before_or_not(served: Served) -> None:
+    body = {**BODY, "image": data_url(picture(33))}  # a point: what is cut around it is not what is cut from its box
+    first = served.http.post("/simulate", json=body).json()
+    other = served.http.post("/simulate", json={**body, "seed": 1}).json()  # which this generator does not heed
+    assert other["reused"] == STAGES[:3]
+    assert other["frames"] == first["frames"]
+    more = served.http.post("/simulate", json={**body, "num_frames": 6}, headers=FRESH).json()
+    again = served.http.post("/simulate", json={**body, "num_frames": 6}).json()
+    assert plain(again) == plain(more)
+
+
 def test_an_answer_takes_what_a_simulation_came_to(served: Served) -> None:
     body = {**BODY, "image": data_url(picture(32))}
     simulation = served.http.post("/simulate", json=body).json()
@@ -859,7 +870,7 @@ def test_a_stop_waits_for_what_is_nearly_done(tmp_path_factory: pytest.TempPathF
 @pytest.mark.slow
 def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: pytest.TempPathFactory) -> None:
     own = {"COW_SHUTDOWN_GRACE": "1", "COW_CONCURRENCY": "1", "COW_MLLM_CONCURRENCY": "1"}
-    with Served(tmp_path_factory.mktemp("longer"), **own) as one, ThreadPoolExecutor(3) as pool:
+    with Served(tmp_path_factory.mktemp("longer"), **own) as one, ThreadPoolExecutor(4) as pool:
         keys = [{"Idempotency-Key": str(seed)} for seed in (92, 93, 94)]
         waiting = [
             pool.submit(one.http.post, "/simulate", json=slow(8, seed=92 + place), headers=key)
@@ -867,7 +878,14 @@ def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: py
         ]
         eventually(lambda: len(one.http.get("/jobs").json()["jobs"]) == 3 and one.clips())
         alone = one.submit(slow(0.2, seed=95))
+        heard: list[str] = []
+        follower = pool.submit(hear_until_cut, one, alone["id"], heard)
+        eventually(lambda: heard)
+        started = time.monotonic()
         one.stop()
+        assert time.monotonic() - started < 30
+        follower.result()
+        assert heard[0].startswith("id: 1\nevent: queued\n")
         for answer in (one.result() for one in waiting):
             problem(answer, 503, "shutting-down")
             assert re.fullmatch("/jobs/[0-9a-f-]{36}", answer.headers["location"])
@@ -883,12 +901,18 @@ def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: py
             assert again.json()["generator"]["seed"] == 92 + place
 
 
+def hear_until_cut(served: Served, job_id: str, heard: list[str]) -> None:
+    with suppress(httpx.RemoteProtocolError), served.http.stream("GET", f"/jobs/{job_id}/events") as response:
+        for part in response.iter_text():
+            heard.append(part)
+
+
 @pytest.mark.slow
 def test_after_a_crash_jobs_go_on_where_they_were(tmp_path_factory: pytest.TempPathFactory) -> None:
     with Served(tmp_path_factory.mktemp("crash")) as one:
         key = {"Idempotency-Key": "crash"}
         job = one.submit(slow(2, seed=96), **key)
-        done = one.ended(one.submit(BODY)["id"])
+        done = one.ended(one.submit({**BODY, "image": data_url(picture(7))})["id"])
         one.rendering(job["id"])
         heard = events_until(one, job["id"], "grounding")
         assert numbers(heard) == [1, 2, 3]

@@ -14,6 +14,8 @@ from servers import ASYNC, BODY, PATIENCE, TERMINAL, Served, data_url, events_of
 
 from cow_service.keys import hash_of, new_key
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass(frozen=True)
 class Caller:
@@ -139,7 +141,13 @@ def test_an_image_is_its_owners_alone(alice: Caller, bob: Caller) -> None:
 
 
 def test_an_image_is_there_for_its_owner_at_once_and_after_a_failure(alice: Caller) -> None:
-    lost = {**BODY, "image": data_url(picture(3)), "grounding": None, "motion": None, "question": "Will the car turn?"}
+    lost = {
+        **BODY,
+        "image": data_url(picture(3)),
+        "grounding": None,
+        "motion": None,
+        "question": "If the pink car turns?",
+    }
     job = alice.ended(lost)
     assert job["status"] == "failed"
     sha256 = image_of(lost)

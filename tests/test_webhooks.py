@@ -83,7 +83,7 @@ def receiver() -> Iterator[Receiver]:
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     one.port = server.server_address[1]
-    thread = threading.Thread(target=server.serve_forever)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
     thread.start()
     yield one
     server.shutdown()
@@ -224,6 +224,7 @@ def test_a_key_that_comes_back_after_its_job_was_deleted_has_its_own_webhook(
     problem(http.post("/simulate", json=other, headers=ASYNC | key), 422, "idempotency-key-reused")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("status", [500, 503, 404, 400, 302, 429])
 def test_whoever_did_not_take_it_is_asked_again(http: TestClient, receiver: Receiver, status: int) -> None:
     receiver.statuses = [status, 200]
@@ -237,6 +238,7 @@ def test_whoever_did_not_take_it_is_asked_again(http: TestClient, receiver: Rece
     assert len(receiver.heard) == 2
 
 
+@pytest.mark.slow
 def test_it_is_given_up_in_the_end(http: TestClient, receiver: Receiver) -> None:
     receiver.statuses = [500]
     job = submitted(http, {**BODY, "webhook": receiver.url})
@@ -247,6 +249,7 @@ def test_it_is_given_up_in_the_end(http: TestClient, receiver: Receiver) -> None
     assert http.get(f"/jobs/{job}").json()["status"] == "succeeded"
 
 
+@pytest.mark.slow
 def test_nobody_there_is_no_end_either(http: TestClient, receiver: Receiver) -> None:
     job = submitted(http, {**BODY, "webhook": "http://127.0.0.1:1/"})
     eventually(lambda: len(attempts(job)) == 3)

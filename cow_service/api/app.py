@@ -54,9 +54,7 @@ def create_app(engine: Engine, readiness: Readiness | None = None) -> FastAPI:
         redirect_slashes=False,
         lifespan=lifespan,
     )
-    app.add_middleware(
-        BodyLimit, megabytes=service.settings.max_body_mb, seconds=service.settings.body_timeout
-    )
+    app.add_middleware(BodyLimit, megabytes=service.settings.max_body_mb, seconds=service.settings.body_timeout)
     install_problem_handlers(app)
     install_layers(app, service.settings, service.metrics)
     submitting = Submitting(engine)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncGenerator
-from typing import Annotated
+from typing import Annotated, Any
 
 from anyio import to_thread
 from fastapi import APIRouter, Header, Request, Response
@@ -17,6 +17,18 @@ from cow_service.jobs.events import END, follow
 from cow_service.records import TERMINAL
 
 PING = 15  # seconds between comments that keep the connection open
+
+EVENT: dict[str, Any] = {
+    "type": "object",
+    "required": ["event", "data"],
+    "properties": {
+        "event": {
+            "enum": ["queued", "running", "stage", "progress", "succeeded", "failed", "canceled", "deleted"],
+        },
+        "id": {"type": "string", "description": "Not of `progress`."},
+        "data": {"type": "string", "contentMediaType": "application/json", "description": "A `Job`, or `{}`."},
+    },
+}
 
 
 def event_routes(engine: Engine) -> APIRouter:
@@ -32,7 +44,7 @@ def event_routes(engine: Engine) -> APIRouter:
             200: {
                 "description": "`queued`, `running`, `stage` (one is done), `progress`, then `succeeded`, `failed`, "
                 "`canceled` or `deleted`. The data is the job without its result.",
-                "content": {"text/event-stream": {"schema": {"type": "string"}}},
+                "content": {"text/event-stream": {"schema": EVENT}},
             },
             204: {"description": "The job has ended, and the caller has heard of it: no need to come back."},
             **documented(*GONE),

@@ -51,6 +51,10 @@ ACCEPTED: dict[int | str, dict[str, Any]] = {
             "Retry-After": {"description": "Seconds.", "schema": {"type": "string"}},
             "Preference-Applied": {"schema": {"type": "string"}},
         },
+        "links": {
+            name: {"operationId": name, "parameters": {"id": "$response.body#/id"}}
+            for name in ("job", "events", "cancel", "delete")
+        },
     }
 }
 

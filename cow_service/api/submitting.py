@@ -84,7 +84,10 @@ class Submitting:
             request_id=context.request_id.get(),
             traceparent=None if trace is None else trace.traceparent,
         )
-        return self.engine.submit(order, generator, asked.owner, asked.prefer.key, image, asked.job_id)
+        is_new = self.engine.submit(order, generator, asked.owner, asked.prefer.key, image, asked.job_id)
+        if is_new and asked.comes_back:
+            self.engine.database.hold(asked.job_id, [order.image])  # whose it is may be asked before a stage is done
+        return is_new
 
     async def _accepted(self, job_id: str, owner: str | None, prefer: Preferences) -> Response:
         def settled() -> Found:
@@ -116,7 +119,7 @@ class Submitting:
                     return await self._accepted(asked.job_id, asked.owner, prefer)
                 await asyncio.wait({waiting.settled, gone}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
                 if gone.done() and not waiting.settled.done():
-                    if is_new and prefer == Preferences(fresh=prefer.fresh):
+                    if is_new and not asked.comes_back:
                         await to_thread.run_sync(engine.cancel, asked.job_id, asked.owner)
                     raise Canceled("The caller went away before the work was done.")
         finally:
@@ -150,6 +153,11 @@ class _Asked:
     owner: str | None
     prefer: Preferences
     job_id: str
+
+    @property
+    def comes_back(self) -> bool:
+        """Whether a header says that somebody may ask for the job."""
+        return self.prefer != Preferences(fresh=self.prefer.fresh)
 
 
 def json_response(body: str, status: int = HTTPStatus.OK, headers: dict[str, str] | None = None) -> Response:

@@ -13,7 +13,7 @@ from dbos import DBOS, WorkflowStatus
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest
 from cow_service.jobs.database import database_errors
-from cow_service.jobs.live import Live, share_done
+from cow_service.jobs.live import STAGES, Live, share_done
 from cow_service.problems import problem_of
 from cow_service.records import Job, JobKind, JobPage, JobStatus
 
@@ -145,7 +145,7 @@ def finished_stages(job_id: str) -> list[str]:
     with database_errors():
         steps = DBOS.list_workflow_steps(job_id)
     done = sorted(steps, key=lambda step: step["function_id"])
-    return [step["function_name"] for step in done if "." not in step["function_name"] and step["error"] is None]
+    return [step["function_name"] for step in done if step["function_name"] in STAGES and step["error"] is None]
 
 
 def _found(status: WorkflowStatus, live: Live) -> Found:

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from dbos import DBOS
+
 from cow_service import tracing
 from cow_service.context import bound, parse_traceparent
 from cow_service.errors import Canceled, CowError, InternalError
@@ -53,14 +55,21 @@ class Worker:
 
     def deliver(self, job_id: str, url: str, attempt: int) -> None:
         """Calls a webhook, and sees to another attempt where that failed."""
+        # As a step: in a workflow, every question to the database would be one, and its answer kept.
+        wait: float | None = DBOS.run_step({"name": "deliver"}, lambda: self._delivered(job_id, url, attempt))
+        if wait is not None:
+            self._webhooks.attempt(job_id, url, attempt + 1, delay=wait)
+
+    def _delivered(self, job_id: str, url: str, attempt: int) -> float | None:
+        """Seconds until another attempt is to follow, where one is."""
         for _ in range(WAITS):
             found = reports.find(job_id, self._ledger.live)
             if found is None:
-                return  # deleted: there is nothing to tell any more
+                return None  # deleted: there is nothing to tell any more
             if found.ended is not None:
-                self._webhooks.send(found.job, url, attempt)
-                return
+                return self._webhooks.send(found.job, url, attempt)
             time.sleep(WAIT)
+        return self._webhooks.wait_after(job_id, attempt, "the job had not ended")  # a crash came between
 
     def _outcome(self, job_id: str, order: Order, running: Running) -> str:
         metrics = self._ledger.service.metrics
@@ -70,6 +79,7 @@ class Worker:
             raise Left from error
         except CowError as error:
             log.info("job %s failed: %s: %s", job_id, error.code, error.detail)
+            self._ledger.database.hold(job_id, [order.image])  # no stage may have done so
             metrics.job(order.kind, "failed")
             self._webhooks.job_ended(job_id, order.webhook)
             raise

@@ -69,10 +69,10 @@ class Webhooks:
     def job_ended(self, job_id: str, url: str | None) -> None:
         """Sees to it that the URL is told, once the database says that the job has ended."""
         if url is not None and self._secret is not None:
-            self._attempt(job_id, url, 1, delay=None)
+            self.attempt(job_id, url, 1, delay=None)
 
-    def send(self, job: Job, url: str, attempt: int) -> None:
-        """One attempt; another one follows where nobody took it."""
+    def send(self, job: Job, url: str, attempt: int) -> float | None:
+        """One attempt; where nobody took it, seconds until another one is to follow."""
         from cow_service.egress import NotAllowed, Unreachable  # noqa: PLC0415
 
         told = {"type": f"job.{job.status}", "timestamp": job.finished_at, "data": job.model_dump(mode="json")}
@@ -82,21 +82,23 @@ class Webhooks:
             status = self._egress.post(url, body, self._headers(message, body))
         except NotAllowed as error:
             log.warning("webhook of job %s: %s", job.id, error)
-            return  # nor will it be later
+            return None  # nor will it be later
         except Unreachable as error:
             log.info("webhook of job %s, attempt %d: %s", job.id, attempt, error)
             status = None
         if status in GOOD or status == _GONE:
-            return
-        if attempt > len(WAITS):
-            log.warning(
-                "webhook of job %s: given up after %d attempts, the last answer was %s", job.id, attempt, status
-            )
-            return
-        wait = WAITS[attempt - 1] * random.uniform(1 - JITTER, 1 + JITTER)  # so that many do not come back at once
-        self._attempt(job.id, url, attempt + 1, delay=wait)
+            return None
+        return self.wait_after(job.id, attempt, f"the last answer was {status}")
 
-    def _attempt(self, job_id: str, url: str, attempt: int, delay: float | None) -> None:
+    def wait_after(self, job_id: str, attempt: int, reason: str) -> float | None:
+        """Seconds until the attempt after this one, None after the last."""
+        if attempt > len(WAITS):
+            log.warning("webhook of job %s: given up after %d attempts, %s", job_id, attempt, reason)
+            return None
+        return WAITS[attempt - 1] * random.uniform(1 - JITTER, 1 + JITTER)  # so that many do not come back at once
+
+    def attempt(self, job_id: str, url: str, attempt: int, delay: float | None) -> None:
+        """Has an attempt made, after some seconds where they are given."""
         with database_errors():
             if not self._registered:
                 DBOS.register_queue(QUEUE, worker_concurrency=AT_ONCE, polling_interval_sec=POLL)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import RLock
@@ -28,6 +29,7 @@ class Scene:
 
     image: Image
     _masks: dict[BBox, Mask] = field(default_factory=dict, repr=False)
+    _kept: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
     _lock: RLock = field(default_factory=RLock, repr=False)
 
     @property
@@ -81,12 +83,19 @@ class Scene:
     def silhouette(self, bbox: BBox) -> Mask:
         """Mask [H, W] of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
         with self._lock:
+            if bbox not in self._masks and bbox in self._kept:
+                self._masks[bbox] = self._kept[bbox]()
             if bbox not in self._masks:
                 region = self.region_of(bbox)
                 known = region is not None and region.is_disc
                 guess = None if region is None else region.cutting.full()
                 self._masks[bbox] = guess if known and guess is not None else mask_from_bbox(self.clean, bbox, guess)
             return self._masks[bbox]
+
+    def recall(self, bbox: BBox, mask: Callable[[], Mask]) -> None:
+        """Says where to find a mask that was cut before: one cut again from its box may differ from one of a point."""
+        with self._lock:
+            self._kept[bbox] = mask
 
     def bbox_at(self, point: tuple[float, float]) -> BBox:
         """Tight box [x0, y0, x1, y1] of the object at a point [x, y]: the smallest region there, or a cut around it."""
