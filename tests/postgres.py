@@ -51,5 +51,7 @@ def postgres_server() -> Iterator[str]:
         run("createdb", "-h", "127.0.0.1", "-p", str(port), "-U", "cow", "cow")
         yield f"postgresql://cow@127.0.0.1:{port}/cow"
     finally:
-        subprocess.run([*as_user, str(programs / "pg_ctl"), "-D", data, "-m", "immediate", "stop"], check=False, cwd="/")
+        subprocess.run(
+            [*as_user, str(programs / "pg_ctl"), "-D", data, "-m", "immediate", "stop"], check=False, cwd="/"
+        )
         shutil.rmtree(folder, ignore_errors=True)

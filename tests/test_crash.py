@@ -12,7 +12,7 @@ from postgres import postgres_server
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from crash import Report, crash  # noqa: E402
+from crash import Report, crash
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 JOBS, KILLS = 200, 20

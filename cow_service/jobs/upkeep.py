@@ -117,10 +117,9 @@ class Upkeep:
         """Has the jobs that were under way in processes that have ended begin again, in any that runs."""
         for name, lock in executors.dead():
             try:
-                left = DBOS.list_workflows(executor_id=name, status="PENDING", load_input=False, load_output=False)
-                for one in left:
-                    log.info("taking over job %s", one.workflow_id)
-                    DBOS.resume_workflow(one.workflow_id)
+                # What DBOS does at its own start: a job that was canceled meanwhile stays so, and each start counts.
+                for handle in DBOS._recover_pending_workflows([name]):  # pyright: ignore[reportPrivateUsage]
+                    log.info("taking over %s", handle.get_workflow_id())
             finally:
                 lock.release()
 
