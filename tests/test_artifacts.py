@@ -59,12 +59,13 @@ def test_no_bytes_are_an_artifact_too(store):
     assert store.read(store.put(b"", "application/json").sha256) == b""
 
 
-def test_a_second_put_changes_nothing(store, folder):
+def test_a_second_put_changes_nothing_but_says_that_it_is_needed(store, folder):
     first = store.put(DATA, "image/png")
     before = store.get(SHA256).path.stat()
     assert store.put(DATA, "image/png") == first
     after = store.get(SHA256).path.stat()
-    assert (before.st_ino, before.st_mtime_ns) == (after.st_ino, after.st_mtime_ns)
+    assert (before.st_ino, before.st_size) == (after.st_ino, after.st_size)
+    assert before.st_mtime_ns <= after.st_mtime_ns
     assert len(files(folder)) == 1
 
 
@@ -211,3 +212,18 @@ def test_the_same_bytes_from_many_threads(store, folder):
         artifacts = list(pool.map(lambda media_type: store.put(DATA, media_type), media_types))
     assert len(set(artifacts)) == 1
     assert len(files(folder)) == 1
+
+
+def test_what_nobody_needs_any_more_goes(store, folder):
+    kept, loose = store.put(DATA, "image/png"), store.put(b"other", "image/png")
+    for artifact in (kept, loose):
+        os.utime(store.get(artifact.sha256).path, (1000, 1000))
+    assert set(store.untouched_since(1000)) == {kept.sha256, loose.sha256}
+    store.touch(kept.sha256)
+    assert list(store.untouched_since(1000)) == [loose.sha256]
+    assert not store.delete(kept.sha256, untouched_since=1000)
+    assert store.delete(loose.sha256, untouched_since=1000)
+    assert not store.delete(loose.sha256, untouched_since=1000)
+    assert store.read(kept.sha256) == DATA
+    with pytest.raises(ArtifactNotFound):
+        store.touch(loose.sha256)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,7 @@ FLOORS: dict[str, int] = {
 HEAVY = ("torch", "transformers", "diffusers", "accelerate")
 
 
+@cache
 def modules() -> dict[str, Path]:
     names = {}
     for path in PACKAGE.rglob("*.py"):
@@ -74,6 +76,7 @@ def modules() -> dict[str, Path]:
     return names
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """Names inside the package that a file imports, lazily or for types only included."""
     found: set[str] = set()
