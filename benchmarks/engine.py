@@ -62,7 +62,9 @@ class Bench:
     async def _job(self) -> None:
         job_id = new_job_id(None, None)
         asked = self.request.model_dump(mode="json", exclude_defaults=True)
-        order = Order(kind="simulate", request=asked, created_at=now(), fresh=True)
+        order = Order(
+            kind="simulate", request=asked, reader="embedded", generator="cutout", created_at=now(), fresh=True
+        )
         with self.engine.live.waiting(job_id) as waiting:
             submit = (order, "cutout", None, None, _again(self.image), job_id)
             await asyncio.to_thread(self.engine.submit, *submit)

@@ -66,7 +66,7 @@ class Backends:
     reader: Callable[[], Reader]
     generator: Callable[[], Generator]
     artifacts: ArtifactStore
-    weights: str = ""  # what tells the generator's weights from others, where its own words do not
+    weights: Callable[[], str] = str  # what tells the generator's weights from others, where its own words do not
     elsewhere: Callable[[], AbstractContextManager[None]] = nullcontext  # around waits for a multimodal LLM
     rendering: Callable[[StillWanted], AbstractContextManager[None]] = _at_once  # around a clip: waits for its turn
 
@@ -279,7 +279,7 @@ def _simulate(
         inputs = {
             **traced_from,
             "generator": info.model_dump(mode="json"),
-            "weights": backends.weights,
+            "weights": backends.weights(),
             "frames": request.frames.model_dump(mode="json"),
             "video": request.video,
         }

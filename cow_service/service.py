@@ -54,6 +54,7 @@ class Service:
         self.settings = settings
         self.slots = Turns(settings.concurrency)  # who computes
         self._turns: dict[str, Turns] = {}  # of generators that take only so many clips at the same time
+        self._identities: dict[str, str] = {}
         self._guard = Lock()
         self.metrics = Metrics()
         self._image_urls = ImageUrls(settings)
@@ -115,8 +116,8 @@ class Service:
             image = image or self.image_of(request.image)[1]
             return answer(request, image, backends, progress, checkpoints, stamp)
 
-    def precheck(self, request: SimulateRequest) -> str:
-        """Says at once what is wrong with a request as far as that costs nothing; returns its generator's name.
+    def precheck(self, request: SimulateRequest) -> tuple[str, str]:
+        """Says at once what is wrong with a request as far as that costs nothing; returns its reader and generator.
 
         Raises `InvalidRequest` for backends that nobody has and for options that the generator does not take, and
         `ReaderUnavailable` or `GeneratorUnavailable` where their modules are not installed.
@@ -126,10 +127,10 @@ class Service:
         _check_modules(reader, ReaderUnavailable)
         _check_modules(name, GeneratorUnavailable)
         if self.generators.is_made(name) or name == self.settings.generator:
-            generator = self.generators.get(name)
+            generator = self._generator(name)
             read_options(generator, request.generator_options)
             check_frames(generator, request)
-        return name
+        return reader, name
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
@@ -165,14 +166,14 @@ class Service:
             reader=lambda: self._reader(reader),
             generator=lambda: self._generator(generator),
             artifacts=self.artifacts,
-            weights=self._weights(generator),
+            weights=partial(self._weights, generator),
             elsewhere=partial(self.slots.left, rank),
             rendering=partial(self._rendering, generator, rank),
         )
 
     def _weights(self, name: str) -> str:
-        manifest = find_manifest(name)
-        return "" if manifest is None else weights_identity(manifest, self.settings)
+        """What told a generator's weights from others when they were loaded: files may have changed since."""
+        return self._identities.get(name, "")
 
     @contextmanager
     def _rendering(self, name: str, rank: str, still_wanted: StillWanted) -> Steps[None]:
@@ -192,6 +193,9 @@ class Service:
 
     def _generator(self, name: str) -> Generator:
         _check_modules(name, GeneratorUnavailable)
+        manifest = find_manifest(name)
+        if manifest is not None and not self.generators.is_made(name):
+            self._identities[name] = weights_identity(manifest, self.settings)
         return self.generators.get(name)
 
     def image_of(self, ref: ImageRef) -> tuple[str, DecodedImage]:
@@ -203,6 +207,7 @@ class Service:
             artifact, image = self.keep_image(self._image_urls.fetch(ref.url if isinstance(ref, ImageUrl) else ref))
             return artifact.sha256, image
         if isinstance(ref, ImageArtifact):
+            self.artifacts.touch(ref.artifact)
             data = self.artifacts.read(ref.artifact)
             return ref.artifact, decode(data, max_megapixels=self.settings.max_image_megapixels)
         artifact, image = self.keep_image(decode_data_url(ref))

@@ -19,6 +19,7 @@ GIVEN = {
     "reader": "embedded",
     "generator": "cutout",
     "generator_options": {},
+    "webhook": None,
 }
 
 
@@ -31,5 +32,5 @@ def before_call(context, case, kwargs) -> None:
     if not is_valid or case.path not in ("/simulate", "/answer") or not isinstance(case.body, dict):
         return
     if case.media_type == "application/json" and "question" in case.body:
-        case.body = {**case.body, **GIVEN, "num_frames": 5, "webhook": None}
+        case.body = {**case.body, **GIVEN, "num_frames": 5}
         case.headers = {**(case.headers or {}), "Prefer": "respond-async"}

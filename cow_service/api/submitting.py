@@ -66,7 +66,7 @@ class Submitting:
         body, image = check(posted, model, service)
         if isinstance(body.image, ImageArtifact):
             self.engine.may_read(body.image.artifact, asked.owner if image is None else None)
-        generator = service.precheck(body)
+        reader, generator = service.precheck(body)
         if body.webhook is not None:
             self.engine.webhooks.check(body.webhook)
         sha256 = None
@@ -78,16 +78,15 @@ class Submitting:
         order = Order(
             kind=asked.kind,
             request=asks.model_dump(mode="json", exclude_defaults=True),
+            reader=reader,
+            generator=generator,
             created_at=now(),
             fresh=asked.prefer.fresh,
             webhook=body.webhook,
             request_id=context.request_id.get(),
             traceparent=None if trace is None else trace.traceparent,
         )
-        is_new = self.engine.submit(order, generator, asked.owner, asked.prefer.key, image, asked.job_id)
-        if is_new and asked.comes_back:
-            self.engine.database.hold(asked.job_id, [order.image])  # whose it is may be asked before a stage is done
-        return is_new
+        return self.engine.submit(order, generator, asked.owner, asked.prefer.key, image, asked.job_id)
 
     async def _accepted(self, job_id: str, owner: str | None, prefer: Preferences) -> Response:
         def settled() -> Found:

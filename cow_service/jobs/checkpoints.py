@@ -69,7 +69,6 @@ class JobCheckpoints:
     """The `Checkpoints` of one job."""
 
     job: str
-    image: str  # its SHA-256
     rank: str  # of the job among those that want to compute
     fresh: bool  # nothing of other jobs is taken
     service: Service
@@ -110,14 +109,14 @@ class JobCheckpoints:
                 result, job, artifacts = kept
                 self.service.metrics.stage_cache(stage, hit=job != self.job)
                 if job != self.job:
-                    self.database.hold(self.job, [self.image, *artifacts])
+                    self.database.hold(self.job, artifacts)
                 return result, job != self.job
             self.service.metrics.stage_cache(stage, hit=False)
             return self._keep(stage, key, compute()), False
 
     def _keep(self, stage: Stage, key: str, result: Result) -> Result:
         text = result.model_dump_json()
-        self.database.keep(key, self.job, stage, text, [self.image, *artifacts_of(text)])
+        self.database.keep(key, self.job, stage, text, artifacts_of(text))
         return result
 
     def _kept(self, key: str, model: type[Result]) -> tuple[Result, str, list[str]] | None:

@@ -72,6 +72,11 @@ class Database:
         with database_errors(), self._reading.connect() as connection:
             connection.execute(sa.text("SELECT 1"))
 
+    def check_far(self) -> None:
+        """As `check`, where the database is a server: DBOS would wait for one that is away, and so would the caller."""
+        if self.file is None:
+            self.check()
+
     def close(self) -> None:
         """Lets go of its connections."""
         self.engine.dispose()
@@ -120,7 +125,8 @@ class Database:
                 loose |= set(connection.execute(mine).scalars())
                 connection.execute(sa.delete(_holds).where(_holds.c.job_id.in_(some)))
                 connection.execute(sa.delete(_results).where(_results.c.job_id.in_(some)))
-        return [sha256 for sha256 in loose if sha256 not in self.held(loose)]
+        held = self.held(loose)
+        return [sha256 for sha256 in loose if sha256 not in held]
 
     def held(self, artifacts: Iterable[str]) -> set[str]:
         """Those of some artifacts that a job holds."""
@@ -210,8 +216,8 @@ def _engine(url: str, is_file: bool) -> sa.Engine:
     if not is_file:
         # A commit is safe from the end of this process at once; `settle` waits for the disk where that matters.
         options = {"options": "-c synchronous_commit=off"}
-        return sa.create_engine(url, pool_size=16, max_overflow=32, connect_args=options)
-    engine = sa.create_engine(url, pool_size=16, max_overflow=32)
+        return sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True, connect_args=options)
+    engine = sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True)
 
     @event.listens_for(engine, "connect")
     def prepare(connection: object, _: object) -> None:  # pyright: ignore[reportUnusedFunction]

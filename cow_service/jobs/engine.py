@@ -184,6 +184,7 @@ class Engine:
         `key` is the caller's idempotency key: the same key and order come to the same job. Raises
         `IdempotencyKeyReused`, `QueueFull`, `ShuttingDown`, `StorageUnavailable`.
         """
+        self.database.check_far()
         if key is None:
             self._submit(order, generator, owner, image, job_id)
             return True
@@ -199,19 +200,21 @@ class Engine:
             at_once = self.ledger.of(generator) < self.room
             self.ledger.count(job_id, generator)
         try:
+            # Before the job: its image must not go while nobody has begun with it.
+            self.database.hold(job_id, [image.info.sha256])
             if at_once:
                 self.live.lend(job_id, image)
                 self._start(job_id, order, owner, generator)
             else:
-                # Before the job: its image must not go while it waits. One that starts is held by its first stage.
-                self.database.hold(job_id, [image.info.sha256])
                 self._enqueue(job_id, order, owner, generator)
         except BaseException:
+            self.live.image(job_id)
             self.ledger.count(job_id, None)
             raise
 
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> Found:
         """A job of an owner. Raises `JobNotFound`, also for a job of somebody else."""
+        self.database.check_far()
         found = reports.find(job_id, self.live, full=full)
         if found is None or (owner is not None and found.owner != owner):
             raise JobNotFound(f"There is no job {job_id[:64]!r}: it was deleted, or never was one of yours.")
@@ -219,6 +222,7 @@ class Engine:
 
     def page(self, owner: str | None, filters: Filters) -> JobPage:
         """Jobs of an owner, newest first."""
+        self.database.check_far()
         return reports.page(owner, filters, self.live)
 
     def cancel(self, job_id: str, owner: str | None) -> Found:
@@ -227,6 +231,10 @@ class Engine:
             found = self.find(job_id, owner, full=False)
             if found.job.status in TERMINAL:
                 return self.find(job_id, owner)
+            order = self._order(job_id)
+            if order is not None:
+                # Before its end, so that no crash comes between: it waits for the end.
+                self.webhooks.job_ended(job_id, order.webhook)
             with database_errors():
                 DBOS.cancel_workflow(job_id)
         self.live.end(job_id)
@@ -234,9 +242,6 @@ class Engine:
         found = self.find(job_id, owner)
         if found.job.status == "canceled":
             self.service.metrics.job(found.job.kind, "canceled")
-            order = self._order(job_id)
-            if order is not None:
-                self.webhooks.job_ended(job_id, order.webhook)
         return found
 
     def delete(self, job_id: str, owner: str | None) -> None:

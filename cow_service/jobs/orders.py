@@ -16,6 +16,8 @@ class Order(Record):
 
     kind: JobKind
     request: dict[str, Any]
+    reader: str = Field(description="As the server chose it, where the request names none.")
+    generator: str = Field(description="As the server chose it, where the request names none.")
     created_at: str = Field(description="RFC 3339, UTC.")
     fresh: bool = Field(default=False, description="Take no results of other jobs.")
     webhook: str | None = Field(default=None, description="URL to call when the job has ended.")
@@ -27,12 +29,7 @@ class Order(Record):
         """The same for requests that ask for the same."""
         return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
 
-    @property
-    def image(self) -> str:
-        """SHA-256 of the image."""
-        return str(self.request["image"]["artifact"])
-
     def parsed(self) -> SimulateRequest | AnswerRequest:
         """The request, as it was checked when it came."""
         model = AnswerRequest if self.kind == "answer" else SimulateRequest
-        return model.model_validate(self.request)
+        return model.model_validate({**self.request, "reader": self.reader, "generator": self.generator})

@@ -79,14 +79,15 @@ def page(owner: str | None, filters: Filters, live: Live) -> JobPage:
         before = min(before or latest + LATE, latest + LATE)
     jobs: list[Job] = []
     while True:
-        most = max(filters.limit, AT_ONCE) if after or latest else filters.limit
+        most = max(filters.limit, AT_ONCE) if after or latest or filters.status else filters.limit
         rest = [one for one in _listed(owner, filters, before, most + len(seen) + 1) if one.workflow_id not in seen]
         taken = 0
         for one in rest[:most]:
             taken += 1
             job = _found(one, live).job
             came = datetime.fromisoformat(job.created_at)
-            if (after is None or after <= came) and (latest is None or came <= latest):
+            fits = not filters.status or job.status in filters.status
+            if fits and (after is None or after <= came) and (latest is None or came <= latest):
                 jobs.append(job)
             if len(jobs) == filters.limit:
                 break
@@ -102,6 +103,8 @@ def _listed(owner: str | None, filters: Filters, before: datetime | None, limit:
     """Jobs by the times of the database, which may be those of the whole second."""
     after = filters.created_after
     wanted = [name for name, status in STATUS.items() if status in filters.status]
+    if "queued" in filters.status:
+        wanted = sorted({*wanted, "PENDING"})  # of those taken from the queue, some still wait
     with database_errors():
         return DBOS.list_workflows(
             name=[filters.kind] if filters.kind else list(KINDS),
@@ -155,7 +158,7 @@ def _found(status: WorkflowStatus, live: Live) -> Found:
     stage, progress = None, 1.0 if told == "succeeded" else 0.0
     if running is not None:
         stage, progress = running.stage, share_done(kind, running.stage, running.done)
-    if told == "running" and (running is None or running.stage is None):
+    if told == "running" and status.executor_id == DBOS.executor_id and (running is None or running.stage is None):
         told = "queued"  # it was taken from the queue, but nobody works on it yet
     error = _error(status) if told == "failed" else None
     created = (status.attributes or {}).get(CREATED) or _time(status.created_at)

@@ -78,8 +78,7 @@ class Worker:
         except Canceled as error:
             raise Left from error
         except CowError as error:
-            log.info("job %s failed: %s: %s", job_id, error.code, error.detail)
-            self._ledger.database.hold(job_id, [order.image])  # no stage may have done so
+            log.info("job %s failed: %s", job_id, error.code)  # its detail may hold what was asked
             metrics.job(order.kind, "failed")
             self._webhooks.job_ended(job_id, order.webhook)
             raise
@@ -104,7 +103,6 @@ class Worker:
         request, image = order.parsed(), ledger.live.image(job_id)
         kept = JobCheckpoints(
             job=job_id,
-            image=order.image,
             rank=order.created_at,
             fresh=order.fresh,
             service=ledger.service,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
 from dbos import DBOS
@@ -22,7 +23,9 @@ LOOK = 1.0  # seconds between looks at jobs that run here
 RECOUNT = 10.0  # seconds
 TIDY = 600.0  # seconds
 GRACE = 3600.0  # seconds that an artifact is kept without a job: somebody may be about to send it with one
+TAKING = 5.0  # seconds in which the database has taken a job that holds its image
 AT_ONCE = 200  # jobs removed in one go
+LONGEST_STOP = 5.0  # seconds
 
 log = logging.getLogger("cow_service")
 
@@ -36,6 +39,7 @@ class Upkeep:
         self._new = threading.Event()
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
+        self._idle: set[str] = set()  # jobs of this process on which nobody worked at the last look
 
     def start(self, executors: Executors) -> None:
         """Starts the threads."""
@@ -50,7 +54,7 @@ class Upkeep:
         self._stop.set()
         self._new.set()
         for thread in self._threads:
-            thread.join()
+            thread.join(LONGEST_STOP)  # one that waits for a database that is away does not keep the process
         self._threads.clear()
 
     def settle(self, job_id: str) -> None:
@@ -62,13 +66,17 @@ class Upkeep:
         """Removes jobs that ended long ago, and artifacts that no job holds."""
         ledger = self._ledger
         before = datetime.now(UTC) - timedelta(hours=ledger.service.settings.job_retention_hours)
-        while jobs := reports.ended_before(before, AT_ONCE):
+        while not self._stop.is_set() and (jobs := reports.ended_before(before, AT_ONCE)):
             ledger.remove(jobs, before.timestamp())
         kept = ledger.database.jobs()
         for start in range(0, len(kept), AT_ONCE):  # of jobs that were deleted while they ran
+            if self._stop.is_set():
+                return
             some = kept[start : start + AT_ONCE]
-            if gone := [job for job in some if job not in reports.existing(some)]:
-                ledger.database.forget(gone)
+            missing = set(some) - reports.existing(some)
+            # One that is just being taken holds its image a moment before the database has it.
+            if missing and not self._stop.wait(TAKING):
+                ledger.database.forget(sorted(missing - reports.existing(sorted(missing))))
         moment = time.time() - GRACE
         loose = list(ledger.service.artifacts.untouched_since(moment))
         held = ledger.database.held(loose)
@@ -80,17 +88,19 @@ class Upkeep:
         while self._new.wait() and not self._stop.is_set():
             self._new.clear()
             while self._settling and not self._stop.wait(SETTLE):
-                self._guarded(self._settle_some)
+                if not self._guarded(self._settle_some):
+                    self._stop.wait(LOOK)
 
     def _settle_some(self) -> None:
         now = time.monotonic()
         for job_id, until in list(self._settling.items()):
+            if now > until:
+                del self._settling[job_id]  # whoever waits looks for themselves now and then
+                continue
             found = reports.find(job_id, self._ledger.live, full=False)
             if found is None or found.ended is not None:
                 self._ledger.ended(job_id, None)
-            elif now < until:
-                continue
-            del self._settling[job_id]
+                del self._settling[job_id]
 
     def _keep_up(self, executors: Executors) -> None:
         counted = tidied = time.monotonic()  # jobs that were cut off take hold of their artifacts before anybody tidies
@@ -101,6 +111,7 @@ class Upkeep:
             if now - counted > RECOUNT:
                 counted = now
                 self._guarded(lambda: self._take_over(executors))
+                self._guarded(self._revive)
                 self._guarded(self._ledger.recount)
             if now - tidied > TIDY:
                 tidied = now
@@ -123,10 +134,29 @@ class Upkeep:
             finally:
                 lock.release()
 
-    def _guarded(self, work: object) -> None:
-        """Upkeep goes on when the database does not answer for a while."""
-        assert callable(work)
+    def _revive(self) -> None:
+        """Has jobs of this process begin again on which nobody works: their end could not be written, say."""
+        pending = DBOS.list_workflows(
+            name=list(reports.KINDS),
+            status="PENDING",
+            executor_id=DBOS.executor_id,
+            load_input=False,
+            load_output=False,
+        )
+        idle = {one.workflow_id for one in pending} - set(self._ledger.live.jobs())
+        for job_id in idle & self._idle:  # also a while ago: it is not just being started
+            log.warning("job %s was left alone, and begins again", job_id)
+            DBOS.resume_workflow(job_id)
+        self._idle = idle
+
+    def _guarded(self, work: Callable[[], None]) -> bool:
+        """Whether work went well. Upkeep goes on whatever happens: nobody would do it instead."""
         try:
             work()
         except (CowError, dbos_error.DBOSException, SQLAlchemyError) as error:
             log.warning("upkeep: %s", getattr(error, "detail", type(error).__name__))
+            return False
+        except Exception:
+            log.exception("upkeep failed")
+            return False
+        return True
