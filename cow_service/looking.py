@@ -91,5 +91,10 @@ class Eyes:
 
     @property
     def usage(self) -> Usage:
-        """What the stages of this request asked of a multimodal LLM."""
-        return sum((reading.usage for reading, reused in self._readings.values() if not reused), Usage())
+        """What this request asked of a multimodal LLM, also for stages that failed, and before a restart."""
+        before = [
+            reading.usage
+            for stage, (reading, reused) in self._readings.items()
+            if not reused and stage not in self._asked
+        ]
+        return sum(before, self.used)

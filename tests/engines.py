@@ -36,4 +36,4 @@ def app_for(service: Service) -> FastAPI:
     """An application whose jobs are this service's from now on. Only one service is at work at a time."""
     engine = running_engine()
     engine.use(service)
-    return create_app(engine)
+    return create_app(engine, closing=False)

@@ -31,8 +31,11 @@ SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-
 DROPPED = ("HTTPValidationError", "ValidationError")  # the framework's error shapes, which no operation returns
 
 
-def create_app(engine: Engine, readiness: Readiness | None = None) -> FastAPI:
-    """The application for an engine that runs, or that the app starts when it begins. It holds no state of its own."""
+def create_app(engine: Engine, readiness: Readiness | None = None, *, closing: bool = True) -> FastAPI:
+    """The application for an engine that runs, or that the app starts when it begins. It holds no state of its own.
+
+    When the app ends, so do engine and service; not with `closing` false, where others go on with them.
+    """
     service = engine.service
     readiness = readiness or Readiness(service)
 
@@ -41,9 +44,10 @@ def create_app(engine: Engine, readiness: Readiness | None = None) -> FastAPI:
         if not engine.runs:
             await to_thread.run_sync(engine.start)
         yield
-        await to_thread.run_sync(engine.close)
-        await to_thread.run_sync(service.close)
-        await to_thread.run_sync(tracing.stop)
+        if closing:
+            await to_thread.run_sync(engine.close)
+            await to_thread.run_sync(service.close)
+            await to_thread.run_sync(tracing.stop)
 
     app = LayeredApp(
         title="COW",
