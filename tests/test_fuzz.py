@@ -68,7 +68,7 @@ def test_every_answer_is_in_the_contract(contract, method: str, path: str, mode:
     reached: set[int] = set()
     check()
     if (path, mode) in (("/simulate", GenerationMode.POSITIVE), ("/answer", GenerationMode.POSITIVE)):
-        assert 200 in reached, "no generated request got past the checks"
+        assert reached & {200, 202}, f"no generated request got past the checks: {reached}"
 
 
 @pytest.mark.timeout(400)

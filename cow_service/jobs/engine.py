@@ -309,6 +309,8 @@ class Engine:
         # After a deletion the same key may have come to the same id again: that job has not ended.
         if outcome is not None or self._has_ended(job_id):
             self.ledger.ended(job_id, outcome)
+        else:
+            self.live.forget(job_id)
 
     def _has_ended(self, job_id: str) -> bool:
         try:

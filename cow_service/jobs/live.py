@@ -23,6 +23,7 @@ class Running:
     stage: Stage | None = None
     done: float = 0.0  # of the stage
     ended: threading.Event = field(default_factory=threading.Event)  # somebody wants it to end
+    over: bool = False  # the work is over, though the database may not have its end yet
 
     def check(self) -> None:
         """Raises `Canceled` where somebody wants it to end."""
@@ -69,8 +70,7 @@ class Live:
         finally:
             with self._lock:
                 self._images.pop(job, None)
-                if self._running.get(job) is one:
-                    del self._running[job]
+                one.over = True
 
     def progress(self, job: str, one: Running, stage: Stage, done: float) -> None:
         """The work on a job got so far. Raises `Canceled` where somebody wants it to end."""
@@ -87,7 +87,14 @@ class Live:
     def jobs(self) -> list[str]:
         """The jobs that this process runs."""
         with self._lock:
-            return list(self._running)
+            return [job for job, one in self._running.items() if not one.over]
+
+    def forget(self, job: str) -> None:
+        """Nothing is known here any more of a job whose work is over."""
+        with self._lock:
+            one = self._running.get(job)
+            if one is not None and one.over:
+                del self._running[job]
 
     def end(self, job: str) -> None:
         """Has the work on a job end at its next step."""
@@ -119,6 +126,7 @@ class Live:
 
     def settled(self, job: str, outcome: str | CowError | None) -> None:
         """A job has ended, and the database says so. `outcome` is its result or error where it is at hand."""
+        self.forget(job)
         for one in self._listeners(job):
             one.loop.call_soon_threadsafe(_settle, one, outcome)
 

@@ -96,6 +96,7 @@ class Upkeep:
         for job_id, until in list(self._settling.items()):
             if now > until:
                 del self._settling[job_id]  # whoever waits looks for themselves now and then
+                self._ledger.live.forget(job_id)
                 continue
             found = reports.find(job_id, self._ledger.live, full=False)
             if found is None or found.ended is not None:
