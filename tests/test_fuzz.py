@@ -76,7 +76,7 @@ def test_a_real_server_keeps_the_contract(server: Server) -> None:
     """Examples, coverage of every constraint, fuzzing, and chains of calls along the links of `openapi.yaml`."""
     command = [
         str(Path(sys.executable).with_name("schemathesis")), "run", str(ROOT / "openapi.yaml"), "--url", server.address,
-        "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", "4", "--seed", "1", "--workers", "2",
+        "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", "4", "--seed", "1",
         "--suppress-health-check", "all", "--max-time", "60",
         "--checks", ",".join(check.__name__ for check in CHECKS), "--request-timeout", "60",
         "--no-color", "--no-shrink",

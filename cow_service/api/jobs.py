@@ -35,7 +35,9 @@ def job_routes(engine: Engine) -> APIRouter:
         created_after: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
         created_before: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
-        cursor: Annotated[str | None, Query(max_length=40_000, description="`next` of the page before.")] = None,
+        cursor: Annotated[
+            str | None, Query(max_length=40_000, pattern=r"^[A-Za-z0-9_-]*$", description="`next` of the page before.")
+        ] = None,
     ) -> JobPage:
         """Without their results. Jobs that come or go between two pages are neither shown twice nor hide others."""
         filters = Filters(tuple(status or ()), kind, created_after, created_before, limit, cursor)
