@@ -630,9 +630,9 @@ def connect(server: Server) -> socket.socket:
     return socket.create_connection((host, int(port)), timeout=20)
 
 
-def received(connection: socket.socket) -> bytes:
-    """All that comes until the server closes the connection."""
-    pieces: list[bytes] = []
+def received(connection: socket.socket, *already: bytes) -> bytes:
+    """All that comes until the server closes the connection, after what came ``already``."""
+    pieces = [piece for piece in already if piece]
     try:
         while piece := connection.recv(65536):
             pieces.append(piece)
@@ -756,7 +756,7 @@ def test_bodies_that_do_not_arrive(hasty: Server, headers: tuple[str, ...], piec
                 break
         waited = time.monotonic() - began
         connection.settimeout(20)
-        response = parsed(answer + received(connection))
+        response = parsed(received(connection, answer))
     told(response, 408, "body-too-slow", seen)
     assert "COW_BODY_TIMEOUT" in response.text
     assert response.headers["connection"] == "close"
