@@ -28,6 +28,7 @@
     │   ├── WeightsUnavailable     weights-unavailable      503
     │   └── CheckpointInvalid      checkpoint-invalid       503
     ├── GeneratorOutOfMemory       generator-out-of-memory  503
+    ├── ModelNotFound              model-not-found          404
     ├── JobNotFound                job-not-found            404
     ├── IdempotencyKeyReused       idempotency-key-reused   422
     ├── WebhookNotAllowed          webhook-not-allowed      422
@@ -39,7 +40,7 @@
     └── InternalError              internal-error           500
 
 An error's docstring is its title on the wire. Its message says what was wrong, with the value, and what to do about it;
-it never holds a path, a trace or a secret.
+it never holds a path, a trace or a secret. The SDK raises the same classes for the same codes.
 """
 
 from __future__ import annotations
@@ -74,6 +75,7 @@ class CowError(Exception):
 
     code: str = "internal-error"
     status: int = 500
+    request_id: str | None = None  # of the response that told it, where there was one
 
     def __init__(
         self, detail: str, *, errors: tuple[FieldError, ...] = (), headers: dict[str, str] | None = None
@@ -251,6 +253,12 @@ class GeneratorOutOfMemory(CowError):
     code, status = "generator-out-of-memory", 503
 
 
+class ModelNotFound(CowError):
+    """No model has that name."""
+
+    code, status = "model-not-found", 404
+
+
 class JobNotFound(CowError):
     """There is no such job."""
 
@@ -306,8 +314,9 @@ class InternalError(CowError):
 
 
 def kinds(base: type[CowError] = CowError) -> dict[str, type[CowError]]:
-    """Every kind of error by its code."""
+    """Every kind of error that goes over the wire, by its code."""
     found = {base.code: base}
     for kind in base.__subclasses__():
-        found |= kinds(kind)
+        if kind.__module__ == __name__:
+            found |= kinds(kind)
     return found | {InternalError.code: InternalError}
