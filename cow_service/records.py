@@ -26,7 +26,8 @@ FramePolicy = Literal["initial", "uniform", "events"]
 class Record(BaseModel):
     """A frozen record; unknown fields are an error, so that a misspelt one is never ignored."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    # Validators are built when first used: whoever imports the SDK or the command line must not wait for all of them.
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 class Artifact(Record):

@@ -40,6 +40,7 @@ FLOORS: dict[str, int] = {
     "checkpoints": 3,
     "manifests": 2,
     "plugins": 2,
+    "client": 3,
     "vision": 3,
     "weights": 3,
     "hub_errors": 3,
@@ -146,11 +147,16 @@ def test_nothing_heavy_is_imported(statement: str) -> None:
     assert imported_by(statement, HEAVY) == []
 
 
+def test_the_sdk_is_light() -> None:
+    suspects = ("fastapi", "uvicorn", "cv2", "numpy", "PIL", "av", "dbos", "sqlalchemy", *HEAVY)
+    assert imported_by("import cow_service.client", suspects) == []
+
+
 def test_help_imports_no_server_and_no_vision() -> None:
     assert imported_by("import cow_service.cli", ("fastapi", "uvicorn", "cv2", "numpy", "av")) == []
 
 
 def imported_by(statement: str, suspects: tuple[str, ...]) -> list[str]:
     code = f"import sys; {statement}; print(*[m for m in {suspects} if m in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
     return result.stdout.split()

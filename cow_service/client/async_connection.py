@@ -1,0 +1,112 @@
+"""How `AsyncClient` does what calls say: requests sent, pauses slept, events followed."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import TypeVar
+
+import httpx
+from httpx_sse import EventSource
+
+from cow_service.client import calls
+from cow_service.client.calls import ACCEPTED, Order, Pause, Send, Steps, Tell
+from cow_service.client.events import Event, Following
+from cow_service.client.progress import ProgressLike, told
+from cow_service.client.results import AsyncAnswer, AsyncSimulation, async_result_from
+from cow_service.client.settings import Target
+from cow_service.records import Job
+
+T = TypeVar("T")
+OK = 200
+
+
+class AsyncConnection:
+    """A server, and the way to it. `own` says whether the way is closed with it."""
+
+    def __init__(self, target: Target, retries: int, http: httpx.AsyncClient, *, own: bool) -> None:
+        self.target = target
+        self.retries = retries
+        self._http = http
+        self._own = own
+
+    async def close(self) -> None:
+        """Closes the connections that were made here."""
+        if self._own:
+            await self._http.aclose()
+
+    async def artifact(self, sha256: str) -> bytes:
+        """The bytes of an artifact."""
+        return await self.run(calls.artifact(sha256, self.retries))
+
+    async def job(self, job_id: str) -> Job:
+        """A job as it is."""
+        return calls.job_in(await self.run(calls.looked_at(job_id, self.retries)))
+
+    async def done(self, order: Order, timeout: float | None, progress: ProgressLike) -> AsyncSimulation | AsyncAnswer:
+        """The result of an order, waited for. One that is canceled cancels its job."""
+        patience = self.target.patience(timeout) if progress is False else 0
+        response = await self.run(calls.begun(order, patience, self.retries))
+        if response.status_code != ACCEPTED:
+            return async_result_from(order.kind, calls.object_in(response), self.artifact)
+        job = calls.job_in(response)
+        try:
+            with told(progress) as tell:
+                return await self.awaited(job, timeout, tell)
+        except asyncio.CancelledError:
+            await self.run(calls.canceled(job.id, retries=0))
+            raise
+
+    async def awaited(self, job: Job, timeout: float | None, tell: Tell | None) -> AsyncSimulation | AsyncAnswer:
+        """The result of a job, once it has ended."""
+        body = await self.run(calls.awaited(job.id, timeout, tell, self.retries))
+        return async_result_from(job.kind, body, self.artifact)
+
+    async def run(self, steps: Steps[T]) -> T:
+        """Does what a call says, to its end."""
+        came: httpx.Response | httpx.HTTPError | None = None
+        while True:
+            try:
+                step = steps.send(came)
+            except StopIteration as end:
+                return end.value
+            if isinstance(step, Pause):
+                await asyncio.sleep(step.seconds)
+                came = None
+            else:
+                came = await self._sent(step)
+
+    async def events(self, job_id: str, after: int) -> AsyncIterator[Event]:
+        """The events of a job after a number, through broken connections."""
+        following = Following(after, self.retries)
+        send = Send("GET", f"/jobs/{job_id}/events")
+        url, limit = self.target.url(send.path), self.target.following
+        while not following.ended:
+            outcome: httpx.Response | httpx.HTTPError | None = None
+            headers = self.target.headers(send) | following.headers
+            try:
+                async with self._http.stream("GET", url, headers=headers, timeout=limit) as response:
+                    if response.status_code == OK:
+                        async for sent in EventSource(response).aiter_sse():
+                            if (event := following.take(sent)) is not None:
+                                yield event
+                    else:
+                        await response.aread()
+                        outcome = response
+            except httpx.HTTPError as error:
+                outcome = error
+            if not following.ended:
+                await asyncio.sleep(following.pause_after(outcome))
+
+    async def _sent(self, send: Send) -> httpx.Response | httpx.HTTPError:
+        try:
+            return await self._http.request(
+                send.method,
+                self.target.url(send.path),
+                headers=self.target.headers(send),
+                params=send.params,
+                content=send.content,
+                timeout=self.target.timeout,
+            )
+        except httpx.HTTPError as error:
+            return error

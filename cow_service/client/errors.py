@@ -1,0 +1,198 @@
+"""What calls raise: the server's own errors, one class for each code, and those of the way to it.
+
+    CowError                        everything here
+    ├── (cow_service.errors)        one class for each problem code: CannotGround, QueueFull, Unauthorized...
+    ├── ServerUnreachable           no connection, or it broke, more often than `retries`
+    ├── WaitTimeout                 a job had not ended in time; it goes on, and `job_id` names it
+    └── BadResponse                 what answered speaks no COW: a proxy's page, a damaged artifact
+
+Each has `code`, `status` (0 where no server told it), `detail` (what was wrong, with the value, and what to do),
+`errors` (a JSON Pointer for each invalid field) and `request_id` (by which the server's log knows the request).
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import httpx
+
+from cow_service.errors import (
+    ArtifactNotFound,
+    BodyTooLarge,
+    BodyTooSlow,
+    BodyTypeUnsupported,
+    Canceled,
+    CannotGround,
+    CannotReadDirection,
+    CheckpointInvalid,
+    CowError,
+    FieldError,
+    GeneratorOutOfMemory,
+    GeneratorUnavailable,
+    IdempotencyKeyReused,
+    ImageTooLarge,
+    ImageTypeUnsupported,
+    ImageUnreadable,
+    ImageUrlNotAllowed,
+    ImageUrlUnreachable,
+    InternalError,
+    InvalidRequest,
+    JobNotFound,
+    MalformedBody,
+    MethodNotAllowed,
+    MllmBadReply,
+    MllmUnavailable,
+    ModelNotFound,
+    NotFound,
+    NotReady,
+    ObjectNotFound,
+    OriginNotAllowed,
+    QueueFull,
+    RangeNotSatisfiable,
+    RateLimited,
+    ReaderUnavailable,
+    ShuttingDown,
+    StorageUnavailable,
+    Unauthorized,
+    WebhookNotAllowed,
+    WeightsUnavailable,
+    kinds,
+)
+
+__all__ = [
+    "ArtifactNotFound",
+    "BadResponse",
+    "BodyTooLarge",
+    "BodyTooSlow",
+    "BodyTypeUnsupported",
+    "Canceled",
+    "CannotGround",
+    "CannotReadDirection",
+    "CheckpointInvalid",
+    "CowError",
+    "FieldError",
+    "GeneratorOutOfMemory",
+    "GeneratorUnavailable",
+    "IdempotencyKeyReused",
+    "ImageTooLarge",
+    "ImageTypeUnsupported",
+    "ImageUnreadable",
+    "ImageUrlNotAllowed",
+    "ImageUrlUnreachable",
+    "InternalError",
+    "InvalidRequest",
+    "JobNotFound",
+    "MalformedBody",
+    "MethodNotAllowed",
+    "MllmBadReply",
+    "MllmUnavailable",
+    "ModelNotFound",
+    "NotFound",
+    "NotReady",
+    "ObjectNotFound",
+    "OriginNotAllowed",
+    "QueueFull",
+    "RangeNotSatisfiable",
+    "RateLimited",
+    "ReaderUnavailable",
+    "ServerUnreachable",
+    "ShuttingDown",
+    "StorageUnavailable",
+    "Unauthorized",
+    "WaitTimeout",
+    "WebhookNotAllowed",
+    "WeightsUnavailable",
+]
+
+SHOWN = 200  # characters of a response that is none of COW's
+
+
+class ServerUnreachable(CowError):
+    """The server could not be reached."""
+
+    code, status = "server-unreachable", 0
+
+
+class WaitTimeout(CowError):
+    """The job had not ended in time."""
+
+    code, status = "wait-timeout", 0
+
+    def __init__(self, detail: str, job_id: str) -> None:
+        super().__init__(detail)
+        self.job_id = job_id
+
+
+class BadResponse(CowError):
+    """The response is not one of COW's."""
+
+    code, status = "bad-response", 0
+
+
+def unreachable(error: httpx.HTTPError) -> ServerUnreachable:
+    """The error of a request that no response came to."""
+    url = error.request.url
+    return ServerUnreachable(
+        f"{error.request.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}. "
+        "Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?"
+    )
+
+
+def error_of(response: httpx.Response) -> CowError:
+    """The error that a response tells; the body has been read."""
+    problem = _problem(response)
+    if problem is None:
+        body = " ".join(response.text.split())
+        error: CowError = BadResponse(
+            f"{response.request.method} {response.url.path} was answered with {response.status_code} "
+            f"{response.reason_phrase}, and with no problem of COW's: {body[:SHOWN] or 'nothing'}. Does a proxy stand "
+            "between?"
+        )
+        error.status = response.status_code
+    else:
+        error = error_from(problem, response.headers)
+    return known_by(error, response)
+
+
+def known_by(error: CowError, response: httpx.Response) -> CowError:
+    """The same error, with the id by which the server's log knows its request; tracebacks show it."""
+    error.request_id = response.headers.get("x-request-id")
+    if error.request_id is not None:
+        error.add_note(f"request id: {error.request_id}")
+    return error
+
+
+def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) -> CowError:
+    """The error that a problem (RFC 9457) is. A code of a later version than this comes as a plain `CowError`."""
+    code = _code(problem)
+    kind = kinds().get(code, CowError)
+    fields = [field for field in problem.get("errors") or () if isinstance(field, dict)]
+    error = kind(
+        str(problem.get("detail", "")),
+        errors=tuple(FieldError(str(field.get("pointer", "")), str(field.get("detail", ""))) for field in fields),
+        headers=dict(headers or {}),
+    )
+    error.code, error.status = code or error.code, int(problem.get("status", error.status))
+    return error
+
+
+def code_of(response: httpx.Response) -> str | None:
+    """The problem code that a response tells; None where it tells none."""
+    problem = _problem(response)
+    return None if problem is None else _code(problem)
+
+
+def _code(problem: dict[str, Any]) -> str:
+    return str(problem.get("type", "")).rpartition(":")[2]
+
+
+def _problem(response: httpx.Response) -> dict[str, Any] | None:
+    """The problem that a response holds; its body has been read."""
+    if not response.headers.get("content-type", "").startswith("application/problem+json"):
+        return None
+    try:
+        body = json.loads(response.content)
+    except ValueError:
+        return None
+    return body if isinstance(body, dict) else None

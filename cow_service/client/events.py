@@ -1,0 +1,76 @@
+"""The life of a job as it happens: events of `GET /jobs/{id}/events`, through broken connections."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, cast, get_args
+
+import httpx
+from httpx_sse import ServerSentEvent
+
+from cow_service.client.calls import read
+from cow_service.client.errors import error_of, unreachable
+from cow_service.client.retries import pause_before_retry
+from cow_service.records import Job
+
+EventName: TypeAlias = Literal["queued", "running", "stage", "progress", "succeeded", "failed", "canceled", "deleted"]
+LAST: frozenset[str] = frozenset({"succeeded", "failed", "canceled", "deleted"})
+NO_CONTENT = 204
+
+
+@dataclass(frozen=True)
+class Event:
+    """One thing that happened to a job.
+
+    `number` is the same however often events are read, and None for `progress`, which is not told again. `job` is the
+    job as it then was, without its result; None where it was deleted.
+    """
+
+    name: EventName
+    number: int | None
+    job: Job | None
+
+
+class Following:
+    """How far one reader of events is; does nothing itself."""
+
+    def __init__(self, after: int, retries: int) -> None:
+        self.heard = after
+        self.ended = False
+        self._retries, self._tried = retries, 0
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """What tells the server where to go on."""
+        return {"Accept": "text/event-stream", **({"Last-Event-ID": str(self.heard)} if self.heard else {})}
+
+    def take(self, sent: ServerSentEvent) -> Event | None:
+        """The event that was sent; None where this version does not know its kind."""
+        self._tried = 0
+        if sent.event not in get_args(EventName):
+            return None
+        name = cast("EventName", sent.event)
+        self.ended = name in LAST
+        body = json.loads(sent.data)
+        # An event without an id of its own repeats the last one (the HTML standard's rule).
+        number = int(sent.id) if name != "progress" and sent.id.isdigit() else None
+        self.heard = number or self.heard
+        return Event(name, number, read(Job, body) if body else None)
+
+    def pause_after(self, outcome: httpx.Response | httpx.HTTPError | None) -> float:
+        """Seconds before the next connection, after one that broke, was refused or just ended (None).
+
+        Raises what stands against another.
+        """
+        self._tried += 1
+        if isinstance(outcome, httpx.Response) and outcome.status_code == NO_CONTENT:
+            self.ended = True
+            return 0.0
+        broken = outcome or httpx.RemoteProtocolError("the stream ended before the job")
+        pause = pause_before_retry(broken, self._tried) if self._tried <= self._retries else None
+        if pause is not None:
+            return pause
+        if isinstance(broken, httpx.Response):
+            raise error_of(broken)
+        raise unreachable(broken) from broken

@@ -1,0 +1,108 @@
+"""Images as callers have them: a file, bytes, a PIL image, an array, a URL, or what the server keeps already."""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+from cow_service.errors import FieldError, InvalidRequest
+from cow_service.records import Artifact, Frame, ImageInfo, Record
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from PIL import Image
+
+    from cow_service.requests import ImageArtifact, ImageUrl
+
+    # A text is a path, or a URL where it begins with http://, https:// or data:. Arrays are RGB, see `encoded_array`.
+    ImageLike: TypeAlias = (
+        str
+        | os.PathLike[str]
+        | bytes
+        | Image.Image
+        | NDArray[np.uint8]
+        | Artifact
+        | Frame
+        | ImageInfo
+        | ImageArtifact
+        | ImageUrl
+    )
+else:
+    ImageLike = Any
+
+URLS = ("http://", "https://", "data:")
+
+
+@dataclass(frozen=True)
+class Upload:
+    """An image to be sent as a file. It holds the bytes themselves, so that every try sends the same."""
+
+    data: bytes
+    name: str = "image"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """An image that the server finds by what stands in the request."""
+
+    json: str | dict[str, str]
+
+
+def image_input(image: ImageLike) -> Upload | Reference:
+    """How an image is sent.
+
+    Raises `OSError` where a file cannot be read, and `InvalidRequest` for anything that is no image.
+    """
+    if isinstance(image, str) and image.startswith(URLS):
+        return Reference(image if image.startswith("data:") else {"url": image})
+    if isinstance(image, str | os.PathLike):
+        path = Path(image)
+        return Upload(path.read_bytes(), path.name or "image")
+    if isinstance(image, bytes | bytearray | memoryview):
+        return Upload(bytes(image))
+    if isinstance(image, Record):
+        kept = isinstance(image, Artifact | Frame | ImageInfo)
+        return Reference({"artifact": image.sha256} if kept else image.model_dump())
+    # Neither library is loaded for this: whoever has such an image has loaded it.
+    if hasattr(image, "__array_interface__") and hasattr(image, "dtype"):
+        return Upload(encoded_array(cast("NDArray[np.uint8]", image)))
+    if hasattr(image, "save") and hasattr(image, "mode"):
+        return Upload(encoded_picture(cast("Image.Image", image)))
+    raise _wrong(
+        f"got {type(image).__name__}; give a path, bytes, a PIL image, an array (height, width, 3) of uint8, a URL, or "
+        "an artifact"
+    )
+
+
+def encoded_array(array: NDArray[np.uint8]) -> bytes:
+    """PNG of an array: (height, width) grey, (height, width, 3) RGB or (height, width, 4) RGBA, uint8."""
+    from PIL import Image  # noqa: PLC0415
+
+    shape, kind = tuple(array.shape), str(array.dtype)
+    if kind != "uint8" or len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (3, 4)) or 0 in shape:
+        raise _wrong(
+            f"is an array {shape} of {kind}; give (height, width), or (height, width, 3 or 4), of uint8 in RGB"
+        )
+    return _png(Image.fromarray(array))
+
+
+def encoded_picture(picture: Image.Image) -> bytes:
+    """PNG of a PIL image, upright: what its EXIF says of its orientation is applied."""
+    from PIL import ImageOps  # noqa: PLC0415
+
+    upright = ImageOps.exif_transpose(picture)
+    return _png(upright if upright.mode in ("1", "L", "LA", "P", "RGB", "RGBA", "I;16") else upright.convert("RGB"))
+
+
+def _png(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG", compress_level=1)  # it crosses a network once: small matters less than soon
+    return buffer.getvalue()
+
+
+def _wrong(detail: str) -> InvalidRequest:
+    return InvalidRequest(f"`image` {detail}.", errors=(FieldError("/image", detail),))

@@ -1,0 +1,37 @@
+"""What calls take beside image and question: the fields of `SimulateRequest` and `AnswerRequest`, by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+if TYPE_CHECKING:
+    from cow_service.requests import FramesRequest, GroundingRequest, MotionRequest, TrajectoryRequest
+
+Given = Mapping[str, Any]  # a record as a plain mapping, checked by the server
+
+
+class SimulateOptions(TypedDict, total=False):
+    """All of `SimulateRequest` but image and question; README.md and `cow_service.requests` say what each means."""
+
+    options: Sequence[str] | None
+    grounding: GroundingRequest | Given | None
+    motion: MotionRequest | Given | None
+    trajectory: TrajectoryRequest | Given | None
+    reader: str | None
+    generator: str | None
+    num_frames: int
+    fps: float
+    seed: int
+    video: bool
+    frames: FramesRequest | Given
+    generator_options: Given
+    webhook: str | None
+
+
+class AnswerOptions(SimulateOptions, total=False):
+    """As for a simulation, and how to answer from it."""
+
+    imagine: Literal["always", "never"]
+    baseline: bool
+    votes: int

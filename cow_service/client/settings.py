@@ -1,0 +1,62 @@
+"""Where the server is and how it is called, the same for both clients."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import httpx
+
+from cow_service import __version__
+from cow_service.client.calls import PATIENCE, Send
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
+SILENCE = 60.0  # seconds in a stream of events; the server says something every 15
+RETRIES = 6
+
+
+@dataclass(frozen=True)
+class Target:
+    """A server, by address and key."""
+
+    base_url: str
+    api_key: str | None
+    timeout: httpx.Timeout
+
+    def patience(self, timeout: float | None) -> int:
+        """Seconds that one request waits for a job: well within the time after which silence counts as broken."""
+        longest = PATIENCE if self.timeout.read is None else min(PATIENCE, int(self.timeout.read / 2))
+        return longest if timeout is None else min(longest, int(timeout))
+
+    @property
+    def following(self) -> httpx.Timeout:
+        """Limits of a stream of events, in which the server may be silent for longer."""
+        return httpx.Timeout(
+            connect=self.timeout.connect, read=SILENCE, write=self.timeout.write, pool=self.timeout.pool
+        )
+
+    def url(self, path: str) -> str:
+        """The address of a path of the API."""
+        return self.base_url + path
+
+    def headers(self, send: Send) -> dict[str, str]:
+        """The headers of a request."""
+        headers = {"User-Agent": f"cow-service/{__version__}", "Accept": "application/json, */*", **send.headers}
+        if send.media_type is not None:
+            headers["Content-Type"] = send.media_type
+        if self.api_key is not None:
+            headers["Authorization"] = f"Bearer {self.api_key}"
+        return headers
+
+
+def target_of(base_url: str | None, api_key: str | None, timeout: float | httpx.Timeout | None) -> Target:
+    """The server of these arguments, else of COW_BASE_URL and COW_API_KEY, else the one on this machine.
+
+    Raises `ValueError` for what is no address.
+    """
+    address = (base_url or os.environ.get("COW_BASE_URL") or DEFAULT_URL).rstrip("/")
+    if not address.startswith(("http://", "https://")):
+        raise ValueError(f"base_url must begin with http:// or https://, got {address!r}")
+    limit = timeout if isinstance(timeout, httpx.Timeout) else httpx.Timeout(timeout, connect=min(10, timeout or 10))
+    return Target(address, api_key or os.environ.get("COW_API_KEY") or None, limit)
