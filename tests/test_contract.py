@@ -63,6 +63,7 @@ def test_every_error_has_its_own_code_and_is_documented() -> None:
 
 # Of other operations, or of none.
 OTHERS = (
+    "model-not-found",
     "not-found",
     "method-not-allowed",
     "internal-error",

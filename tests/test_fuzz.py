@@ -11,7 +11,7 @@ import pytest
 import schemathesis
 from conftest import ROOT, Server
 from engines import app_for
-from fuzz_hooks import GIVEN
+from fuzz_hooks import POSTED, doable
 from hypothesis import HealthCheck, given, settings
 from schemathesis import GenerationMode
 from schemathesis.checks import not_a_server_error
@@ -41,6 +41,10 @@ def contract(tmp_path_factory: pytest.TempPathFactory):
         ("POST", "/simulate", GenerationMode.NEGATIVE),
         ("POST", "/answer", GenerationMode.POSITIVE),
         ("POST", "/answer", GenerationMode.NEGATIVE),
+        ("POST", "/v1/chat/completions", GenerationMode.POSITIVE),
+        ("POST", "/v1/chat/completions", GenerationMode.NEGATIVE),
+        ("GET", "/v1/models", GenerationMode.POSITIVE),
+        ("GET", "/v1/models/{model}", GenerationMode.POSITIVE),
         ("GET", "/artifacts/{sha256}", GenerationMode.POSITIVE),
         ("GET", "/jobs", GenerationMode.POSITIVE),
         ("GET", "/jobs", GenerationMode.NEGATIVE),
@@ -62,12 +66,12 @@ def test_every_answer_is_in_the_contract(contract, method: str, path: str, mode:
     @settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))
     def check(case) -> None:
         if mode is GenerationMode.POSITIVE and isinstance(case.body, dict) and case.media_type == "application/json":
-            case.body = {**case.body, **GIVEN, "num_frames": case.body.get("num_frames", 9) % 20 + 2}
+            case.body = doable(path, case.body, case.body.get("num_frames", 9) % 20 + 2)
         reached.add(case.call_and_validate(checks=CHECKS).status_code)
 
     reached: set[int] = set()
     check()
-    if (path, mode) in (("/simulate", GenerationMode.POSITIVE), ("/answer", GenerationMode.POSITIVE)):
+    if path in POSTED and mode is GenerationMode.POSITIVE:
         assert reached & {200, 202}, f"no generated request got past the checks: {reached}"
 
 
@@ -91,4 +95,5 @@ def test_a_real_server_keeps_the_contract(server: Server) -> None:
 def test_the_contract_has_no_other_operations(contract) -> None:
     jobs = {"/jobs", "/jobs/{id}", "/jobs/{id}/events", "/jobs/{id}/cancel"}
     others = {"/artifacts/{sha256}", "/models", "/livez", "/readyz", "/metrics"}
-    assert set(contract) == {"/simulate", "/answer"} | jobs | others
+    chat = {"/v1/chat/completions", "/v1/models", "/v1/models/{model}"}
+    assert set(contract) == {"/simulate", "/answer"} | chat | jobs | others

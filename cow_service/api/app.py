@@ -13,6 +13,8 @@ from fastapi.openapi.utils import get_openapi
 from cow_service import __version__, tracing
 from cow_service.api.answer import answer_routes
 from cow_service.api.artifacts import artifact_routes
+from cow_service.api.chat import chat_routes, document_chat
+from cow_service.api.chat_problems import ChatProblems
 from cow_service.api.events import event_routes
 from cow_service.api.health import health_routes
 from cow_service.api.jobs import job_routes
@@ -61,10 +63,14 @@ def create_app(engine: Engine, readiness: Readiness | None = None, *, closing: b
     app.add_middleware(BodyLimit, megabytes=service.settings.max_body_mb, seconds=service.settings.body_timeout)
     install_problem_handlers(app)
     install_layers(app, service.settings, service.metrics)
+    layers = app.surround
+    # Around the layers, too: they refuse requests themselves.
+    app.surround = lambda stack: ChatProblems(stack if layers is None else layers(stack))
     submitting = Submitting(engine)
     for router in (
         simulate_routes(submitting),
         answer_routes(submitting),
+        chat_routes(submitting),
         job_routes(engine),
         event_routes(engine),
         artifact_routes(engine),
@@ -90,6 +96,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
                 if "HTTPValidationError" in str(operation["responses"].get("422")):
                     del operation["responses"]["422"]
         document_layers(document)
+        document_chat(document)
         for name in DROPPED:
             schemas.pop(name, None)
         document["components"]["schemas"] = dict(sorted(schemas.items()))

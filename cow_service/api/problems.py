@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
@@ -33,13 +34,15 @@ SHOWN_CHARACTERS = 80  # of what the caller sent
 log = logging.getLogger("cow_service")
 
 
-def invalid(error: ValidationError | RequestValidationError) -> InvalidRequest:
-    """A pydantic error as ours, with a JSON Pointer per field."""
+def invalid(
+    error: ValidationError | RequestValidationError, placed: Callable[[str], str] = lambda pointer: pointer
+) -> InvalidRequest:
+    """A pydantic error as ours, with a JSON Pointer per field; `placed` says where that stands in the request."""
     fields: dict[str, FieldError] = {}
     if any(item["type"] in ("json_invalid", "model_type") and not item["loc"] for item in error.errors()):
         return MalformedBody(f"The body is no JSON object: {error.errors()[0]['msg']}.")
     for item in error.errors():
-        pointer = "".join("/" + pointer_part(part) for part in _location(item["loc"]))
+        pointer = placed("".join("/" + pointer_part(part) for part in _location(item["loc"])))
         fields.setdefault(pointer, FieldError(pointer, _told(str(item["msg"]), item["input"])))
     told = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in list(fields.values())[:5])
     return InvalidRequest(f"{told}. See /openapi.json for what the request may hold.", errors=tuple(fields.values()))

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from http import HTTPStatus
+from typing import TypeVar
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import Request, Response
 
 from cow_service import context
-from cow_service.api.intake import Body, Posted, check, receive
+from cow_service.api.intake import Body, check, receive
 from cow_service.api.preferences import Preferences, preferences_of
 from cow_service.errors import Canceled, CowError, JobNotFound
+from cow_service.images import DecodedImage
 from cow_service.jobs.engine import Engine, new_job_id
 from cow_service.jobs.live import Waiting
 from cow_service.jobs.orders import Order
 from cow_service.jobs.reports import Found
 from cow_service.pipeline import now
 from cow_service.records import TERMINAL, JobKind
-from cow_service.requests import ImageArtifact
+from cow_service.requests import ImageArtifact, SimulateRequest
 
 LOOK = 3.0  # seconds between looks at the database: another process may have run the job
 AT_ONCE = 4  # bodies that are decoded at the same time
 RETRY_AFTER = {"Retry-After": "1"}
+
+Made = TypeVar("Made")
 
 
 def owner_of(request: Request) -> str | None:
@@ -34,9 +38,27 @@ def owner_of(request: Request) -> str | None:
     return owner
 
 
+Checked = tuple[SimulateRequest, DecodedImage | None]  # a request, and its image where that is kept and decoded
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Who asks for which job, and how they want to be answered."""
+
+    kind: JobKind
+    owner: str | None
+    prefer: Preferences
+    job_id: str
+
+    @property
+    def comes_back(self) -> bool:
+        """Whether a header says that somebody may ask for the job."""
+        return self.prefer != Preferences(fresh=self.prefer.fresh)
+
+
 @dataclass
 class Submitting:
-    """Takes requests of one kind after the other to the engine. Bodies are decoded in threads."""
+    """Takes requests to the engine, and what they come to back. Bodies are decoded in threads."""
 
     engine: Engine
 
@@ -48,22 +70,88 @@ class Submitting:
 
         Raises what is wrong with the request, and what the job fails with.
         """
+        asked = self.asked(request, kind)
+        posted = await receive(request)
+        result = await self.result(request, asked, lambda: check(posted, model, self.engine.service))
+        return await self.accepted(asked) if result is None else json_response(result)
+
+    def asked(self, request: Request, kind: JobKind) -> Asked:
+        """What the request's headers say. Raises `QueueFull` and `ShuttingDown` where no job can be taken."""
         prefer, owner = preferences_of(request.headers), owner_of(request)
         if prefer.key is None:
             self.engine.check_room()  # before the body: whoever is refused is told at once
-        posted = await receive(request)
-        job_id = new_job_id(owner, prefer.key)
-        with self.engine.live.waiting(job_id) as waiting:
-            order = _Asked(kind, owner, prefer, job_id)
-            is_new = await to_thread.run_sync(self._submit, posted, model, order, limiter=self._limiter)
-            if prefer.respond_async and not prefer.wait:
-                return await self._accepted(job_id, owner, prefer)
-            async with _left(request) as left:
-                return await self._awaited(order, waiting, left, is_new)
+        return Asked(kind, owner, prefer, new_job_id(owner, prefer.key))
 
-    def _submit(self, posted: Posted, model: type[Body], asked: _Asked) -> bool:
+    async def apart(self, work: Callable[[], Made]) -> Made:
+        """Does work on a body in a thread, a few at the same time."""
+        return await to_thread.run_sync(work, limiter=self._limiter)
+
+    async def take(self, asked: Asked, read: Callable[[], Checked]) -> bool:
+        """Makes a job of the request that `read` gives, in a thread; says whether the job is new."""
+        return await self.apart(lambda: self._submit(asked, *read()))
+
+    async def result(self, request: Request, asked: Asked, read: Callable[[], Checked]) -> str | None:
+        """What the request comes to, as JSON; None where the caller wants the job instead."""
+        with self.engine.live.waiting(asked.job_id) as waiting:
+            is_new = await self.take(asked, read)
+            if asked.prefer.respond_async and not asked.prefer.wait:
+                return None
+            async with _left(request) as left:
+                return await self.outcome(asked, waiting, is_new, left, asked.prefer.wait)
+
+    async def accepted(self, asked: Asked) -> Response:
+        """The job, for a caller who does not wait for its end."""
+
+        def settled() -> Found:
+            self.engine.database.settle()  # nobody is told of a job that a loss of power could take back
+            return self.engine.find(asked.job_id, asked.owner)
+
+        found = await to_thread.run_sync(settled)
+        headers = {"Location": f"/jobs/{asked.job_id}", "Preference-Applied": asked.prefer.applied, **RETRY_AFTER}
+        return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers)
+
+    async def outcome(
+        self, asked: Asked, waiting: Waiting, is_new: bool, left: asyncio.Event, wait: float | None = None
+    ) -> str | None:
+        """What the job comes to once it has ended; None once `wait` seconds are over. Raises what it fails with.
+
+        A job that is not new, or was not waited for from its beginning, may have ended: then `is_new` is false.
+        """
+        loop = asyncio.get_running_loop()
+        until = None if wait is None else loop.time() + wait
+        gone = asyncio.ensure_future(left.wait())
+        look = not is_new
+        try:
+            while not waiting.settled.done():
+                if look:
+                    found = await to_thread.run_sync(self.engine.find, asked.job_id, asked.owner)
+                    if found.job.status in TERMINAL:
+                        break
+                look = True
+                rest = LOOK if until is None else min(LOOK, until - loop.time())
+                if rest <= 0:
+                    return None
+                await asyncio.wait({waiting.settled, gone}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
+                if gone.done() and not waiting.settled.done():
+                    await self.leave(asked, is_new)
+                    raise Canceled("The caller went away before the work was done.")
+        finally:
+            gone.cancel()
+        if waiting.settled.done():
+            outcome = waiting.settled.result()
+            if isinstance(outcome, CowError):
+                raise outcome
+            if outcome is not None:
+                return outcome
+        return await to_thread.run_sync(self._ended, asked)
+
+    async def leave(self, asked: Asked, is_new: bool) -> None:
+        """The caller has gone: ends a job that nobody else can know of."""
+        if is_new and not asked.comes_back:
+            await to_thread.run_sync(self.engine.cancel, asked.job_id, asked.owner)
+
+    def _submit(self, asked: Asked, body: SimulateRequest, image: DecodedImage | None) -> bool:
         service = self.engine.service
-        body, image = check(posted, model, service)
         if isinstance(body.image, ImageArtifact):
             self.engine.may_read(body.image.artifact, asked.owner if image is None else None)
         reader, generator = service.precheck(body)
@@ -88,51 +176,8 @@ class Submitting:
         )
         return self.engine.submit(order, generator, asked.owner, asked.prefer.key, image, asked.job_id)
 
-    async def _accepted(self, job_id: str, owner: str | None, prefer: Preferences) -> Response:
-        def settled() -> Found:
-            self.engine.database.settle()  # nobody is told of a job that a loss of power could take back
-            return self.engine.find(job_id, owner)
-
-        found = await to_thread.run_sync(settled)
-        headers = {"Location": f"/jobs/{job_id}", "Preference-Applied": prefer.applied, **RETRY_AFTER}
-        return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers)
-
-    async def _awaited(self, asked: _Asked, waiting: Waiting, left: asyncio.Event, is_new: bool) -> Response:
-        """The response once the job has ended or the caller has waited long enough.
-
-        A caller who leaves ends a job that nobody else can know of.
-        """
-        loop, engine, prefer = asyncio.get_running_loop(), self.engine, asked.prefer
-        until = None if prefer.wait is None else loop.time() + prefer.wait
-        gone = asyncio.ensure_future(left.wait())
-        look = not is_new
-        try:
-            while not waiting.settled.done():
-                if look:
-                    found = await to_thread.run_sync(engine.find, asked.job_id, asked.owner)
-                    if found.job.status in TERMINAL:
-                        break
-                look = True
-                rest = LOOK if until is None else min(LOOK, until - loop.time())
-                if rest <= 0:
-                    return await self._accepted(asked.job_id, asked.owner, prefer)
-                await asyncio.wait({waiting.settled, gone}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
-                if gone.done() and not waiting.settled.done():
-                    if is_new and not asked.comes_back:
-                        await to_thread.run_sync(engine.cancel, asked.job_id, asked.owner)
-                    raise Canceled("The caller went away before the work was done.")
-        finally:
-            gone.cancel()
-        if waiting.settled.done():
-            outcome = waiting.settled.result()
-            if isinstance(outcome, CowError):
-                raise outcome
-            if outcome is not None:
-                return json_response(outcome)
-        return await to_thread.run_sync(self._ended, asked)
-
-    def _ended(self, asked: _Asked) -> Response:
-        """The response of a job whose end only the database tells."""
+    def _ended(self, asked: Asked) -> str:
+        """The result of a job whose end only the database tells."""
         try:
             found = self.engine.find(asked.job_id, asked.owner)
         except JobNotFound as error:
@@ -141,22 +186,7 @@ class Submitting:
             raise found.error
         if found.result is None:
             raise Canceled("The job was canceled before it was done.")
-        return json_response(found.result)
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """Who asks for which job, and how they want to be answered."""
-
-    kind: JobKind
-    owner: str | None
-    prefer: Preferences
-    job_id: str
-
-    @property
-    def comes_back(self) -> bool:
-        """Whether a header says that somebody may ask for the job."""
-        return self.prefer != Preferences(fresh=self.prefer.fresh)
+        return found.result
 
 
 def json_response(body: str, status: int = HTTPStatus.OK, headers: dict[str, str] | None = None) -> Response:

@@ -1,0 +1,116 @@
+"""What the `/v1` operations return: OpenAI's records, each with what COW has to say besides as `cow`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from cow_service.records import Answer, JobStatus, Problem, Record
+
+
+class ChatModel(Record):
+    """A model: who answers, with imagination or without."""
+
+    id: str
+    object: Literal["model"] = "model"
+    created: int = Field(description="Seconds since 1970: when this server started.")
+    owned_by: Literal["cow"] = "cow"
+
+
+class ChatModels(Record):
+    """What `GET /v1/models` returns."""
+
+    object: Literal["list"] = "list"
+    data: tuple[ChatModel, ...]
+
+
+class ChatUsage(Record):
+    """Tokens of everything that the multimodal LLM was asked: simulation, votes and baseline."""
+
+    prompt_tokens: int
+    completion_tokens: int
+    total_tokens: int
+
+
+class ChatReply(Record):
+    """The answer as a message."""
+
+    role: Literal["assistant"] = "assistant"
+    content: str = Field(description='A letter; text for an open question; "Not sure" where `cow.answer` is null.')
+    reasoning_content: str | None = Field(default=None, description="The MLLM's own, where there is one.")
+    refusal: None = None
+
+
+class ChatChoice(Record):
+    """The only choice."""
+
+    index: Literal[0] = 0
+    message: ChatReply
+    finish_reason: Literal["stop"] = "stop"
+    logprobs: None = None
+
+
+class ChatCompletion(Record):
+    """What `POST /v1/chat/completions` returns."""
+
+    id: str = Field(description="`chatcmpl-` and the id of the job.")
+    object: Literal["chat.completion"] = "chat.completion"
+    created: int = Field(description="Seconds since 1970.")
+    model: str
+    choices: tuple[ChatChoice]
+    usage: ChatUsage
+    cow: Answer = Field(description="The whole answer, as `POST /answer` returns it.")
+
+
+class ChatDelta(Record):
+    """What a chunk adds to the message."""
+
+    role: Literal["assistant"] | None = None
+    content: str | None = None
+    reasoning_content: str | None = None
+
+
+class ChunkChoice(Record):
+    """The only choice."""
+
+    index: Literal[0] = 0
+    delta: ChatDelta
+    finish_reason: Literal["stop"] | None = None
+    logprobs: None = None
+
+
+class ChatProgress(Record):
+    """How far the job is."""
+
+    job: str = Field(description="Its id: `GET /jobs/{id}`.")
+    status: JobStatus
+    stage: str | None
+    progress: float = Field(ge=0, le=1, description="Share of the work that is done.")
+
+
+class ChatChunk(Record):
+    """One event of a stream: progress, then the answer's reasoning and text, then its end."""
+
+    id: str
+    object: Literal["chat.completion.chunk"] = "chat.completion.chunk"
+    created: int
+    model: str
+    choices: tuple[ChunkChoice, ...] = Field(description="Empty in the chunk that has `usage`.")
+    usage: ChatUsage | None = None
+    cow: ChatProgress | Answer | None = Field(default=None, description="Progress; the answer in the last chunk.")
+
+
+class ChatError(Record):
+    """An error as OpenAI's clients read it."""
+
+    message: str = Field(description="`detail` of the problem.")
+    type: str
+    param: str | None = Field(description="The first invalid field.")
+    code: str = Field(description="The last segment of the problem's `type`.")
+
+
+class ChatProblem(Problem):
+    """Why a request under `/v1` failed: a problem (RFC 9457), and the same as OpenAI's clients read it."""
+
+    error: ChatError
