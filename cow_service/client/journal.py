@@ -1,0 +1,188 @@
+"""The folder of a batch: what has come of each question, kept so that a batch that was killed goes on where it was.
+
+    batch.json      what is asked of each question, and the secret of which its idempotency keys are made
+    results.jsonl   one line for each question that is done, appended when it is
+    retried.jsonl   failures that were asked again
+
+A line is written at once and whole. What a kill left half is cut off at the next start; its question is then sent again
+under the same key, and the server, which has kept the job, only tells its result.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import secrets
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+from filelock import FileLock, Timeout
+
+from cow_service.client.questions import Question
+from cow_service.errors import InvalidRequest
+from cow_service.records import JobKind
+
+VERSION = 1
+
+
+class Journal:
+    """One batch's folder, held by one process at a time. Safe to use from every thread."""
+
+    def __init__(self, folder: Path, kind: JobKind, *, retry_failed: bool = False) -> None:
+        """Opens the folder, which is made if missing.
+
+        Raises `InvalidRequest` where another process holds it, or where it is that of another kind of batch.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        self.results = folder / "results.jsonl"
+        self._retried = folder / "retried.jsonl"
+        self._lock = FileLock(folder / ".lock")
+        self._guard = threading.Lock()
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout as error:
+            raise InvalidRequest(
+                f"'{folder}' is in use by another batch: wait for it, or use another folder."
+            ) from error
+        try:
+            self._secret = self._begin(kind)
+            _cut(self.results)
+            _cut(self._retried)
+            self._attempts = {line["id"]: line["attempt"] for line in _lines(self._retried)}
+            if retry_failed:
+                self._put_failures_by()
+            self.done: dict[str, tuple[str, str]] = {
+                line["id"]: (line["fingerprint"], line["status"]) for line in _lines(self.results)
+            }
+            self._file = os.open(self.results, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Lets go of the folder."""
+        with self._guard:
+            if self._file >= 0:
+                os.close(self._file)
+                self._file = -1
+        self._lock.release()
+
+    def has(self, question: Question) -> bool:
+        """Whether its outcome is here. Raises `InvalidRequest` where that is one of another question of the same id."""
+        known = self.done.get(question.id)
+        if known is not None and known[0] != question.fingerprint:
+            raise InvalidRequest(
+                f"'{self.folder}' has the outcome of another question with the id '{question.id}': what it asks, or "
+                "what all are asked, has changed. Use another folder, or another id."
+            )
+        return known is not None
+
+    def key(self, question: Question, content: bytes) -> str:
+        """The idempotency key of a question: the same until it fails and is asked again."""
+        attempt = self._attempts.get(question.id, 0)
+        parts = (self._secret, question.id, str(attempt), hashlib.sha256(content).hexdigest())
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+    def append(self, question: Question, line: dict[str, Any]) -> None:
+        """Keeps an outcome: in one write, so that no two lines mix."""
+        whole = {
+            "id": question.id,
+            **line,
+            "meta": question.meta,
+            "attempt": self._attempts.get(question.id, 0),
+            "fingerprint": question.fingerprint,
+        }
+        data = json.dumps(whole, ensure_ascii=False, separators=(",", ":")).encode() + b"\n"
+        with self._guard:
+            if self._file < 0:
+                return  # the batch was given up; the server keeps what came of this one
+            while data:
+                data = data[os.write(self._file, data) :]
+            self.done[question.id] = (question.fingerprint, line["status"])
+
+    def lines(self) -> Iterator[dict[str, Any]]:
+        """All outcomes that are here, in the order in which they came."""
+        return _lines(self.results)
+
+    def _begin(self, kind: JobKind) -> str:
+        path = self.folder / "batch.json"
+        with contextlib.suppress(FileNotFoundError):
+            known = json.loads(path.read_bytes())
+            if known["version"] != VERSION or known["kind"] != kind:
+                raise InvalidRequest(
+                    f"'{self.folder}' is the folder of a batch of kind '{known['kind']}' (version {known['version']}): "
+                    "use another folder."
+                )
+            return str(known["secret"])
+        secret = secrets.token_hex(16)
+        _replace(path, json.dumps({"version": VERSION, "kind": kind, "secret": secret}, indent=2).encode() + b"\n")
+        return secret
+
+    def _put_failures_by(self) -> None:
+        """Moves failures to `retried.jsonl`. Killed in between, they stand in both, and are moved at the next start."""
+        kept, failed = [], []
+        for line in _lines(self.results):
+            (failed if line["status"] == "failed" else kept).append(line)
+        if not failed:
+            return
+        with self._retried.open("ab") as file:
+            for line in failed:
+                line = {**line, "attempt": line["attempt"] + 1}  # noqa: PLW2901
+                file.write(json.dumps(line, ensure_ascii=False).encode() + b"\n")
+                self._attempts[line["id"]] = line["attempt"]
+            file.flush()
+            os.fsync(file.fileno())
+        _replace(
+            self.results,
+            b"".join(json.dumps(line, ensure_ascii=False, separators=(",", ":")).encode() + b"\n" for line in kept),
+        )
+
+
+def _cut(path: Path) -> None:
+    """Cuts off a last line that was not written to its end."""
+    with contextlib.suppress(FileNotFoundError), path.open("r+b") as file:
+        end = file.seek(0, os.SEEK_END)
+        at = end
+        while at > 0:
+            begin = max(0, at - 65536)
+            file.seek(begin)
+            found = file.read(at - begin).rfind(b"\n")
+            if found >= 0:
+                at = begin + found + 1
+                break
+            at = begin
+        if at < end:
+            file.truncate(at)
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+        for number, line in enumerate(file, 1):
+            if not line.endswith(b"\n"):
+                return
+            try:
+                yield json.loads(line)
+            except ValueError as error:
+                raise InvalidRequest(
+                    f"'{path}' is damaged in line {number}: take that line out; its question is then asked again."
+                ) from error
+
+
+def _replace(path: Path, data: bytes) -> None:
+    beside = path.with_name(path.name + ".new")
+    with beside.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)

@@ -1,0 +1,385 @@
+"""Batches: questions by id, a folder that survives kills, outcomes of both clients, and `cow batch` itself."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from conftest import Server
+from hypothesis import given
+from hypothesis import strategies as st
+from servers import BODY, IMAGE, QUESTION, Served, eventually
+
+from cow_service.client import AsyncClient, Client, errors
+from cow_service.client.batch_progress import Tally, duration, pace
+from cow_service.client.batches import Patience
+from cow_service.client.journal import Journal
+from cow_service.client.questions import Question, questions
+
+COMMAND = [sys.executable, "-m", "cow_service.cli", "batch"]
+GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}
+
+
+def asked(count: int, **others: Any) -> list[dict[str, Any]]:
+    """Questions that differ in their seeds, which take milliseconds each."""
+    return [{"id": f"q{n}", "image": IMAGE, "question": QUESTION, **GIVEN, "seed": n, **others} for n in range(count)]
+
+
+def written(folder: Path, items: list[dict[str, Any]]) -> Path:
+    """A file of questions, and the picture that they name beside it."""
+    (folder / "ball.png").write_bytes(IMAGE)
+    path = folder / "questions.jsonl"
+    path.write_text("".join(json.dumps({**item, "image": "ball.png"}) + "\n" for item in items))
+    return path
+
+
+def lines_of(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
+
+
+def job_count(http: httpx.Client) -> int:
+    count, cursor = 0, None
+    while True:
+        page = http.get("/jobs", params={"limit": 500, **({"cursor": cursor} if cursor else {})}).json()
+        count += len(page["jobs"])
+        if (cursor := page["next"]) is None:
+            return count
+
+
+# Questions
+
+
+def test_ids_are_given_or_made_of_what_is_asked() -> None:
+    items = [{"image": "a.png", "question": "?"}, ("a.png", "?"), {"id": 7, "image": "b.png", "question": "?"}]
+    ids = [question.id for question in questions(items)]
+    assert ids[1] == f"{ids[0]}-2"
+    assert ids[2] == "7"
+    again = [question.id for question in questions([items[2], items[0]])]
+    assert again == [ids[2], ids[0]], "an id must not hang on the order"
+
+
+def test_what_decides_is_in_the_fingerprint() -> None:
+    def fingerprint(item: dict[str, Any], **defaults: Any) -> str:
+        return next(questions([item], defaults)).fingerprint
+
+    base = {"image": "a.png", "question": "?"}
+    assert fingerprint(base) == fingerprint({**base, "meta": 5, "id": "x"})
+    different = [base, {**base, "image": "b.png"}, {**base, "question": "!"}, {**base, "seed": 1}]
+    assert len({fingerprint(item) for item in different} | {fingerprint(base, votes=3)}) == 5
+    grey = np.zeros((20, 20), np.uint8)
+    assert fingerprint({**base, "image": grey}) != fingerprint({**base, "image": grey + 1})
+    assert fingerprint({**base, "image": b"x"}) == fingerprint({**base, "image": b"x"})
+
+
+@pytest.mark.parametrize(
+    ("items", "says"),
+    [
+        ([{"question": "?"}], "Question 1: `image`"),
+        ([{"image": "a.png"}], "Question 1: `question`"),
+        ([{"image": "a.png", "question": 5}], "must be a text, got int"),
+        ([{"id": "", "image": "a.png", "question": "?"}], "0 characters"),
+        ([{"id": "x", "image": "a.png", "question": "?"}] * 2, "Question 2: `id` 'x' stands before"),
+    ],
+)
+def test_questions_that_are_none(items: list[Any], says: str) -> None:
+    with pytest.raises(errors.InvalidRequest, match=says):
+        list(questions(items))
+
+
+@given(st.text(min_size=1, max_size=200))
+def test_every_id_has_a_folder_inside(own: str) -> None:
+    name = next(questions([{"id": own, "image": "a.png", "question": "?"}])).folder
+    assert Path("items", name).parts == ("items", name)
+    assert name not in (".", "..")
+
+
+# The folder
+
+
+def line(status: str = "succeeded") -> dict[str, Any]:
+    return {"status": status, "seconds": 0.1, "result": {}}
+
+
+def a_question(own: str = "q", fingerprint: str = "f") -> Question:
+    return Question(own, "a.png", "?", fingerprint=fingerprint)
+
+
+def test_a_half_written_line_is_cut_off_and_asked_again_under_the_same_key(tmp_path: Path) -> None:
+    with Journal(tmp_path, "answer") as journal:
+        journal.append(a_question("first"), line())
+        key = journal.key(a_question("second"), b"body")
+        journal.append(a_question("second"), line())
+    results = tmp_path / "results.jsonl"
+    whole = results.read_bytes()
+    for cut in range(whole.index(b"\n") + 1, len(whole)):
+        results.write_bytes(whole[:cut])
+        with Journal(tmp_path, "answer") as journal:
+            assert journal.has(a_question("first"))
+            assert not journal.has(a_question("second"))
+            assert journal.key(a_question("second"), b"body") == key
+            journal.append(a_question("second"), line())
+        assert results.read_bytes() == whole
+
+
+def test_keys_differ_by_batch_question_and_body(tmp_path: Path) -> None:
+    with Journal(tmp_path / "a", "answer") as a, Journal(tmp_path / "b", "answer") as b:
+        keys = {a.key(a_question(), b"x"), b.key(a_question(), b"x"), a.key(a_question("r"), b"x")}
+        assert len(keys | {a.key(a_question(), b"y")}) == 4
+
+
+def test_a_failure_is_asked_again_under_another_key_and_only_when_told(tmp_path: Path) -> None:
+    with Journal(tmp_path, "answer") as journal:
+        keys = [journal.key(a_question("bad"), b"")]
+        journal.append(a_question("good"), line())
+        journal.append(a_question("bad"), line("failed"))
+    with Journal(tmp_path, "answer") as journal:
+        assert journal.has(a_question("bad"))
+    for _ in range(2):
+        with Journal(tmp_path, "answer", retry_failed=True) as journal:
+            assert not journal.has(a_question("bad"))
+            assert journal.has(a_question("good"))
+            keys.append(journal.key(a_question("bad"), b""))
+        with Journal(tmp_path, "answer") as journal:  # killed before it had an outcome: no other key
+            assert journal.key(a_question("bad"), b"") == keys[-1]
+            journal.append(a_question("bad"), line("failed"))
+    assert len(set(keys)) == 3
+    assert [entry["id"] for entry in lines_of(tmp_path)] == ["good", "bad"]
+
+
+def test_a_folder_is_for_one_batch_at_a_time_and_of_one_kind(tmp_path: Path) -> None:
+    with Journal(tmp_path, "answer") as journal:
+        journal.append(a_question(), line())
+        with pytest.raises(errors.InvalidRequest, match="in use"):
+            Journal(tmp_path, "answer")
+        with pytest.raises(errors.InvalidRequest, match="another question with the id 'q'"):
+            journal.has(a_question(fingerprint="other"))
+    with pytest.raises(errors.InvalidRequest, match="of kind 'answer'"):
+        Journal(tmp_path, "simulate")
+    (tmp_path / "results.jsonl").write_bytes(b"{}x\n")
+    with pytest.raises(errors.InvalidRequest, match="damaged in line 1"):
+        Journal(tmp_path, "answer")
+    (tmp_path / "results.jsonl").unlink()
+    Journal(tmp_path, "answer").close()
+
+
+# Both clients
+
+
+def test_outcomes_of_both_clients_are_the_same(server: Server) -> None:
+    items = [*asked(4), {**asked(5)[4], "question": "hello", "grounding": None, "imagine": "always"}]
+    items.append({"id": "missing", "image": "/nowhere/image.png", "question": QUESTION})
+    items.append({"id": "none", "image": b"no image", "question": QUESTION})
+
+    def plain(outcome: Any) -> Any:
+        return outcome.id, outcome.result and outcome.result.answer, outcome.error and (outcome.error.code)
+
+    with Client(server.address) as client:
+        came = {plain(outcome) for outcome in client.map(items, concurrency=3)}
+
+    async def others() -> set[Any]:
+        async with AsyncClient(server.address) as client:
+            return {plain(outcome) async for outcome in client.map(items, concurrency=3)}
+
+    assert asyncio.run(others()) == came
+    assert len(came) == 7
+    assert {error for _, _, error in came if error} == {"image-unreadable", "image-type-unsupported"}
+
+
+def test_a_second_call_finds_everything(server: Server, http: httpx.Client, tmp_path: Path) -> None:
+    items = asked(6, meta={"truth": "Yes"})
+    out = tmp_path / "out"
+    with Client(server.address) as client:
+        first = {
+            o.id: o.result.model_dump() for o in client.map(items, out=out, kind="simulate", save=True) if o.result
+        }
+        before = job_count(http)
+        again = {o.id: o.result.model_dump() for o in client.map(items, out=out, kind="simulate") if o.result}
+        assert list(client.map(items, out=out, kind="simulate", only_new=True)) == []
+        assert job_count(http) == before
+    assert again == first
+    assert len(first) == 6
+    assert {entry["meta"]["truth"] for entry in lines_of(out)} == {"Yes"}
+    assert sorted(path.name for path in (out / "items").iterdir()) == [f"q{n}" for n in range(6)]
+    assert (out / "items" / "q0" / "overlay.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_an_async_batch_that_is_canceled_leaves_its_jobs_to_the_next(tmp_path: Path) -> None:
+    items = asked(4, generator="slow", generator_options={"seconds": 2.0}, num_frames=80)
+    with Served(tmp_path) as served:
+        address = str(served.http.base_url)
+
+        async def canceled() -> None:
+            async with AsyncClient(address) as client:
+                async with asyncio.timeout(1.5):
+                    async for _ in client.map(items, kind="simulate", out=tmp_path / "out"):
+                        pass
+
+        with pytest.raises(TimeoutError):
+            asyncio.run(canceled())
+        with Client(address) as client:
+            assert all(o.succeeded for o in client.map(items, kind="simulate", out=tmp_path / "out"))
+        assert sorted(served.clips()) == [0, 1, 2, 3], "a job was begun twice"
+        assert job_count(served.http) == 4
+
+
+def test_arguments_that_do_not_fit(tmp_path: Path) -> None:
+    with Client("http://127.0.0.1:1") as client:
+        for wrong in ({"concurrency": 0}, {"save": True}, {"retry_failed": True}):
+            with pytest.raises(ValueError, match=next(iter(wrong))):
+                list(client.map([], **wrong))
+
+
+def test_what_all_questions_would_meet_ends_the_batch(server: Server, tmp_path: Path) -> None:
+    with Client(server.address + "/elsewhere") as client, pytest.raises(errors.NotFound):
+        list(client.map(asked(3), out=tmp_path))
+    assert lines_of(tmp_path) == [], "no question failed: the batch did"
+
+
+def test_patience_with_a_server_that_takes_nothing() -> None:
+    assert Patience(60).pause_after(errors.QueueFull("full")) is not None
+    assert Patience(60).pause_after(errors.CannotGround("no")) is None
+    with pytest.raises(errors.ServerUnreachable):
+        Patience(-1).pause_after(errors.ServerUnreachable("gone"))
+    with pytest.raises(errors.Unauthorized):
+        Patience(60).pause_after(errors.Unauthorized("no key"))
+
+
+def test_progress_in_words() -> None:
+    tally = Tally(100, began=time.monotonic() - 10)
+    for _ in range(50):
+        tally.count(True, before=True)
+    for _ in range(20):
+        tally.count(True)
+    tally.count(False)
+    assert str(tally) == "71/100 done, 1 failed, 2.1/s, 14 s left"
+    assert [duration(s) for s in (59.4, 61, 3600, 7300)] == ["59 s", "1:01 min", "1:00 h", "2:01 h"]
+    assert [pace(r) for r in (2.04, 0.5)] == ["2.0/s", "30.0/min"]
+
+
+# The command
+
+
+def run(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    own = {name: value for name, value in os.environ.items() if not name.startswith("COW_")} | environment
+    return subprocess.run([*COMMAND, *map(str, arguments)], env=own, capture_output=True, text=True, check=False)
+
+
+def test_the_command_tells_by_its_exit_code(server: Server, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    path = written(tmp_path, asked(5))
+    result = run(path, "-o", out, COW_BASE_URL=server.address)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == f"5 succeeded, 0 failed: {out / 'results.jsonl'}\n"
+    assert len(lines_of(out)) == 5
+
+    wrong = {"id": "red", "image": "ball.png", "question": "hello", "video": False, "num_frames": 5}
+    path.write_text(
+        path.read_text() + json.dumps(wrong) + "\n" + json.dumps({**wrong, "id": "gone", "image": "no.png"})
+    )
+    for _ in range(2):
+        result = run(path, "-o", out, "--url", server.address, "--kind", "answer")
+        assert result.returncode == 3
+        assert "image-unreadable 1" in result.stderr
+        assert "gone: image-unreadable: " in result.stderr
+    assert len(lines_of(out)) == 7
+    (tmp_path / "no.png").write_bytes(IMAGE)
+    result = run(path, "-o", out, "--url", server.address, "--retry-failed")
+    assert result.returncode == 0, result.stderr
+    assert len(lines_of(out)) == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "says"),
+    [
+        ("", (), "holds no questions"),
+        ("{", (), "line 1: no JSON"),
+        ("[]", (), "must be an object, got list"),
+        ('{"image": "a.png", "question": "?", "votes": 99}', (), "Question 1 ("),
+        ('{"image": "a.png", "question": "?", "vote": 1}', (), "/vote: Extra inputs"),
+        ('{"image": "a.png", "question": "?"}', ("--request", '{"num_frames": 1}'), "/num_frames"),
+        ('{"image": "a.png", "question": "?"}', ("--request", "[]"), "--request must be an object"),
+        ('{"image": "a.png", "question": "?", "baseline": true}', ("--kind", "simulate"), "/baseline"),
+    ],
+)
+def test_a_file_that_cannot_be_asked_is_refused_before_anything_is_sent(
+    tmp_path: Path, text: str, options: tuple[str, ...], says: str
+) -> None:
+    path = tmp_path / "questions.jsonl"
+    path.write_text(text)
+    result = run(path, "-o", tmp_path / "out", "--url", "http://127.0.0.1:1", *options)
+    assert result.returncode == 1
+    assert says in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupt_ends_at_once_and_loses_nothing(tmp_path: Path) -> None:
+    items = asked(3, generator="slow", generator_options={"seconds": 2.0}, num_frames=80)
+    path, out = written(tmp_path, items), tmp_path / "out"
+    with Served(tmp_path) as served:
+        command = [*COMMAND, str(path), "-o", str(out), "--url", str(served.http.base_url)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            eventually(lambda: job_count(served.http) == 3)
+            process.send_signal(signal.SIGINT)
+            began = time.monotonic()
+            _, said = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert "The same command goes on with it" in said
+        assert "Traceback" not in said
+        assert time.monotonic() - began < 3, "it waited for jobs"
+        result = run(path, "-o", out, "--url", str(served.http.base_url))
+        assert result.returncode == 0, result.stderr
+        assert sorted(served.clips()) == [0, 1, 2]
+        assert job_count(served.http) == 3
+
+
+@pytest.fixture
+def fast(tmp_path: Path) -> Iterator[Served]:
+    with Served(tmp_path) as served:
+        yield served
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_batch_of_a_thousand_killed_three_times(fast: Served, tmp_path: Path) -> None:
+    """1,000 results, none twice, and the server was asked for no finished one again."""
+    path, out = written(tmp_path, asked(1000)), tmp_path / "out"
+    url, concurrency = str(fast.http.base_url), 8
+    draw = random.Random()
+    moments = sorted(draw.sample(range(20, 980), 3))
+    print("killed at", moments)  # pytest shows it when the test fails
+
+    def count() -> int:
+        results = out / "results.jsonl"
+        return results.read_bytes().count(b"\n") if results.exists() else 0
+
+    for moment in moments:
+        with subprocess.Popen([*COMMAND, str(path), "-o", str(out), "--url", url], stderr=subprocess.PIPE) as process:
+            eventually(lambda: count() >= moment or process.poll() is not None, patience=300)  # noqa: B023
+            assert process.poll() is None, process.stderr and process.stderr.read()
+            process.kill()
+    finished = count()
+    result = run(path, "-o", out, "--url", url)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("1000 succeeded, 0 failed")
+    outcomes = lines_of(out)
+    assert [entry["status"] for entry in outcomes] == ["succeeded"] * 1000
+    assert {entry["id"] for entry in outcomes} == {f"q{n}" for n in range(1000)}
+    assert finished < 1000
+    # The server's own count: one job a question, and no more requests than questions and those cut off in the middle.
+    assert job_count(fast.http) == 1000
+    metrics = fast.http.get("/metrics").text.splitlines()
+    posts = sum(float(m.split()[-1]) for m in metrics if m.startswith("cow_http_requests_total") and '"/answer"' in m)
+    print("requests", posts)
+    assert 1000 <= posts <= 1000 + 3 * concurrency
