@@ -1,0 +1,54 @@
+# COW on any machine: the default backends, and multimodal LLMs that are served elsewhere.
+#
+#     docker build -f docker/cpu.Dockerfile -t cow:cpu .
+#     docker run --rm --init --stop-timeout 45 -p 127.0.0.1:8000:8000 -v cow-data:/data cow:cpu
+#
+# Without keys whoever reaches the port can use the server. Before it is published on more than 127.0.0.1:
+#
+#     docker run --rm cow:cpu keys new alice
+#
+# prints a key, and the COW_API_KEYS to give with `-e`. A folder in place of the volume must belong to 10001:10001.
+
+# Every package has a wheel for glibc, so that neither stage needs a compiler. An exact tag, to be raised on purpose.
+ARG PYTHON_IMAGE=python:3.13.14-slim-trixie
+
+FROM ${PYTHON_IMAGE} AS build
+WORKDIR /src
+# pip installs into the environment from outside, and stays out of it: an image that runs is not to be changed.
+ENV PIP_PYTHON=/opt/cow/bin/python
+RUN python -m venv --without-pip /opt/cow
+COPY pyproject.toml README.md LICENSE ./
+COPY models models
+COPY prompts prompts
+COPY cow_service cow_service
+RUN --mount=type=cache,target=/root/.cache/pip \
+    pip install "/src[providers,otel]"
+
+FROM ${PYTHON_IMAGE}
+ARG PYTHON_IMAGE
+ARG COW_VERSION=0.1.0
+LABEL org.opencontainers.image.title="COW" \
+      org.opencontainers.image.description="An inference service that lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out." \
+      org.opencontainers.image.version="${COW_VERSION}" \
+      org.opencontainers.image.licenses="Apache-2.0" \
+      org.opencontainers.image.base.name="docker.io/library/${PYTHON_IMAGE}"
+# A number that does not change from build to build: what lies in volumes belongs to it.
+RUN groupadd --gid 10001 cow \
+    && useradd --uid 10001 --gid cow --no-log-init --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin cow \
+    && install --directory --owner=cow --group=cow /data
+COPY --from=build /opt/cow /opt/cow
+ENV PATH=/opt/cow/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    COW_HOST=0.0.0.0 \
+    COW_PORT=8000 \
+    COW_DATA_DIR=/data
+VOLUME ["/data"]
+WORKDIR /data
+USER 10001:10001
+EXPOSE 8000
+STOPSIGNAL SIGTERM
+# Not by urllib: it would ask a proxy, where the environment names one. /livez needs no key.
+HEALTHCHECK --interval=30s --timeout=5s --start-period=30s --retries=3 \
+    CMD ["python", "-c", "import http.client, os, sys; server = http.client.HTTPConnection('127.0.0.1', int(os.environ['COW_PORT']), timeout=4); server.request('GET', '/livez'); sys.exit(server.getresponse().status != 200)"]
+ENTRYPOINT ["cow"]
+CMD ["serve"]
