@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from cow_service import __version__, keys_cli, models_cli, tracks_cli
+from cow_service import __version__, batch_cli, keys_cli, mcp_cli, models_cli, tracks_cli
 from cow_service import cli_options as options
 from cow_service.errors import CowError
 
@@ -248,6 +248,8 @@ class _Told(TyperGroup):
             return super().invoke(ctx)
 
 
+app.command("batch")(_errors_told()(batch_cli.batch))
+app.command("mcp")(_errors_told()(mcp_cli.mcp))
 app.add_typer(keys_cli.app, name="keys", cls=_Told)
 app.add_typer(models_cli.app, name="models", cls=_Told)
 app.add_typer(tracks_cli.app, name="tracks", cls=_Told)

@@ -21,7 +21,7 @@ from cow_service.plugins import Registry
 from cow_service.service import Service
 from cow_service.settings import Settings
 
-README = (ROOT / "README.md").read_text()
+README = "".join(path.read_text() for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))))
 CLASSES = [c for _, c in inspect.getmembers(errors, inspect.isclass) if issubclass(c, CowError) and c is not CowError]
 
 

@@ -60,10 +60,14 @@ FLOORS: dict[str, int] = {
     "answer_console": 10,
     "cli_options": 1,
     "doctor": 9,
+    "batch_cli": 10,
     "keys_cli": 10,
     "models_cli": 10,
     "tracks_cli": 10,
-    "cli": 12,
+    "mcp_tools": 4,
+    "mcp_serving": 11,
+    "mcp_cli": 12,
+    "cli": 13,
 }
 HEAVY = ("torch", "transformers", "diffusers", "accelerate")
 

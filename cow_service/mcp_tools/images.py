@@ -1,0 +1,85 @@
+"""An image as the caller of a tool names it: a file here, an address, the data itself, or one that is kept already."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+from cow_service.client import ImageLike
+from cow_service.errors import FieldError, InvalidRequest
+from cow_service.requests import ImageArtifact
+
+ARTIFACTS = "cow://artifacts/"
+KEPT = "the 64-digit `image_sha256` of an earlier result, which asks about the same image again without sending it"
+WITH_PATHS = f"The image: the absolute path of a PNG, JPEG or WebP file, a data URL, an http(s) URL, or {KEPT}."
+WITHOUT_PATHS = (
+    f"The image (PNG, JPEG or WebP): a data URL (data:image/png;base64,...), an http(s) URL, or {KEPT}. No path: this "
+    "server does not read files."
+)
+_DIGEST = re.compile(rf"(?:{ARTIFACTS})?([0-9a-f]{{64}})", re.IGNORECASE | re.ASCII)
+_SCHEME = re.compile(r"(data:|[a-z][a-z0-9+.-]*://)", re.IGNORECASE | re.ASCII)
+_SENT = ("data:", "http://", "https://")
+_HEAD = 12  # bytes that tell what a file is
+_SHOWN = 200  # characters
+
+
+def image_of(text: str, *, paths: bool) -> ImageLike:
+    """What the SDK takes for an image; reads a file where it is one. `paths` says whether files may be named.
+
+    Raises `InvalidRequest`, also for a file that is no image: nothing else leaves the machine.
+    """
+    text = text.strip()
+    if digest := digest_of(text):
+        return ImageArtifact(artifact=digest)
+    scheme = found[0].lower() if (found := _SCHEME.match(text)) else None
+    if scheme in _SENT:
+        return scheme + text[len(scheme) :]
+    if not paths:
+        raise _wrong(
+            f"{_shown(text)} is no data URL, http(s) URL or SHA-256 digest; files of the server's machine are not read"
+        )
+    if scheme not in (None, "file://"):
+        raise _wrong(f"{_shown(text)} cannot be opened: give a path, a data URL, an http(s) URL or a digest")
+    return _read(Path(url2pathname(urlsplit(text).path)) if scheme else Path(text))
+
+
+def digest_of(text: str) -> str | None:
+    """The SHA-256 that a text names, as such or as a resource; None where it names none."""
+    found = _DIGEST.fullmatch(text)
+    return found and found[1].lower()
+
+
+def _read(path: Path) -> bytes:
+    try:
+        path = path.expanduser().absolute()
+        if not path.is_file():  # devices and pipes may never end
+            raise _wrong(f"there is no file {_shown(str(path))}; give an absolute path")
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+            if media_type(head) not in ("image/png", "image/jpeg", "image/webp"):
+                raise _wrong(f"{_shown(str(path))} is no PNG, JPEG or WebP")
+            return head + file.read()
+    except (OSError, RuntimeError, ValueError) as error:  # no home folder; NUL in the name
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise _wrong(f"{_shown(str(path))} cannot be read: {why or type(error).__name__}") from error
+
+
+def media_type(data: bytes) -> str:
+    """What the service's artifacts are, by their first bytes."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "image/png"
+    if data.startswith(b"\xff\xd8\xff"):
+        return "image/jpeg"
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return "image/webp"
+    return "video/mp4" if data[4:8] == b"ftyp" else "application/octet-stream"
+
+
+def _shown(text: str) -> str:
+    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+
+
+def _wrong(detail: str) -> InvalidRequest:
+    return InvalidRequest("The image cannot be used.", errors=(FieldError("/image", detail),))

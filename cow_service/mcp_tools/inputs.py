@@ -1,0 +1,186 @@
+"""What the tools take: flat, because models fill in flat arguments best. The server checks what it is given."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from cow_service.errors import FieldError, InvalidRequest, pointer_part
+from cow_service.records import FramePolicy, MotionKind
+
+
+def _listed(value: Any) -> Any:
+    """Some clients write a list as a string of JSON."""
+    if isinstance(value, str) and value.lstrip().startswith("["):
+        try:
+            return json.loads(value)
+        except ValueError:
+            return value
+    return value
+
+
+FromText = BeforeValidator(_listed)
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Box = Annotated[list[Number], Field(min_length=4, max_length=4)]
+
+
+class Asked(BaseModel):
+    """Arguments of either tool."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    image: str
+    question: str = Field(
+        description="What if? In English, naming the thing that moves and how it moves: 'If the red ball moves to the "
+        "left, will it hit the vase?', 'If the cup falls, what does it land on?'"
+    )
+    object: str | None = Field(
+        default=None, description="What moves, in words ('red ball'). Only together with `bbox` or `point`."
+    )
+    bbox: Annotated[Box | None, FromText] = Field(
+        default=None,
+        description="Box of the thing that moves, [x0, y0, x1, y1] in pixels of the image (upright, x right, y down). "
+        "Give it, or `point`, where the thing is hard to find by its name.",
+    )
+    point: Annotated[Pair | None, FromText] = Field(
+        default=None, description="Instead of `bbox`: a point on the thing, [x, y], pixels."
+    )
+    direction: Annotated[Pair | None, FromText] = Field(
+        default=None,
+        description="Where it moves, [dx, dy] in the image, x right, y down, any length: [-1, 0] is to the left. "
+        "By default it is read from the question and from arrows drawn in the image.",
+    )
+    motion_kind: MotionKind | None = Field(
+        default=None,
+        description="linear: straight on (with `direction`); projectile: thrown, with gravity (with `direction`); "
+        "fall: dropped; static: stays. By default it is read from the question.",
+    )
+    speed: Number | None = Field(
+        default=None, description="Pixels per second, with `direction`. By default 0.26 image widths per second."
+    )
+    num_frames: int | None = Field(
+        default=None, description="Frames of the clip, 16 a second. By default 81: five seconds."
+    )
+    seed: int | None = Field(default=None, description="For generators that draw random numbers.")
+    frames_policy: FramePolicy | None = None
+    frames_count: int | None = Field(default=None, description="How many pictures to return; by default 3.")
+    generator: str | None = Field(
+        default=None, description="Who makes the frames, by name; by default the server's choice."
+    )
+    reader: str | None = Field(
+        default=None, description="Who looks at the image, by name; by default the server's choice."
+    )
+
+    def rest(self) -> dict[str, Any]:
+        """What the SDK takes beside image and question."""
+        grounding = _given(object=self.object, bbox=self.bbox, point=self.point)
+        motion = _given(direction=self.direction, kind=self.motion_kind, speed=self.speed)
+        frames = _given(policy=self.frames_policy, count=self.frames_count)
+        return _given(
+            grounding=grounding or None,
+            motion=motion or None,
+            frames=frames or None,
+            num_frames=self.num_frames,
+            seed=self.seed,
+            generator=self.generator,
+            reader=self.reader,
+        )
+
+
+class SimulateInput(Asked):
+    """Arguments of `simulate`: the pictures are for the caller to look at, and the video may be wanted."""
+
+    frames_policy: FramePolicy | None = Field(
+        default="events",
+        description="events: where it meets something, and on the way; uniform: evenly over the clip; initial: the "
+        "first moments.",
+    )
+    video: bool | None = Field(default=False, description="Make an mp4 of the whole clip, too.")
+
+    def rest(self) -> dict[str, Any]:
+        """See above."""
+        return super().rest() | {"video": bool(self.video)}
+
+
+class AnswerInput(Asked):
+    """Arguments of `answer`."""
+
+    options: Annotated[list[str] | None, FromText] = Field(
+        default=None,
+        description="Answers to choose from, lettered A, B, C... By default those that the question lists, as in "
+        "'(A) Yes (B) No (C) Not sure'; without any the answer is in words.",
+    )
+    votes: int | None = Field(
+        default=None, description="Ask so often and take the most frequent answer; by default 1, at most 32."
+    )
+    baseline: bool | None = Field(default=None, description="Answer without imagined frames, too, for comparison.")
+    frames_policy: FramePolicy | None = Field(
+        default=None,
+        description="Which frames the answer is reasoned on: initial (the default): the first moments; events: where "
+        "it meets something; uniform: evenly over the clip.",
+    )
+
+    def rest(self) -> dict[str, Any]:
+        """See above."""
+        return super().rest() | _given(options=self.options, votes=self.votes, baseline=self.baseline)
+
+
+Input = TypeVar("Input", bound=Asked)
+
+
+def parsed(model: type[Input], arguments: dict[str, Any]) -> Input:
+    """The arguments of a call. Raises `InvalidRequest` that points at each wrong one."""
+    try:
+        return model.model_validate(arguments)
+    except ValidationError as error:
+        wrong = tuple(
+            FieldError("".join(f"/{pointer_part(part)}" for part in item["loc"]), _told(item, model))
+            for item in error.errors(include_url=False)
+        )
+        raise InvalidRequest("The arguments of the tool are not valid.", errors=wrong) from error
+
+
+def input_schema(model: type[Asked], image: str) -> dict[str, Any]:
+    """The JSON schema of a tool's arguments; `image` says how an image may be given."""
+    schema = model.model_json_schema()
+    del schema["description"]  # the tool has one
+    schema["properties"]["image"]["description"] = image
+    return lean({**schema, "properties": {name: _plain(value) for name, value in schema["properties"].items()}})
+
+
+def _plain(schema: dict[str, Any]) -> dict[str, Any]:
+    """Without null: it is taken, since some clients send it for what they leave out, but nobody has to know."""
+    given = [one for one in schema.get("anyOf", ()) if one != {"type": "null"}]
+    return {**{key: value for key, value in schema.items() if key != "anyOf"}, **given[0]} if given else schema
+
+
+def lean(schema: Any) -> Any:
+    """A JSON schema without what costs a model's attention and says nothing: titles, and defaults of null."""
+    if isinstance(schema, list):
+        return [lean(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    return {
+        name: {key: lean(part) for key, part in value.items()} if name in ("properties", "$defs") else lean(value)
+        for name, value in schema.items()
+        if not (name == "title" and isinstance(value, str)) and not (name == "default" and value is None)
+    }
+
+
+def _given(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _told(item: Any, model: type[Asked]) -> str:
+    if item["type"] == "extra_forbidden":
+        return f"there is no such argument; there are: {', '.join(model.model_fields)}"
+    if item["type"] == "missing":
+        return "is needed"
+    return str(item["msg"])[:1].lower() + str(item["msg"])[1:]
+
+
+ToolName = Literal["simulate", "answer"]
+INPUTS: dict[ToolName, type[Asked]] = {"simulate": SimulateInput, "answer": AnswerInput}
