@@ -11,9 +11,11 @@ pictures are given or taken as such.
 
 from cow_service.client import errors
 from cow_service.client.aio import AsyncClient, AsyncJobHandle
+from cow_service.client.batches import Outcome
 from cow_service.client.errors import CowError
 from cow_service.client.events import Event
 from cow_service.client.inputs import ImageLike
+from cow_service.client.questions import Question, QuestionLike
 from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
 from cow_service.client.sync import Client, JobHandle
 
@@ -28,6 +30,9 @@ __all__ = [
     "Event",
     "ImageLike",
     "JobHandle",
+    "Outcome",
+    "Question",
+    "QuestionLike",
     "Simulation",
     "errors",
 ]

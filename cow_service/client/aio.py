@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from contextlib import aclosing
 from datetime import datetime
+from functools import partial
+from os import PathLike
 from types import TracebackType
 from typing import Any, Generic, Literal, Self, TypeVar, Unpack, cast, overload
 
@@ -11,11 +14,14 @@ import httpx
 
 from cow_service.client import calls
 from cow_service.client.async_connection import AsyncConnection
+from cow_service.client.async_map import mapped
+from cow_service.client.batches import CONCURRENCY, Outcome, batch_of
 from cow_service.client.calls import Tell, order_of
 from cow_service.client.events import Event
 from cow_service.client.inputs import ImageLike
 from cow_service.client.options import AnswerOptions, SimulateOptions
 from cow_service.client.progress import ProgressLike, told
+from cow_service.client.questions import QuestionLike
 from cow_service.client.results import AsyncAnswer, AsyncSimulation
 from cow_service.client.settings import DEFAULT_TIMEOUT, RETRIES, target_of
 from cow_service.records import Job, JobKind, JobStatus, Models
@@ -62,9 +68,10 @@ class AsyncJobHandle(Generic[R_co]):
 
     async def events(self, after: int = 0) -> AsyncIterator[Event]:
         """What happens to it until its end, through broken connections; `after` leaves out events up to that number."""
-        async for event in self._connection.events(self.id, after):
-            self.job = event.job or self.job
-            yield event
+        async with aclosing(self._connection.events(self.id, after)) as events:
+            async for event in events:
+                self.job = event.job or self.job
+                yield event
 
     def _hearing(self, tell: Tell | None) -> Tell:
         def hear(job: Job) -> None:
@@ -87,7 +94,7 @@ class AsyncClient:
     ...     async with AsyncClient(base_url) as client:
     ...         return (await client.answer("image.jpg", question)).option
     >>> asyncio.run(ask("If the yellow ball moves to the right, will it hit the blue mug? (A) Yes (B) No"))
-    'Yes'
+    'No'
     """
 
     def __init__(
@@ -135,7 +142,7 @@ class AsyncClient:
         """Imagines the future of an image.
 
         `image` is a path, bytes, a PIL image, an array (height, width, 3) of uint8, a URL, or an artifact. `timeout` is
-        in seconds. `fresh` takes no results of earlier requests. A call that is canceled cancels its job.
+        in seconds, for everything together. `fresh` takes no results of earlier requests. An interrupt ends the job.
         Raises the errors of `errors.py`, `WaitTimeout` among them.
         """
         order = order_of("simulate", image, question, cast("Mapping[str, Any]", options), idempotency_key, fresh)
@@ -195,6 +202,81 @@ class AsyncClient:
         return AsyncJobHandle(
             self._connection, await self._connection.run(calls.submitted(order, self._connection.retries))
         )
+
+    @overload
+    def map(
+        self,
+        questions: Iterable[QuestionLike],
+        *,
+        kind: Literal["answer"] = "answer",
+        concurrency: int = CONCURRENCY,
+        out: str | PathLike[str] | None = None,
+        retry_failed: bool = False,
+        only_new: bool = False,
+        save: bool = False,
+        timeout: float | None = None,
+        fresh: bool = False,
+        progress: bool = False,
+        **options: Unpack[AnswerOptions],
+    ) -> AsyncIterator[Outcome[AsyncAnswer]]: ...
+
+    @overload
+    def map(
+        self,
+        questions: Iterable[QuestionLike],
+        *,
+        kind: Literal["simulate"],
+        concurrency: int = CONCURRENCY,
+        out: str | PathLike[str] | None = None,
+        retry_failed: bool = False,
+        only_new: bool = False,
+        save: bool = False,
+        timeout: float | None = None,
+        fresh: bool = False,
+        progress: bool = False,
+        **options: Unpack[SimulateOptions],
+    ) -> AsyncIterator[Outcome[AsyncSimulation]]: ...
+
+    def map(
+        self,
+        questions: Iterable[QuestionLike],
+        *,
+        kind: JobKind = "answer",
+        concurrency: int = CONCURRENCY,
+        out: str | PathLike[str] | None = None,
+        retry_failed: bool = False,
+        only_new: bool = False,
+        save: bool = False,
+        timeout: float | None = None,
+        fresh: bool = False,
+        progress: bool = False,
+        **options: Any,
+    ) -> AsyncIterator[Outcome[Any]]:
+        """Asks many questions, `concurrency` at the same time, and gives what comes of each as it comes.
+
+        A question is a mapping with `image` and `question`, maybe an `id`, a `meta` that stands beside its outcome, and
+        fields of the request, or a pair of image and question. `options` are for those that do not have them. One that
+        fails is an outcome with an `error`; an error is raised where no question would get through, and when the server
+        has taken none for five minutes.
+
+        With `out` every outcome is a line of `results.jsonl` in that folder, and the same call goes on where one ended
+        that was killed: nothing is asked twice. Outcomes of before come last, or not at all with `only_new`.
+        `retry_failed` asks those again that failed. `save` writes the pictures of each into `items/` there.
+        """
+        begin = partial(
+            batch_of,
+            questions,
+            options,
+            kind=kind,
+            concurrency=concurrency,
+            timeout=timeout,
+            fresh=fresh,
+            out=out,
+            retry_failed=retry_failed,
+            save=save,
+            progress=progress,
+        )
+        return mapped(self._connection, begin, only_new=only_new)
 
     async def job(self, id: str) -> AsyncJobHandle[AsyncSimulation | AsyncAnswer]:
         """A job that was handed in before. Raises `JobNotFound`."""

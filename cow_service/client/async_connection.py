@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+import contextlib
+from collections.abc import AsyncGenerator
 from typing import TypeVar
 
 import httpx
 from httpx_sse import EventSource
 
 from cow_service.client import calls
-from cow_service.client.calls import ACCEPTED, Order, Pause, Send, Steps, Tell
-from cow_service.client.events import Event, Following
+from cow_service.client.calls import Order, Pause, Placed, Send, Steps, Tell
+from cow_service.client.events import Event, Following, streams
 from cow_service.client.progress import ProgressLike, told
 from cow_service.client.results import AsyncAnswer, AsyncSimulation, async_result_from
 from cow_service.client.settings import Target
+from cow_service.errors import CowError
 from cow_service.records import Job
 
 T = TypeVar("T")
-OK = 200
 
 
 class AsyncConnection:
@@ -29,6 +30,7 @@ class AsyncConnection:
         self.retries = retries
         self._http = http
         self._own = own
+        self._leaving: set[asyncio.Task[None]] = set()
 
     async def close(self) -> None:
         """Closes the connections that were made here."""
@@ -43,23 +45,35 @@ class AsyncConnection:
         """A job as it is."""
         return calls.job_in(await self.run(calls.looked_at(job_id, self.retries)))
 
-    async def done(self, order: Order, timeout: float | None, progress: ProgressLike) -> AsyncSimulation | AsyncAnswer:
-        """The result of an order, waited for. One that is canceled cancels its job."""
+    async def done(
+        self, order: Order, timeout: float | None, progress: ProgressLike, *, keep: bool = False
+    ) -> AsyncSimulation | AsyncAnswer:
+        """The result of an order, waited for. The caller's cancellation ends its job, unless `keep`."""
         patience = self.target.patience(timeout) if progress is False else 0
-        response = await self.run(calls.begun(order, patience, self.retries))
-        if response.status_code != ACCEPTED:
-            return async_result_from(order.kind, calls.object_in(response), self.artifact)
-        job = calls.job_in(response)
-        try:
-            with told(progress) as tell:
-                return await self.awaited(job, timeout, tell)
-        except asyncio.CancelledError:
-            await self.run(calls.canceled(job.id, retries=0))
-            raise
+        placed = Placed(order)
+        with told(progress) as tell:
+            try:
+                body = await self.run(calls.done(placed, patience, timeout, tell, self.retries))
+            except CowError:
+                raise
+            except (asyncio.CancelledError, Exception):
+                if not keep:
+                    # A task of its own: whoever is canceled may be canceled again before the server has heard of it.
+                    leaving = asyncio.create_task(self._withdraw(placed))
+                    self._leaving.add(leaving)
+                    leaving.add_done_callback(self._leaving.discard)
+                    await asyncio.shield(leaving)
+                raise
+        return async_result_from(order.kind, body, self.artifact)
+
+    async def finished(self, order: Order, timeout: float | None) -> AsyncSimulation | AsyncAnswer:
+        """The result of an order, whose job goes on when nobody waits for it any more."""
+        steps = calls.done(Placed(order), self.target.patience(timeout), timeout, None, self.retries)
+        return async_result_from(order.kind, await self.run(steps), self.artifact)
 
     async def awaited(self, job: Job, timeout: float | None, tell: Tell | None) -> AsyncSimulation | AsyncAnswer:
         """The result of a job, once it has ended."""
-        body = await self.run(calls.awaited(job.id, timeout, tell, self.retries))
+        body = await self.run(calls.awaited(job.id, timeout, calls.deadline(timeout), tell, self.retries))
         return async_result_from(job.kind, body, self.artifact)
 
     async def run(self, steps: Steps[T]) -> T:
@@ -76,27 +90,32 @@ class AsyncConnection:
             else:
                 came = await self._sent(step)
 
-    async def events(self, job_id: str, after: int) -> AsyncIterator[Event]:
+    async def events(self, job_id: str, after: int) -> AsyncGenerator[Event]:
         """The events of a job after a number, through broken connections."""
         following = Following(after, self.retries)
-        send = Send("GET", f"/jobs/{job_id}/events")
+        send = calls.events_of(job_id)
         url, limit = self.target.url(send.path), self.target.following
         while not following.ended:
-            outcome: httpx.Response | httpx.HTTPError | None = None
             headers = self.target.headers(send) | following.headers
             try:
                 async with self._http.stream("GET", url, headers=headers, timeout=limit) as response:
-                    if response.status_code == OK:
+                    outcome: httpx.Response | httpx.HTTPError = response
+                    if streams(response):
                         async for sent in EventSource(response).aiter_sse():
                             if (event := following.take(sent)) is not None:
                                 yield event
+                            if following.ended:
+                                break
                     else:
                         await response.aread()
-                        outcome = response
             except httpx.HTTPError as error:
                 outcome = error
             if not following.ended:
                 await asyncio.sleep(following.pause_after(outcome))
+
+    async def _withdraw(self, placed: Placed) -> None:
+        with contextlib.suppress(Exception):
+            await self.run(calls.withdrawn(placed))
 
     async def _sent(self, send: Send) -> httpx.Response | httpx.HTTPError:
         try:
@@ -106,7 +125,7 @@ class AsyncConnection:
                 headers=self.target.headers(send),
                 params=send.params,
                 content=send.content,
-                timeout=self.target.timeout,
+                timeout=self.target.timeout if send.limit is None else send.limit,
             )
         except httpx.HTTPError as error:
             return error

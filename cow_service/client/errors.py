@@ -130,13 +130,15 @@ class BadResponse(CowError):
     code, status = "bad-response", 0
 
 
-def unreachable(error: httpx.HTTPError) -> ServerUnreachable:
-    """The error of a request that no response came to."""
+def unreachable(error: httpx.HTTPError) -> ServerUnreachable | BadResponse:
+    """The error of a request that no response came to, or none that can be read."""
     url = error.request.url
-    return ServerUnreachable(
-        f"{error.request.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}. "
-        "Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?"
+    told = (
+        f"{error.request.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}."
     )
+    if isinstance(error, httpx.DecodingError):
+        return BadResponse(f"{told} Does a proxy stand between?")
+    return ServerUnreachable(f"{told} Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?")
 
 
 def error_of(response: httpx.Response) -> CowError:
@@ -144,10 +146,11 @@ def error_of(response: httpx.Response) -> CowError:
     problem = _problem(response)
     if problem is None:
         body = " ".join(response.text.split())
+        moved = response.headers.get("location")
         error: CowError = BadResponse(
             f"{response.request.method} {response.url.path} was answered with {response.status_code} "
-            f"{response.reason_phrase}, and with no problem of COW's: {body[:SHOWN] or 'nothing'}. Does a proxy stand "
-            "between?"
+            f"{response.reason_phrase}, and with nothing of COW's: {body[:SHOWN] or 'no body'}. "
+            + (f"It points to {moved}: is that its address (COW_BASE_URL)?" if moved else "Does a proxy stand between?")
         )
         error.status = response.status_code
     else:
@@ -167,13 +170,16 @@ def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) ->
     """The error that a problem (RFC 9457) is. A code of a later version than this comes as a plain `CowError`."""
     code = _code(problem)
     kind = kinds().get(code, CowError)
-    fields = [field for field in problem.get("errors") or () if isinstance(field, dict)]
+    told = problem.get("errors")
+    fields = [field for field in told if isinstance(field, dict)] if isinstance(told, list) else []
     error = kind(
-        str(problem.get("detail", "")),
+        str(problem.get("detail") or problem.get("title") or ""),
         errors=tuple(FieldError(str(field.get("pointer", "")), str(field.get("detail", ""))) for field in fields),
         headers=dict(headers or {}),
     )
-    error.code, error.status = code or error.code, int(problem.get("status", error.status))
+    error.code = code or error.code
+    if isinstance(status := problem.get("status"), int):
+        error.status = status
     return error
 
 
@@ -189,7 +195,7 @@ def _code(problem: dict[str, Any]) -> str:
 
 def _problem(response: httpx.Response) -> dict[str, Any] | None:
     """The problem that a response holds; its body has been read."""
-    if not response.headers.get("content-type", "").startswith("application/problem+json"):
+    if not response.headers.get("content-type", "").lower().startswith("application/problem+json"):
         return None
     try:
         body = json.loads(response.content)

@@ -16,7 +16,7 @@ from cow_service.records import Job
 
 EventName: TypeAlias = Literal["queued", "running", "stage", "progress", "succeeded", "failed", "canceled", "deleted"]
 LAST: frozenset[str] = frozenset({"succeeded", "failed", "canceled", "deleted"})
-NO_CONTENT = 204
+OK, NO_CONTENT = 200, 204
 
 
 @dataclass(frozen=True)
@@ -43,23 +43,28 @@ class Following:
     @property
     def headers(self) -> dict[str, str]:
         """What tells the server where to go on."""
-        return {"Accept": "text/event-stream", **({"Last-Event-ID": str(self.heard)} if self.heard else {})}
+        return {"Last-Event-ID": str(self.heard)} if self.heard else {}
 
     def take(self, sent: ServerSentEvent) -> Event | None:
-        """The event that was sent; None where this version does not know its kind."""
+        """The event that was sent; None where it was heard before, or this version does not know its kind.
+
+        Raises `BadResponse` for one that cannot be read.
+        """
         self._tried = 0
         if sent.event not in get_args(EventName):
             return None
         name = cast("EventName", sent.event)
-        self.ended = name in LAST
-        body = json.loads(sent.data)
         # An event without an id of its own repeats the last one (the HTML standard's rule).
-        number = int(sent.id) if name != "progress" and sent.id.isdigit() else None
+        number = int(sent.id) if name != "progress" and sent.id.isdecimal() else None
+        job = _job_in(sent)
+        self.ended = name in LAST
+        if number is not None and number <= self.heard:
+            return None
         self.heard = number or self.heard
-        return Event(name, number, read(Job, body) if body else None)
+        return Event(name, number, job)
 
-    def pause_after(self, outcome: httpx.Response | httpx.HTTPError | None) -> float:
-        """Seconds before the next connection, after one that broke, was refused or just ended (None).
+    def pause_after(self, outcome: httpx.Response | httpx.HTTPError) -> float:
+        """Seconds before the next connection, after one that broke, was refused or ended before the job.
 
         Raises what stands against another.
         """
@@ -67,10 +72,25 @@ class Following:
         if isinstance(outcome, httpx.Response) and outcome.status_code == NO_CONTENT:
             self.ended = True
             return 0.0
-        broken = outcome or httpx.RemoteProtocolError("the stream ended before the job")
-        pause = pause_before_retry(broken, self._tried) if self._tried <= self._retries else None
+        if isinstance(outcome, httpx.Response) and streams(outcome):
+            outcome = httpx.RemoteProtocolError("the stream ended before the job", request=outcome.request)
+        pause = pause_before_retry(outcome, self._tried) if self._tried <= self._retries else None
         if pause is not None:
             return pause
-        if isinstance(broken, httpx.Response):
-            raise error_of(broken)
-        raise unreachable(broken) from broken
+        if isinstance(outcome, httpx.Response):
+            raise error_of(outcome)
+        raise unreachable(outcome) from outcome
+
+
+def streams(response: httpx.Response) -> bool:
+    """Whether a response is a stream of events."""
+    media_type = response.headers.get("content-type", "").partition(";")[0].strip().lower()
+    return response.status_code == OK and media_type == "text/event-stream"
+
+
+def _job_in(sent: ServerSentEvent) -> Job | None:
+    try:
+        body = json.loads(sent.data)
+    except ValueError:
+        body = sent.data
+    return read(Job, {**body, "result": None} if isinstance(body, dict) else body) if body != {} else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
         str
         | os.PathLike[str]
         | bytes
+        | bytearray
+        | memoryview
         | Image.Image
         | NDArray[np.uint8]
         | Artifact
@@ -30,11 +33,13 @@ if TYPE_CHECKING:
         | ImageInfo
         | ImageArtifact
         | ImageUrl
+        | Mapping[str, str]  # as it stands in a request
     )
 else:
     ImageLike = Any
 
 URLS = ("http://", "https://", "data:")
+_OTHER_ALPHA = {"PA": "RGBA", "RGBa": "RGBA", "La": "LA"}  # modes that PNG has not, with an alpha to keep
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,6 @@ class Upload:
     """An image to be sent as a file. It holds the bytes themselves, so that every try sends the same."""
 
     data: bytes
-    name: str = "image"
 
 
 @dataclass(frozen=True)
@@ -57,16 +61,14 @@ def image_input(image: ImageLike) -> Upload | Reference:
 
     Raises `OSError` where a file cannot be read, and `InvalidRequest` for anything that is no image.
     """
-    if isinstance(image, str) and image.startswith(URLS):
-        return Reference(image if image.startswith("data:") else {"url": image})
+    if isinstance(image, str) and image[:8].lower().startswith(URLS):
+        return Reference(image if image[:5].lower() == "data:" else {"url": image})
     if isinstance(image, str | os.PathLike):
-        path = Path(image)
-        return Upload(path.read_bytes(), path.name or "image")
+        return Upload(Path(image).read_bytes())
     if isinstance(image, bytes | bytearray | memoryview):
         return Upload(bytes(image))
-    if isinstance(image, Record):
-        kept = isinstance(image, Artifact | Frame | ImageInfo)
-        return Reference({"artifact": image.sha256} if kept else image.model_dump())
+    if isinstance(image, Mapping | Record) and (reference := _reference(image)) is not None:
+        return reference
     # Neither library is loaded for this: whoever has such an image has loaded it.
     if hasattr(image, "__array_interface__") and hasattr(image, "dtype"):
         return Upload(encoded_array(cast("NDArray[np.uint8]", image)))
@@ -76,6 +78,16 @@ def image_input(image: ImageLike) -> Upload | Reference:
         f"got {type(image).__name__}; give a path, bytes, a PIL image, an array (height, width, 3) of uint8, a URL, or "
         "an artifact"
     )
+
+
+def _reference(image: Mapping[str, str] | Record) -> Reference | None:
+    from cow_service.requests import ImageArtifact, ImageUrl  # noqa: PLC0415 - not needed to import the SDK
+
+    if isinstance(image, Mapping):
+        return Reference(dict(image))
+    if isinstance(image, Artifact | Frame | ImageInfo):
+        return Reference({"artifact": image.sha256})
+    return Reference(image.model_dump()) if isinstance(image, ImageArtifact | ImageUrl) else None
 
 
 def encoded_array(array: NDArray[np.uint8]) -> bytes:
@@ -91,16 +103,28 @@ def encoded_array(array: NDArray[np.uint8]) -> bytes:
 
 
 def encoded_picture(picture: Image.Image) -> bytes:
-    """PNG of a PIL image, upright: what its EXIF says of its orientation is applied."""
+    """PNG of a PIL image, upright: what its EXIF says of its orientation is applied, and no EXIF sent."""
     from PIL import ImageOps  # noqa: PLC0415
 
+    if 0 in picture.size or picture.mode in ("I", "F"):
+        raise _wrong(
+            f"is a PIL image {picture.size} of mode {picture.mode}; give one of at least one pixel, of 8 or 16 bits a "
+            "channel: of I and F nothing says what is white"
+        )
     upright = ImageOps.exif_transpose(picture)
-    return _png(upright if upright.mode in ("1", "L", "LA", "P", "RGB", "RGBA", "I;16") else upright.convert("RGB"))
+    if upright.mode.startswith("I;16"):
+        upright = upright.convert("I").convert("I;16")
+    elif upright.mode in _OTHER_ALPHA:
+        upright = upright.convert(_OTHER_ALPHA[upright.mode])
+    elif upright.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
+        upright = upright.convert("RGB")
+    return _png(upright)
 
 
 def _png(picture: Image.Image) -> bytes:
     buffer = io.BytesIO()
-    picture.save(buffer, "PNG", compress_level=1)  # it crosses a network once: small matters less than soon
+    # It crosses a network once: small matters less than soon. A profile would be that of the mode before.
+    picture.save(buffer, "PNG", compress_level=1, icc_profile=None)
     return buffer.getvalue()
 
 

@@ -20,8 +20,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
-from filelock import FileLock, Timeout
-
 from cow_service.client.questions import Question
 from cow_service.errors import InvalidRequest
 from cow_service.records import JobKind
@@ -37,6 +35,8 @@ class Journal:
 
         Raises `InvalidRequest` where another process holds it, or where it is that of another kind of batch.
         """
+        from filelock import FileLock, Timeout  # noqa: PLC0415 - whoever only calls a server need not have it
+
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self.results = folder / "results.jsonl"

@@ -15,11 +15,16 @@ ProgressLike: TypeAlias = bool | Literal["rich", "tqdm"] | Callable[[Job], None]
 
 @contextmanager
 def told(progress: ProgressLike) -> Generator[Callable[[Job], None] | None]:
-    """Whom to tell of a job as it goes on; None for nobody. Raises `ImportError` where the bar is not installed."""
+    """Whom to tell of a job as it goes on; None for nobody.
+
+    Raises `ImportError` where the bar is not installed, and `ValueError` for one that nobody knows.
+    """
     if progress is False:
         yield None
     elif callable(progress):
         yield progress
+    elif progress is not True and progress not in ("rich", "tqdm"):
+        raise ValueError(f"progress must be True, False, 'rich', 'tqdm' or a function, got {progress!r}")
     else:
         with _bar(progress) as tell:
             yield tell
@@ -53,7 +58,8 @@ def _tqdm() -> Generator[Callable[[Job], None]]:
 
         def tell(job: Job) -> None:
             bar.set_description_str(describe(job), refresh=False)
-            bar.update(job.progress - bar.n)
+            bar.n = job.progress  # what is added up is not the same to the last digit, and tqdm warns of too much
+            bar.refresh()
 
         yield tell
 

@@ -17,12 +17,14 @@ from cow_service.client.calls import read
 from cow_service.client.shown import (
     answer_html,
     answered,
+    brief,
     filmstrip_png,
     met,
     picture_of,
     simulation_html,
     stacked,
 )
+from cow_service.errors import CowError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,12 +32,44 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
-class Files:
+class _Held:
+    """Bytes by their digests. They are no part of what a result says: results that say the same are equal."""
+
+    def __init__(self) -> None:
+        self._held: dict[str, bytes] = {}
+
+    def shown(self, sha256: str) -> bytes | None:
+        """The bytes, for a notebook; None where they are not here."""
+        return self._held.get(sha256)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Held)
+
+    __hash__ = object.__hash__
+
+    def __deepcopy__(self, _: dict[int, Any]) -> Self:
+        return self  # bytes by their digests are the same for every copy
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A connection does not go into another process; what it has brought does.
+        return type(self), (), {"_held": self._held}
+
+
+def _nowhere(sha256: str) -> bytes:
+    raise ValueError(f"This result comes from a file or another process: get {sha256} by `Client.artifact`.")
+
+
+async def _async_nowhere(sha256: str) -> bytes:
+    return _nowhere(sha256)
+
+
+class Files(_Held):
     """Artifacts of one result: downloaded once, then held."""
 
-    def __init__(self, download: Callable[[str], bytes]) -> None:
+    def __init__(self, download: Callable[[str], bytes] = _nowhere) -> None:
+        super().__init__()
+        self._given_up = False
         self._download = download
-        self._held: dict[str, bytes] = {}
 
     def get(self, sha256: str) -> bytes:
         """The bytes; downloads them the first time."""
@@ -43,17 +77,22 @@ class Files:
             self._held[sha256] = self._download(sha256)
         return self._held[sha256]
 
-    def held(self, sha256: str) -> bytes | None:
-        """The bytes, where they are here."""
+    def shown(self, sha256: str) -> bytes | None:
+        """The bytes, for a notebook, which shows what it can: nothing is downloaded after that has failed once."""
+        if not self._given_up and sha256 not in self._held:
+            try:
+                self.get(sha256)
+            except (CowError, ValueError):
+                self._given_up = True
         return self._held.get(sha256)
 
 
-class AsyncFiles:
+class AsyncFiles(_Held):
     """The same, where downloads are awaited."""
 
-    def __init__(self, download: Callable[[str], Awaitable[bytes]]) -> None:
+    def __init__(self, download: Callable[[str], Awaitable[bytes]] = _async_nowhere) -> None:
+        super().__init__()
         self._download = download
-        self._held: dict[str, bytes] = {}
 
     async def get(self, sha256: str) -> bytes:
         """The bytes; downloads them the first time."""
@@ -61,18 +100,25 @@ class AsyncFiles:
             self._held[sha256] = await self._download(sha256)
         return self._held[sha256]
 
-    def held(self, sha256: str) -> bytes | None:
-        """The bytes, where they are here."""
-        return self._held.get(sha256)
-
 
 class _Simulation(records.Simulation):
     """What both kinds of simulation have in common."""
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.id}: {self.grounding.object} {met(self)}; {len(self.frames)} frames>"
+        told = brief(f"{self.grounding.object} {met(self)}")
+        return f"<{type(self).__name__} {self.id}: {told}; {len(self.frames)} frames>"
 
     __str__ = __repr__
+
+    def shown(self, sha256: str) -> bytes | None:
+        """The bytes of one of its pictures, for a notebook; None where they are not to be had."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        return simulation_html(self, self.shown)
+
+    def _repr_png_(self) -> bytes | None:
+        return filmstrip_png(self, self.shown)
 
     def _pictures(self) -> Iterator[tuple[str, str]]:
         """Names of files in a folder and their digests, but for the video."""
@@ -92,9 +138,17 @@ class _Answer(records.Answer):
     """What both kinds of answer have in common."""
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.id}: {answered(self)}>"
+        return f"<{type(self).__name__} {self.id}: {brief(answered(self))}>"
 
     __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        simulation = self.simulation
+        return answer_html(self, simulation.shown if isinstance(simulation, _Simulation) else lambda _: None)
+
+    def _repr_png_(self) -> bytes | None:
+        simulation = self.simulation
+        return filmstrip_png(simulation, simulation.shown) if isinstance(simulation, _Simulation) else None
 
 
 class Simulation(_Simulation):
@@ -104,18 +158,18 @@ class Simulation(_Simulation):
     >>> [frame.index for frame in simulation.frames]
     [1, 3, 5]
     >>> simulation.numpy_frames().shape
-    (3, 308, 512, 3)
+    (3, 295, 512, 3)
     """
 
-    _files: Files = PrivateAttr()
+    _files: Files = PrivateAttr(default_factory=Files)
 
     def bind(self, files: Files) -> None:
         """Tells where its pictures come from."""
         self._files = files
 
-    def held(self, sha256: str) -> bytes | None:
-        """The bytes of one of its artifacts, where they have been downloaded."""
-        return self._files.held(sha256)
+    def shown(self, sha256: str) -> bytes | None:
+        """The bytes of one of its pictures, for a notebook; None where they are not to be had."""
+        return self._files.shown(sha256)
 
     def pil_frames(self) -> list[Image.Image]:
         """The frames chosen for reasoning as PIL images, RGB, in order of time."""
@@ -149,25 +203,19 @@ class Simulation(_Simulation):
         self._write(folder)
         return folder
 
-    def _repr_html_(self) -> str:
-        return simulation_html(self.load(), self._files.held)
-
-    def _repr_png_(self) -> bytes | None:
-        return filmstrip_png(self.load(), self._files.held)
-
 
 class AsyncSimulation(_Simulation):
     """A simulation, as `AsyncClient` returns it. A notebook shows what `await simulation.load()` has brought."""
 
-    _files: AsyncFiles = PrivateAttr()
+    _files: AsyncFiles = PrivateAttr(default_factory=AsyncFiles)
 
     def bind(self, files: AsyncFiles) -> None:
         """Tells where its pictures come from."""
         self._files = files
 
-    def held(self, sha256: str) -> bytes | None:
-        """The bytes of one of its artifacts, where they have been downloaded."""
-        return self._files.held(sha256)
+    def shown(self, sha256: str) -> bytes | None:
+        """The bytes of one of its pictures, for a notebook; None where they are not to be had."""
+        return self._files.shown(sha256)
 
     async def pil_frames(self) -> list[Image.Image]:
         """The frames chosen for reasoning as PIL images, RGB, in order of time."""
@@ -201,12 +249,6 @@ class AsyncSimulation(_Simulation):
         self._write(folder)
         return folder
 
-    def _repr_html_(self) -> str:
-        return simulation_html(self, self._files.held)
-
-    def _repr_png_(self) -> bytes | None:
-        return filmstrip_png(self, self._files.held)
-
 
 class Answer(_Answer):
     """An answer, as `Client` returns it; its `simulation` has the pictures that it was reasoned on.
@@ -214,7 +256,9 @@ class Answer(_Answer):
     >>> question = "If the yellow ball moves to the right, will it hit the blue mug? (A) Yes (B) No"
     >>> answer = client.answer("image.jpg", question)
     >>> answer.answer, answer.option
-    ('A', 'Yes')
+    ('B', 'No')
+    >>> [encounter.kind for encounter in answer.simulation.trajectory.encounters]
+    ['occluded-by']
     """
 
     simulation: Simulation | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: nobody assigns it
@@ -232,12 +276,6 @@ class Answer(_Answer):
             self.simulation.save(folder)
         _written(folder / "answer.json", self)
         return folder
-
-    def _repr_html_(self) -> str:
-        return answer_html(self.load(), _held_by(self.simulation))
-
-    def _repr_png_(self) -> bytes | None:
-        return None if self.simulation is None else filmstrip_png(self.simulation.load(), self.simulation.held)
 
 
 class AsyncAnswer(_Answer):
@@ -259,12 +297,6 @@ class AsyncAnswer(_Answer):
         _written(folder / "answer.json", self)
         return folder
 
-    def _repr_html_(self) -> str:
-        return answer_html(self, _held_by(self.simulation))
-
-    def _repr_png_(self) -> bytes | None:
-        return None if self.simulation is None else filmstrip_png(self.simulation, self.simulation.held)
-
 
 def result_from(kind: records.JobKind, body: Any, download: Callable[[str], bytes]) -> Simulation | Answer:
     """The result of a job from its JSON."""
@@ -284,10 +316,6 @@ def async_result_from(
     if simulation is not None:
         simulation.bind(AsyncFiles(download))
     return result
-
-
-def _held_by(simulation: Simulation | AsyncSimulation | None) -> Callable[[str], bytes | None]:
-    return (lambda _: None) if simulation is None else simulation.held
 
 
 def _made(folder: str | Path) -> Path:

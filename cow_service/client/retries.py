@@ -8,6 +8,7 @@ from __future__ import annotations
 import email.utils
 import random
 import time
+from datetime import UTC
 
 import httpx
 
@@ -40,11 +41,11 @@ def _asked(retry_after: str | None) -> float | None:
     """What `Retry-After` says, in seconds: a number, or a date (RFC 9110)."""
     if retry_after is None:
         return None
+    if retry_after.isascii() and retry_after.isdecimal():
+        return float(retry_after)
     try:
-        return max(0.0, float(int(retry_after)))
-    except ValueError:
-        pass
-    try:
-        return max(0.0, email.utils.parsedate_to_datetime(retry_after).timestamp() - time.time())
+        date = email.utils.parsedate_to_datetime(retry_after)
     except ValueError:
         return None
+    # Without a zone it is the old asctime form, which is in GMT as well.
+    return max(0.0, (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp() - time.time())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 
 import httpx
@@ -13,7 +14,8 @@ from cow_service.client.calls import PATIENCE, Send
 DEFAULT_URL = "http://127.0.0.1:8000"
 DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
 SILENCE = 60.0  # seconds in a stream of events; the server says something every 15
-RETRIES = 6
+RETRIES = 5
+_KEY = re.compile(r"[\x21-\x7e]+")
 
 
 @dataclass(frozen=True)
@@ -53,10 +55,19 @@ class Target:
 def target_of(base_url: str | None, api_key: str | None, timeout: float | httpx.Timeout | None) -> Target:
     """The server of these arguments, else of COW_BASE_URL and COW_API_KEY, else the one on this machine.
 
-    Raises `ValueError` for what is no address.
+    Raises `ValueError` for what is no address, and for what is no key.
     """
     address = (base_url or os.environ.get("COW_BASE_URL") or DEFAULT_URL).rstrip("/")
     if not address.startswith(("http://", "https://")):
         raise ValueError(f"base_url must begin with http:// or https://, got {address!r}")
+    try:
+        url = httpx.URL(address)
+    except httpx.InvalidURL as error:
+        raise ValueError(f"base_url {address!r} is no address: {error}") from error
+    if not url.host or "%" in url.host or not 0 < (url.port or 80) < 65536 or url.query or url.fragment:
+        raise ValueError(f"base_url must be a host, maybe a port and a path, and nothing else, got {address!r}")
+    key = (os.environ.get("COW_API_KEY") if api_key is None else api_key) or None  # empty: none, whatever is set
+    if key is not None and not _KEY.fullmatch(key):
+        raise ValueError("api_key must be printable ASCII without spaces; has a line break been read with it?")
     limit = timeout if isinstance(timeout, httpx.Timeout) else httpx.Timeout(timeout, connect=min(10, timeout or 10))
-    return Target(address, api_key or os.environ.get("COW_API_KEY") or None, limit)
+    return Target(address, key, limit)

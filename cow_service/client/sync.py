@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
+from functools import partial
+from os import PathLike
 from types import TracebackType
 from typing import Any, Generic, Literal, Self, TypeVar, Unpack, cast, overload
 
 import httpx
 
 from cow_service.client import calls
+from cow_service.client.batches import CONCURRENCY, Outcome, batch_of
 from cow_service.client.calls import Tell, order_of
 from cow_service.client.events import Event
 from cow_service.client.inputs import ImageLike
 from cow_service.client.options import AnswerOptions, SimulateOptions
 from cow_service.client.progress import ProgressLike, told
+from cow_service.client.questions import QuestionLike
 from cow_service.client.results import Answer, Simulation
 from cow_service.client.settings import DEFAULT_TIMEOUT, RETRIES, target_of
 from cow_service.client.sync_connection import Connection
+from cow_service.client.sync_map import mapped
 from cow_service.records import Job, JobKind, JobStatus, Models
 
 R_co = TypeVar("R_co", bound=Simulation | Answer, covariant=True)
@@ -87,7 +92,7 @@ class Client:
     >>> with Client(base_url) as client:
     ...     answer = client.answer("image.jpg", question)
     >>> answer.option
-    'Yes'
+    'No'
     """
 
     def __init__(
@@ -133,7 +138,7 @@ class Client:
         """Imagines the future of an image.
 
         `image` is a path, bytes, a PIL image, an array (height, width, 3) of uint8, a URL, or an artifact. `timeout` is
-        in seconds. `fresh` takes no results of earlier requests. One that is interrupted is canceled.
+        in seconds, for everything together. `fresh` takes no results of earlier requests. An interrupt ends the job.
         Raises the errors of `errors.py`, `WaitTimeout` among them.
         """
         order = order_of("simulate", image, question, cast("Mapping[str, Any]", options), idempotency_key, fresh)
@@ -191,6 +196,86 @@ class Client:
         """Hands in a simulation or an answer, and does not wait for it. Once this returns, the server keeps the job."""
         order = order_of(kind, image, question, options, idempotency_key, fresh)
         return JobHandle(self._connection, self._connection.run(calls.submitted(order, self._connection.retries)))
+
+    @overload
+    def map(
+        self,
+        questions: Iterable[QuestionLike],
+        *,
+        kind: Literal["answer"] = "answer",
+        concurrency: int = CONCURRENCY,
+        out: str | PathLike[str] | None = None,
+        retry_failed: bool = False,
+        only_new: bool = False,
+        save: bool = False,
+        timeout: float | None = None,
+        fresh: bool = False,
+        progress: bool = False,
+        **options: Unpack[AnswerOptions],
+    ) -> Iterator[Outcome[Answer]]: ...
+
+    @overload
+    def map(
+        self,
+        questions: Iterable[QuestionLike],
+        *,
+        kind: Literal["simulate"],
+        concurrency: int = CONCURRENCY,
+        out: str | PathLike[str] | None = None,
+        retry_failed: bool = False,
+        only_new: bool = False,
+        save: bool = False,
+        timeout: float | None = None,
+        fresh: bool = False,
+        progress: bool = False,
+        **options: Unpack[SimulateOptions],
+    ) -> Iterator[Outcome[Simulation]]: ...
+
+    def map(
+        self,
+        questions: Iterable[QuestionLike],
+        *,
+        kind: JobKind = "answer",
+        concurrency: int = CONCURRENCY,
+        out: str | PathLike[str] | None = None,
+        retry_failed: bool = False,
+        only_new: bool = False,
+        save: bool = False,
+        timeout: float | None = None,
+        fresh: bool = False,
+        progress: bool = False,
+        **options: Any,
+    ) -> Iterator[Outcome[Any]]:
+        """Asks many questions, `concurrency` at the same time, and gives what comes of each as it comes.
+
+        A question is a mapping with `image` and `question`, maybe an `id`, a `meta` that stands beside its outcome, and
+        fields of the request, or a pair of image and question. `options` are for those that do not have them. One that
+        fails is an outcome with an `error`; an error is raised where no question would get through, and when the server
+        has taken none for five minutes.
+
+        With `out` every outcome is a line of `results.jsonl` in that folder, and the same call goes on where one ended
+        that was killed: nothing is asked twice. Outcomes of before come last, or not at all with `only_new`.
+        `retry_failed` asks those again that failed. `save` writes the pictures of each into `items/` there.
+
+        >>> question = "If the yellow ball falls, will it hit the blue mug?"
+        >>> questions = [{"id": "q1", "image": "image.jpg", "question": question}]
+        >>> [(outcome.id, outcome.succeeded) for outcome in client.map(questions, out="out")]
+        [('q1', True)]
+        """
+        begin = partial(
+            batch_of,
+            questions,
+            options,
+            kind=kind,
+            concurrency=concurrency,
+            timeout=timeout,
+            fresh=fresh,
+            out=out,
+            retry_failed=retry_failed,
+            save=save,
+            progress=progress,
+        )
+        return mapped(self._connection, begin, only_new=only_new)
 
     def job(self, id: str) -> JobHandle[Simulation | Answer]:
         """A job that was handed in before. Raises `JobNotFound`."""

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import TypeVar
 
 import httpx
 from httpx_sse import EventSource
 
 from cow_service.client import calls
-from cow_service.client.calls import ACCEPTED, Order, Pause, Send, Steps, Tell
-from cow_service.client.events import Event, Following
+from cow_service.client.calls import Order, Pause, Placed, Send, Steps, Tell
+from cow_service.client.events import Event, Following, streams
 from cow_service.client.progress import ProgressLike, told
 from cow_service.client.results import Answer, Simulation, result_from
 from cow_service.client.settings import Target
+from cow_service.errors import CowError
 from cow_service.records import Job
 
 T = TypeVar("T")
-OK = 200
 
 
 class Connection:
@@ -43,23 +44,32 @@ class Connection:
         """A job as it is."""
         return calls.job_in(self.run(calls.looked_at(job_id, self.retries)))
 
-    def done(self, order: Order, timeout: float | None, progress: ProgressLike) -> Simulation | Answer:
-        """The result of an order, waited for. An interrupt cancels its job."""
+    def done(
+        self, order: Order, timeout: float | None, progress: ProgressLike, *, keep: bool = False
+    ) -> Simulation | Answer:
+        """The result of an order, waited for. An interrupt ends its job, unless `keep`."""
         patience = self.target.patience(timeout) if progress is False else 0
-        response = self.run(calls.begun(order, patience, self.retries))
-        if response.status_code != ACCEPTED:
-            return result_from(order.kind, calls.object_in(response), self.artifact)
-        job = calls.job_in(response)
-        try:
-            with told(progress) as tell:
-                return self.awaited(job, timeout, tell)
-        except KeyboardInterrupt:
-            self.run(calls.canceled(job.id, retries=0))
-            raise
+        placed = Placed(order)
+        with told(progress) as tell:
+            try:
+                body = self.run(calls.done(placed, patience, timeout, tell, self.retries))
+            except CowError:
+                raise
+            except BaseException:
+                if not keep:
+                    with contextlib.suppress(Exception):
+                        self.run(calls.withdrawn(placed))
+                raise
+        return result_from(order.kind, body, self.artifact)
+
+    def finished(self, order: Order, timeout: float | None) -> Simulation | Answer:
+        """The result of an order, whose job goes on when nobody waits for it any more."""
+        steps = calls.done(Placed(order), self.target.patience(timeout), timeout, None, self.retries)
+        return result_from(order.kind, self.run(steps), self.artifact)
 
     def awaited(self, job: Job, timeout: float | None, tell: Tell | None) -> Simulation | Answer:
         """The result of a job, once it has ended."""
-        body = self.run(calls.awaited(job.id, timeout, tell, self.retries))
+        body = self.run(calls.awaited(job.id, timeout, calls.deadline(timeout), tell, self.retries))
         return result_from(job.kind, body, self.artifact)
 
     def run(self, steps: Steps[T]) -> T:
@@ -76,23 +86,24 @@ class Connection:
             else:
                 came = self._sent(step)
 
-    def events(self, job_id: str, after: int) -> Iterator[Event]:
+    def events(self, job_id: str, after: int) -> Generator[Event]:
         """The events of a job after a number, through broken connections."""
         following = Following(after, self.retries)
-        send = Send("GET", f"/jobs/{job_id}/events")
+        send = calls.events_of(job_id)
         url, limit = self.target.url(send.path), self.target.following
         while not following.ended:
-            outcome: httpx.Response | httpx.HTTPError | None = None
             headers = self.target.headers(send) | following.headers
             try:
                 with self._http.stream("GET", url, headers=headers, timeout=limit) as response:
-                    if response.status_code == OK:
+                    outcome: httpx.Response | httpx.HTTPError = response
+                    if streams(response):
                         for sent in EventSource(response).iter_sse():
                             if (event := following.take(sent)) is not None:
                                 yield event
+                            if following.ended:
+                                break
                     else:
                         response.read()
-                        outcome = response
             except httpx.HTTPError as error:
                 outcome = error
             if not following.ended:
@@ -106,7 +117,7 @@ class Connection:
                 headers=self.target.headers(send),
                 params=send.params,
                 content=send.content,
-                timeout=self.target.timeout,
+                timeout=self.target.timeout if send.limit is None else send.limit,
             )
         except httpx.HTTPError as error:
             return error
