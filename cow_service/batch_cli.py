@@ -66,6 +66,9 @@ def batch(
         typer.echo(f"Interrupted. The same command goes on with it; {out / 'results.jsonl'} is whole.", err=True)
         sys.stderr.flush()
         os._exit(INTERRUPTED)  # threads that wait for jobs are not waited for
+    except OSError as error:
+        told = error.strerror or str(error)
+        raise CowError(f"'{out}' cannot be written: {told}. The same command goes on with the batch.") from error
     except CowError as error:
         error.detail += " The same command goes on with the batch."
         raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import os
 import random
@@ -156,6 +157,24 @@ def test_a_failure_is_asked_again_under_another_key_and_only_when_told(tmp_path:
             journal.append(a_question("bad"), line("failed"))
     assert len(set(keys)) == 3
     assert [entry["id"] for entry in lines_of(tmp_path)] == ["good", "bad"]
+
+
+def test_a_full_disk_leaves_whole_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write, room = os.write, [20]
+
+    def little(descriptor: int, data: bytes) -> int:
+        if not room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(descriptor, data[: room.pop()])
+
+    with Journal(tmp_path, "answer") as journal:
+        journal.append(a_question("first"), line())
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+            patch.setattr("cow_service.client.journal.os.write", little)
+            journal.append(a_question("second"), line())
+        assert not journal.has(a_question("second"))
+        journal.append(a_question("third"), line())
+    assert [entry["id"] for entry in lines_of(tmp_path)] == ["first", "third"]
 
 
 def test_a_folder_is_for_one_batch_at_a_time_and_of_one_kind(tmp_path: Path) -> None:

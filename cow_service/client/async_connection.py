@@ -66,11 +66,6 @@ class AsyncConnection:
                 raise
         return async_result_from(order.kind, body, self.artifact)
 
-    async def finished(self, order: Order, timeout: float | None) -> AsyncSimulation | AsyncAnswer:
-        """The result of an order, whose job goes on when nobody waits for it any more."""
-        steps = calls.done(Placed(order), self.target.patience(timeout), timeout, None, self.retries)
-        return async_result_from(order.kind, await self.run(steps), self.artifact)
-
     async def awaited(self, job: Job, timeout: float | None, tell: Tell | None) -> AsyncSimulation | AsyncAnswer:
         """The result of a job, once it has ended."""
         body = await self.run(calls.awaited(job.id, timeout, calls.deadline(timeout), tell, self.retries))

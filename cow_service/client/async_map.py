@@ -64,10 +64,7 @@ async def _outcome(connection: AsyncConnection, question: Question, plan: Plan, 
     while True:
         try:
             order = plan.order(question)
-            if plan.keeps:
-                result = await connection.finished(order, plan.timeout)
-            else:
-                result = await connection.done(order, plan.timeout, progress=False)
+            result = await connection.done(order, plan.timeout, progress=False, keep=plan.keeps)
             folder = plan.folder(question)
             if folder is not None:
                 await result.save(folder)

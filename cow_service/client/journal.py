@@ -107,8 +107,13 @@ class Journal:
         with self._guard:
             if self._file < 0:
                 return  # the batch was given up; the server keeps what came of this one
-            while data:
-                data = data[os.write(self._file, data) :]
+            end = os.fstat(self._file).st_size
+            try:
+                while data:
+                    data = data[os.write(self._file, data) :]
+            except OSError:
+                os.ftruncate(self._file, end)  # half a line would spoil the next one
+                raise
             self.done[question.id] = (question.fingerprint, line["status"])
 
     def lines(self) -> Iterator[dict[str, Any]]:

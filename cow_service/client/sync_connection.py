@@ -62,11 +62,6 @@ class Connection:
                 raise
         return result_from(order.kind, body, self.artifact)
 
-    def finished(self, order: Order, timeout: float | None) -> Simulation | Answer:
-        """The result of an order, whose job goes on when nobody waits for it any more."""
-        steps = calls.done(Placed(order), self.target.patience(timeout), timeout, None, self.retries)
-        return result_from(order.kind, self.run(steps), self.artifact)
-
     def awaited(self, job: Job, timeout: float | None, tell: Tell | None) -> Simulation | Answer:
         """The result of a job, once it has ended."""
         body = self.run(calls.awaited(job.id, timeout, calls.deadline(timeout), tell, self.retries))

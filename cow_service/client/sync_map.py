@@ -93,7 +93,8 @@ class _Run:
         began = time.monotonic()
         while not self.stop.is_set():
             try:
-                result = self._connection.finished(self._plan.order(question), self._plan.timeout)
+                order = self._plan.order(question)
+                result = self._connection.done(order, self._plan.timeout, progress=False, keep=self._plan.keeps)
                 folder = self._plan.folder(question)
                 if folder is not None:
                     result.save(folder)
