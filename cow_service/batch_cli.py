@@ -6,17 +6,24 @@ import json
 import os
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cow_service.errors import CowError, FieldError, InvalidRequest
+from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
+from cow_service.terminal import printable
+
+if TYPE_CHECKING:
+    from cow_service.client.questions import Question
 
 SOME_FAILED = 3
 INTERRUPTED = 130
 SHOWN_FAILURES = 5
+SHOWN_FAULTS = 10
+AGAIN = "The same command goes on with the batch."
 
 
 class BatchKind(StrEnum):
@@ -57,27 +64,29 @@ def batch(
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
     """
-    asked = _read(questions)
-    defaults = _defaults(request)
-    _check(asked, defaults, kind)
+    from cow_service.client.batches import PASSING  # noqa: PLC0415
+
+    asked = _read(questions, _defaults(request), kind)
     try:
-        _ask(asked, defaults, out, kind, url, concurrency, timeout, save, retry_failed)
+        _ask(asked, out, kind, url, concurrency, timeout, save, retry_failed)
     except KeyboardInterrupt:
         typer.echo(f"Interrupted. The same command goes on with it; {out / 'results.jsonl'} is whole.", err=True)
         sys.stderr.flush()
         os._exit(INTERRUPTED)  # threads that wait for jobs are not waited for
     except OSError as error:
         told = error.strerror or str(error)
-        raise CowError(f"'{out}' cannot be written: {told}. The same command goes on with the batch.") from error
-    except CowError as error:
-        error.detail += " The same command goes on with the batch."
+        raise StorageUnavailable(f"'{out}' cannot be written: {told}. {AGAIN}") from error
+    except Unauthorized as error:
+        error.detail += " Here: set COW_API_KEY."
+        raise
+    except PASSING as error:
+        error.detail += f" {AGAIN}"
         raise
     raise typer.Exit(_tell(out))
 
 
 def _ask(
-    asked: list[dict[str, Any]],
-    defaults: dict[str, Any],
+    asked: list[Question],
     out: Path,
     kind: BatchKind,
     url: str | None,
@@ -88,7 +97,11 @@ def _ask(
 ) -> None:
     from cow_service.client import Client  # noqa: PLC0415
 
-    with Client(url) as client:
+    try:
+        client = Client(url)
+    except ValueError as error:
+        raise InvalidRequest(f"{error}.") from error
+    with client:
         outcomes = client.map(
             asked,
             kind=kind.value,  # pyright: ignore[reportArgumentType] - one of the two
@@ -99,31 +112,65 @@ def _ask(
             save=save,
             timeout=timeout,
             progress=True,
-            **defaults,
         )
-        for _ in outcomes:
-            pass
+        for outcome in outcomes:
+            if outcome.unsaved is not None:
+                typer.echo(printable(f"{outcome.id}: not saved: {outcome.unsaved.detail}"), err=True)
 
 
-def _read(path: Path) -> list[dict[str, Any]]:
-    """The questions of a file; images are looked for beside it. Raises `InvalidRequest` with the line."""
-    asked: list[dict[str, Any]] = []
+def _read(path: Path, defaults: dict[str, Any], kind: BatchKind) -> list[Question]:
+    """The questions of a file; images are looked for beside it.
+
+    Raises `InvalidRequest` for whatever the server would refuse, before it is asked anything.
+    """
+    from cow_service.client.questions import questions  # noqa: PLC0415
+
+    items: list[dict[str, Any]] = []
+    faults: list[str] = []
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
-        if not line.strip():
-            continue
-        try:
-            item = json.loads(line)
-        except ValueError as error:
-            raise InvalidRequest(f"{path.name}, line {number}: no JSON: {error}.") from error
-        if not isinstance(item, dict):
-            raise InvalidRequest(f"{path.name}, line {number}: must be an object, got {type(item).__name__}.")
-        image = item.get("image")
-        if isinstance(image, str) and not image.startswith(("data:", "http://", "https://")):
-            item["image"] = str(path.parent / image)
-        asked.append(item)
-    if not asked:
+        if line.strip():
+            try:
+                item = _parsed(line)
+                (question,) = questions([item], defaults, path.parent)
+                _check(question, kind)
+                items.append(item)
+            except InvalidRequest as error:
+                told = error.detail.removeprefix("Question 1: ")
+                faults.append(f"{path.name}, line {number}: {told}")
+    if faults:
+        more = f"\n... and {len(faults) - SHOWN_FAULTS} more" if len(faults) > SHOWN_FAULTS else ""
+        raise InvalidRequest("\n".join(faults[:SHOWN_FAULTS]) + more)
+    if not items:
         raise InvalidRequest(f"{path.name} holds no questions: give one JSON object a line.")
+    asked = list(questions(items, defaults, path.parent))
+    _look_for_images(asked, path)
     return asked
+
+
+def _parsed(line: bytes) -> dict[str, Any]:
+    try:
+        item = json.loads(line)
+    except ValueError as error:
+        raise InvalidRequest(f"no JSON: {error}.") from error
+    if not isinstance(item, dict):
+        raise InvalidRequest(f"must be an object, got {type(item).__name__}.")
+    return item
+
+
+def _look_for_images(asked: list[Question], path: Path) -> None:
+    """Says which files are missing: their questions will fail. Raises `InvalidRequest` where all are."""
+    files = [question.image for question in asked if isinstance(question.image, Path)]
+    missing = [file for file in files if not file.is_file()]
+    if files and len(missing) == len(files):
+        raise InvalidRequest(
+            f"{path.name}: none of the {len(files)} images is there, such as '{files[0]}': a path starts at the folder "
+            "of the file that names it."
+        )
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        names = ", ".join(file.name for file in missing[:SHOWN_FAILURES])
+        told = f"{len(missing)} of {len(files)} images {verb} not there: {names}"
+        typer.echo(printable(told + (", ..." if len(missing) > SHOWN_FAILURES else "")), err=True)
 
 
 def _defaults(text: str | None) -> dict[str, Any]:
@@ -136,24 +183,18 @@ def _defaults(text: str | None) -> dict[str, Any]:
     return given
 
 
-def _check(asked: list[dict[str, Any]], defaults: dict[str, Any], kind: BatchKind) -> None:
-    """Raises `InvalidRequest` for whatever the server would refuse, before it is asked anything."""
+def _check(question: Question, kind: BatchKind) -> None:
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from cow_service.client.questions import questions  # noqa: PLC0415
     from cow_service.requests import AnswerRequest, SimulateRequest  # noqa: PLC0415
 
     model = AnswerRequest if kind is BatchKind.answer else SimulateRequest
-    for place, question in enumerate(questions(asked, defaults), 1):
-        try:
-            model.model_validate({"image": "data:", "question": question.question, **question.options})
-        except ValidationError as error:
-            wrong = error.errors()[0]
-            pointer = "/" + "/".join(str(part) for part in wrong["loc"])
-            raise InvalidRequest(
-                f"Question {place} ('{question.id}'): {pointer}: {wrong['msg']}.",
-                errors=(FieldError(pointer, wrong["msg"]),),
-            ) from error
+    image = dict(question.image) if isinstance(question.image, Mapping) else "data:"
+    try:
+        model.model_validate({**question.options, "image": image, "question": question.question})
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        raise InvalidRequest(f"/{'/'.join(str(part) for part in wrong['loc'])}: {wrong['msg']}.") from error
 
 
 def _tell(out: Path) -> int:
@@ -161,20 +202,22 @@ def _tell(out: Path) -> int:
     results = out / "results.jsonl"
     codes: Counter[str] = Counter()
     failures: list[str] = []
-    count = 0
+    count = unimagined = 0
     with results.open("rb") as lines:
         for line in map(json.loads, lines):
             count += 1
+            unimagined += "result" in line and line["result"].get("simulation", ...) is None
             if line["status"] == "failed":
-                code = line["problem"]["type"].rpartition(":")[2]
+                code = line["problem"]["code"]
                 codes[code] += 1
                 failures.append(f"  {line['id']}: {code}: {line['problem']['detail']}")
-    typer.echo(f"{count - len(failures)} succeeded, {len(failures)} failed: {results}")
+    without = f" ({unimagined} without a simulation)" if unimagined else ""
+    typer.echo(f"{count - len(failures)} succeeded{without}, {len(failures)} failed: {results}")
     if not failures:
         return 0
     typer.echo(", ".join(f"{code} {times}" for code, times in codes.most_common()), err=True)
     for told in failures[:SHOWN_FAILURES]:
-        typer.echo(told, err=True)
+        typer.echo(printable(told), err=True)
     if len(failures) > SHOWN_FAILURES:
         typer.echo(f"  ... and {len(failures) - SHOWN_FAILURES} more", err=True)
     return SOME_FAILED

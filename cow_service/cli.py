@@ -15,6 +15,7 @@ from typer.core import TyperGroup
 from cow_service import __version__, batch_cli, keys_cli, mcp_cli, models_cli, tracks_cli
 from cow_service import cli_options as options
 from cow_service.errors import CowError
+from cow_service.terminal import printable
 
 # Notes that these libraries print when they are imported, such as on optional packages, are not for our users.
 QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
@@ -229,11 +230,11 @@ def _errors_told() -> Generator[None]:
         yield
     except CowError as error:
         typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
-        typer.echo(error.detail, err=True)
+        typer.echo(printable(error.detail), err=True)
         if error.code in options.HINTS:
             typer.echo(options.HINTS[error.code], err=True)
         for field in error.errors:
-            typer.echo(f"  {field.pointer}: {field.detail}", err=True)
+            typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
         raise typer.Exit(1) from error
     except SettingsError as error:
         typer.secho(str(error), fg="red", err=True)

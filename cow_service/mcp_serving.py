@@ -207,7 +207,8 @@ async def _leave_on_signal(close: Callable[[], Awaitable[None]]) -> None:
 
 def run_http(house: House, settings: Settings, *, names: Sequence[str] = ()) -> None:
     """Serves at `settings.host` and `port`, until a signal ends it; `names` are others by which it may be asked."""
-    connect = house.connect if is_local(settings.host) else with_own_keys(house.connect)
+    # Another name is that of a proxy, and whoever stands before one is not known.
+    connect = with_own_keys(house.connect, all_of_them=bool(names) or not is_local(settings.host))
     server = create_server(connect, house.lifespan, paths=False, links=house.links)
     app = server.streamable_http_app(
         streamable_http_path=PATH,
@@ -226,12 +227,13 @@ def run_http(house: House, settings: Settings, *, names: Sequence[str] = ()) -> 
     uvicorn.Server(config).run()
 
 
-def with_own_keys(connect: Connect) -> Connect:
-    """The same way for callers from elsewhere: COW_API_KEY is for whoever sits at this machine."""
+def with_own_keys(connect: Connect, *, all_of_them: bool) -> Connect:
+    """The same way for callers from elsewhere, or all: COW_API_KEY is for whoever sits at this machine."""
 
     @asynccontextmanager
     async def connected(caller: Caller) -> AsyncGenerator[AsyncClient]:
-        if caller.key is None and os.environ.get("COW_API_KEY"):  # which the SDK would take instead
+        far = all_of_them or caller.forwarded
+        if far and caller.key is None and os.environ.get("COW_API_KEY"):  # which the SDK would take instead
             raise Unauthorized("The request has no key. Send the header `Authorization: Bearer <key>`.")
         async with connect(caller) as client:
             yield client

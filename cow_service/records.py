@@ -209,6 +209,11 @@ class GeneratorInfo(Record):
     options: dict[str, bool | int | float | str] = Field(default_factory=dict)
 
 
+MEETINGS: dict[EncounterKind, str] = {
+    "touches": "touches",
+    "occludes": "passes in front of",
+    "occluded-by": "passes behind",
+}  # what the mover does with the other object, in words
 ENCOUNTERS_UNKNOWN = "encounters were not computed"  # part of the warning that says so
 
 

@@ -10,8 +10,10 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import aclosing
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +108,36 @@ def test_every_id_has_a_folder_inside(own: str) -> None:
     assert name not in (".", "..")
 
 
+def test_questions_are_taken_as_they_are_and_completed() -> None:
+    own = Question("scene/1", "a.png", "?", {"votes": 3})
+    (asked,) = questions([own], {"votes": 5, "seed": 2})
+    assert asked.options == {"votes": 3, "seed": 2}
+    assert asked.fingerprint != own.fingerprint
+    assert own.fingerprint != Question("scene/1", "a.png", "!", {"votes": 3}).fingerprint
+    assert asked.folder not in ("", Question("scene:1", "a.png", "?").folder)
+
+
+def test_a_question_is_the_same_from_wherever_its_file_is_looked_at(tmp_path: Path) -> None:
+    item = {"image": "a.png", "question": "?"}
+    here, there = (next(questions([item], None, folder)) for folder in (tmp_path, Path("elsewhere")))
+    assert here.image != there.image
+    assert (here.id, here.fingerprint) == (there.id, there.fingerprint)
+
+
+@pytest.mark.parametrize(
+    ("item", "name"),
+    [({"id": "\ud800"}, "id"), ({"question": "\ud800"}, "question"), ({"meta": object()}, "meta")],
+)
+def test_what_cannot_be_written_down_is_refused_before_it_is_asked(item: dict[str, Any], name: str) -> None:
+    with pytest.raises(errors.InvalidRequest, match=f"Question 1: `{name}` cannot be written"):
+        list(questions([{"image": "a.png", "question": "?", **item}]))
+
+
+def test_defaults_are_of_the_request_alone() -> None:
+    with pytest.raises(errors.InvalidRequest, match="`image` and `question`"):
+        list(questions([], {"image": "a.png", "question": "?"}))
+
+
 # The folder
 
 
@@ -113,8 +145,8 @@ def line(status: str = "succeeded") -> dict[str, Any]:
     return {"status": status, "seconds": 0.1, "result": {}}
 
 
-def a_question(own: str = "q", fingerprint: str = "f") -> Question:
-    return Question(own, "a.png", "?", fingerprint=fingerprint)
+def a_question(own: str = "q", question: str = "?") -> Question:
+    return Question(own, "a.png", question)
 
 
 def test_a_half_written_line_is_cut_off_and_asked_again_under_the_same_key(tmp_path: Path) -> None:
@@ -137,7 +169,28 @@ def test_a_half_written_line_is_cut_off_and_asked_again_under_the_same_key(tmp_p
 def test_keys_differ_by_batch_question_and_body(tmp_path: Path) -> None:
     with Journal(tmp_path / "a", "answer") as a, Journal(tmp_path / "b", "answer") as b:
         keys = {a.key(a_question(), b"x"), b.key(a_question(), b"x"), a.key(a_question("r"), b"x")}
-        assert len(keys | {a.key(a_question(), b"y")}) == 4
+        assert len(keys | {a.key(a_question(), b"y"), a.key(a_question(), b"x", fresh=True)}) == 5
+
+
+def test_what_goes_with_a_question_may_be_numpys(tmp_path: Path) -> None:
+    (question,) = questions([{"image": "a.png", "question": "?", "meta": {"truth": np.int64(3)}}])
+    with Journal(tmp_path, "answer") as journal:
+        journal.append(question, line())
+    assert lines_of(tmp_path)[0]["meta"] == {"truth": 3}
+
+
+def test_a_folder_may_be_let_go_in_another_thread(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, "answer")
+    closing = threading.Thread(target=journal.close)
+    closing.start()
+    closing.join()
+    Journal(tmp_path, "answer").close()
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "batch.json").write_text("{}")
+    with pytest.raises(errors.InvalidRequest, match="not that of a batch"):
+        Journal(tmp_path, "answer")
 
 
 def test_a_failure_is_asked_again_under_another_key_and_only_when_told(tmp_path: Path) -> None:
@@ -169,9 +222,10 @@ def test_a_full_disk_leaves_whole_lines(tmp_path: Path, monkeypatch: pytest.Monk
 
     with Journal(tmp_path, "answer") as journal:
         journal.append(a_question("first"), line())
-        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-            patch.setattr("cow_service.client.journal.os.write", little)
+        monkeypatch.setattr("cow_service.client.journal.os.write", little)
+        with pytest.raises(OSError, match="No space"):
             journal.append(a_question("second"), line())
+        monkeypatch.undo()
         assert not journal.has(a_question("second"))
         journal.append(a_question("third"), line())
     assert [entry["id"] for entry in lines_of(tmp_path)] == ["first", "third"]
@@ -183,7 +237,7 @@ def test_a_folder_is_for_one_batch_at_a_time_and_of_one_kind(tmp_path: Path) -> 
         with pytest.raises(errors.InvalidRequest, match="in use"):
             Journal(tmp_path, "answer")
         with pytest.raises(errors.InvalidRequest, match="another question with the id 'q'"):
-            journal.has(a_question(fingerprint="other"))
+            journal.has(a_question(question="other"))
     with pytest.raises(errors.InvalidRequest, match="of kind 'answer'"):
         Journal(tmp_path, "simulate")
     (tmp_path / "results.jsonl").write_bytes(b"{}x\n")
@@ -266,11 +320,121 @@ def test_what_all_questions_would_meet_ends_the_batch(server: Server, tmp_path: 
     assert lines_of(tmp_path) == [], "no question failed: the batch did"
 
 
+@pytest.mark.parametrize(
+    "kind", [errors.QueueFull, errors.ShuttingDown, errors.StorageUnavailable, errors.RateLimited, errors.BodyTooSlow]
+)
+def test_what_passes_is_no_failure_of_a_question(kind: type[errors.CowError]) -> None:
+    assert Patience(60).pause_after(kind("not now")) is not None
+
+
+def scripted(*, cancel: int = 200) -> Callable[[httpx.Request], httpx.Response]:
+    """A server on which every job runs for ever."""
+    job = {"id": "j", "kind": "simulate", "status": "running", "progress": 0, "created_at": "now", "generator": "x"}
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.url.path.endswith("/cancel") and cancel != 200:
+            problem = {"type": "urn:cow:problem:job-not-found", "title": "", "status": 404, "detail": "gone"}
+            return httpx.Response(cancel, json=problem, headers={"content-type": "application/problem+json"})
+        return httpx.Response(202 if request.method == "POST" else 200, json=job)
+
+    return answer
+
+
+@pytest.mark.parametrize("cancel", [200, 404])
+def test_a_question_that_takes_too_long_fails_alone(tmp_path: Path, cancel: int) -> None:
+    def plain(outcome: Any) -> Any:
+        return outcome.id, outcome.error.code, outcome.error.job_id
+
+    http = httpx.Client(transport=httpx.MockTransport(scripted(cancel=cancel)))
+    with http, Client("http://x", http_client=http) as client:
+        came = [plain(o) for o in client.map(asked(2), kind="simulate", timeout=0.2, out=tmp_path / "a")]
+        again = [plain(o) for o in client.map(asked(2), kind="simulate", timeout=0.2, out=tmp_path / "a")]
+
+    async def others() -> list[Any]:
+        transport = httpx.MockTransport(scripted(cancel=cancel))
+        async with httpx.AsyncClient(transport=transport) as http, AsyncClient("http://x", http_client=http) as client:
+            return [plain(o) async for o in client.map(asked(2), kind="simulate", timeout=0.2)]
+
+    assert sorted(came) == sorted(again) == sorted(asyncio.run(others()))
+    assert sorted(came) == [("q0", "wait-timeout", "j"), ("q1", "wait-timeout", "j")]
+
+
+def test_looks_at_jobs_are_words_of_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[int] = []
+    monkeypatch.setattr(Patience, "hear", lambda _: heard.append(1))
+    http = httpx.Client(transport=httpx.MockTransport(scripted()))
+    with http, Client("http://x", http_client=http) as client:
+        list(client.map(asked(1), kind="simulate", timeout=0.5))
+    assert len(heard) > 2, "only the end of the question was heard"
+
+
+def test_a_batch_without_a_folder_that_is_left_ends_its_jobs(tmp_path: Path) -> None:
+    quick = {**asked(1)[0], "id": "quick", "seed": 99}
+    items = [quick, *asked(3, generator="slow", generator_options={"seconds": 20.0}, num_frames=80)]
+    with Served(tmp_path) as served:
+        address = str(served.http.base_url)
+
+        def ended() -> bool:
+            jobs = served.http.get("/jobs").json()["jobs"]
+            return len(jobs) >= 2 and all(job["status"] in ("succeeded", "canceled") for job in jobs)
+
+        with Client(address, timeout=4) as client:
+            outcomes = client.map(items, kind="simulate", concurrency=4)
+            next(outcomes)
+            outcomes.close()  # as `break` and the end of the function do
+            eventually(ended, patience=20)
+
+        async def left() -> None:
+            async with (
+                AsyncClient(address, timeout=4) as client,
+                aclosing(client.map(items, kind="simulate", concurrency=4, fresh=True)) as outcomes,
+            ):
+                async for _ in outcomes:
+                    break
+
+        asyncio.run(left())
+        eventually(ended, patience=20)
+
+
+def test_pictures_that_cannot_be_saved_lose_no_answer(tmp_path: Path, server: Server) -> None:
+    def broken(request: httpx.Request) -> httpx.Response:
+        if "/artifacts/" in request.url.path:
+            return httpx.Response(200, content=b"damaged")
+        return http.send(
+            http.build_request(request.method, request.url, headers=request.headers, content=request.read())
+        )
+
+    between = httpx.Client(transport=httpx.MockTransport(broken))
+    with httpx.Client() as http, between, Client(server.address, http_client=between) as client:
+        (outcome,) = client.map(asked(1), kind="simulate", out=tmp_path, save=True)
+    assert outcome.succeeded
+    assert outcome.unsaved.code == "bad-response"
+    (kept,) = lines_of(tmp_path)
+    assert kept["status"] == "succeeded"
+    assert "damaged" in kept["unsaved"]
+
+
+def test_the_callers_iterator_is_used_where_it_lives(server: Server) -> None:
+    def items() -> Iterator[dict[str, Any]]:
+        for item in asked(12):
+            assert threading.current_thread() is threading.main_thread()
+            yield item
+
+    with Client(server.address) as client:
+        assert sum(o.succeeded for o in client.map(items(), kind="simulate", concurrency=2)) == 12
+
+
 def test_patience_with_a_server_that_takes_nothing() -> None:
-    assert Patience(60).pause_after(errors.QueueFull("full")) is not None
     assert Patience(60).pause_after(errors.CannotGround("no")) is None
+    with pytest.raises(errors.QueueFull):
+        Patience(-1).pause_after(errors.QueueFull("full"))
+    told: list[str | None] = []
+    patience = Patience(60, lambda error: told.append(error and error.code))
     with pytest.raises(errors.ServerUnreachable):
-        Patience(-1).pause_after(errors.ServerUnreachable("gone"))
+        patience.pause_after(errors.ServerUnreachable("there never was one"))
+    patience.hear()
+    assert patience.pause_after(errors.ServerUnreachable("it is away for a moment")) is not None
+    assert told == [None, "server-unreachable"]
     with pytest.raises(errors.Unauthorized):
         Patience(60).pause_after(errors.Unauthorized("no key"))
 
@@ -312,6 +476,7 @@ def test_the_command_tells_by_its_exit_code(server: Server, tmp_path: Path) -> N
         assert result.returncode == 3
         assert "image-unreadable 1" in result.stderr
         assert "gone: image-unreadable: " in result.stderr
+        assert "1 of 7 images is not there: no.png" in result.stderr
     assert len(lines_of(out)) == 7
     (tmp_path / "no.png").write_bytes(IMAGE)
     result = run(path, "-o", out, "--url", server.address, "--retry-failed")
@@ -323,9 +488,11 @@ def test_the_command_tells_by_its_exit_code(server: Server, tmp_path: Path) -> N
     ("text", "options", "says"),
     [
         ("", (), "holds no questions"),
-        ("{", (), "line 1: no JSON"),
-        ("[]", (), "must be an object, got list"),
-        ('{"image": "a.png", "question": "?", "votes": 99}', (), "Question 1 ("),
+        ("{", (), "questions.jsonl, line 1: no JSON"),
+        ("\n[]", (), "line 2: must be an object, got list"),
+        ('{"image": "a.png", "question": "?", "votes": 99}', (), "line 1: /votes: "),
+        ('{"question": "?"}\n\n{"image": "a.png"}', (), "line 3: `question` is missing"),
+        ('{"image": "a.png", "question": "?"}', (), "none of the 1 images is there"),
         ('{"image": "a.png", "question": "?", "vote": 1}', (), "/vote: Extra inputs"),
         ('{"image": "a.png", "question": "?"}', ("--request", '{"num_frames": 1}'), "/num_frames"),
         ('{"image": "a.png", "question": "?"}', ("--request", "[]"), "--request must be an object"),
@@ -340,7 +507,29 @@ def test_a_file_that_cannot_be_asked_is_refused_before_anything_is_sent(
     result = run(path, "-o", tmp_path / "out", "--url", "http://127.0.0.1:1", *options)
     assert result.returncode == 1
     assert says in result.stderr
+    assert "Traceback" not in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--url", "127.0.0.1:8000"), "must begin with http://"),
+        (("--url", "http://127.0.0.1:1"), "server-unreachable"),
+        (("--out", "questions.jsonl"), "'questions.jsonl' cannot be written"),
+    ],
+)
+def test_what_keeps_a_batch_from_beginning_is_told_at_once(
+    server: Server, tmp_path: Path, options: tuple[str, ...], says: str
+) -> None:
+    path = written(tmp_path, asked(20))
+    began = time.monotonic()
+    command = [*COMMAND, str(path), "--out", str(tmp_path / "out"), "--url", server.address, *options]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
+    assert time.monotonic() - began < 20
 
 
 def test_an_interrupt_ends_at_once_and_loses_nothing(tmp_path: Path) -> None:

@@ -59,6 +59,7 @@ FLOORS: dict[str, int] = {
     "console": 9,
     "answer_console": 10,
     "cli_options": 1,
+    "terminal": 1,
     "doctor": 9,
     "batch_cli": 10,
     "keys_cli": 10,

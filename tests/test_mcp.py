@@ -22,6 +22,7 @@ from typing import Any
 import anyio
 import httpx
 import httpx2
+import numpy as np
 import pytest
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 from conftest import EXAMPLES, Server
@@ -41,7 +42,7 @@ from cow_service.keys import hash_of, new_key
 from cow_service.mcp_tools.failures import REMEDIES, in_words
 from cow_service.mcp_tools.images import image_of
 from cow_service.mcp_tools.inputs import AnswerInput, SimulateInput, parsed
-from cow_service.mcp_tools.pictures import fit
+from cow_service.mcp_tools.pictures import BUDGET, fitted
 from cow_service.mcp_tools.server import Caller
 from cow_service.requests import ImageArtifact
 from cow_service.settings import Settings, SettingsError
@@ -452,13 +453,16 @@ class Door(BaseHTTPRequestHandler):
         pass
 
 
-def test_callers_from_elsewhere_bring_their_own_key(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "listening", [("--host", "0.0.0.0"), ("--allow-host", "cow.example.org")], ids=["an open address", "behind a proxy"]
+)
+def test_callers_from_elsewhere_bring_their_own_key(tmp_path: Path, listening: tuple[str, ...]) -> None:
     keys: list[str | None] = []
     door = ThreadingHTTPServer(("127.0.0.1", 0), type("_Door", (Door,), {"keys": keys}))
     threading.Thread(target=door.serve_forever).start()
     try:
         url = f"http://127.0.0.1:{door.server_port}"
-        with serving(tmp_path, "--host", "0.0.0.0", "--url", url, COW_API_KEY="ours") as address:
+        with serving(tmp_path, *listening, "--url", url, COW_API_KEY="ours") as address:
             for key in (None, BOB):
                 with over_http(address, key) as session:
                     result = session.call("answer", image=data_url(SCENE.read_bytes()), question=QUESTION)
@@ -467,7 +471,8 @@ def test_callers_from_elsewhere_bring_their_own_key(tmp_path: Path) -> None:
         door.shutdown()
         door.server_close()
     assert keys == [f"Bearer {BOB}"]
-    assert "Whoever reaches 0.0.0.0 can use the COW server behind it" in (tmp_path / "log").read_text()
+    open_to_all = "0.0.0.0" in listening
+    assert open_to_all == ("Whoever reaches 0.0.0.0 can use the COW server behind it" in (tmp_path / "log").read_text())
 
 
 class Raw:
@@ -607,9 +612,11 @@ def test_arguments_become_a_request() -> None:
 def test_large_pictures_are_made_fit_for_a_model() -> None:
     buffer = io.BytesIO()
     Image.new("RGB", (3000, 1500), "red").save(buffer, "PNG")
-    with Image.open(io.BytesIO(fit(buffer.getvalue()))) as small:
+    media_type, (shown,) = fitted([buffer.getvalue()])
+    assert media_type == "image/png"
+    with Image.open(io.BytesIO(shown)) as small:
         assert small.size == (1024, 512)
-    assert fit(fit(buffer.getvalue())) == fit(buffer.getvalue())
+    assert fitted([shown]) == ("image/png", [shown])
 
 
 def test_remedies_are_for_errors_that_there_are() -> None:
@@ -635,13 +642,16 @@ def test_our_own_key_is_not_lent_to_others(monkeypatch: pytest.MonkeyPatch) -> N
     async def way(_: Caller) -> AsyncGenerator[AsyncClient]:
         yield AsyncClient("http://cow")
 
-    async def asked(caller: Caller) -> None:
-        async with mcp_serving.with_own_keys(way)(caller) as client:
+    async def asked(caller: Caller, all_of_them: bool) -> None:
+        async with mcp_serving.with_own_keys(way, all_of_them=all_of_them)(caller) as client:
             await client.close()
 
-    anyio.run(asked, Caller("theirs"))
-    with pytest.raises(Unauthorized):
-        anyio.run(asked, Caller())
+    anyio.run(asked, Caller("theirs"), True)
+    anyio.run(asked, Caller(), False)
+    anyio.run(asked, Caller("theirs", forwarded=True), False)
+    for caller, all_of_them in ((Caller(), True), (Caller(forwarded=True), False)):
+        with pytest.raises(Unauthorized):
+            anyio.run(asked, caller, all_of_them)
 
 
 def test_a_server_of_ones_own_has_no_keys(tmp_path: Path) -> None:
@@ -650,3 +660,23 @@ def test_a_server_of_ones_own_has_no_keys(tmp_path: Path) -> None:
     assert (own.api_keys, own.cors_origins, own.host, own.data_dir) == ({}, (), "127.0.0.1", tmp_path)
     with pytest.raises(SettingsError, match="http"):
         mcp_serving.house_of(settings, "cow.example")
+
+
+@pytest.mark.parametrize("count", [1, 3, 30])
+def test_pictures_of_photographs_fit_into_a_message(count: int) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (600, 1400, 3), np.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(noise).save(buffer, "PNG")
+    media_type, shown = fitted([buffer.getvalue()] * count)
+    assert len(shown) == count
+    assert sum(map(len, shown)) <= BUDGET
+    sizes = {Image.open(io.BytesIO(data)).size for data in shown}
+    assert len(sizes) == 1
+    assert max(sizes.pop()) <= 1024
+    assert media_type == "image/jpeg"
+
+
+def test_small_pictures_stay_as_they_are() -> None:
+    buffer = io.BytesIO()
+    Image.new("RGB", (300, 200), "red").save(buffer, "PNG")
+    assert fitted([buffer.getvalue()]) == ("image/png", [buffer.getvalue()])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import aclosing
 from datetime import datetime
 from functools import partial
@@ -218,7 +218,7 @@ class AsyncClient:
         fresh: bool = False,
         progress: bool = False,
         **options: Unpack[AnswerOptions],
-    ) -> AsyncIterator[Outcome[AsyncAnswer]]: ...
+    ) -> AsyncGenerator[Outcome[AsyncAnswer]]: ...
 
     @overload
     def map(
@@ -235,7 +235,7 @@ class AsyncClient:
         fresh: bool = False,
         progress: bool = False,
         **options: Unpack[SimulateOptions],
-    ) -> AsyncIterator[Outcome[AsyncSimulation]]: ...
+    ) -> AsyncGenerator[Outcome[AsyncSimulation]]: ...
 
     def map(
         self,
@@ -251,7 +251,7 @@ class AsyncClient:
         fresh: bool = False,
         progress: bool = False,
         **options: Any,
-    ) -> AsyncIterator[Outcome[Any]]:
+    ) -> AsyncGenerator[Outcome[Any]]:
         """Asks many questions, `concurrency` at the same time, and gives what comes of each as it comes.
 
         A question is a mapping with `image` and `question`, maybe an `id`, a `meta` that stands beside its outcome, and
@@ -275,8 +275,9 @@ class AsyncClient:
             retry_failed=retry_failed,
             save=save,
             progress=progress,
+            only_new=only_new,
         )
-        return mapped(self._connection, begin, only_new=only_new)
+        return mapped(self._connection, begin)
 
     async def job(self, id: str) -> AsyncJobHandle[AsyncSimulation | AsyncAnswer]:
         """A job that was handed in before. Raises `JobNotFound`."""

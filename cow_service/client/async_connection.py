@@ -12,10 +12,11 @@ from httpx_sse import EventSource
 
 from cow_service.client import calls
 from cow_service.client.calls import Order, Pause, Placed, Send, Steps, Tell
+from cow_service.client.errors import closed, unreachable
 from cow_service.client.events import Event, Following, streams
 from cow_service.client.progress import ProgressLike, told
 from cow_service.client.results import AsyncAnswer, AsyncSimulation, async_result_from
-from cow_service.client.settings import Target
+from cow_service.client.settings import Contact, Target
 from cow_service.errors import CowError
 from cow_service.records import Job
 
@@ -30,10 +31,12 @@ class AsyncConnection:
         self.retries = retries
         self._http = http
         self._own = own
+        self._contact = Contact()
         self._leaving: set[asyncio.Task[None]] = set()
 
     async def close(self) -> None:
-        """Closes the connections that were made here."""
+        """Closes the connections that were made here, once the server has heard who has left."""
+        await asyncio.gather(*self._leaving, return_exceptions=True)
         if self._own:
             await self._http.aclose()
 
@@ -46,14 +49,23 @@ class AsyncConnection:
         return calls.job_in(await self.run(calls.looked_at(job_id, self.retries)))
 
     async def done(
-        self, order: Order, timeout: float | None, progress: ProgressLike, *, keep: bool = False
+        self,
+        order: Order,
+        timeout: float | None,
+        progress: ProgressLike,
+        *,
+        keep: bool = False,
+        hear: Tell | None = None,
     ) -> AsyncSimulation | AsyncAnswer:
-        """The result of an order, waited for. The caller's cancellation ends its job, unless `keep`."""
+        """The result of an order, waited for. The caller's cancellation ends its job, unless `keep`.
+
+        `hear` is told of each look.
+        """
         patience = self.target.patience(timeout) if progress is False else 0
         placed = Placed(order)
         with told(progress) as tell:
             try:
-                body = await self.run(calls.done(placed, patience, timeout, tell, self.retries))
+                body = await self.run(calls.done(placed, patience, timeout, hear or tell, self.retries))
             except CowError:
                 raise
             except (asyncio.CancelledError, Exception):
@@ -84,6 +96,8 @@ class AsyncConnection:
                 came = None
             else:
                 came = await self._sent(step)
+                if self._contact.missing(came) and isinstance(came, httpx.HTTPError):
+                    raise unreachable(came) from came
 
     async def events(self, job_id: str, after: int) -> AsyncGenerator[Event]:
         """The events of a job after a number, through broken connections."""
@@ -113,6 +127,8 @@ class AsyncConnection:
             await self.run(calls.withdrawn(placed))
 
     async def _sent(self, send: Send) -> httpx.Response | httpx.HTTPError:
+        if self._http.is_closed:
+            raise closed()
         try:
             return await self._http.request(
                 send.method,
@@ -120,7 +136,7 @@ class AsyncConnection:
                 headers=self.target.headers(send),
                 params=send.params,
                 content=send.content,
-                timeout=self.target.timeout if send.limit is None else send.limit,
+                timeout=self.target.limited(send.limit),
             )
         except httpx.HTTPError as error:
             return error

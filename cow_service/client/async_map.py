@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncGenerator, Callable, Iterable
+from contextlib import aclosing, suppress
 
 from cow_service.client import calls
 from cow_service.client.async_connection import AsyncConnection
-from cow_service.client.batches import Batch, Outcome, Patience, Plan, outcome_from
+from cow_service.client.batches import Batch, Outcome, Patience, Plan, outcome_from, outcome_of
 from cow_service.client.errors import WaitTimeout
 from cow_service.client.questions import Question
 from cow_service.client.results import AsyncAnswer, AsyncSimulation, async_result_from
@@ -17,25 +18,22 @@ from cow_service.errors import CowError
 Result = AsyncSimulation | AsyncAnswer
 
 
-async def mapped(
-    connection: AsyncConnection, begin: Callable[[], Batch], *, only_new: bool
-) -> AsyncIterator[Outcome[Result]]:
+async def mapped(connection: AsyncConnection, begin: Callable[[], Batch]) -> AsyncGenerator[Outcome[Result]]:
     """The outcomes of a batch as they come, then those of before."""
     with begin() as batch:
         kind = batch.plan.kind
-        async for outcome in _asked(connection, batch.todo(), batch.plan):
-            batch.count(outcome)
-            yield outcome
-        if not only_new:
-            for question, line in batch.earlier():
-                yield outcome_from(question, line, lambda body: async_result_from(kind, body, connection.artifact))
+        async with aclosing(_asked(connection, batch.todo(), batch.plan, batch.patience)) as outcomes:
+            async for outcome in outcomes:
+                batch.count(outcome)
+                yield outcome
+        for question, line in batch.earlier():
+            yield outcome_from(question, line, lambda body: async_result_from(kind, body, connection.artifact))
 
 
 async def _asked(
-    connection: AsyncConnection, questions: Iterable[Question], plan: Plan
-) -> AsyncIterator[Outcome[Result]]:
+    connection: AsyncConnection, questions: Iterable[Question], plan: Plan, patience: Patience
+) -> AsyncGenerator[Outcome[Result]]:
     """The outcomes, as they come; each is written down before it is handed out. See `sync_map`."""
-    patience = Patience()
     waiting = iter(questions)
     tasks: set[asyncio.Task[Outcome[Result]]] = set()
     try:
@@ -62,19 +60,22 @@ async def _kept(connection: AsyncConnection, question: Question, plan: Plan, pat
 async def _outcome(connection: AsyncConnection, question: Question, plan: Plan, patience: Patience) -> Outcome[Result]:
     began = time.monotonic()
     while True:
+        result, failed = None, None
         try:
-            order = plan.order(question)
-            result = await connection.done(order, plan.timeout, progress=False, keep=plan.keeps)
+            order = await asyncio.to_thread(plan.order, question)  # files are read, pictures encoded
+            result = await connection.done(
+                order, plan.timeout, progress=False, keep=plan.keeps, hear=lambda _: patience.hear()
+            )
             folder = plan.folder(question)
             if folder is not None:
                 await result.save(folder)
         except CowError as error:
+            failed = error
             if isinstance(error, WaitTimeout):
-                await connection.run(calls.canceled(error.job_id, connection.retries))
-            pause = patience.pause_after(error)
-            if pause is None:
-                return Outcome(question, None, error, time.monotonic() - began)
-            await asyncio.sleep(pause)
-        else:
+                with suppress(CowError):
+                    await connection.run(calls.canceled(error.job_id, connection.retries))
+        pause = None if failed is None else patience.pause_after(failed)
+        if pause is None:
             patience.hear()
-            return Outcome(question, result, None, time.monotonic() - began)
+            return outcome_of(question, result, failed, time.monotonic() - began)
+        await asyncio.sleep(pause)

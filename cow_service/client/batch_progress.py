@@ -19,6 +19,7 @@ class Tally:
     succeeded: int = 0
     failed: int = 0
     before: int = 0  # of those, found in the folder
+    note: str = ""  # what keeps it from going on, where something does
     began: float = field(default_factory=time.monotonic)
 
     @property
@@ -47,7 +48,7 @@ class Tally:
     def __str__(self) -> str:
         of = "" if self.total is None else f"/{self.total}"
         left = "" if self.left is None else f", {duration(self.left)} left"
-        return f"{self.done}{of} done, {self.failed} failed, {pace(self.rate)}{left}"
+        return f"{self.done}{of} done, {self.failed} failed, {pace(self.rate)}{left}{self.note and '; '}{self.note}"
 
 
 def pace(rate: float) -> str:
@@ -74,11 +75,11 @@ def shown(tally: Tally, progress: bool) -> Generator[Callable[[], None]]:
         with _bar(tally) as tell:
             yield tell
     else:
-        last = [time.monotonic()]
+        last, noted = [time.monotonic()], [tally.note]
 
         def tell_now_and_then() -> None:
-            if time.monotonic() - last[0] >= LINE_EVERY:
-                last[0] = time.monotonic()
+            if time.monotonic() - last[0] >= LINE_EVERY or tally.note != noted[0]:
+                last[0], noted[0] = time.monotonic(), tally.note
                 print(tally, file=sys.stderr, flush=True)
 
         yield tell_now_and_then

@@ -9,15 +9,16 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar
 
 from cow_service.client.batch_progress import Tally, shown
 from cow_service.client.calls import Order, order_of
-from cow_service.client.errors import BadResponse, ServerUnreachable, error_from
+from cow_service.client.errors import BadResponse, ServerUnreachable, WaitTimeout, error_from
 from cow_service.client.journal import Journal
 from cow_service.client.questions import Question, QuestionLike, questions
 from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
 from cow_service.errors import (
+    BodyTooSlow,
     CowError,
     ImageUnreadable,
     MethodNotAllowed,
@@ -27,6 +28,7 @@ from cow_service.errors import (
     QueueFull,
     RateLimited,
     ShuttingDown,
+    StorageUnavailable,
     Unauthorized,
 )
 from cow_service.problems import problem_of
@@ -36,7 +38,7 @@ PATIENCE = 300.0  # seconds without any answer after which a batch gives up; it 
 PAUSE = 2.0  # seconds before a question is sent again that the server could not take
 CONCURRENCY = 8
 _FINAL = (Unauthorized, OriginNotAllowed, MethodNotAllowed, NotFound)  # every other question would meet it, too
-_PASSING = (ServerUnreachable, ShuttingDown, QueueFull, RateLimited, NotReady)
+PASSING = (ServerUnreachable, ShuttingDown, QueueFull, RateLimited, NotReady, StorageUnavailable, BodyTooSlow)
 
 R_co = TypeVar("R_co", bound=Simulation | Answer | AsyncSimulation | AsyncAnswer, covariant=True)
 
@@ -49,6 +51,7 @@ class Outcome(Generic[R_co]):
     result: R_co | None
     error: CowError | None
     seconds: float
+    unsaved: CowError | None = None  # why its pictures were not saved, where they were not
 
     @property
     def id(self) -> str:
@@ -60,14 +63,29 @@ class Outcome(Generic[R_co]):
         """Whether there is a result."""
         return self.error is None
 
+    @property
+    def status(self) -> Literal["succeeded", "failed"]:
+        """The same in a word, as in `results.jsonl`."""
+        return "succeeded" if self.succeeded else "failed"
+
     def line(self) -> dict[str, Any]:
         """What is kept of it."""
-        head = {"status": "succeeded" if self.succeeded else "failed", "seconds": round(self.seconds, 3)}
+        head = {"status": self.status, "seconds": round(self.seconds, 3)}
         if self.error is not None:
-            problem = problem_of(self.error).model_dump(mode="json")
-            return {**head, "problem": {**problem, "request_id": self.error.request_id}}
+            problem = {"code": self.error.code, **problem_of(self.error).model_dump(mode="json")}
+            job = {"job_id": self.error.job_id} if isinstance(self.error, WaitTimeout) else {}
+            return {**head, "problem": {**problem, "request_id": self.error.request_id, **job}}
         assert self.result is not None
+        if self.unsaved is not None:
+            head["unsaved"] = self.unsaved.detail
         return {**head, "result": self.result.model_dump(mode="json")}
+
+
+def outcome_of(question: Question, result: R_co | None, failed: CowError | None, seconds: float) -> Outcome[R_co]:
+    """The outcome of a question. Where its pictures failed to be saved, its result stands."""
+    if result is None:
+        return Outcome(question, None, failed, seconds)
+    return Outcome(question, result, None, seconds, unsaved=failed)
 
 
 def outcome_from(question: Question, line: Mapping[str, Any], read: Callable[[dict[str, Any]], R_co]) -> Outcome[R_co]:
@@ -76,21 +94,28 @@ def outcome_from(question: Question, line: Mapping[str, Any], read: Callable[[di
         return Outcome(question, read(line["result"]), None, line["seconds"])
     error = error_from(line["problem"])
     error.request_id = line["problem"].get("request_id")
+    if isinstance(error, WaitTimeout):
+        error.job_id = line["problem"].get("job_id", "")
     return Outcome(question, None, error, line["seconds"])
 
 
 class Patience:
     """How long a batch bears a server that takes nothing. One for all questions, safe to use from every thread."""
 
-    def __init__(self, seconds: float = PATIENCE) -> None:
+    def __init__(self, seconds: float = PATIENCE, waiting: Callable[[CowError | None], None] | None = None) -> None:
+        """`waiting` is told what the batch waits for, and None when that is over."""
         self._seconds = seconds
+        self._waiting = waiting
         self._guard = threading.Lock()
         self._heard = time.monotonic()
+        self._answered = False
 
     def hear(self) -> None:
         """The server has answered."""
         with self._guard:
-            self._heard = time.monotonic()
+            self._heard, self._answered = time.monotonic(), True
+            if self._waiting is not None:
+                self._waiting(None)
 
     def pause_after(self, error: CowError) -> float | None:
         """Seconds before the question is sent again; None where the error is about the question.
@@ -100,12 +125,15 @@ class Patience:
         proxy = isinstance(error, BadResponse)
         if isinstance(error, _FINAL) or (proxy and 300 <= error.status < 500):
             raise error
-        if not (isinstance(error, _PASSING) or (proxy and error.status >= 500)):
+        if not (isinstance(error, PASSING) or (proxy and error.status >= 500)):
             self.hear()
             return None
         with self._guard:
-            if time.monotonic() - self._heard > self._seconds:
+            missing = isinstance(error, ServerUnreachable) and not self._answered
+            if missing or time.monotonic() - self._heard > self._seconds:
                 raise error
+            if self._waiting is not None:
+                self._waiting(error)
         return PAUSE
 
 
@@ -129,7 +157,11 @@ class Plan:
             order = order_of(self.kind, question.image, question.question, question.options, None, self.fresh)
         except OSError as error:
             raise ImageUnreadable(f"'{question.image}' cannot be read: {error.strerror or error}.") from error
-        return order if self.journal is None else replace(order, key=self.journal.key(question, order.content))
+        return (
+            order
+            if self.journal is None
+            else replace(order, key=self.journal.key(question, order.content, fresh=self.fresh))
+        )
 
     def folder(self, question: Question) -> Path | None:
         """Where a question's pictures are saved; None where they are not."""
@@ -143,14 +175,24 @@ class Plan:
     def keep(self, outcome: Outcome[Any]) -> None:
         """Writes an outcome down."""
         if self.journal is not None:
-            self.journal.append(outcome.question, outcome.line())
+            folder = {"folder": f"items/{outcome.question.folder}"} if self.save and outcome.succeeded else {}
+            self.journal.append(outcome.question, {**outcome.line(), **folder})
 
 
 class Batch:
     """One batch from its questions to its outcomes, but for the asking. A context that holds the folder."""
 
-    def __init__(self, plan: Plan, items: Iterable[QuestionLike], defaults: Mapping[str, Any], progress: bool) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        items: Iterable[QuestionLike],
+        defaults: Mapping[str, Any],
+        *,
+        progress: bool,
+        tells_earlier: bool,
+    ) -> None:
         self.plan = plan
+        self._tells_earlier = tells_earlier
         self.tally = Tally(len(items) if isinstance(items, Sized) else None)
         self._items, self._defaults, self._progress = items, defaults, progress
         self._known: dict[str, Question] = {}
@@ -173,8 +215,21 @@ class Batch:
             if journal is None or not journal.has(question):
                 yield question
             else:
-                self._known[question.id] = question
+                if self._tells_earlier:
+                    self._known[question.id] = question
                 self.tally.count(journal.done[question.id][1] == "succeeded", before=True)
+
+    @property
+    def patience(self) -> Patience:
+        """With the server; the bar tells when it is needed."""
+
+        def wait(error: CowError | None) -> None:
+            note = "" if error is None else f"waiting for the server ({error.code})"
+            if note != self.tally.note:
+                self.tally.note = note
+                self._tell()
+
+        return Patience(waiting=wait)
 
     def count(self, outcome: Outcome[Any]) -> None:
         """One more has come."""
@@ -201,6 +256,7 @@ def batch_of(
     retry_failed: bool,
     save: bool,
     progress: bool,
+    only_new: bool,
 ) -> Batch:
     """A batch that is about to begin. Raises `ValueError` for what does not fit together, and what `Journal` raises."""
     if concurrency < 1:
@@ -208,4 +264,5 @@ def batch_of(
     if out is None and (retry_failed or save):
         raise ValueError("retry_failed and save need `out`, the folder of the batch")
     journal = None if out is None else Journal(Path(out), kind, retry_failed=retry_failed)
-    return Batch(Plan(kind, concurrency, timeout, fresh, journal, save), items, defaults, progress)
+    plan = Plan(kind, concurrency, timeout, fresh, journal, save)
+    return Batch(plan, items, defaults, progress=progress, tells_earlier=not only_new)

@@ -12,7 +12,7 @@ import re
 import secrets
 import time
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias, TypeVar
 from urllib.parse import quote
 
@@ -27,6 +27,7 @@ from cow_service.records import TERMINAL, Job, JobKind, JobPage, Models
 
 FIRST_LOOK, GROWTH, SLOWEST_LOOK = 0.1, 1.5, 2.0  # seconds between two looks at a job
 PATIENCE = 10  # seconds that one request waits for a job; after that, looks at it do not hang on one connection
+AFTER = 1.0  # seconds that a request may go on after the caller's time is over
 LEAVING = 5.0  # seconds for each of the two requests that end the job of a caller who does not want it any more
 PAGE = 100  # jobs
 ACCEPTED, NOT_FOUND = 202, 404
@@ -40,7 +41,7 @@ Tell: TypeAlias = Callable[[Job], None]
 
 @dataclass(frozen=True)
 class Send:
-    """A request to be sent. `limit` is how many seconds the server may say nothing, where that is not the client's."""
+    """A request to be sent. `limit` is how many seconds the server may say nothing, where that is less than else."""
 
     method: str
     path: str
@@ -68,7 +69,7 @@ def exchange(send: Send, retries: int, until: float | None = None) -> Steps[http
     """
     tried = 0
     while True:
-        outcome = yield send
+        outcome = yield send if until is None else replace(send, limit=max(until - time.monotonic(), 0) + AFTER)
         assert outcome is not None
         tried += 1
         pause = pause_before_retry(outcome, tried) if tried <= retries else None
@@ -133,7 +134,7 @@ def order_of(
 
 def _body_of(sent: Upload | Reference, question: str, rest: Mapping[str, Any]) -> tuple[bytes, str]:
     if isinstance(sent, Reference):
-        return to_json({"image": sent.json, "question": question, **rest}), "application/json"
+        return to_json({**rest, "image": sent.json, "question": question}), "application/json"
     boundary = hashlib.sha256(sent.data).hexdigest()[:32]  # the same in every try, and nothing that the image holds
     form = httpx.Request(
         "POST",
@@ -214,7 +215,7 @@ def awaited(
             return result_in(response)
         rest = pause if until is None else until - time.monotonic()
         if rest <= 0:
-            raise WaitTimeout(f"The job {job_id} had not ended within {timeout:g} s. It goes on: wait again.", job_id)
+            raise WaitTimeout.of(job_id, timeout or 0)
         yield Pause(min(pause, rest))
         pause = min(pause * GROWTH, SLOWEST_LOOK)
 

@@ -119,15 +119,28 @@ class WaitTimeout(CowError):
 
     code, status = "wait-timeout", 0
 
-    def __init__(self, detail: str, job_id: str) -> None:
-        super().__init__(detail)
-        self.job_id = job_id
+    job_id = ""
+
+    @classmethod
+    def of(cls, job_id: str, timeout: float) -> WaitTimeout:
+        """The error of a wait for a job."""
+        error = cls(f"The job {job_id} had not ended within {timeout:g} s. It goes on: wait again.")
+        error.job_id = job_id
+        return error
 
 
 class BadResponse(CowError):
     """The response is not one of COW's."""
 
     code, status = "bad-response", 0
+
+
+OWN: dict[str, type[CowError]] = {kind.code: kind for kind in (ServerUnreachable, WaitTimeout, BadResponse)}
+
+
+def closed() -> ServerUnreachable:
+    """The error of a call of a client that is closed, such as for a picture that was not downloaded before."""
+    return ServerUnreachable("The client is closed. Call `load()` or `save()` on results before that.")
 
 
 def unreachable(error: httpx.HTTPError) -> ServerUnreachable | BadResponse:
@@ -169,7 +182,7 @@ def known_by(error: CowError, response: httpx.Response) -> CowError:
 def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) -> CowError:
     """The error that a problem (RFC 9457) is. A code of a later version than this comes as a plain `CowError`."""
     code = _code(problem)
-    kind = kinds().get(code, CowError)
+    kind = (kinds() | OWN).get(code, CowError)
     told = problem.get("errors")
     fields = [field for field in told if isinstance(field, dict)] if isinstance(told, list) else []
     error = kind(

@@ -42,6 +42,11 @@ URLS = ("http://", "https://", "data:")
 _OTHER_ALPHA = {"PA": "RGBA", "RGBa": "RGBA", "La": "LA"}  # modes that PNG has not, with an alpha to keep
 
 
+def is_url(text: str) -> bool:
+    """Whether a text is a URL, and no path."""
+    return text[:8].lower().startswith(URLS)
+
+
 @dataclass(frozen=True)
 class Upload:
     """An image to be sent as a file. It holds the bytes themselves, so that every try sends the same."""
@@ -61,7 +66,7 @@ def image_input(image: ImageLike) -> Upload | Reference:
 
     Raises `OSError` where a file cannot be read, and `InvalidRequest` for anything that is no image.
     """
-    if isinstance(image, str) and image[:8].lower().startswith(URLS):
+    if isinstance(image, str) and is_url(image):
         return Reference(image if image[:5].lower() == "data:" else {"url": image})
     if isinstance(image, str | os.PathLike):
         return Upload(Path(image).read_bytes())

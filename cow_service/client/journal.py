@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
+from cow_service.client.calls import to_json
 from cow_service.client.questions import Question
 from cow_service.errors import InvalidRequest
 from cow_service.records import JobKind
@@ -41,7 +42,7 @@ class Journal:
         self.folder = folder
         self.results = folder / "results.jsonl"
         self._retried = folder / "retried.jsonl"
-        self._lock = FileLock(folder / ".lock")
+        self._lock = FileLock(folder / ".lock", thread_local=False)
         self._guard = threading.Lock()
         try:
             self._lock.acquire(timeout=0)
@@ -88,10 +89,10 @@ class Journal:
             )
         return known is not None
 
-    def key(self, question: Question, content: bytes) -> str:
+    def key(self, question: Question, content: bytes, *, fresh: bool = False) -> str:
         """The idempotency key of a question: the same until it fails and is asked again."""
         attempt = self._attempts.get(question.id, 0)
-        parts = (self._secret, question.id, str(attempt), hashlib.sha256(content).hexdigest())
+        parts = (self._secret, question.id, str(attempt), str(fresh), hashlib.sha256(content).hexdigest())
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
     def append(self, question: Question, line: dict[str, Any]) -> None:
@@ -103,7 +104,7 @@ class Journal:
             "attempt": self._attempts.get(question.id, 0),
             "fingerprint": question.fingerprint,
         }
-        data = json.dumps(whole, ensure_ascii=False, separators=(",", ":")).encode() + b"\n"
+        data = to_json(whole) + b"\n"
         with self._guard:
             if self._file < 0:
                 return  # the batch was given up; the server keeps what came of this one
@@ -123,35 +124,42 @@ class Journal:
     def _begin(self, kind: JobKind) -> str:
         path = self.folder / "batch.json"
         with contextlib.suppress(FileNotFoundError):
-            known = json.loads(path.read_bytes())
-            if known["version"] != VERSION or known["kind"] != kind:
+            known = _parsed(path)
+            try:
+                version, known_kind, secret = known["version"], known["kind"], str(known["secret"])
+            except (KeyError, TypeError) as error:
+                raise InvalidRequest(f"'{path}' is not that of a batch: use another folder.") from error
+            if version != VERSION or known_kind != kind:
                 raise InvalidRequest(
-                    f"'{self.folder}' is the folder of a batch of kind '{known['kind']}' (version {known['version']}): "
+                    f"'{self.folder}' is the folder of a batch of kind '{known_kind}' (version {version}): "
                     "use another folder."
                 )
-            return str(known["secret"])
+            return secret
         secret = secrets.token_hex(16)
         _replace(path, json.dumps({"version": VERSION, "kind": kind, "secret": secret}, indent=2).encode() + b"\n")
         return secret
 
     def _put_failures_by(self) -> None:
         """Moves failures to `retried.jsonl`. Killed in between, they stand in both, and are moved at the next start."""
-        kept, failed = [], []
-        for line in _lines(self.results):
-            (failed if line["status"] == "failed" else kept).append(line)
-        if not failed:
-            return
-        with self._retried.open("ab") as file:
-            for line in failed:
-                line = {**line, "attempt": line["attempt"] + 1}  # noqa: PLW2901
-                file.write(json.dumps(line, ensure_ascii=False).encode() + b"\n")
-                self._attempts[line["id"]] = line["attempt"]
-            file.flush()
-            os.fsync(file.fileno())
-        _replace(
-            self.results,
-            b"".join(json.dumps(line, ensure_ascii=False, separators=(",", ":")).encode() + b"\n" for line in kept),
-        )
+        beside = self.results.with_name(self.results.name + ".new")
+        failed = 0
+        with contextlib.suppress(FileNotFoundError):
+            with self.results.open("rb") as lines, beside.open("wb") as kept, self._retried.open("ab") as retried:
+                for number, text in enumerate(lines, 1):
+                    line = _line(self.results, number, text)
+                    if line["status"] != "failed":
+                        kept.write(text)
+                        continue
+                    failed += 1
+                    self._attempts[line["id"]] = line["attempt"] + 1
+                    retried.write(to_json({**line, "attempt": line["attempt"] + 1}) + b"\n")
+                for file in (retried, kept):
+                    file.flush()
+                    os.fsync(file.fileno())
+            if failed:
+                beside.replace(self.results)
+            else:
+                beside.unlink()
 
 
 def _cut(path: Path) -> None:
@@ -176,12 +184,26 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
         for number, line in enumerate(file, 1):
             if not line.endswith(b"\n"):
                 return
-            try:
-                yield json.loads(line)
-            except ValueError as error:
-                raise InvalidRequest(
-                    f"'{path}' is damaged in line {number}: take that line out; its question is then asked again."
-                ) from error
+            yield _line(path, number, line)
+
+
+def _line(path: Path, number: int, text: bytes) -> dict[str, Any]:
+    try:
+        line = json.loads(text)
+        if not {"id", "status", "attempt", "fingerprint"} <= line.keys():
+            raise ValueError
+    except (ValueError, AttributeError) as error:
+        raise InvalidRequest(
+            f"'{path}' is damaged in line {number}: take that line out; its question is then asked again."
+        ) from error
+    return line
+
+
+def _parsed(path: Path) -> Any:
+    try:
+        return json.loads(path.read_bytes())
+    except ValueError:
+        return None
 
 
 def _replace(path: Path, data: bytes) -> None:

@@ -15,7 +15,22 @@ DEFAULT_URL = "http://127.0.0.1:8000"
 DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
 SILENCE = 60.0  # seconds in a stream of events; the server says something every 15
 RETRIES = 5
+FIRST_TRIES = 3  # connections to a server that has never answered
 _KEY = re.compile(r"[\x21-\x7e]+")
+
+
+class Contact:
+    """Whether a server has ever answered: one that has not is soon said to be missing, and not waited for."""
+
+    def __init__(self) -> None:
+        self._answered = False
+        self._refused = 0
+
+    def missing(self, came: httpx.Response | httpx.HTTPError) -> bool:
+        """Whether this was one refused connection too many, with no answer before."""
+        self._answered = self._answered or isinstance(came, httpx.Response)
+        self._refused += isinstance(came, httpx.ConnectError)
+        return not self._answered and self._refused >= FIRST_TRIES
 
 
 @dataclass(frozen=True)
@@ -38,6 +53,14 @@ class Target:
             connect=self.timeout.connect, read=SILENCE, write=self.timeout.write, pool=self.timeout.pool
         )
 
+    def limited(self, seconds: float | None) -> httpx.Timeout:
+        """Limits of a request, none of them longer than so many seconds."""
+        own = self.timeout
+        if seconds is None:
+            return own
+        connect, read, write, pool = (seconds if one is None else min(one, seconds) for one in _parts(own))
+        return httpx.Timeout(connect=connect, read=read, write=write, pool=pool)
+
     def url(self, path: str) -> str:
         """The address of a path of the API."""
         return self.base_url + path
@@ -50,6 +73,10 @@ class Target:
         if self.api_key is not None:
             headers["Authorization"] = f"Bearer {self.api_key}"
         return headers
+
+
+def _parts(timeout: httpx.Timeout) -> tuple[float | None, float | None, float | None, float | None]:
+    return timeout.connect, timeout.read, timeout.write, timeout.pool
 
 
 def target_of(base_url: str | None, api_key: str | None, timeout: float | httpx.Timeout | None) -> Target:

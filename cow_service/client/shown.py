@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from cow_service.records import ENCOUNTERS_UNKNOWN, Answer, Frame, Simulation, Verdict
+from cow_service.records import ENCOUNTERS_UNKNOWN, MEETINGS, Answer, Frame, Simulation, Verdict
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 Held = Callable[[str], bytes | None]  # the bytes of an artifact, where they have been downloaded
 STRIP_HEIGHT, IN_A_ROW = 240, 4  # px, of a row of the one picture; pictures
 GAP = 6  # px
-_MEETINGS = {"touches": "touches", "occludes": "passes in front of", "occluded-by": "passes behind"}
 # Inherited colours, dimmed by opacity: notebooks are light or dark. Long words of callers and models break.
 _TEXT = "font:14px/1.45 system-ui,sans-serif;max-width:72em;overflow-wrap:anywhere"
 _DIM = "opacity:.7"
@@ -51,7 +50,7 @@ def brief(text: str, most: int = 120) -> str:
 def met(simulation: Simulation) -> str:
     """What the mover encounters, in words."""
     fps = simulation.trajectory.fps
-    told = [f"{_MEETINGS[e.kind]} {e.object} at {e.first_frame / fps:.1f} s" for e in simulation.trajectory.encounters]
+    told = [f"{MEETINGS[e.kind]} {e.object} at {e.first_frame / fps:.1f} s" for e in simulation.trajectory.encounters]
     return ", ".join(told) or ("meets nothing" if simulation.encounters_known else ENCOUNTERS_UNKNOWN)
 
 

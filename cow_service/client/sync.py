@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
 from os import PathLike
@@ -212,7 +212,7 @@ class Client:
         fresh: bool = False,
         progress: bool = False,
         **options: Unpack[AnswerOptions],
-    ) -> Iterator[Outcome[Answer]]: ...
+    ) -> Generator[Outcome[Answer]]: ...
 
     @overload
     def map(
@@ -229,7 +229,7 @@ class Client:
         fresh: bool = False,
         progress: bool = False,
         **options: Unpack[SimulateOptions],
-    ) -> Iterator[Outcome[Simulation]]: ...
+    ) -> Generator[Outcome[Simulation]]: ...
 
     def map(
         self,
@@ -245,7 +245,7 @@ class Client:
         fresh: bool = False,
         progress: bool = False,
         **options: Any,
-    ) -> Iterator[Outcome[Any]]:
+    ) -> Generator[Outcome[Any]]:
         """Asks many questions, `concurrency` at the same time, and gives what comes of each as it comes.
 
         A question is a mapping with `image` and `question`, maybe an `id`, a `meta` that stands beside its outcome, and
@@ -274,8 +274,9 @@ class Client:
             retry_failed=retry_failed,
             save=save,
             progress=progress,
+            only_new=only_new,
         )
-        return mapped(self._connection, begin, only_new=only_new)
+        return mapped(self._connection, begin)
 
     def job(self, id: str) -> JobHandle[Simulation | Answer]:
         """A job that was handed in before. Raises `JobNotFound`."""

@@ -12,10 +12,11 @@ from httpx_sse import EventSource
 
 from cow_service.client import calls
 from cow_service.client.calls import Order, Pause, Placed, Send, Steps, Tell
+from cow_service.client.errors import closed, unreachable
 from cow_service.client.events import Event, Following, streams
 from cow_service.client.progress import ProgressLike, told
 from cow_service.client.results import Answer, Simulation, result_from
-from cow_service.client.settings import Target
+from cow_service.client.settings import Contact, Target
 from cow_service.errors import CowError
 from cow_service.records import Job
 
@@ -30,6 +31,7 @@ class Connection:
         self.retries = retries
         self._http = http
         self._own = own
+        self._contact = Contact()
 
     def close(self) -> None:
         """Closes the connections that were made here."""
@@ -45,14 +47,20 @@ class Connection:
         return calls.job_in(self.run(calls.looked_at(job_id, self.retries)))
 
     def done(
-        self, order: Order, timeout: float | None, progress: ProgressLike, *, keep: bool = False
+        self,
+        order: Order,
+        timeout: float | None,
+        progress: ProgressLike,
+        *,
+        keep: bool = False,
+        hear: Tell | None = None,
     ) -> Simulation | Answer:
-        """The result of an order, waited for. An interrupt ends its job, unless `keep`."""
+        """The result of an order, waited for. An interrupt ends its job, unless `keep`; `hear` is told of each look."""
         patience = self.target.patience(timeout) if progress is False else 0
         placed = Placed(order)
         with told(progress) as tell:
             try:
-                body = self.run(calls.done(placed, patience, timeout, tell, self.retries))
+                body = self.run(calls.done(placed, patience, timeout, hear or tell, self.retries))
             except CowError:
                 raise
             except BaseException:
@@ -80,6 +88,8 @@ class Connection:
                 came = None
             else:
                 came = self._sent(step)
+                if self._contact.missing(came) and isinstance(came, httpx.HTTPError):
+                    raise unreachable(came) from came
 
     def events(self, job_id: str, after: int) -> Generator[Event]:
         """The events of a job after a number, through broken connections."""
@@ -105,6 +115,8 @@ class Connection:
                 time.sleep(following.pause_after(outcome))
 
     def _sent(self, send: Send) -> httpx.Response | httpx.HTTPError:
+        if self._http.is_closed:
+            raise closed()
         try:
             return self._http.request(
                 send.method,
@@ -112,7 +124,7 @@ class Connection:
                 headers=self.target.headers(send),
                 params=send.params,
                 content=send.content,
-                timeout=self.target.timeout if send.limit is None else send.limit,
+                timeout=self.target.limited(send.limit),
             )
         except httpx.HTTPError as error:
             return error

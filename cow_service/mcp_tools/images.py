@@ -21,6 +21,7 @@ WITHOUT_PATHS = (
 _DIGEST = re.compile(rf"(?:{ARTIFACTS})?([0-9a-f]{{64}})", re.IGNORECASE | re.ASCII)
 _SCHEME = re.compile(r"(data:|[a-z][a-z0-9+.-]*://)", re.IGNORECASE | re.ASCII)
 _SENT = ("data:", "http://", "https://")
+LARGEST = 100_000_000  # bytes of a file; servers take less
 _HEAD = 12  # bytes that tell what a file is
 _SHOWN = 200  # characters
 
@@ -60,7 +61,10 @@ def _read(path: Path) -> bytes:
             head = file.read(_HEAD)
             if media_type(head) not in ("image/png", "image/jpeg", "image/webp"):
                 raise _wrong(f"{_shown(str(path))} is no PNG, JPEG or WebP")
-            return head + file.read()
+            rest = file.read(LARGEST)
+            if len(head) + len(rest) > LARGEST:
+                raise _wrong(f"{_shown(str(path))} is larger than {LARGEST // 1_000_000} MB")
+            return head + rest
     except (OSError, RuntimeError, ValueError) as error:  # no home folder; NUL in the name
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise _wrong(f"{_shown(str(path))} cannot be read: {why or type(error).__name__}") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 
 from anyio import to_thread
 from mcp_types import ImageContent
@@ -13,24 +14,50 @@ from cow_service.client import AsyncClient
 from cow_service.records import Simulation
 
 MOST = 1024  # px of the longest side: of more, models see no more
+BUDGET = 500_000  # bytes of all pictures of a result: in base64 a third more, and clients refuse messages of 1 MB
+# What is tried when PNGs are too large, as those of photographs are: quality of JPEG, share of the sides.
+_SMALLER = ((90, 1.0), (80, 1.0), (75, 0.75), (75, 0.5), (70, 0.35), (60, 0.25), (50, 0.15))
 
 
 async def pictures_of(simulation: Simulation, client: AsyncClient) -> list[ImageContent]:
-    """PNGs; downloads them."""
-    blocks: list[ImageContent] = []
-    for sha256 in (simulation.overlay.sha256, *(frame.sha256 for frame in simulation.frames)):
-        shown = await to_thread.run_sync(fit, await client.artifact(sha256))
-        blocks.append(ImageContent(data=base64.b64encode(shown).decode(), mime_type="image/png"))
-    return blocks
+    """Downloads the pictures; PNGs where they are small enough together, else JPEGs."""
+    names = (simulation.overlay.sha256, *(frame.sha256 for frame in simulation.frames))
+    kept = [await client.artifact(sha256) for sha256 in names]
+    media_type, shown = await to_thread.run_sync(fitted, kept)
+    return [ImageContent(data=base64.b64encode(data).decode(), mime_type=media_type) for data in shown]
 
 
-def fit(png: bytes) -> bytes:
-    """A PNG of at most `MOST` pixels on its longest side: the same bytes where it is."""
+def fitted(pngs: Sequence[bytes]) -> tuple[str, list[bytes]]:
+    """Pictures of at most `MOST` pixels on the longest side and `BUDGET` bytes together, and their media type."""
+    shown = [_fit(png) for png in pngs]
+    media_type = "image/png"
+    for quality, share in _SMALLER:
+        if sum(map(len, shown)) <= BUDGET:
+            break
+        media_type, shown = "image/jpeg", [_jpeg(png, quality, share) for png in pngs]
+    return media_type, shown
+
+
+def _fit(png: bytes) -> bytes:
     with Image.open(io.BytesIO(png)) as picture:
         if max(picture.size) <= MOST:
             return png
+    return _saved(_thumbnail(png, 1.0), "PNG")
+
+
+def _jpeg(png: bytes, quality: int, share: float) -> bytes:
+    return _saved(_thumbnail(png, share), "JPEG", quality=quality)
+
+
+def _thumbnail(png: bytes, share: float) -> Image.Image:
+    with Image.open(io.BytesIO(png)) as picture:
         small = picture.convert("RGB")
-    small.thumbnail((MOST, MOST), Image.Resampling.LANCZOS)
+    most = share * min(MOST, max(small.size))
+    small.thumbnail((most, most), Image.Resampling.LANCZOS)
+    return small
+
+
+def _saved(picture: Image.Image, kind: str, **options: int) -> bytes:
     buffer = io.BytesIO()
-    small.save(buffer, "PNG")
+    picture.save(buffer, kind, **options)
     return buffer.getvalue()

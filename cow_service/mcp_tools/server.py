@@ -110,6 +110,7 @@ class Caller:
 
     key: str | None = None
     address: tuple[str, int] | None = None
+    forwarded: bool = False  # by a proxy, which may stand before anybody
 
 
 Connect: TypeAlias = Callable[[Caller], AbstractAsyncContextManager[AsyncClient]]
@@ -225,7 +226,8 @@ def _caller(context: ServerRequestContext[Any]) -> Caller:
         return Caller()
     scheme, _, key = request.headers.get("authorization", "").strip().partition(" ")
     address = None if request.client is None else (request.client.host, request.client.port)
-    return Caller((key.strip() or None) if scheme.lower() == "bearer" else None, address)
+    forwarded = any(name in request.headers for name in ("forwarded", "x-forwarded-for", "x-real-ip", "via"))
+    return Caller((key.strip() or None) if scheme.lower() == "bearer" else None, address, forwarded)
 
 
 def _returned(result: Result, text: str, pictures: list[ImageContent]) -> CallToolResult:

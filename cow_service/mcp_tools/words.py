@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from cow_service.mcp_tools.results import AnswerResult, Met, SimulateResult, Verdict
-
-_VERBS = {"touches": "touches", "occludes": "passes in front of", "occluded-by": "passes behind"}
+from cow_service.records import MEETINGS
 
 
 def simulation_in_words(simulation: SimulateResult) -> str:
@@ -64,7 +63,7 @@ def _meets(simulation: SimulateResult) -> str:
 
 
 def _met(encounter: Met) -> str:
-    return f"{_VERBS[encounter.kind]} {encounter.object} from {encounter.time_s:g} s (frame {encounter.frame})"
+    return f"{MEETINGS[encounter.kind]} {encounter.object} from {encounter.time_s:g} s (frame {encounter.frame})"
 
 
 def _verdict(answer: str | None, option: str | None) -> str:

@@ -16,12 +16,11 @@ from cow_service.readers.mllm.pictures import encode, view_of
 from cow_service.readers.mllm.scale import Scaled
 from cow_service.readers.mllm.serving import Served
 from cow_service.readers.mllm.units import box_order, line_order, units_of
-from cow_service.records import AnswerOption, BBox, Encounter
+from cow_service.records import MEETINGS, AnswerOption, BBox, Encounter
 from cow_service.vision.scene import Scene
 
 REASONING = 2000  # characters, where the manifest says nothing else
 VOTING_TEMPERATURE = 0.7  # without chance every vote would be the same
-_MEETINGS = {"touches": "touches", "occludes": "passes in front of", "occluded-by": "passes behind"}
 
 
 class Questions:
@@ -128,4 +127,4 @@ def _hypothesis(imagined: Imagined) -> dict[str, object]:
 
 def _met(encounter: Encounter, fps: float) -> str:
     name = " ".join(encounter.object.split())
-    return f"{_MEETINGS[encounter.kind]} the {name.removeprefix('the ')}, {encounter.first_frame / fps:.2f} s in"
+    return f"{MEETINGS[encounter.kind]} the {name.removeprefix('the ')}, {encounter.first_frame / fps:.2f} s in"
