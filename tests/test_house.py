@@ -157,6 +157,16 @@ def test_the_sdk_is_light() -> None:
     assert imported_by("import cow_service.client", suspects) == []
 
 
+def test_all_of_the_sdk_is_where_it_says() -> None:
+    from cow_service import client
+
+    assert {name for name in client.__all__ if getattr(client, name) is None} == set()
+    assert set(client.__all__) <= set(dir(client))
+    assert imported_by("from cow_service.client import Client", ("fastapi", "cv2", "PIL", *HEAVY)) == []
+    with pytest.raises(AttributeError, match="no attribute 'Klient'"):
+        client.Klient  # noqa: B018
+
+
 def test_help_imports_no_server_and_no_vision() -> None:
     assert imported_by("import cow_service.cli", ("fastapi", "uvicorn", "cv2", "numpy", "av")) == []
 

@@ -9,15 +9,19 @@
 pictures are given or taken as such.
 """
 
-from cow_service.client import errors
-from cow_service.client.aio import AsyncClient, AsyncJobHandle
-from cow_service.client.batches import Outcome
-from cow_service.client.errors import CowError
-from cow_service.client.events import Event
-from cow_service.client.inputs import ImageLike
-from cow_service.client.questions import Question, QuestionLike
-from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
-from cow_service.client.sync import Client, JobHandle
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cow_service.client import errors
+    from cow_service.client.aio import AsyncClient, AsyncJobHandle
+    from cow_service.client.batches import Outcome
+    from cow_service.client.errors import CowError
+    from cow_service.client.events import Event
+    from cow_service.client.inputs import ImageLike
+    from cow_service.client.questions import Question, QuestionLike
+    from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
+    from cow_service.client.sync import Client, JobHandle
 
 __all__ = [
     "Answer",
@@ -36,3 +40,35 @@ __all__ = [
     "Simulation",
     "errors",
 ]
+
+# Each is loaded when it is first asked for: whoever calls one client need not wait for the other.
+_HOMES = {
+    "Answer": "results",
+    "AsyncAnswer": "results",
+    "AsyncClient": "aio",
+    "AsyncJobHandle": "aio",
+    "AsyncSimulation": "results",
+    "Client": "sync",
+    "CowError": "errors",
+    "Event": "events",
+    "ImageLike": "inputs",
+    "JobHandle": "sync",
+    "Outcome": "batches",
+    "Question": "questions",
+    "QuestionLike": "questions",
+    "Simulation": "results",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "errors":
+        return import_module("cow_service.client.errors")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
