@@ -288,6 +288,7 @@ def test_a_second_call_finds_everything(server: Server, http: httpx.Client, tmp_
     assert (out / "items" / "q0" / "overlay.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_an_async_batch_that_is_canceled_leaves_its_jobs_to_the_next(tmp_path: Path) -> None:
     items = asked(4, generator="slow", generator_options={"seconds": 2.0}, num_frames=80)
     with Served(tmp_path) as served:
@@ -368,6 +369,7 @@ def test_looks_at_jobs_are_words_of_the_server(monkeypatch: pytest.MonkeyPatch) 
     assert len(heard) > 2, "only the end of the question was heard"
 
 
+@pytest.mark.slow
 def test_a_batch_without_a_folder_that_is_left_ends_its_jobs(tmp_path: Path) -> None:
     quick = {**asked(1)[0], "id": "quick", "seed": 99}
     items = [quick, *asked(3, generator="slow", generator_options={"seconds": 20.0}, num_frames=80)]
@@ -511,6 +513,7 @@ def test_a_file_that_cannot_be_asked_is_refused_before_anything_is_sent(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -532,6 +535,7 @@ def test_what_keeps_a_batch_from_beginning_is_told_at_once(
     assert time.monotonic() - began < 20
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_at_once_and_loses_nothing(tmp_path: Path) -> None:
     items = asked(3, generator="slow", generator_options={"seconds": 2.0}, num_frames=80)
     path, out = written(tmp_path, items), tmp_path / "out"

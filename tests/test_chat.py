@@ -26,6 +26,7 @@ from cow_service.records import Answer
 from cow_service.service import Service
 from cow_service.settings import Settings
 
+pytestmark = pytest.mark.slow
 MLLM = "cow/qwen3-vl-8b"
 WITHOUT = ":no-imagination"
 SCENE = example("ball-and-mug")

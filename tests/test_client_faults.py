@@ -41,6 +41,7 @@ from cow_service.client.retries import LONGEST_PAUSE
 from cow_service.errors import kinds
 
 __all__ = ["connect", "hurried"]  # fixtures
+pytestmark = pytest.mark.slow
 
 OK = Reply(200, SIMULATION)
 ACCEPTED = Reply(202, JOB)

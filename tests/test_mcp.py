@@ -47,6 +47,7 @@ from cow_service.mcp_tools.server import Caller
 from cow_service.requests import ImageArtifact
 from cow_service.settings import Settings, SettingsError
 
+pytestmark = pytest.mark.slow
 SCENE = EXAMPLES / "ball-and-mug" / "image.jpg"
 SIZE = (832, 480)
 MOVES = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
