@@ -22,7 +22,7 @@ async def mapped(connection: AsyncConnection, begin: Callable[[], Batch]) -> Asy
     """The outcomes of a batch as they come, then those of before."""
     with begin() as batch:
         kind = batch.plan.kind
-        async with aclosing(_asked(connection, batch.todo(), batch.plan, batch.patience)) as outcomes:
+        async with aclosing(_asked(connection, batch.todo(), batch.plan, batch.patience())) as outcomes:
             async for outcome in outcomes:
                 batch.count(outcome)
                 yield outcome

@@ -219,9 +219,8 @@ class Batch:
                     self._known[question.id] = question
                 self.tally.count(journal.done[question.id][1] == "succeeded", before=True)
 
-    @property
     def patience(self) -> Patience:
-        """With the server; the bar tells when it is needed."""
+        """A fresh one with the server; the bar tells when it is needed."""
 
         def wait(error: CowError | None) -> None:
             note = "" if error is None else f"waiting for the server ({error.code})"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
 from queue import SimpleQueue
@@ -29,7 +29,7 @@ def mapped(connection: Connection, begin: Callable[[], Batch]) -> Generator[Outc
     """The outcomes of a batch as they come, then those of before."""
     with begin() as batch:
         kind = batch.plan.kind
-        for outcome in _asked(connection, batch.todo(), batch.plan, batch.patience):
+        for outcome in _asked(connection, batch.todo(), batch.plan, batch.patience()):
             batch.count(outcome)
             yield outcome
         for question, line in batch.earlier():
@@ -51,12 +51,12 @@ def _asked(
         thread.start()
     try:
         # Questions are taken here, where the caller's iterator lives, and as few as keep the threads busy.
-        at_work = sum(run.feed(question) for question in islice(questions, 2 * plan.concurrency))
+        at_work = run.feed(islice(questions, 2 * plan.concurrency))
         while at_work:
             came = run.came.get()
             if not isinstance(came, Outcome):
                 raise came
-            at_work += sum(run.feed(question) for question in islice(questions, 1)) - 1
+            at_work += run.feed(islice(questions, 1)) - 1
             yield came
     finally:
         run.stop.set()
@@ -73,10 +73,12 @@ class _Run:
         self.stop = threading.Event()
         self._connection, self._plan, self._patience = connection, plan, patience
 
-    def feed(self, question: Question) -> int:
-        """Hands a question to whichever thread is free; returns how many that is."""
-        self.todo.put(question)
-        return 1
+    def feed(self, questions: Iterable[Question]) -> int:
+        """Hands questions to whichever threads are free; returns how many they are."""
+        handed = list(questions)
+        for question in handed:
+            self.todo.put(question)
+        return len(handed)
 
     def work(self) -> None:
         """One thread: question after question, until there is none or the batch is given up."""
