@@ -87,7 +87,7 @@ class Ground:
         """Starts a server and waits until it is ready; returns the seconds that took."""
         started = time.monotonic()
         self.port = self.port or _free_port()
-        command = [sys.executable, "-m", "cow_service.cli", "serve", "--port", str(self.port)]
+        command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", str(self.port)]
         self.process = subprocess.Popen(command, env=self._environment, stdout=self._log, stderr=self._log)
         while True:
             try:

@@ -45,7 +45,7 @@ def timed(run: Callable[[], object], runs: int) -> dict[str, float]:
 
 def cow(*arguments: str) -> list[str]:
     """The command line of this interpreter's environment."""
-    return [sys.executable, "-m", "cow_service.cli", *arguments]
+    return [sys.executable, "-m", "cow_service.cli.main", *arguments]
 
 
 def start_server(data: Path) -> tuple[subprocess.Popen[str], str, float]:

@@ -33,7 +33,7 @@ from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.generators.wan.tracks import Tracks
-from cow_service.manifests import Manifest, load_manifests
+from cow_service.weights.manifests import Manifest, load_manifests
 
 SEED = 0
 SPREAD = 0.02  # of the random weights: what such models start their training with

@@ -45,7 +45,7 @@ from cow_service.generators.wan.device import choose_device, on_threads, within_
 from cow_service.generators.wan.pipeline import TEXT_LENGTH, latent_shape
 from cow_service.generators.wan.profiles import Profile, profile_of
 from cow_service.generators.wan.tracks import nearest_lengths
-from cow_service.manifests import load_manifests
+from cow_service.weights.manifests import load_manifests
 
 PLAIN = "plain"
 WARM_UP_STEPS = 2

@@ -16,33 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service import __version__
-from cow_service.artifacts import ArtifactStore
-from cow_service.checkpoints import (
-    Answered,
-    Checkpoints,
-    Grounded,
-    Moved,
-    Rendered,
-    Traced,
-    digest_of,
-    keep_nothing,
-)
-from cow_service.drawing import draw_overlay
 from cow_service.errors import Canceled, CowError, InvalidRequest, MllmUnavailable, ReaderUnavailable
 from cow_service.generators.base import Generator, Shot
-from cow_service.images import DecodedImage, decode_own, encode_png
-from cow_service.looking import Eyes, place_of
+from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.images import DecodedImage, decode_own, encode_png
+from cow_service.media.overlay import draw_overlay
 from cow_service.readers.base import Reader
-from cow_service.readers.choices import read_choices
+from cow_service.readers.question.choices import read_choices
 from cow_service.records import Answer, Artifact, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages import answering
-from cow_service.stages.doubts import doubts
+from cow_service.stages.checks import check_frames, read_options
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
-from cow_service.stages.options import check_frames, read_options
+from cow_service.stages.reading import Eyes, place_of
+from cow_service.stages.results import Answered, Checkpoints, Grounded, Moved, Rendered, Traced, digest_of, keep_nothing
 from cow_service.stages.trajectory import compute_trajectory
+from cow_service.stages.warnings import doubts
 from cow_service.vision.obstacles import obstacles_of
 from cow_service.vision.scene import Scene
 

@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from threading import Lock
 
-from cow_service.artifacts import ArtifactStore
-from cow_service.checkpoints import Checkpoints, keep_nothing
+from cow_service.concurrency import Turns
 from cow_service.errors import (
     CowError,
     FieldError,
@@ -21,19 +20,20 @@ from cow_service.errors import (
     ReaderUnavailable,
 )
 from cow_service.generators.base import Generator
-from cow_service.image_urls import ImageUrls
-from cow_service.images import DecodedImage, decode
-from cow_service.manifests import find_manifest, load_manifests
-from cow_service.metrics import Metrics
+from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.images import DecodedImage, decode
+from cow_service.net.images import ImageUrls
+from cow_service.observability.metrics import Metrics
 from cow_service.pipeline import Backends, Progress, Stamp, StillWanted, answer, ignore_progress, simulate
-from cow_service.plugins import Registry
 from cow_service.readers.base import Reader
 from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulation
+from cow_service.registry import Registry
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, SimulateRequest
 from cow_service.settings import Settings, SettingsError
-from cow_service.stages.options import check_frames, read_options
-from cow_service.turns import Turns
-from cow_service.weights import ready, weights_identity
+from cow_service.stages.checks import check_frames, read_options
+from cow_service.stages.results import Checkpoints, keep_nothing
+from cow_service.weights.lock import ready, weights_identity
+from cow_service.weights.manifests import find_manifest, load_manifests
 
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
 _OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)

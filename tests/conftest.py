@@ -84,7 +84,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A real `cow serve` in its own process."""
     data = tmp_path_factory.mktemp("server")
     environment = os.environ | {"COW_DATA_DIR": str(data), "COW_MAX_BODY_MB": "3"}
-    command = [sys.executable, "-m", "cow_service.cli", "serve", "--port", "0"]
+    command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", "0"]
     log = (data / "log").open("w")
     with subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None

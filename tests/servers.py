@@ -73,7 +73,7 @@ class Served:
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
         self._environment |= own | settings
         self._command = (
-            [sys.executable, "-m", "cow_service.cli", "serve"] if code is None else [sys.executable, "-c", code]
+            [sys.executable, "-m", "cow_service.cli.main", "serve"] if code is None else [sys.executable, "-c", code]
         )
         self.process: subprocess.Popen[bytes] | None = None
         self.http = httpx.Client()

@@ -11,10 +11,10 @@ from drawn import ball, block, floor
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.images import encode_png
-from cow_service.readers.choices import not_sure_option, option_saying, read_choices, says_not_sure
-from cow_service.readers.encounter_answers import choose_option, read_asked
-from cow_service.readers.sentences import parse
+from cow_service.media.images import encode_png
+from cow_service.readers.embedded.encounter_answers import choose_option, read_asked
+from cow_service.readers.question.choices import not_sure_option, option_saying, read_choices, says_not_sure
+from cow_service.readers.question.sentences import parse
 from cow_service.records import Answer
 from cow_service.requests import AnswerRequest
 from cow_service.service import Service

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from cow_service.artifacts import MEDIA_TYPES, ArtifactStore
 from cow_service.errors import ArtifactNotFound, StorageUnavailable
+from cow_service.media.artifacts import MEDIA_TYPES, ArtifactStore
 
 DATA = b"frame" * 1000
 SHA256 = hashlib.sha256(DATA).hexdigest()

@@ -82,7 +82,7 @@ def fetched(http: httpx.Client, url: str) -> np.ndarray:
 @contextmanager
 def another_server(folder: Path, **environment: str) -> Iterator[Server]:
     """A server with settings of its own."""
-    command = [sys.executable, "-m", "cow_service.cli", "serve", "--port", "0"]
+    command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", "0"]
     told_to = os.environ | {"COW_DATA_DIR": str(folder)} | environment
     with subprocess.Popen(
         command, env=told_to, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True

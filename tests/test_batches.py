@@ -31,7 +31,7 @@ from cow_service.client.batches import Patience
 from cow_service.client.journal import Journal
 from cow_service.client.questions import Question, questions
 
-COMMAND = [sys.executable, "-m", "cow_service.cli", "batch"]
+COMMAND = [sys.executable, "-m", "cow_service.cli.main", "batch"]
 GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}
 
 

@@ -30,7 +30,7 @@ def picture(tmp_path: Path) -> Path:
 def cow(tmp_path: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     plain = {"COW_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     return subprocess.run(
-        [sys.executable, "-m", "cow_service.cli", *arguments],
+        [sys.executable, "-m", "cow_service.cli.main", *arguments],
         env=os.environ | plain | environment,
         cwd=tmp_path,
         capture_output=True,

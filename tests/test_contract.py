@@ -17,7 +17,7 @@ from fastapi import FastAPI
 from cow_service import errors
 from cow_service.api.problems import problem_of
 from cow_service.errors import CowError, FieldError
-from cow_service.plugins import Registry
+from cow_service.registry import Registry
 from cow_service.service import Service
 from cow_service.settings import Settings
 
@@ -102,7 +102,7 @@ def test_every_setting_is_in_the_readme() -> None:
 def test_every_command_and_option_is_in_the_readme() -> None:
     from typer.main import get_command
 
-    from cow_service.cli import app
+    from cow_service.cli.main import app
 
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
         if not command.hidden:
@@ -148,7 +148,7 @@ def test_a_backend_that_cannot_be_imported_is_unavailable() -> None:
 def test_a_backend_that_failed_to_load_is_not_tried_at_every_request(monkeypatch: pytest.MonkeyPatch) -> None:
     from types import SimpleNamespace
 
-    from cow_service import plugins
+    from cow_service import registry as plugins
 
     tries: list[Settings] = []
 

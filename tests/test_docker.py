@@ -25,11 +25,11 @@ from conftest import ROOT, Server
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service import __version__
-from cow_service.cli import app
+from cow_service.cli.main import app
 from cow_service.jobs.engine import LEFT_OVER
-from cow_service.manifests import load_manifests
-from cow_service.serving import BEYOND
+from cow_service.server import BEYOND
 from cow_service.settings import Settings, load_settings
+from cow_service.weights.manifests import load_manifests
 
 DOCKER = ROOT / "docker"
 IMAGES = {"cow:cpu": DOCKER / "cpu.Dockerfile", "cow:cuda": DOCKER / "cuda.Dockerfile"}

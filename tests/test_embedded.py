@@ -9,7 +9,7 @@ from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import Asked
-from cow_service.readers.embedded import EmbeddedReader
+from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
 from cow_service.vision.scene import Scene, iou
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from cow_service.errors import CowError, ImageTooLarge, ImageTypeUnsupported, ImageUnreadable
-from cow_service.images import MIN_SIDE, DecodedImage, decode, encode_png, fit_within
+from cow_service.media.images import MIN_SIDE, DecodedImage, decode, encode_png, fit_within
 
 WHITE = [255, 255, 255]
 BLACK = [0, 0, 0]

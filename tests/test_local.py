@@ -46,7 +46,6 @@ from cow_service.errors import (
     ReaderUnavailable,
     WeightsUnavailable,
 )
-from cow_service.manifests import Manifest, Source, load_manifests
 from cow_service.readers.local import loading
 from cow_service.readers.local.chat import chat_of
 from cow_service.readers.local.decoding import Row, Sampling
@@ -55,6 +54,7 @@ from cow_service.readers.local.loading import device_map, load_local
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny, save_tiny
 from cow_service.settings import Settings
+from cow_service.weights.manifests import Manifest, Source, load_manifests
 
 BOX = {
     "type": "object",

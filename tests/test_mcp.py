@@ -34,16 +34,17 @@ from mcp_types import CallToolResult, Tool
 from PIL import Image
 from servers import SLOW_GENERATOR, data_url, eventually, picture
 
-from cow_service import __version__, mcp_serving
+from cow_service import __version__
+from cow_service.api.middleware.keys import hash_of, new_key
 from cow_service.client import AsyncClient, CowError
 from cow_service.client.errors import CannotGround
 from cow_service.errors import FieldError, InvalidRequest, Unauthorized
-from cow_service.keys import hash_of, new_key
-from cow_service.mcp_tools.failures import REMEDIES, in_words
-from cow_service.mcp_tools.images import image_of
-from cow_service.mcp_tools.inputs import AnswerInput, SimulateInput, parsed
-from cow_service.mcp_tools.pictures import BUDGET, fitted
-from cow_service.mcp_tools.server import Caller
+from cow_service.mcp import transport as mcp_serving
+from cow_service.mcp.errors import REMEDIES, in_words
+from cow_service.mcp.images import image_of
+from cow_service.mcp.inputs import AnswerInput, SimulateInput, parsed
+from cow_service.mcp.pictures import BUDGET, fitted
+from cow_service.mcp.server import Caller
 from cow_service.requests import ImageArtifact
 from cow_service.settings import Settings, SettingsError
 
@@ -52,7 +53,7 @@ SCENE = EXAMPLES / "ball-and-mug" / "image.jpg"
 SIZE = (832, 480)
 MOVES = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
 QUESTION = f"{MOVES} (A) Yes (B) No (C) Not sure"
-COMMAND = [sys.executable, "-m", "cow_service.cli", "mcp"]
+COMMAND = [sys.executable, "-m", "cow_service.cli.main", "mcp"]
 ALICE, BOB = new_key(), new_key()
 KEYS = json.dumps({"alice": hash_of(ALICE), "bob": hash_of(BOB)})
 
@@ -560,7 +561,7 @@ def test_a_signal_ends_it_and_the_job_goes_on_at_the_next_start(tmp_path: Path) 
 def test_what_cannot_start_says_why(
     tmp_path: Path, code: str, options: tuple[str, ...], exit_code: int, told: str
 ) -> None:
-    program = f"import sys; {code}; from cow_service.cli import app; app(['mcp', *sys.argv[1:]])"
+    program = f"import sys; {code}; from cow_service.cli.main import app; app(['mcp', *sys.argv[1:]])"
     result = subprocess.run(
         [sys.executable, "-c", program, *options],
         env=environment(COW_DATA_DIR=str(tmp_path)),

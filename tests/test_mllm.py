@@ -28,20 +28,20 @@ from hypothesis import strategies as st
 from mllm_server import MllmServer
 
 from cow_service.errors import ReaderUnavailable
-from cow_service.images import encode_png
-from cow_service.manifests import load_families
+from cow_service.media.images import encode_png
 from cow_service.readers.base import Asked
-from cow_service.readers.choices import read_choices
-from cow_service.readers.coordinates import View
 from cow_service.readers.mllm.choose import read_answer
+from cow_service.readers.mllm.coordinates import View
 from cow_service.readers.mllm.identify import read_identified
 from cow_service.readers.mllm.locate import read_located
+from cow_service.readers.mllm.replies import ReplyError, values_in
 from cow_service.readers.mllm.serving import manifest_for
-from cow_service.readers.replies import ReplyError, values_in
+from cow_service.readers.question.choices import read_choices
 from cow_service.records import Grounding
 from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.vision.scene import Scene
+from cow_service.weights.manifests import load_families
 
 SHARED = ROOT.parent / "shared" / "mllm_replies" / "replies.json"
 OWN = Path(__file__).parent / "data" / "mllm_replies.json"

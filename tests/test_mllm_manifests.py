@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 
-from cow_service.manifests import Manifest, load_families, load_manifests
-from cow_service.resources import family_names, manifest_names
+from cow_service.weights.manifests import Manifest, load_families, load_manifests
+from cow_service.weights.resources import family_names, manifest_names
 
 ALL = {name: manifest for name, manifest in load_manifests().items() if manifest.door == "mllm"}
 # One without a name under which it is served is a toy, made from nothing.

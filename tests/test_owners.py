@@ -12,7 +12,7 @@ import httpx
 import pytest
 from servers import ASYNC, BODY, PATIENCE, TERMINAL, Served, data_url, events_of, eventually, picture, problem, slow
 
-from cow_service.keys import hash_of, new_key
+from cow_service.api.middleware.keys import hash_of, new_key
 
 pytestmark = pytest.mark.slow
 

@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jinja2.exceptions import SecurityError
 
-from cow_service.manifests import Coordinates
-from cow_service.readers.choices import read_choices
-from cow_service.readers.coordinates import View
 from cow_service.readers.mllm import choose, identify, locate, scale
+from cow_service.readers.mllm.coordinates import View
 from cow_service.readers.prompts import load_prompt, parse_prompt
-from cow_service.readers.wording import direction_words, motion_sentence
+from cow_service.readers.question.choices import read_choices
+from cow_service.readers.question.wording import direction_words, motion_sentence
 from cow_service.records import MotionKind, Vector
-from cow_service.resources import prompt_names
+from cow_service.weights.manifests import Coordinates
+from cow_service.weights.resources import prompt_names
 
 HEAD = "---\nstage: motion\nversion: 1\ninputs: [name]\noutput: text\n---\n"
 

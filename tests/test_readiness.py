@@ -9,10 +9,10 @@ import pytest
 from engines import app_for, running_engine
 from test_contract import get
 
-from cow_service import readiness
 from cow_service.api.app import create_app
 from cow_service.errors import GeneratorUnavailable, NotReady, StorageUnavailable
-from cow_service.readiness import Readiness
+from cow_service.jobs import readiness
+from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cow_service import resources
+from cow_service.weights import resources
 
 ROOT = Path(__file__).parents[1]
 

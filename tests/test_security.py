@@ -14,10 +14,10 @@ from fastapi import FastAPI, Request
 from typer.testing import CliRunner
 
 from cow_service.api.app import create_app
-from cow_service.api.rates import Buckets, address_of
-from cow_service.cli import app as cow
+from cow_service.api.middleware.keys import KeyRing, hash_of, new_key
+from cow_service.api.middleware.rate_limit import Buckets, address_of
+from cow_service.cli.main import app as cow
 from cow_service.jobs.engine import Engine
-from cow_service.keys import KeyRing, hash_of, new_key
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError, load_settings
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cow_service.readers import lexicon
-from cow_service.readers.sentences import Question, parse
+from cow_service.readers.question import lexicon
+from cow_service.readers.question.sentences import Question, parse
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 SLIGHT, DIAGONAL = math.sin(math.pi / 8), math.sqrt(0.5)

@@ -23,13 +23,14 @@ from otlp import Collector, value
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.types import Message
 
-from cow_service import context, logs, tracing
 from cow_service.api.app import create_app
-from cow_service.api.origins import Origins
-from cow_service.context import TraceContext, parse_traceparent
+from cow_service.api.middleware.keys import hash_of
+from cow_service.api.middleware.origins import Origins
 from cow_service.jobs.engine import Engine
-from cow_service.keys import hash_of
-from cow_service.metrics import Metrics
+from cow_service.observability import context, tracing
+from cow_service.observability import logging as logs
+from cow_service.observability.context import TraceContext, parse_traceparent
+from cow_service.observability.metrics import Metrics
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
 
@@ -341,7 +342,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.address,
             "OTEL_RESOURCE_ATTRIBUTES": "deployment.environment=test",
         }
-        command = [sys.executable, "-m", "cow_service.cli", "serve", "--port", "0"]
+        command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", "0"]
         with subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as process:

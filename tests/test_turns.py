@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from cow_service.turns import Turns
+from cow_service.concurrency import Turns
 
 
 class GoneError(Exception):

@@ -12,7 +12,7 @@ import pytest
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from cow_service.errors import InternalError, StorageUnavailable
-from cow_service.video import write_mp4
+from cow_service.media.video import write_mp4
 
 
 def scene(index: int, width: int = 96, height: int = 64) -> np.ndarray:

@@ -387,8 +387,8 @@ def test_parts_of_ones_own_carry_no_pulled_revision(tmp_path: Path) -> None:
     """A whole pipeline of one's own brings its own other parts, whatever was pulled."""
     from cow_service.generators.wan.loading import _revisions
     from cow_service.generators.wan.profiles import profile_of
-    from cow_service.manifests import load_manifests
-    from cow_service.weights import Lock, folder_of, write_lock
+    from cow_service.weights.lock import Lock, folder_of, write_lock
+    from cow_service.weights.manifests import load_manifests
 
     manifest = load_manifests()["ati"]
     profile = profile_of(manifest, "portable")

@@ -15,7 +15,7 @@ from cow_service.generators.wan.pipeline import Guide, WanTrackPipeline
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.generators.wan.tracks import to_ati_tensor
-from cow_service.manifests import load_manifests
+from cow_service.weights.manifests import load_manifests
 
 CPU = torch.device("cpu")
 

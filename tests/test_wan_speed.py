@@ -18,7 +18,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from cow_service.generators.wan.checkpoints import load_transformer
 from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.tiny import make_tiny
-from cow_service.manifests import load_manifests
+from cow_service.weights.manifests import load_manifests
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))

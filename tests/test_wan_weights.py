@@ -18,8 +18,8 @@ from hub import Blob, Hub, running
 from safetensors.torch import save
 
 from cow_service.generators.wan.tiny import make_tiny
-from cow_service.manifests import load_manifests
 from cow_service.records import Simulation
+from cow_service.weights.manifests import load_manifests
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -71,7 +71,7 @@ def cow(home: Path, hub: Hub, *arguments: str, **settings: str) -> subprocess.Co
         "COW_DATA_DIR": str(home / "data"), "COW_PROFILE": "portable", "COW_DEVICE": "cpu", "HF_ENDPOINT": hub.address,
         "HF_HOME": str(home / "hub"), "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb",
     }  # fmt: skip
-    command = [sys.executable, "-m", "cow_service.cli", *arguments]
+    command = [sys.executable, "-m", "cow_service.cli.main", *arguments]
     return subprocess.run(
         command, env=os.environ | environment | settings, cwd=home, capture_output=True, text=True, check=False
     )

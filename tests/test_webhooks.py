@@ -22,8 +22,8 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from servers import ASYNC, BODY, PATIENCE, SLOW_GENERATOR, events_of, eventually, problem, slow
 
-from cow_service.egress import Egress
 from cow_service.jobs import webhooks
+from cow_service.net.egress import Egress
 from cow_service.records import Job
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError, load_settings

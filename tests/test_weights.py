@@ -19,12 +19,12 @@ from conftest import ROOT
 from hub import Blob, Hub, running
 from typer.testing import CliRunner
 
-from cow_service import hub_errors
-from cow_service.cli import app
+from cow_service.cli.main import app
 from cow_service.errors import WeightsUnavailable
-from cow_service.hub import Step, fetch, plan, pull
-from cow_service.manifests import Manifest, Source, load_manifests
-from cow_service.weights import Lock, LockedFile, check, examine, folder_of, read_lock, ready, verify
+from cow_service.weights import hub_errors
+from cow_service.weights.hub import Step, fetch, plan, pull
+from cow_service.weights.lock import Lock, LockedFile, check, examine, folder_of, read_lock, ready, verify
+from cow_service.weights.manifests import Manifest, Source, load_manifests
 
 TOY = "acme/toy"
 CONFIG = Blob(b'{"layers": 2}', lfs=False)
@@ -148,8 +148,8 @@ def test_a_pull_that_was_killed_goes_on_with_its_revision(hub: Hub, folder: Path
     hub.stall["vae/model.safetensors"] = 1000
     arguments = SOURCE.model_dump_json(), str(folder), hub.address
     code = (
-        "import sys; from pathlib import Path; from cow_service.hub import pull; "
-        "from cow_service.manifests import Source; "
+        "import sys; from pathlib import Path; from cow_service.weights.hub import pull; "
+        "from cow_service.weights.manifests import Source; "
         "pull(Source.model_validate_json(sys.argv[1]), Path(sys.argv[2]), endpoint=sys.argv[3])"
     )
     environment = os.environ | {"HF_HOME": str(tmp_path)}
@@ -323,7 +323,7 @@ def test_the_exceptions_that_have_reasons_exist() -> None:
 def test_progress_is_told_where_files_come_in_chunks_by_the_other_protocol() -> None:
     from huggingface_hub.utils._xet_progress_reporting import XetDownloadProgressReporter
 
-    from cow_service.hub import _bar
+    from cow_service.weights.hub import _bar
 
     told: list[int] = []
     with XetDownloadProgressReporter(
@@ -436,7 +436,7 @@ PARTS = {
 def toy(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Callable[..., tuple[int, str]]:
     """`cow models ...` in this process, where there is a model `toy` in three parts: exit code, and what it said."""
     manifests = load_manifests() | {"toy": manifest().model_copy(update={"sources": PARTS})}
-    monkeypatch.setattr("cow_service.manifests.load_manifests", lambda: manifests)
+    monkeypatch.setattr("cow_service.weights.manifests.load_manifests", lambda: manifests)
     monkeypatch.setenv("COW_MODELS_DIR", str(folder))
 
     def run(*arguments: str) -> tuple[int, str]:
@@ -461,7 +461,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cow(checkout: Path, folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     plain = {"COW_MODELS_DIR": str(folder), "COLUMNS": "200", "TERM": "dumb", "HF_HOME": str(checkout / "hf")}
     return subprocess.run(
-        [sys.executable, "-m", "cow_service.cli", "models", *arguments],
+        [sys.executable, "-m", "cow_service.cli.main", "models", *arguments],
         env=os.environ | plain | environment,
         cwd=checkout,
         capture_output=True,

@@ -10,22 +10,23 @@ from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from cow_service import __version__, tracing
-from cow_service.api.answer import answer_routes
-from cow_service.api.artifacts import artifact_routes
-from cow_service.api.chat import chat_routes, document_chat
-from cow_service.api.chat_problems import ChatProblems
-from cow_service.api.events import event_routes
-from cow_service.api.health import health_routes
-from cow_service.api.jobs import job_routes
-from cow_service.api.layers import LayeredApp, document_layers, install_layers
-from cow_service.api.limits import BodyLimit
-from cow_service.api.metrics import metrics_routes
+from cow_service import __version__
+from cow_service.api.middleware.body_limit import BodyLimit
+from cow_service.api.middleware.order import LayeredApp, document_layers, install_layers
+from cow_service.api.openai.errors import ChatProblems
+from cow_service.api.openai.routes import chat_routes, document_chat
 from cow_service.api.problems import install_problem_handlers
-from cow_service.api.simulate import simulate_routes
-from cow_service.api.submitting import Submitting
+from cow_service.api.routes.answer import answer_routes
+from cow_service.api.routes.artifacts import artifact_routes
+from cow_service.api.routes.events import event_routes
+from cow_service.api.routes.health import health_routes
+from cow_service.api.routes.jobs import job_routes
+from cow_service.api.routes.metrics import metrics_routes
+from cow_service.api.routes.simulate import simulate_routes
+from cow_service.api.submission import Submitting
 from cow_service.jobs.engine import Engine
-from cow_service.readiness import Readiness
+from cow_service.jobs.readiness import Readiness
+from cow_service.observability import tracing
 from cow_service.records import Problem
 from cow_service.requests import AnswerRequest, SimulateRequest
 

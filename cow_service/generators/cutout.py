@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service import __version__
 from cow_service.generators.base import Shot
-from cow_service.images import fit_within
+from cow_service.media.images import fit_within
 from cow_service.physics.camera import has_passed
 from cow_service.physics.encounters import box_at, stands_nearer
 from cow_service.records import BBox, GeneratorInfo

@@ -36,18 +36,18 @@ from cow_service.errors import (
     ShuttingDown,
     StorageUnavailable,
 )
-from cow_service.images import DecodedImage
 from cow_service.jobs import reports, workflows
-from cow_service.jobs.checkpoints import Left
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.executors import Executors
 from cow_service.jobs.ledger import Ledger
+from cow_service.jobs.maintenance import Upkeep
 from cow_service.jobs.orders import Order
 from cow_service.jobs.reports import CREATED, GENERATOR, Filters, Found
-from cow_service.jobs.running import Worker
 from cow_service.jobs.serializer import JsonSerializer
-from cow_service.jobs.upkeep import Upkeep
+from cow_service.jobs.stage_cache import Left
 from cow_service.jobs.webhooks import Webhooks
+from cow_service.jobs.worker import Worker
+from cow_service.media.images import DecodedImage
 from cow_service.records import TERMINAL, JobPage
 from cow_service.service import Service
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from cow_service.errors import Canceled, CowError
-from cow_service.images import DecodedImage
+from cow_service.media.images import DecodedImage
 from cow_service.requests import Stage
 
 STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")

@@ -6,9 +6,9 @@ from typing import Any
 
 from pydantic import Field
 
-from cow_service.checkpoints import digest_of
 from cow_service.records import JobKind, Record
 from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.stages.results import digest_of
 
 
 class Order(Record):

@@ -24,7 +24,7 @@ from cow_service.records import Job
 from cow_service.settings import Settings
 
 if TYPE_CHECKING:
-    from cow_service.egress import Egress
+    from cow_service.net.egress import Egress
 
 QUEUE = "cow-webhooks"
 AT_ONCE = 8
@@ -47,7 +47,7 @@ class Webhooks:
 
     @cached_property
     def _egress(self) -> Egress:
-        from cow_service.egress import Egress  # noqa: PLC0415 # an HTTP client is costly to import
+        from cow_service.net.egress import Egress  # noqa: PLC0415 # an HTTP client is costly to import
 
         return Egress(None) if self._given is None else self._given
 
@@ -57,7 +57,7 @@ class Webhooks:
 
     def check(self, url: str) -> None:
         """Raises `WebhookNotAllowed` for a URL that would not be called."""
-        from cow_service.egress import NotAllowed  # noqa: PLC0415
+        from cow_service.net.egress import NotAllowed  # noqa: PLC0415
 
         if self._secret is None:
             raise WebhookNotAllowed("This server calls no webhooks: COW_WEBHOOK_SECRET is not set. Ask for the job.")
@@ -73,7 +73,7 @@ class Webhooks:
 
     def send(self, job: Job, url: str, attempt: int) -> float | None:
         """One attempt; where nobody took it, seconds until another one is to follow."""
-        from cow_service.egress import NotAllowed, Unreachable  # noqa: PLC0415
+        from cow_service.net.egress import NotAllowed, Unreachable  # noqa: PLC0415
 
         told = {"type": f"job.{job.status}", "timestamp": job.finished_at, "data": job.model_dump(mode="json")}
         body = json.dumps(told, separators=(",", ":")).encode()

@@ -14,7 +14,7 @@ from jinja2 import StrictUndefined, Template
 from jinja2.meta import find_undeclared_variables
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from cow_service.resources import read_prompt_text
+from cow_service.weights.resources import read_prompt_text
 
 FIELDS = ("stage", "version", "inputs", "output")
 _FENCE = "---"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from cow_service.artifacts import ArtifactStore
 from cow_service.errors import CowError, MllmBadReply
-from cow_service.images import decode_own
+from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.images import decode_own
 from cow_service.readers.base import AnswerReading, Imagined, Look
 from cow_service.records import AnswerOption, Simulation, Verdict
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.artifacts import ArtifactStore
 from cow_service.generators.base import Generator, Shot
-from cow_service.images import encode_png, fit_within
+from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.images import encode_png, fit_within
+from cow_service.media.video import write_mp4
 from cow_service.records import Clip, Frame, Trajectory, Video
 from cow_service.requests import FramesRequest
-from cow_service.video import write_mp4
 
 Image = NDArray[np.uint8]
 

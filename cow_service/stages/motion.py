@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.readers.base import Look, MotionReading
-from cow_service.readers.wording import motion_sentence
+from cow_service.readers.question.wording import motion_sentence
 from cow_service.records import Grounding, MetresPerPixel, Motion, Source, Vector
 from cow_service.requests import MotionRequest, TrajectoryRequest
 from cow_service.vision.scene import Scene

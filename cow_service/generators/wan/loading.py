@@ -18,9 +18,9 @@ from cow_service.generators.wan.lora import add_lora
 from cow_service.generators.wan.pipeline import WanTrackPipeline
 from cow_service.generators.wan.profiles import Profile, profile_of
 from cow_service.generators.wan.tiny import make_tiny
-from cow_service.manifests import Manifest, load_manifests
 from cow_service.settings import Settings
-from cow_service.weights import read_lock, verify
+from cow_service.weights.lock import read_lock, verify
+from cow_service.weights.manifests import Manifest, load_manifests
 
 # Seeds and lazy initialisation are the whole process's: two models made at once would get into each other's weights.
 _one_at_a_time = Lock()

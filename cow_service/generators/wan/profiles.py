@@ -9,8 +9,8 @@ from pydantic import Field, ValidationError, model_validator
 from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan.acceleration import Acceleration
 from cow_service.generators.wan.sampling import Sampling
-from cow_service.manifests import Manifest
 from cow_service.records import Record
+from cow_service.weights.manifests import Manifest
 
 Precision = Literal["float32", "bfloat16", "float16"]
 

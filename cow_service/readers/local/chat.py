@@ -22,7 +22,7 @@ from pydantic_ai.messages import (
     UserPromptPart,
 )
 
-from cow_service.images import decode
+from cow_service.media.images import decode
 
 Role = Literal["system", "user", "assistant"]
 Turn = dict[str, Any]  # as chat templates take it: {"role": ..., "content": [{"type": "text", "text": ...}, ...]}

@@ -17,7 +17,6 @@ from pydantic_ai.settings import ModelSettings
 from transformers import AutoModelForImageTextToText, PreTrainedModel, ProcessorMixin
 
 from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
-from cow_service.manifests import Manifest, load_manifests
 from cow_service.readers.local.engine import Engine
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.processors import load_processor
@@ -25,7 +24,8 @@ from cow_service.readers.local.tiny import make_tiny
 from cow_service.readers.local.worker import is_out_of_memory
 from cow_service.records import Record
 from cow_service.settings import Settings
-from cow_service.weights import verify
+from cow_service.weights.lock import verify
+from cow_service.weights.manifests import Manifest, load_manifests
 
 SHOWN = 4  # weights in an error
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from cow_service.manifests import load_families
 from cow_service.readers.local.loading import load_local
 from cow_service.readers.mllm.asking import Asker
 from cow_service.readers.mllm.reader import MllmReader
 from cow_service.readers.mllm.serving import Served, described
 from cow_service.settings import Settings
-from cow_service.weights import weights_identity
+from cow_service.weights.lock import weights_identity
+from cow_service.weights.manifests import load_families
 
 
 def create(settings: Settings) -> MllmReader:

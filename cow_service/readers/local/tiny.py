@@ -22,8 +22,8 @@ from transformers import (
 )
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-from cow_service.manifests import load_manifests
 from cow_service.readers.local.processors import still
+from cow_service.weights.manifests import load_manifests
 
 NAME = "tiny-qwen3-vl"
 SEED = 0

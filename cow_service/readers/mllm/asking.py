@@ -22,10 +22,10 @@ from cow_service.readers.base import Asked
 from cow_service.readers.mllm.loop import Loop
 from cow_service.readers.mllm.patience import OneTry, Patient, why
 from cow_service.readers.mllm.pictures import MEDIA_TYPE
+from cow_service.readers.mllm.replies import ReplyError
 from cow_service.readers.mllm.schemas import Schema
 from cow_service.readers.mllm.serving import Served
 from cow_service.readers.prompts import load_prompt
-from cow_service.readers.replies import ReplyError
 from cow_service.records import Usage
 from cow_service.settings import Settings
 

@@ -8,10 +8,18 @@ from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 from cow_service.readers.base import AnswerReading
-from cow_service.readers.choices import not_sure_option, option_saying, plain, says_not_sure
 from cow_service.readers.mllm.prose import MARKS, announced, is_broken_json, lines_of
+from cow_service.readers.mllm.replies import (
+    ReplyError,
+    fields_of,
+    first_of,
+    is_none,
+    text_of,
+    values_in,
+    without_thinking,
+)
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
-from cow_service.readers.replies import ReplyError, fields_of, first_of, is_none, text_of, values_in, without_thinking
+from cow_service.readers.question.choices import not_sure_option, option_saying, plain, says_not_sure
 from cow_service.records import AnswerOption
 
 MAX_ANSWER = 400  # characters of an open answer

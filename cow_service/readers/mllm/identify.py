@@ -8,8 +8,16 @@ from dataclasses import dataclass
 from typing import Any, cast, get_args
 
 from cow_service.readers.mllm.prose import is_broken_json, names_nothing
+from cow_service.readers.mllm.replies import (
+    ReplyError,
+    fields_of,
+    first_of,
+    is_none,
+    text_of,
+    values_in,
+    without_thinking,
+)
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
-from cow_service.readers.replies import ReplyError, fields_of, first_of, is_none, text_of, values_in, without_thinking
 from cow_service.records import MotionKind
 
 MAX_OBJECT = 120  # characters

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cow_service.readers.coordinates import View
+from cow_service.readers.mllm.coordinates import View
 from cow_service.readers.mllm.identify import MAX_OTHERS
 from cow_service.readers.mllm.lines import Line, line_in
 from cow_service.readers.mllm.places import Place, chosen, places_in, same_words, tagged_places
+from cow_service.readers.mllm.replies import ReplyError, fields_of, is_none, values_in, without_thinking
 from cow_service.readers.mllm.schemas import Schema, nullable, numbers, object_of, one_of, words
-from cow_service.readers.replies import ReplyError, fields_of, is_none, values_in, without_thinking
 from cow_service.records import BBox, LocatedObject, Point
 
 CUES = ("arrow", "trail", "text", "orientation", "none")

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import InternalError, InvalidRequest
-from cow_service.manifests import Family
-from cow_service.readers.coordinates import View, size_seen
-from cow_service.readers.replies import ReplyError
+from cow_service.readers.mllm.coordinates import View, size_seen
+from cow_service.readers.mllm.replies import ReplyError
+from cow_service.weights.manifests import Family
 
 MEDIA_TYPE = "image/jpeg"
 QUALITY = 95  # percent; fine lines such as drawn arrows stay clean

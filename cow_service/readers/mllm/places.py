@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from cow_service.readers.coordinates import NUMBER, View, names_corners
-from cow_service.readers.replies import ReplyError, fields_of, first_of, text_of
+from cow_service.readers.mllm.coordinates import NUMBER, View, names_corners
+from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, text_of
 
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
 POINT_KEYS = ("point_2d", "point", "center", "centre", "point2d")

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from cow_service.readers.base import AnswerReading, Asked, Imagined
-from cow_service.readers.choices import question_without
-from cow_service.readers.coordinates import View
 from cow_service.readers.mllm import choose, identify, locate, scale
 from cow_service.readers.mllm.asking import Question
+from cow_service.readers.mllm.coordinates import View
 from cow_service.readers.mllm.identify import Identified
 from cow_service.readers.mllm.locate import Located
 from cow_service.readers.mllm.pictures import encode, view_of
 from cow_service.readers.mllm.scale import Scaled
 from cow_service.readers.mllm.serving import Served
 from cow_service.readers.mllm.units import box_order, line_order, units_of
+from cow_service.readers.question.choices import question_without
 from cow_service.records import MEETINGS, AnswerOption, BBox, Encounter
 from cow_service.vision.scene import Scene
 

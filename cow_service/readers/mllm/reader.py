@@ -11,10 +11,9 @@ from typing import Any
 from cow_service import __version__
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
-from cow_service.readers import sentences
 from cow_service.readers.base import AnswerReading, Asked, GroundingReading, Imagined, MotionReading
-from cow_service.readers.geometry import doubt_box, follow_arrow
 from cow_service.readers.mllm.asking import Asker, Question, Tally
+from cow_service.readers.mllm.geometry import doubt_box, follow_arrow
 from cow_service.readers.mllm.identify import Identified
 from cow_service.readers.mllm.lines import Line
 from cow_service.readers.mllm.locate import Located
@@ -22,10 +21,11 @@ from cow_service.readers.mllm.places import shares_words
 from cow_service.readers.mllm.questions import Questions
 from cow_service.readers.mllm.scale import Scaled
 from cow_service.readers.mllm.serving import UNKNOWN, serve
+from cow_service.readers.question import sentences
 from cow_service.records import AnswerOption, BBox, Cue, Grounding, MotionKind, ReaderInfo, Source, Usage
-from cow_service.resources import prompt_names, read_prompt_text
 from cow_service.settings import Settings
 from cow_service.vision.scene import Scene
+from cow_service.weights.resources import prompt_names, read_prompt_text
 
 DIRECTED: tuple[MotionKind, ...] = ("linear", "projectile")
 FALLING: tuple[MotionKind, ...] = ("projectile", "fall")

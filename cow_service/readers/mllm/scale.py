@@ -5,9 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from cow_service.readers.coordinates import View
+from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.replies import (
+    ReplyError,
+    fields_of,
+    first_of,
+    is_none,
+    text_of,
+    values_in,
+    without_thinking,
+)
 from cow_service.readers.mllm.schemas import Schema, nullable, numbers, object_of, one_of, words
-from cow_service.readers.replies import ReplyError, fields_of, first_of, is_none, text_of, values_in, without_thinking
 from cow_service.records import MetresPerPixel, Vector
 
 DOWN: dict[str, Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}

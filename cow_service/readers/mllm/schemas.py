@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from cow_service.readers.coordinates import View
+from cow_service.readers.mllm.coordinates import View
 
 Schema = dict[str, Any]
 

@@ -15,8 +15,8 @@ from pydantic_ai.providers import Provider, infer_provider_class
 from pydantic_ai.providers.openai_compatible import OpenAICompatibleProvider
 
 from cow_service.errors import ReaderUnavailable
-from cow_service.manifests import Family, Manifest, load_families, load_manifests
 from cow_service.settings import Settings
+from cow_service.weights.manifests import Family, Manifest, load_families, load_manifests
 
 UNKNOWN = "generic"  # the manifest for models that no other one describes
 OWN_PROTOCOL = ("anthropic", "google", "google-gla")  # these speak their own protocol at a base URL, too

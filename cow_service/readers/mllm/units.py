@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cow_service.readers.coordinates import View
+from cow_service.readers.mllm.coordinates import View
 
 
 def units_of(view: View) -> str:

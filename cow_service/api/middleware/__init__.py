@@ -1,0 +1,1 @@
+"""What stands around the routes: order, ids, origins, logs, limits, authentication."""

@@ -1,0 +1,109 @@
+"""What the operator sees of each request: one line in the log, two metrics, and what its span says.
+
+It also answers for faults of whatever stands further in, so that no caller is left without a problem to read.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Callable, Iterable
+from urllib.parse import quote
+
+from starlette.routing import compile_path
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from cow_service.api.problems import respond
+from cow_service.errors import InternalError
+from cow_service.observability import tracing
+from cow_service.observability.metrics import Metrics
+
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+UNMATCHED = "unmatched"
+LEFT = 499  # nothing was sent: the caller left, or the server stopped
+MOST_PATH = 500  # characters of a path in a log
+
+log = logging.getLogger("cow_service")
+access = logging.getLogger("cow_service.access")
+
+
+class Observer:
+    """ASGI middleware: observes each request from its first to its last byte.
+
+    `paths` gives the templates of all routes, for requests that were refused before the router saw them.
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics, paths: Callable[[], Iterable[str]]) -> None:
+        self.app = app
+        self.metrics = metrics
+        self._paths = paths
+        self._templates: list[tuple[re.Pattern[str], str]] | None = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Passes a request on, and records what came of it."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        started = time.perf_counter()
+        status, complete = 0, False
+
+        async def observed(message: Message) -> None:
+            nonlocal status, complete
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            elif message["type"] == "http.response.body":
+                complete = not message.get("more_body", False)
+            await send(message)
+
+        try:
+            await self.app(scope, receive, observed)
+        except Exception as error:
+            if not status:
+                log.error("%s %s failed", scope["method"], _shown(scope), exc_info=error)
+                told = "The server met an error that it did not foresee; its log has the trace."
+                await respond(InternalError(told))(scope, receive, observed)
+            elif not complete:
+                raise  # the server must break the connection off: the caller would take the part for the whole
+            # Else the framework has answered and logged it, and raised it again only to tell the server.
+        finally:
+            self._record(scope, status or LEFT, time.perf_counter() - started)
+
+    def _record(self, scope: Scope, status: int, seconds: float) -> None:
+        method = scope["method"] if scope["method"] in METHODS else "other"
+        route = self._route(scope)
+        owner = scope.get("state", {}).get("owner")
+        self.metrics.request(method, route, status, seconds)
+        tracing.describe(
+            f"{method} {route}" if route != UNMATCHED else method,
+            failed=status >= 500,
+            **{
+                "http.request.method": method,
+                "http.response.status_code": status,
+                "http.route": route,
+                "url.path": _shown(scope),
+                "cow.owner": owner,
+            },
+        )
+        fields = {
+            "method": method,
+            "path": _shown(scope),
+            "status": status,
+            "milliseconds": round(seconds * 1000, 1),
+            "owner": owner,
+        }
+        access.info("%s %s %d %.1f ms", method, fields["path"], status, seconds * 1000, extra=fields)
+
+    def _route(self, scope: Scope) -> str:
+        """The template of the route that was or would have been taken: of those there are only so many."""
+        path = getattr(scope.get("route"), "path", None)
+        if isinstance(path, str):
+            return path
+        if self._templates is None:
+            self._templates = [(compile_path(template)[0], template) for template in self._paths()]
+        return next((template for regex, template in self._templates if regex.match(scope["path"])), UNMATCHED)
+
+
+def _shown(scope: Scope) -> str:
+    """The path without its query, percent-encoded: nothing in it can end a line of a log."""
+    return quote(scope["path"][:MOST_PATH], safe="/:@!$&'()*+,;=~")

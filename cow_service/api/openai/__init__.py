@@ -1,0 +1,1 @@
+"""The OpenAI-compatible operations under `/v1`."""

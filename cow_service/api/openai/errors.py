@@ -1,0 +1,85 @@
+"""Errors under `/v1`: the house's problems, and in each the member `error` that OpenAI's clients read."""
+
+from __future__ import annotations
+
+import json
+import re
+from http import HTTPStatus
+from typing import Any
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from cow_service.api.openai.records import ChatError, ChatProblem
+from cow_service.api.problems import MEDIA_TYPE
+from cow_service.problems import TYPE_PREFIX
+from cow_service.records import Problem
+
+ROOT = "/v1/"
+TYPES = {
+    HTTPStatus.UNAUTHORIZED: "authentication_error",
+    HTTPStatus.FORBIDDEN: "permission_error",
+    HTTPStatus.TOO_MANY_REQUESTS: "rate_limit_error",
+}
+
+
+def chat_problem(problem: Problem) -> ChatProblem:
+    """A problem with what OpenAI's clients read."""
+    other = "server_error" if problem.status >= HTTPStatus.INTERNAL_SERVER_ERROR else "invalid_request_error"
+    error = ChatError(
+        message=problem.detail,
+        type=TYPES.get(HTTPStatus(problem.status), other),
+        param=_parameter(problem.errors[0].pointer) if problem.errors else None,
+        code=problem.type.removeprefix(TYPE_PREFIX),
+    )
+    return ChatProblem(**dict(problem), error=error)
+
+
+class ChatProblems:
+    """ASGI middleware, around all others: whoever refuses a request under `/v1`, OpenAI's clients can read why."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Passes a request on; a problem that is answered waits here until it is whole."""
+        if scope["type"] != "http" or not scope["path"].startswith(ROOT):
+            await self.app(scope, receive, send)
+            return
+        start: Message | None = None
+        body = b""
+
+        async def told(message: Message) -> None:
+            nonlocal start, body
+            if message["type"] == "http.response.start" and _is_problem(message):
+                start = message
+            elif start is None:
+                await send(message)
+            else:
+                body += message.get("body", b"")
+                if not message.get("more_body", False):
+                    text = chat_problem(Problem.model_validate_json(body)).model_dump_json().encode()
+                    MutableHeaders(scope=start)["Content-Length"] = str(len(text))
+                    await send(start)
+                    await send({**message, "body": text})
+
+        await self.app(scope, receive, told)
+
+
+def document_problems(document: dict[str, Any]) -> None:
+    """Puts their shape into the contract."""
+    schema = json.dumps({"$ref": "#/components/schemas/Problem"})
+    own = json.dumps({"$ref": f"#/components/schemas/{ChatProblem.__name__}"})
+    for path in [path for path in document["paths"] if path.startswith(ROOT)]:
+        document["paths"][path] = json.loads(json.dumps(document["paths"][path]).replace(schema, own))
+
+
+def _is_problem(start: Message) -> bool:
+    return Headers(raw=start["headers"]).get("content-type") == MEDIA_TYPE
+
+
+def _parameter(pointer: str) -> str | None:
+    """A JSON Pointer as OpenAI writes places: messages[0].content."""
+    parts = [part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:]]
+    written = "".join(f"[{part}]" if re.fullmatch("[0-9]+", part) else f".{part}" for part in parts)
+    return written.lstrip(".") or None

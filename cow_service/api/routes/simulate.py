@@ -1,0 +1,94 @@
+"""`POST /simulate`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+
+from cow_service import errors
+from cow_service.api.body import body_of
+from cow_service.api.problems import documented
+from cow_service.api.submission import Submitting
+from cow_service.records import Job, Simulation
+from cow_service.requests import SimulateRequest
+
+FAILURES = (
+    errors.MalformedBody,
+    errors.InvalidRequest,
+    errors.ArtifactNotFound,
+    errors.BodyTooLarge,
+    errors.BodyTooSlow,
+    errors.BodyTypeUnsupported,
+    errors.ImageTooLarge,
+    errors.ImageUnreadable,
+    errors.ImageTypeUnsupported,
+    errors.ImageUrlNotAllowed,
+    errors.CannotGround,
+    errors.ObjectNotFound,
+    errors.CannotReadDirection,
+    errors.ReaderUnavailable,
+    errors.MllmBadReply,
+    errors.MllmUnavailable,
+    errors.GeneratorUnavailable,
+    errors.WeightsUnavailable,
+    errors.CheckpointInvalid,
+    errors.GeneratorOutOfMemory,
+    errors.StorageUnavailable,
+    errors.ImageUrlUnreachable,
+    errors.IdempotencyKeyReused,
+    errors.WebhookNotAllowed,
+    errors.QueueFull,
+    errors.ShuttingDown,
+    errors.Canceled,
+)
+ACCEPTED: dict[int | str, dict[str, Any]] = {
+    202: {
+        "model": Job,
+        "description": "The job, where `Prefer` says not to wait so long.",
+        "headers": {
+            "Location": {"description": "Where the job is.", "schema": {"type": "string"}},
+            "Retry-After": {"description": "Seconds.", "schema": {"type": "string"}},
+            "Preference-Applied": {"schema": {"type": "string"}},
+        },
+        "links": {
+            name: {"operationId": name, "parameters": {"id": "$response.body#/id"}}
+            for name in ("job", "events", "cancel", "delete")
+        },
+    }
+}
+
+
+def _header(name: str, description: str) -> dict[str, Any]:
+    return {"name": name, "in": "header", "required": False, "description": description, "schema": {"type": "string"}}
+
+
+STATED = [
+    _header("Prefer", "`respond-async`: answer with the job at once; `wait=N`: after N seconds (RFC 7240)."),
+    _header("Idempotency-Key", "The same key and body come to the same job, however often they are sent."),
+    _header("Cache-Control", "`no-cache`: take no results of earlier requests."),
+]
+
+
+def simulate_routes(submitting: Submitting) -> APIRouter:
+    """The operation, bound to an engine."""
+    router = APIRouter()
+
+    @router.post(
+        "/simulate",
+        operation_id="simulate",
+        response_model=Simulation,
+        tags=["simulation"],
+        summary="Imagine the future of an image",
+        responses={**ACCEPTED, **documented(*FAILURES)},
+        openapi_extra={"requestBody": body_of(SimulateRequest), "parameters": STATED},
+    )
+    async def simulate(request: Request) -> Response:
+        """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once.
+
+        A caller who closes the connection ends the work, a video model after the step that it is in, unless a header
+        `Prefer` or `Idempotency-Key` says that somebody comes back.
+        """
+        return await submitting.run(request, "simulate", SimulateRequest)
+
+    return router

@@ -1,0 +1,223 @@
+"""`cow batch`: a file of questions, asked of a server, into a folder of outcomes."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections import Counter
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cow_service.cli.terminal import printable
+from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
+
+if TYPE_CHECKING:
+    from cow_service.client.questions import Question
+
+SOME_FAILED = 3
+INTERRUPTED = 130
+SHOWN_FAILURES = 5
+SHOWN_FAULTS = 10
+AGAIN = "The same command goes on with the batch."
+
+
+class BatchKind(StrEnum):
+    """What each question asks for."""
+
+    answer = "answer"
+    simulate = "simulate"
+
+
+def batch(
+    questions: Annotated[
+        Path,
+        typer.Argument(
+            metavar="QUESTIONS",
+            help='JSON Lines: {"image": FILE or URL, "question": TEXT}, maybe "id", "meta", and fields of the request.',
+            exists=True,
+            dir_okay=False,
+            readable=True,
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.jsonl; a batch in it is gone on with.")],
+    kind: Annotated[BatchKind, typer.Option(help="Whether to answer, or only to simulate.")] = BatchKind.answer,
+    request: Annotated[
+        str | None,
+        typer.Option(metavar="JSON", help='Fields for questions that lack them: {"votes": 5}.', show_default="none"),
+    ] = None,
+    concurrency: Annotated[int, typer.Option(min=1, help="Questions at the same time.")] = 8,
+    timeout: Annotated[
+        float | None, typer.Option(min=0.001, help="Longest wait for one question, s.", show_default="none")
+    ] = None,
+    save: Annotated[bool, typer.Option("--save", help="Keep the pictures of each in OUT/items.")] = False,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Ask those again that failed.")] = False,
+    url: Annotated[
+        str | None, typer.Option(help="The server.", show_default="COW_BASE_URL, http://127.0.0.1:8000")
+    ] = None,
+) -> None:
+    """Ask many questions of a server; the same command goes on where it was killed.
+
+    Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
+    """
+    from cow_service.client.batches import PASSING  # noqa: PLC0415
+
+    asked = _read(questions, _defaults(request), kind)
+    try:
+        _ask(asked, out, kind, url, concurrency, timeout, save, retry_failed)
+    except KeyboardInterrupt:
+        typer.echo(f"Interrupted. The same command goes on with it; {out / 'results.jsonl'} is whole.", err=True)
+        sys.stderr.flush()
+        os._exit(INTERRUPTED)  # threads that wait for jobs are not waited for
+    except OSError as error:
+        told = error.strerror or str(error)
+        raise StorageUnavailable(f"'{out}' cannot be written: {told}. {AGAIN}") from error
+    except Unauthorized as error:
+        error.detail += " Here: set COW_API_KEY."
+        raise
+    except PASSING as error:
+        error.detail += f" {AGAIN}"
+        raise
+    raise typer.Exit(_tell(out))
+
+
+def _ask(
+    asked: list[Question],
+    out: Path,
+    kind: BatchKind,
+    url: str | None,
+    concurrency: int,
+    timeout: float | None,
+    save: bool,
+    retry_failed: bool,
+) -> None:
+    from cow_service.client import Client  # noqa: PLC0415
+
+    try:
+        client = Client(url)
+    except ValueError as error:
+        raise InvalidRequest(f"{error}.") from error
+    with client:
+        outcomes = client.map(
+            asked,
+            kind=kind.value,  # pyright: ignore[reportArgumentType] - one of the two
+            concurrency=concurrency,
+            out=out,
+            retry_failed=retry_failed,
+            only_new=True,
+            save=save,
+            timeout=timeout,
+            progress=True,
+        )
+        for outcome in outcomes:
+            if outcome.unsaved is not None:
+                typer.echo(printable(f"{outcome.id}: not saved: {outcome.unsaved.detail}"), err=True)
+
+
+def _read(path: Path, defaults: dict[str, Any], kind: BatchKind) -> list[Question]:
+    """The questions of a file; images are looked for beside it.
+
+    Raises `InvalidRequest` for whatever the server would refuse, before it is asked anything.
+    """
+    from cow_service.client.questions import questions  # noqa: PLC0415
+
+    items: list[dict[str, Any]] = []
+    faults: list[str] = []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        if line.strip():
+            try:
+                item = _parsed(line)
+                (question,) = questions([item], defaults, path.parent)
+                _check(question, kind)
+                items.append(item)
+            except InvalidRequest as error:
+                told = error.detail.removeprefix("Question 1: ")
+                faults.append(f"{path.name}, line {number}: {told}")
+    if faults:
+        more = f"\n... and {len(faults) - SHOWN_FAULTS} more" if len(faults) > SHOWN_FAULTS else ""
+        raise InvalidRequest("\n".join(faults[:SHOWN_FAULTS]) + more)
+    if not items:
+        raise InvalidRequest(f"{path.name} holds no questions: give one JSON object a line.")
+    asked = list(questions(items, defaults, path.parent))
+    _look_for_images(asked, path)
+    return asked
+
+
+def _parsed(line: bytes) -> dict[str, Any]:
+    try:
+        item = json.loads(line)
+    except ValueError as error:
+        raise InvalidRequest(f"no JSON: {error}.") from error
+    if not isinstance(item, dict):
+        raise InvalidRequest(f"must be an object, got {type(item).__name__}.")
+    return item
+
+
+def _look_for_images(asked: list[Question], path: Path) -> None:
+    """Says which files are missing: their questions will fail. Raises `InvalidRequest` where all are."""
+    files = [question.image for question in asked if isinstance(question.image, Path)]
+    missing = [file for file in files if not file.is_file()]
+    if files and len(missing) == len(files):
+        raise InvalidRequest(
+            f"{path.name}: none of the {len(files)} images is there, such as '{files[0]}': a path starts at the folder "
+            "of the file that names it."
+        )
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        names = ", ".join(file.name for file in missing[:SHOWN_FAILURES])
+        told = f"{len(missing)} of {len(files)} images {verb} not there: {names}"
+        typer.echo(printable(told + (", ..." if len(missing) > SHOWN_FAILURES else "")), err=True)
+
+
+def _defaults(text: str | None) -> dict[str, Any]:
+    try:
+        given = json.loads(text or "{}")
+    except ValueError as error:
+        raise InvalidRequest(f"--request is no JSON: {error}.") from error
+    if not isinstance(given, dict):
+        raise InvalidRequest(f"--request must be an object, got {type(given).__name__}.")
+    return given
+
+
+def _check(question: Question, kind: BatchKind) -> None:
+    from pydantic import ValidationError  # noqa: PLC0415
+
+    from cow_service.requests import AnswerRequest, SimulateRequest  # noqa: PLC0415
+
+    model = AnswerRequest if kind is BatchKind.answer else SimulateRequest
+    image = dict(question.image) if isinstance(question.image, Mapping) else "data:"
+    try:
+        model.model_validate({**question.options, "image": image, "question": question.question})
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        raise InvalidRequest(f"/{'/'.join(str(part) for part in wrong['loc'])}: {wrong['msg']}.") from error
+
+
+def _tell(out: Path) -> int:
+    """Says what the folder holds of the batch; returns the exit code."""
+    results = out / "results.jsonl"
+    codes: Counter[str] = Counter()
+    failures: list[str] = []
+    count = unimagined = 0
+    with results.open("rb") as lines:
+        for line in map(json.loads, lines):
+            count += 1
+            unimagined += "result" in line and line["result"].get("simulation", ...) is None
+            if line["status"] == "failed":
+                code = line["problem"]["code"]
+                codes[code] += 1
+                failures.append(f"  {line['id']}: {code}: {line['problem']['detail']}")
+    without = f" ({unimagined} without a simulation)" if unimagined else ""
+    typer.echo(f"{count - len(failures)} succeeded{without}, {len(failures)} failed: {results}")
+    if not failures:
+        return 0
+    typer.echo(", ".join(f"{code} {times}" for code, times in codes.most_common()), err=True)
+    for told in failures[:SHOWN_FAILURES]:
+        typer.echo(printable(told), err=True)
+    if len(failures) > SHOWN_FAILURES:
+        typer.echo(f"  ... and {len(failures) - SHOWN_FAILURES} more", err=True)
+    return SOME_FAILED

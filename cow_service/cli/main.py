@@ -1,0 +1,265 @@
+"""The command line. Heavy imports stand inside the commands, so that `cow --help` is quick."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from cow_service import __version__
+from cow_service.cli import batch as batch_cli
+from cow_service.cli import keys as keys_cli
+from cow_service.cli import mcp as mcp_cli
+from cow_service.cli import models as models_cli
+from cow_service.cli import options
+from cow_service.cli import tracks as tracks_cli
+from cow_service.cli.terminal import printable
+from cow_service.errors import CowError
+
+# Notes that these libraries print when they are imported, such as on optional packages, are not for our users.
+QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
+
+if TYPE_CHECKING:
+    from cow_service.service import Service
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Look before you answer: imagine the future of an image.",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cow {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Look before you answer: imagine the future of an image."""
+
+
+@app.command()
+def simulate(
+    image: options.Image,
+    question: options.Question,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the results.", show_default="./<image>-cow")
+    ] = None,
+    point: options.Place = None,
+    box: options.Box = None,
+    name: options.Name = None,
+    direction: options.Direction = None,
+    kind: options.KindOfMotion = options.Kind.linear,
+    speed: options.Speed = None,
+    trajectory: options.Path_ = None,
+    reader: options.Reader = None,
+    generator: options.Generator = None,
+    option: options.GeneratorOption = None,
+    num_frames: options.NumFrames = 81,
+    fps: options.Fps = 16,
+    seed: options.Seed = 0,
+    video: Annotated[bool, typer.Option(help="Make the mp4.")] = True,
+    frames: options.Frames = options.Policy.initial,
+    count: options.Count = 3,
+    max_side: options.MaxSide = 512,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the simulation as JSON, and nothing else.")] = False,
+) -> None:
+    """Imagine one image's future: frames, video, overlay and simulation.json in a folder."""
+    with _errors_told():
+        from cow_service.cli.console import build_request, run_simulation  # noqa: PLC0415
+
+        request = build_request(
+            question=question,
+            point=point,
+            box=box,
+            name=name,
+            direction=direction,
+            kind=kind.value,
+            speed=speed,
+            trajectory=trajectory,
+            reader=reader,
+            generator=generator,
+            option=option or [],
+            num_frames=num_frames,
+            fps=fps,
+            seed=seed,
+            video=video,
+            frames={"policy": frames.value, "count": count, "max_side": max_side or None},
+        )
+        with _service() as service:
+            run_simulation(service, image, request, out or Path(f"{image.stem}-cow"), as_json=as_json)
+
+
+@app.command()
+def answer(
+    image: options.Image,
+    question: options.Question,
+    choice: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TEXT",
+            help="An answer to choose from, in order A, B, C...; may be repeated.",
+            show_default="those in the question",
+        ),
+    ] = None,
+    imagine: Annotated[bool, typer.Option(help="Simulate first, or answer from the image alone.")] = True,
+    votes: Annotated[int, typer.Option(help="How often to ask; the most frequent answer is taken.")] = 1,
+    baseline: Annotated[bool, typer.Option("--baseline", help="Answer without frames, too, for comparison.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the simulation and answer.json.", show_default="none")
+    ] = None,
+    point: options.Place = None,
+    box: options.Box = None,
+    name: options.Name = None,
+    direction: options.Direction = None,
+    kind: options.KindOfMotion = options.Kind.linear,
+    speed: options.Speed = None,
+    trajectory: options.Path_ = None,
+    reader: options.Reader = None,
+    generator: options.Generator = None,
+    option: options.GeneratorOption = None,
+    num_frames: options.NumFrames = 81,
+    fps: options.Fps = 16,
+    seed: options.Seed = 0,
+    frames: options.Frames = options.Policy.initial,
+    count: options.Count = 3,
+    max_side: options.MaxSide = 512,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON, and nothing else.")] = False,
+) -> None:
+    """Look, then answer: the answer, the votes, the baseline, tokens and time."""
+    with _errors_told():
+        from cow_service.cli.answer_console import run_answer  # noqa: PLC0415
+        from cow_service.cli.console import build_request  # noqa: PLC0415
+
+        request = build_request(
+            question=question,
+            options=choice,
+            imagine="always" if imagine else "never",
+            votes=votes,
+            baseline=baseline,
+            point=point,
+            box=box,
+            name=name,
+            direction=direction,
+            kind=kind.value,
+            speed=speed,
+            trajectory=trajectory,
+            reader=reader,
+            generator=generator,
+            option=option or [],
+            num_frames=num_frames,
+            fps=fps,
+            seed=seed,
+            video=out is not None,
+            frames={"policy": frames.value, "count": count, "max_side": max_side or None},
+        )
+        with _service() as service:
+            run_answer(service, image, request, out, as_json=as_json)
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.", show_default="COW_HOST, 127.0.0.1")] = None,
+    port: Annotated[
+        int | None, typer.Option(help="Port to listen on; 0 takes a free one.", show_default="COW_PORT, 8000")
+    ] = None,
+) -> None:
+    """Start the server."""
+    with _errors_told():
+        service = _service(host=host, port=port)
+        from cow_service.observability import logging as logs  # noqa: PLC0415
+        from cow_service.observability import tracing  # noqa: PLC0415
+
+        logs.set_up(service.settings)
+        tracing.start()
+        from cow_service.api.middleware.order import tell_if_open  # noqa: PLC0415
+        from cow_service.server import run_server  # noqa: PLC0415
+
+        tell_if_open(service.settings)
+        run_server(service)
+
+
+@app.command()
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+    """Say what is installed, what is missing for which backend, and the line that installs it."""
+    with _errors_told():
+        from cow_service.cli.doctor import examine, print_report  # noqa: PLC0415
+
+        with _service() as service:
+            report = examine(service)
+        print_report(report, as_json=as_json)
+        if not report.healthy:
+            raise typer.Exit(1)
+
+
+@app.command(hidden=True)
+def openapi() -> None:
+    """Print the HTTP contract as YAML; `make openapi` keeps openapi.yaml with it."""
+    with _errors_told():
+        import yaml  # noqa: PLC0415
+
+        from cow_service.api.app import create_app  # noqa: PLC0415
+        from cow_service.jobs.engine import Engine  # noqa: PLC0415
+
+        document = create_app(Engine(_service())).openapi()
+        typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
+
+
+def _service(host: str | None = None, port: int | None = None) -> Service:
+    from cow_service.service import Service  # noqa: PLC0415
+    from cow_service.settings import load_settings  # noqa: PLC0415
+
+    for name, level in QUIET.items():
+        os.environ.setdefault(name, level)
+    return Service(load_settings(host=host, port=port))
+
+
+@contextmanager
+def _errors_told() -> Generator[None]:
+    """Errors as a few plain lines on standard error, and exit code 1; 2 for bad settings."""
+    from cow_service.settings import SettingsError  # noqa: PLC0415
+
+    try:
+        yield
+    except CowError as error:
+        typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
+        typer.echo(printable(error.detail), err=True)
+        if error.code in options.HINTS:
+            typer.echo(options.HINTS[error.code], err=True)
+        for field in error.errors:
+            typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
+        raise typer.Exit(1) from error
+    except SettingsError as error:
+        typer.secho(str(error), fg="red", err=True)
+        raise typer.Exit(2) from error
+
+
+class _Told(TyperGroup):
+    """A group of commands whose errors are told as those of the other commands are."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with _errors_told():
+            return super().invoke(ctx)
+
+
+app.command("batch")(_errors_told()(batch_cli.batch))
+app.command("mcp")(_errors_told()(mcp_cli.mcp))
+app.add_typer(keys_cli.app, name="keys", cls=_Told)
+app.add_typer(models_cli.app, name="models", cls=_Told)
+app.add_typer(tracks_cli.app, name="tracks", cls=_Told)
+
+if __name__ == "__main__":
+    sys.exit(app())

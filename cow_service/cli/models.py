@@ -1,0 +1,184 @@
+"""`cow models`: what there is, and how weights come here and are checked. Heavy imports stand inside the commands."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cow_service.errors import InvalidRequest
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from cow_service.weights.hub import Listener, Plan, Step
+    from cow_service.weights.manifests import Manifest, Source
+
+app = typer.Typer(help="List readers and generators; pull and check weights.")
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="As `cow models` lists it.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+@app.callback(invoke_without_command=True)
+def models(context: typer.Context, as_json: AsJson = False) -> None:
+    """List readers and generators, and whether each is ready; pull and check weights."""
+    if context.invoked_subcommand is not None:
+        if as_json:
+            raise typer.BadParameter("--json goes after the command.")
+        return
+    from cow_service.cli.console import print_models  # noqa: PLC0415
+    from cow_service.service import Service  # noqa: PLC0415
+    from cow_service.settings import load_settings  # noqa: PLC0415
+
+    print_models(Service(load_settings()).models(), as_json=as_json)
+
+
+@app.command()
+def pull(
+    name: Name,
+    revision: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[PART=]REV",
+            help="Branch, tag or commit, of all parts or of one; may be repeated.",
+            show_default="what was pulled before, else the newest",
+        ),
+    ] = None,
+) -> None:
+    """Download a model's weights and check every file; files that are here already stay."""
+    manifest = _manifest(name)
+    revisions = _revisions(manifest, revision or [])
+    if not manifest.sources:
+        typer.echo(f"{name} needs no weights.")
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.filesize import decimal  # noqa: PLC0415
+
+    from cow_service.weights.hub import fetch  # noqa: PLC0415
+    from cow_service.weights.lock import folder_of  # noqa: PLC0415
+
+    weights_dir = _weights_dir()
+    console = Console(highlight=False, soft_wrap=True, markup=False)
+    console.print("Looking at what is there, and at what is here ...")
+    plans = _plans(manifest, weights_dir, revisions)
+    count, size = sum(len(each.files) for each in plans), sum(each.size for each in plans)
+    pending, needed = sum(len(each.pending) for each in plans), sum(each.pending_size for each in plans)
+    console.print(f"{name}: {count} files, {decimal(size)}; to download: {pending} files, {decimal(needed)}.")
+    with _shown(console, needed) as show:
+        fetch(plans, weights_dir, show)
+    for each in plans:
+        folder = folder_of(weights_dir, each.lock.repository)
+        console.print(f"{each.lock.repository} at {each.lock.revision[:12]} is in {folder}")
+
+
+@app.command()
+def check(name: Name, as_json: AsJson = False) -> None:
+    """Say whether a model's weights are here and are those that were pulled; exit code 1 if not."""
+    import json  # noqa: PLC0415
+
+    from cow_service.weights import lock as weights  # noqa: PLC0415
+
+    manifest, weights_dir = _manifest(name), _weights_dir()
+    findings = {part: weights.check(source, weights_dir) for part, source in manifest.sources.items()}
+    complete = not any(findings.values())
+    if as_json:
+        parts = {part: [finding.model_dump() for finding in found] for part, found in findings.items()}
+        typer.echo(json.dumps({"name": name, "complete": complete, "findings": parts}, indent=2))
+    elif not findings:
+        typer.echo(f"{name} needs no weights.")
+    else:
+        for part, found in findings.items():
+            source = manifest.sources[part]
+            typer.echo(f"{part} ({source.repository}, {source.licence}): {'not complete' if found else 'complete'}")
+            for finding in found:
+                typer.echo(f"  {finding.told()}")
+    if not complete:
+        typer.echo(f"Run `cow models pull {name}`.", err=True)
+        raise typer.Exit(1)
+
+
+def _weights_dir() -> Path:
+    from cow_service.settings import load_settings  # noqa: PLC0415
+
+    return load_settings().weights_dir
+
+
+def _manifest(name: str) -> Manifest:
+    from cow_service.weights.manifests import load_manifests  # noqa: PLC0415
+
+    manifests = load_manifests()
+    if name not in manifests:
+        known = ", ".join(sorted(each for each, manifest in manifests.items() if manifest.sources))
+        raise InvalidRequest(f"There is no model '{name}'. With weights to download there are: {known or 'none'}.")
+    return manifests[name]
+
+
+def _revisions(manifest: Manifest, wanted: list[str]) -> dict[str, str]:
+    """The revision of each part for which one was given. Raises `InvalidRequest` for a part that does not exist."""
+    revisions: dict[str, str] = {}
+    for each in wanted:
+        part, _, revision = each.rpartition("=")
+        if part and part not in manifest.sources:
+            parts = ", ".join(manifest.sources) or "none"
+            raise InvalidRequest(f"--revision {each}: '{manifest.name}' has no part '{part}'. Its parts: {parts}.")
+        revisions |= {part: revision} if part else dict.fromkeys(manifest.sources, revision)
+    return revisions
+
+
+def _plans(manifest: Manifest, weights_dir: Path, revisions: dict[str, str]) -> list[Plan]:
+    """One plan for each repository: parts that come from the same one share its folder and its revision."""
+    from cow_service.weights.hub import plan  # noqa: PLC0415
+
+    sources: dict[str, Source] = {}
+    chosen: dict[str, str] = {}
+    for part, source in manifest.sources.items():
+        known = sources.get(source.repository, source)
+        files = tuple(dict.fromkeys((*known.files, *source.files)))
+        sources[source.repository] = known.model_copy(update={"files": files})
+        if part in revisions and chosen.setdefault(source.repository, revisions[part]) != revisions[part]:
+            raise InvalidRequest(f"Parts of '{source.repository}' share its folder: give them one --revision.")
+    return [plan(source, weights_dir, chosen.get(name)) for name, source in sources.items()]
+
+
+@contextmanager
+def _shown(console: Console, size: int) -> Generator[Listener]:
+    """Bars for the files and for all bytes; where there is no terminal, a line for each file."""
+    from rich.filesize import decimal  # noqa: PLC0415
+    from rich.progress import (  # noqa: PLC0415
+        BarColumn,
+        DownloadColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
+
+    def tell(step: Step) -> None:
+        if step.state == "downloading" and step.done == 0:
+            console.print(f"{step.repository}: {step.file}, {decimal(step.size)}")
+
+    if not console.is_terminal:
+        yield tell
+        return
+    text = TextColumn("{task.description}", markup=False)
+    columns = text, BarColumn(bar_width=24), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console) as bars:
+        overall = bars.add_task("all files", total=size)
+        tasks: dict[tuple[str, str], TaskID] = {}
+        done: dict[tuple[str, str], int] = {}
+
+        def show(step: Step) -> None:
+            key = step.repository, step.file
+            if key not in tasks:
+                tasks[key] = bars.add_task(step.file, total=step.size)
+            done[key] = step.done
+            suffix = "" if step.state == "downloading" else f" ({step.state})"
+            bars.update(tasks[key], completed=step.done, description=step.file + suffix, visible=step.state != "done")
+            bars.update(overall, completed=sum(done.values()))
+
+        yield show

@@ -1,0 +1,188 @@
+"""What the tools return as data: the records of the service without the thousands of numbers of a trajectory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cow_service import records
+from cow_service.mcp.images import ARTIFACTS
+from cow_service.mcp.inputs import lean
+from cow_service.records import EncounterKind, MotionKind
+
+
+class Result(BaseModel):
+    """Something that a tool returns."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class Met(Result):
+    """The mover's silhouette meets another thing: a hypothesis, computed from the image alone."""
+
+    object: str
+    kind: EncounterKind = Field(
+        description="touches; occludes: the mover passes in front of it; occluded-by: the mover passes behind it."
+    )
+    time_s: float = Field(description="When it begins, seconds from now.")
+    frame: int = Field(description="When it begins, frame of the clip.")
+
+
+class FrameShown(Result):
+    """One of the returned pictures, after the overlay and in this order."""
+
+    index: int = Field(description="Frame of the clip.")
+    time_s: float
+    sha256: str
+    width: int
+    height: int
+
+
+class VideoMade(Result):
+    """The clip as mp4."""
+
+    sha256: str
+    uri: str = Field(description="The resource that holds it.")
+    url: str | None = Field(description="Its address on the COW server; null where that has none.")
+    fps: float
+    num_frames: int
+    width: int
+    height: int
+
+
+class SimulateResult(Result):
+    """What `simulate` returns."""
+
+    id: str
+    object: str = Field(description="What moves.")
+    bbox: list[float] = Field(description="Where it is now, [x0, y0, x1, y1], pixels of the image.")
+    motion: str = Field(description="How it moves, in a sentence.")
+    kind: MotionKind
+    direction: list[float] | None = Field(
+        description="Unit vector [dx, dy], x right, y down; null for a fall or a thing that stays."
+    )
+    speed: float = Field(description="Pixels per second at first.")
+    leaves_at_s: float | None = Field(description="When its centre leaves the image; null where it stays inside.")
+    encounters: list[Met] = Field(description="What it meets on its way, in order of time.")
+    encounters_known: bool = Field(description="Whether an empty list of encounters means that it meets nothing.")
+    frames: list[FrameShown]
+    video: VideoMade | None
+    overlay_sha256: str = Field(description="The image with box, direction and path drawn: the first picture.")
+    image_sha256: str = Field(description="Give this as `image` to ask about the same image again.")
+    image_width: int = Field(description="Pixels.")
+    image_height: int = Field(description="Pixels.")
+    generator: str
+    reader: str
+    warnings: list[str] = Field(description="What was assumed or could be meant otherwise.")
+
+
+class Verdict(Result):
+    """An answer without imagined frames, for comparison."""
+
+    answer: str | None
+    option: str | None
+    not_sure: bool
+    votes: dict[str, int]
+
+
+class Usage(Result):
+    """What the multimodal LLM of the service was asked."""
+
+    calls: int
+    input_tokens: int
+    output_tokens: int
+
+
+class AnswerResult(Result):
+    """What `answer` returns."""
+
+    id: str
+    answer: str | None = Field(
+        description="A letter, or text where the question is open; null where it is not sure and no option says so."
+    )
+    option: str | None = Field(description="Text of the option with that letter.")
+    not_sure: bool
+    reasoning: str = Field(description="The answerer's own; empty where nobody reasons.")
+    votes: dict[str, int]
+    baseline: Verdict | None
+    warnings: list[str] = Field(description="What was assumed or could be meant otherwise.")
+    simulation: SimulateResult | None = Field(description="What was imagined; null where that failed.")
+    image_sha256: str = Field(description="Give this as `image` to ask about the same image again.")
+    reader: str
+    usage: Usage
+
+
+def simulate_result(simulation: records.Simulation, base_url: str | None) -> SimulateResult:
+    """A simulation as a tool returns it; `base_url` is the address of its server, where that has one."""
+    motion, trajectory, video = simulation.motion, simulation.trajectory, simulation.video
+    gone = [not visible for visible in trajectory.visible]
+    return SimulateResult(
+        id=simulation.id,
+        object=simulation.grounding.object,
+        bbox=_rounded(simulation.grounding.bbox, 1),
+        motion=motion.sentence,
+        kind=motion.kind,
+        direction=None if motion.direction is None else _rounded(motion.direction, 3),
+        speed=round(motion.speed, 1),
+        leaves_at_s=round(gone.index(True) / trajectory.fps, 2) if any(gone) else None,
+        encounters=[
+            Met(object=e.object, kind=e.kind, time_s=round(e.first_frame / trajectory.fps, 2), frame=e.first_frame)
+            for e in sorted(trajectory.encounters, key=lambda e: e.first_frame)
+        ],
+        encounters_known=simulation.encounters_known,
+        frames=[
+            FrameShown(index=f.index, time_s=round(f.time, 2), sha256=f.sha256, width=f.width, height=f.height)
+            for f in simulation.frames
+        ],
+        video=None if video is None else _video(video, base_url),
+        overlay_sha256=simulation.overlay.sha256,
+        image_sha256=simulation.image.sha256,
+        image_width=simulation.image.width,
+        image_height=simulation.image.height,
+        generator=simulation.generator.name,
+        reader=simulation.reader.name,
+        warnings=list(simulation.warnings),
+    )
+
+
+def answer_result(answer: records.Answer, base_url: str | None) -> AnswerResult:
+    """An answer as a tool returns it."""
+    baseline = answer.baseline
+    return AnswerResult(
+        id=answer.id,
+        answer=answer.answer,
+        option=answer.option,
+        not_sure=answer.not_sure,
+        reasoning=answer.reasoning,
+        votes=answer.votes,
+        baseline=None
+        if baseline is None
+        else Verdict(answer=baseline.answer, option=baseline.option, not_sure=baseline.not_sure, votes=baseline.votes),
+        warnings=list(answer.warnings),
+        simulation=None if answer.simulation is None else simulate_result(answer.simulation, base_url),
+        image_sha256=answer.image.sha256,
+        reader=answer.reader.name,
+        usage=Usage.model_validate(answer.usage.model_dump()),
+    )
+
+
+def output_schema(model: type[Result]) -> dict[str, Any]:
+    """The JSON schema of what a tool returns."""
+    return lean(model.model_json_schema(mode="serialization"))
+
+
+def _video(video: records.Video, base_url: str | None) -> VideoMade:
+    return VideoMade(
+        sha256=video.sha256,
+        uri=ARTIFACTS + video.sha256,
+        url=None if base_url is None else base_url + video.url,
+        fps=video.fps,
+        num_frames=video.num_frames,
+        width=video.width,
+        height=video.height,
+    )
+
+
+def _rounded(values: tuple[float, ...], digits: int) -> list[float]:
+    return [round(value, digits) for value in values]

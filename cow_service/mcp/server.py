@@ -1,0 +1,233 @@
+"""The protocol's side: two tools, and the artifacts of their results as resources.
+
+The low-level server of the library takes arguments as they come: its high-level one leaves out those that it does not
+know, and tells wrong ones in pydantic's words.
+"""
+
+from __future__ import annotations
+
+import base64
+import logging
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+from anyio import to_thread
+from mcp.server.context import ServerRequestContext
+from mcp.server.lowlevel import Server
+from mcp.shared.exceptions import MCPError
+from mcp_types import (
+    INTERNAL_ERROR,
+    INVALID_PARAMS,
+    BlobResourceContents,
+    CallToolRequestParams,
+    CallToolResult,
+    ImageContent,
+    ListResourcesResult,
+    ListResourceTemplatesResult,
+    ListToolsResult,
+    PaginatedRequestParams,
+    ReadResourceRequestParams,
+    ReadResourceResult,
+    ResourceTemplate,
+    TextContent,
+    Tool,
+    ToolAnnotations,
+)
+
+from cow_service import __version__
+from cow_service.client import AsyncAnswer, AsyncClient, CowError
+from cow_service.errors import InternalError
+from cow_service.mcp import errors as failures
+from cow_service.mcp.images import ARTIFACTS, WITH_PATHS, WITHOUT_PATHS, digest_of, image_of, media_type
+from cow_service.mcp.inputs import INPUTS, ToolName, input_schema, parsed
+from cow_service.mcp.pictures import pictures_of
+from cow_service.mcp.progress import result_of
+from cow_service.mcp.results import AnswerResult, Result, SimulateResult, answer_result, output_schema, simulate_result
+from cow_service.mcp.text import answer_in_words, simulation_in_words
+
+INSTRUCTIONS = """\
+COW imagines what would happen in a picture. Use it for what-if questions about one still image in which something \
+moves: will it hit, reach, hide or be hidden by something, where does it come to, what does it land on. `simulate` \
+returns imagined frames for you to look at; `answer` returns an answer with its imagined frames. Both compute where \
+the thing goes rather than guess, from an image and a question in plain English."""
+
+LIMITS = """\
+Limits: one thing moves, everything else stays; its velocity is constant but for gravity, through what it meets: \
+nothing bounces, breaks, rolls or is pushed. Encounters come from silhouettes in the picture (what stands lower is \
+taken to be nearer): hypotheses, not measurements. `warnings` say what was assumed. Where the thing or its direction \
+is not found, the error says what was seen and which arguments to add."""
+
+DESCRIPTIONS: dict[ToolName, str] = {
+    "simulate": f"""\
+Imagine the future of a still image: finds the thing that moves, reads its motion from the question and from arrows \
+drawn in the image, computes its path, and makes frames of what would be seen. Use it when you want to look for \
+yourself before you answer a question on motion, collision, occlusion or falling.
+
+Returns pictures (first the image with box, direction and path drawn, then frames at the moments that matter), and in \
+words and as data: what moves, how, and what it touches, passes in front of or passes behind, and when.
+
+{LIMITS}
+
+Examples:
+  image="/photos/table.jpg", question="If the red ball moves to the left, will it hit the vase?"
+  image="/photos/shelf.png", question="What does the cup land on if it falls?", bbox=[310, 80, 365, 150], \
+object="cup", motion_kind="fall"
+""",
+    "answer": f"""\
+Answer a what-if question about a still image by imagining it first: does what `simulate` does, has the result looked \
+at, and returns the answer with the pictures that it rests on. Use it when you want a verdict. List the options in the \
+question, '(A) Yes (B) No (C) Not sure', or in `options`; then the answer is a letter. An answer can be 'not sure': \
+then look at the pictures and judge for yourself, or say more exactly what moves (`bbox`, `direction`).
+
+{LIMITS} Without a multimodal LLM on the server (reader 'embedded'), only plain questions on hitting, landing on, \
+hiding and being hidden by one thing are answered; all else is 'not sure'.
+
+Example:
+  image="/photos/table.jpg", question="If the yellow ball moves against the arrow, will it hit the mug? (A) Yes (B) No"
+""",
+}
+TITLES: dict[ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
+OUTPUTS: dict[ToolName, type[Result]] = {"simulate": SimulateResult, "answer": AnswerResult}
+# It only looks; the same arguments come to the same result; images may be fetched, and shown to a provider's model.
+HINTS = {"read_only_hint": True, "destructive_hint": False, "idempotent_hint": True, "open_world_hint": True}
+
+log = logging.getLogger("cow_service")
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who calls a tool: by key and address where the call came over HTTP, else nothing is known."""
+
+    key: str | None = None
+    address: tuple[str, int] | None = None
+    forwarded: bool = False  # by a proxy, which may stand before anybody
+
+
+Connect: TypeAlias = Callable[[Caller], AbstractAsyncContextManager[AsyncClient]]
+Lifespan: TypeAlias = Callable[[Server[Any]], AbstractAsyncContextManager[Any]]
+
+
+def create_server(connect: Connect, lifespan: Lifespan, *, paths: bool, links: bool) -> Server[Any]:
+    """The server of the tools.
+
+    `connect` opens the way to COW for one call, and may raise a `CowError`. `paths` says whether images may be files
+    of this machine, `links` whether the addresses of artifacts can be opened by others.
+    """
+    tools = _Tools(connect, paths=paths, links=links)
+    return Server(
+        "cow",
+        title="COW",
+        version=__version__,
+        instructions=INSTRUCTIONS,
+        lifespan=lifespan,
+        on_list_tools=tools.list,
+        on_call_tool=tools.call,
+        on_list_resources=tools.resources,
+        on_list_resource_templates=tools.templates,
+        on_read_resource=tools.read,
+    )
+
+
+class _Tools:
+    def __init__(self, connect: Connect, *, paths: bool, links: bool) -> None:
+        self._connect, self._paths, self._links = connect, paths, links
+        self._listed = [
+            Tool(
+                name=name,
+                title=TITLES[name],
+                description=DESCRIPTIONS[name],
+                input_schema=input_schema(model, WITH_PATHS if paths else WITHOUT_PATHS),
+                output_schema=output_schema(OUTPUTS[name]),
+                annotations=ToolAnnotations(title=TITLES[name], **HINTS),
+            )
+            for name, model in INPUTS.items()
+        ]
+
+    async def list(self, _: ServerRequestContext[Any], __: PaginatedRequestParams | None) -> ListToolsResult:
+        return ListToolsResult(tools=self._listed)
+
+    async def call(self, context: ServerRequestContext[Any], params: CallToolRequestParams) -> CallToolResult:
+        """What a tool returns; every error is told in it, since that is where a model looks."""
+        if params.name not in INPUTS:
+            raise MCPError(code=INVALID_PARAMS, message=f"Unknown tool: {params.name[:80]!r}")
+        tool = params.name
+        try:
+            return await self._done(tool, context, params.arguments or {})
+        except CowError as error:
+            log.info("%s failed: %s", tool, error.code)
+            return _failed(error)
+        except Exception:
+            log.exception("%s failed", tool)
+            return _failed(InternalError("The tool met an error that it did not foresee; its log has the trace."))
+
+    async def _done(
+        self, tool: ToolName, context: ServerRequestContext[Any], arguments: dict[str, Any]
+    ) -> CallToolResult:
+        given = parsed(INPUTS[tool], arguments)
+
+        async def report(done: float, doing: str) -> None:
+            await context.session.report_progress(done, 1.0, doing)
+
+        image = await to_thread.run_sync(partial(image_of, given.image, paths=self._paths))
+        async with self._connect(_caller(context)) as client:
+            result = await result_of(client, tool, image, given.question, given.rest(), report)
+            simulation = result.simulation if isinstance(result, AsyncAnswer) else result
+            pictures = [] if simulation is None else await pictures_of(simulation, client)
+            base_url = client.base_url if self._links else None
+        if isinstance(result, AsyncAnswer):
+            answer = answer_result(result, base_url)
+            return _returned(answer, answer_in_words(answer), pictures)
+        simulated = simulate_result(result, base_url)
+        return _returned(simulated, simulation_in_words(simulated), pictures)
+
+    async def resources(self, _: ServerRequestContext[Any], __: PaginatedRequestParams | None) -> ListResourcesResult:
+        return ListResourcesResult(resources=[])
+
+    async def templates(
+        self, _: ServerRequestContext[Any], __: PaginatedRequestParams | None
+    ) -> ListResourceTemplatesResult:
+        artifact = ResourceTemplate(
+            uri_template=ARTIFACTS + "{sha256}",
+            name="artifact",
+            title="Pictures and videos of results",
+            description="The bytes of a picture or video, by the SHA-256 that a result names it with.",
+        )
+        return ListResourceTemplatesResult(resource_templates=[artifact])
+
+    async def read(self, context: ServerRequestContext[Any], params: ReadResourceRequestParams) -> ReadResourceResult:
+        uri = str(params.uri)
+        sha256 = digest_of(uri)
+        if sha256 is None:
+            raise MCPError(code=INVALID_PARAMS, message=f"There is no resource {uri[:200]!r}.")
+        try:
+            async with self._connect(_caller(context)) as client:
+                data = await client.artifact(sha256)
+        except CowError as error:
+            code = INVALID_PARAMS if error.code == "artifact-not-found" else INTERNAL_ERROR
+            raise MCPError(code=code, message=failures.in_words(error)) from error
+        blob = base64.b64encode(data).decode()
+        return ReadResourceResult(contents=[BlobResourceContents(uri=uri, mime_type=media_type(data), blob=blob)])
+
+
+def _caller(context: ServerRequestContext[Any]) -> Caller:
+    """Who made the HTTP request that brought a message: each has its own headers, also within one session."""
+    request = context.request
+    if request is None:
+        return Caller()
+    scheme, _, key = request.headers.get("authorization", "").strip().partition(" ")
+    address = None if request.client is None else (request.client.host, request.client.port)
+    forwarded = any(name in request.headers for name in ("forwarded", "x-forwarded-for", "x-real-ip", "via"))
+    return Caller((key.strip() or None) if scheme.lower() == "bearer" else None, address, forwarded)
+
+
+def _returned(result: Result, text: str, pictures: list[ImageContent]) -> CallToolResult:
+    return CallToolResult(
+        content=[TextContent(text=text), *pictures], structured_content=result.model_dump(mode="json")
+    )
+
+
+def _failed(error: CowError) -> CallToolResult:
+    return CallToolResult(content=[TextContent(text=failures.in_words(error))], is_error=True)

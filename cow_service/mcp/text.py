@@ -1,0 +1,89 @@
+"""What came of a call in words, for models and for clients that do not look at the data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from cow_service.mcp.results import AnswerResult, Met, SimulateResult, Verdict
+from cow_service.records import MEETINGS
+
+
+def simulation_in_words(simulation: SimulateResult) -> str:
+    """What moves, how, what it meets when; which picture is which; what to mind."""
+    return "\n".join([*_imagined(simulation), *_notes(simulation.warnings), _again(simulation.image_sha256)])
+
+
+def answer_in_words(answer: AnswerResult) -> str:
+    """The answer first, then what was imagined for it."""
+    lines = [f"Answer: {_verdict(answer.answer, answer.option)}."]
+    if answer.reasoning:
+        lines.append(f"Reasoning: {answer.reasoning}")
+    if sum(answer.votes.values()) > 1:
+        lines.append(f"Votes: {_votes(answer.votes)}.")
+    if answer.baseline is not None:
+        lines.append(f"Without imagined frames: {_baseline(answer.baseline)}.")
+    warnings = list(answer.warnings)
+    if answer.simulation is not None:
+        lines += ["", "Imagined:", *_imagined(answer.simulation)]
+        warnings += answer.simulation.warnings
+    else:
+        lines.append("Nothing was imagined: the answer is from the image alone.")
+    return "\n".join([*lines, *_notes(warnings), _again(answer.image_sha256)])
+
+
+def _imagined(simulation: SimulateResult) -> Iterable[str]:
+    box = ", ".join(f"{side:g}" for side in simulation.bbox)
+    size = f"{simulation.image_width} x {simulation.image_height} px"
+    yield simulation.motion
+    yield f"It is the {simulation.object} at [{box}] in the image of {size}; {_how(simulation)}."
+    yield _meets(simulation)
+    if simulation.leaves_at_s is not None:
+        yield f"Its centre leaves the image at {simulation.leaves_at_s:g} s."
+    frames = [f"frame {frame.index} ({frame.time_s:g} s)" for frame in simulation.frames]
+    yield f"Pictures, in this order: the image with box, direction and path drawn; {', '.join(frames)}."
+    if simulation.video is not None:
+        yield f"Video: {simulation.video.url or simulation.video.uri}"
+    yield f"Simulation {simulation.id}; generator {simulation.generator}, reader {simulation.reader}."
+
+
+def _how(simulation: SimulateResult) -> str:
+    if simulation.direction is None:
+        return simulation.kind
+    along = ", ".join(f"{part:g}" for part in simulation.direction)
+    return f"{simulation.kind}, direction [{along}] (x right, y down), {simulation.speed:g} px/s"
+
+
+def _meets(simulation: SimulateResult) -> str:
+    met = "; ".join(_met(encounter) for encounter in simulation.encounters)
+    if met:
+        return f"On its way (from silhouettes, hypotheses) it {met}."
+    if simulation.encounters_known:
+        return "It meets nothing on its way, as far as silhouettes tell."
+    return "What it meets was not computed."
+
+
+def _met(encounter: Met) -> str:
+    return f"{MEETINGS[encounter.kind]} {encounter.object} from {encounter.time_s:g} s (frame {encounter.frame})"
+
+
+def _verdict(answer: str | None, option: str | None) -> str:
+    if answer is None:
+        return "not sure"
+    return answer if option is None else f"{answer} ({option})"
+
+
+def _baseline(baseline: Verdict) -> str:
+    told = _verdict(baseline.answer, baseline.option)
+    return f"{told}; votes {_votes(baseline.votes)}" if sum(baseline.votes.values()) > 1 else told
+
+
+def _votes(votes: dict[str, int]) -> str:
+    return ", ".join(f"{answer}: {count}" for answer, count in votes.items())
+
+
+def _notes(warnings: Iterable[str]) -> Iterable[str]:
+    return (f"Note: {warning}" for warning in dict.fromkeys(warnings))
+
+
+def _again(sha256: str) -> str:
+    return f'To ask about this image again, give image="{sha256}".'

@@ -1,0 +1,1 @@
+"""Bytes of images and videos: decoding, encoding, drawing, keeping."""

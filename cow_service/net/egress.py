@@ -1,0 +1,258 @@
+"""Outgoing HTTP to addresses that strangers name: nothing inside can be reached with it, and nobody can hold it up.
+
+Every hop is checked in full before anything is sent: scheme, host, and every address that the name has now. The
+connection goes to the addresses that were checked, never to the name, so that a name server that answers otherwise the
+second time changes nothing. Proxies of the environment are not asked, redirects of a POST are not followed, no body is
+decompressed, and one clock runs over name, connection, TLS, headers and body together.
+
+httpcore, the lower half of httpx, takes its connections from a backend of ours: the clock has to stop a server that
+sends its headers byte by byte, and httpx's time limits begin anew with every read.
+"""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Callable, Generator, Iterable, Mapping
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Thread
+
+import httpcore
+import httpx
+
+from cow_service import __version__
+from cow_service.net.hosts import HostList, host_name, is_address, is_public
+from cow_service.net.pinned import Clock, Pinned
+
+MAX_REDIRECTS = 3
+MAX_URL = 4096  # characters
+REDIRECTS = frozenset((301, 302, 303, 307, 308))
+_DEFAULT_PORTS = {"http": 80, "https": 443}
+
+
+class EgressError(Exception):
+    """Nothing came of it. The message is whole sentences and names no address that a host name led to."""
+
+
+class NotAllowed(EgressError):
+    """The URL is none that may be asked."""
+
+
+class Unreachable(EgressError):
+    """Whoever was asked cannot be reached, or did not answer as it must."""
+
+
+# What others raise, and what becomes of it. The first row that fits is taken.
+TRANSLATED: tuple[tuple[type[Exception], type[EgressError], str], ...] = (
+    (ssl.SSLCertVerificationError, Unreachable, "The certificate of '{host}' is not one to trust for that name."),
+    (ssl.SSLError, Unreachable, "No TLS connection to '{host}' could be made."),
+    (socket.gaierror, Unreachable, "The host name '{host}' is not known. Check its spelling."),
+    (socket.herror, Unreachable, "The host name '{host}' is not known. Check its spelling."),
+    (TimeoutError, Unreachable, "'{host}' took too long."),
+    (httpcore.TimeoutException, Unreachable, "'{host}' took too long."),
+    (ConnectionRefusedError, Unreachable, "'{host}' takes no connections at that port."),
+    (OSError, Unreachable, "The connection to '{host}' failed."),
+    (httpcore.NetworkError, Unreachable, "The connection to '{host}' failed."),
+    (httpcore.ProxyError, Unreachable, "The connection to '{host}' failed."),
+    (httpcore.ConnectionNotAvailable, Unreachable, "The connection to '{host}' failed."),
+    (httpcore.LocalProtocolError, NotAllowed, "The request to '{host}' cannot be written as HTTP."),
+    (httpcore.ProtocolError, Unreachable, "'{host}' does not speak HTTP, or broke off in the middle."),
+    (httpcore.UnsupportedProtocol, NotAllowed, "'{host}' is to be asked by something other than HTTP."),
+    (httpx.InvalidURL, NotAllowed, "{host} cannot be read. Give one like https://images.example.org/1.png."),
+    (UnicodeError, NotAllowed, "{host} comes with characters that cannot be sent. Escape them."),
+    (ValueError, NotAllowed, "{host} cannot be read. Give one like https://images.example.org/1.png."),
+)
+
+
+@contextmanager
+def _told(host: str) -> Generator[None]:
+    """Exceptions of others become ours, by the table."""
+    try:
+        yield
+    except tuple(foreign for foreign, _, _ in TRANSLATED) as error:
+        ours, text = next((ours, text) for foreign, ours, text in TRANSLATED if isinstance(error, foreign))
+        raise ours(text.format(host=host)) from error
+
+
+def look_up(host: str, port: int) -> list[str]:
+    """Every address that a host name has, as the system's resolver tells. Raises `OSError`."""
+    return [str(found[4][0]) for found in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
+
+
+class Egress:
+    """Asks addresses that strangers name. Safe to use from several threads.
+
+    `allow` lists the hosts that may be asked, as `HostList` reads them; None allows every public host at every port.
+    `seconds` is for a whole exchange with all redirects, `connect_seconds` for taking up one connection.
+    `resolve` and `permitted` say which addresses a name has and which may be connected to.
+    Raises `ValueError` for an entry of `allow` that cannot be read.
+    """
+
+    def __init__(
+        self,
+        allow: Iterable[str] | None,
+        *,
+        seconds: float = 10.0,
+        connect_seconds: float = 5.0,
+        resolve: Callable[[str, int], list[str]] = look_up,
+        permitted: Callable[[str], bool] = is_public,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        self._allow = None if allow is None else HostList(allow)
+        self._seconds = seconds
+        self._connect_seconds = connect_seconds
+        self._resolve = resolve
+        self._permitted = permitted
+        self._given_tls = tls
+
+    def fetch(self, url: str, most_bytes: int) -> bytes:
+        """The body at a URL, at most so long. Raises `NotAllowed` or `Unreachable`."""
+        clock = Clock(self._seconds)
+        target = self._target(url, "The URL")
+        for _ in range(MAX_REDIRECTS + 1):
+            with _told(target.host), self._exchange("GET", target, clock) as response:
+                location = _headers(response, b"location")
+                if response.status not in REDIRECTS or not location:
+                    return _body(response, target.host, most_bytes)
+                where = location[0].decode()
+            with _told("A redirect"):
+                where = str(target.url.join(where))
+            target = self._target(where, "A redirect")
+        raise Unreachable(f"There were more than {MAX_REDIRECTS} redirects. Give the URL that they end at.")
+
+    def post(self, url: str, body: bytes, headers: Mapping[str, str]) -> int:
+        """Sends a body, and returns the HTTP status of the answer, which may be that of a redirect.
+
+        `headers` says its type and whatever else; host, length and encoding are put in here. Raises `NotAllowed` or
+        `Unreachable`.
+        """
+        target = self._target(url, "The URL")
+        with _told(target.host), self._exchange("POST", target, Clock(self._seconds), body, headers) as response:
+            return response.status
+
+    def check(self, url: str) -> None:
+        """Raises `NotAllowed` for a URL that is never asked. What a name leads to is not looked up yet."""
+        target = self._target(url, "The URL")
+        if is_address(target.host):
+            self._check_addresses(target, [target.host])
+
+    def _target(self, text: str, what: str) -> _Target:
+        """A URL taken apart, once; what is checked is what is used. Raises `NotAllowed`."""
+        if not text[:8].lower().startswith(("http://", "https://")):
+            raise NotAllowed(f"{what} does not begin with http:// or https://.")
+        if len(text) > MAX_URL:
+            raise NotAllowed(f"{what} is longer than {MAX_URL} characters.")
+        with _told(what):
+            url = httpx.URL(text)
+        if url.userinfo:
+            raise NotAllowed(f"{what} holds a user name or a password. Leave them out.")
+        raw = url.raw_host.decode("ascii")
+        host = host_name(raw)
+        if host is None:
+            raise NotAllowed(f"{what} names no host that can be asked: '{raw[:100]}'. Give a name or a plain address.")
+        port = _DEFAULT_PORTS[url.scheme] if url.port is None else url.port
+        if not 0 < port < 65536:
+            raise NotAllowed(f"{what} names a port that does not exist: {str(port)[:20]}.")
+        if self._allow is not None and not self._allow.has(host, port):
+            raise NotAllowed(f"{what} names the host '{host}' at port {port}, which is not on this server's list.")
+        return _Target(url, host, port, what)
+
+    @contextmanager
+    def _exchange(
+        self,
+        method: str,
+        target: _Target,
+        clock: Clock,
+        body: bytes | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> Generator[httpcore.Response]:
+        """One request, and the beginning of its answer."""
+        ours = {
+            "host": target.netloc,
+            "user-agent": f"cow-service/{__version__}",
+            "accept-encoding": "identity",
+            "connection": "close",
+        } | ({} if body is None else {"content-length": str(len(body))})
+        sent = {name.lower(): value for name, value in (headers or {}).items()} | ours
+        coded = [(name.encode("ascii"), value.encode("ascii")) for name, value in sent.items()]
+        url = httpcore.URL(
+            scheme=target.url.raw_scheme, host=target.host.encode(), port=target.port, target=target.url.raw_path
+        )
+        tls = self._tls if target.url.scheme == "https" else None
+        backend = Pinned(self._addresses(target, clock), clock, self._connect_seconds)
+        with (
+            httpcore.ConnectionPool(ssl_context=tls, network_backend=backend) as pool,
+            pool.stream(method, url, headers=coded, content=body) as response,
+        ):
+            yield response
+
+    def _addresses(self, target: _Target, clock: Clock) -> list[str]:
+        """Where a host is now. Raises `NotAllowed` where any of it may not be connected to."""
+        addresses = [target.host] if is_address(target.host) else self._looked_up(target, clock)
+        if not addresses:
+            raise Unreachable(f"The host name '{target.host}' has no address.")
+        self._check_addresses(target, addresses)
+        return addresses
+
+    def _check_addresses(self, target: _Target, addresses: list[str]) -> None:
+        if not all(self._permitted(address) for address in addresses):
+            raise NotAllowed(f"{target.what} leads to the host '{target.host}', whose address is not a public one.")
+
+    def _looked_up(self, target: _Target, clock: Clock) -> list[str]:
+        # The system's resolver takes no time limit. Where it is too slow, its thread is left to end by itself.
+        answer: Future[list[str]] = Future()
+
+        def ask() -> None:
+            try:
+                answer.set_result(self._resolve(target.host, target.port))
+            except Exception as error:  # noqa: BLE001 - raised where the answer is waited for
+                answer.set_exception(error)
+
+        Thread(target=ask, name="cow-look-up", daemon=True).start()
+        return answer.result(clock.left())
+
+    @cached_property
+    def _tls(self) -> ssl.SSLContext:
+        """Whose certificates are trusted: those of certifi, or of SSL_CERT_FILE. Slow to make, so made when needed."""
+        return self._given_tls or httpx.create_ssl_context()
+
+
+@dataclass(frozen=True)
+class _Target:
+    """A URL that may be asked, as far as that can be told without looking up its host."""
+
+    url: httpx.URL
+    host: str  # normalised: lower case, IDNA, no trailing dot, no brackets
+    port: int
+    what: str  # how messages call it
+
+    @property
+    def netloc(self) -> str:
+        """The Host header."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return host if self.port == _DEFAULT_PORTS[self.url.scheme] else f"{host}:{self.port}"
+
+
+def _headers(response: httpcore.Response, name: bytes) -> list[bytes]:
+    return [value.strip() for key, value in response.headers if key.lower() == name]
+
+
+def _body(response: httpcore.Response, host: str, most_bytes: int) -> bytes:
+    """The body of a good answer. Raises `Unreachable`."""
+    if response.status != 200:
+        raise Unreachable(f"'{host}' answered with HTTP {response.status} instead of 200.")
+    encodings = [value.lower() for value in _headers(response, b"content-encoding")]
+    if any(value not in (b"", b"identity") for value in encodings):
+        raise Unreachable(f"'{host}' answered with a compressed body, although it was asked not to.")
+    too_long = Unreachable(f"What '{host}' sends is larger than {most_bytes} bytes.")
+    if any(int(length) > most_bytes for length in _headers(response, b"content-length")):
+        raise too_long
+    body = bytearray()
+    for part in response.iter_stream():
+        body += part
+        if len(body) > most_bytes:
+            raise too_long
+    return bytes(body)

@@ -1,0 +1,105 @@
+"""Logs of the server: text for people or one JSON object a line for machines, each with the ids of its request.
+
+Requests are told on standard output, everything else on standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import sys
+from datetime import UTC, datetime
+from typing import Any, TextIO
+
+from cow_service.observability import context
+from cow_service.settings import Settings
+
+ACCESS = "cow_service.access"
+_NOT_EXTRA = frozenset((*vars(logging.makeLogRecord({})), "message", "asctime", "color_message", "taskName"))
+_SHOWN = ("request_id", "job_id", "owner")  # what a line of text says of them
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+_FAILED_JOB = "Exception encountered in background workflow"
+
+
+class Ids(logging.Filter):
+    """Puts the ids of the request or job at work onto each record; keeps those that it brings."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Takes every record."""
+        for name, value in context.ids().items():
+            if not hasattr(record, name):
+                setattr(record, name, value)
+        return True
+
+
+class NoFailedJobs(logging.Filter):
+    """Drops what the job engine says of jobs that failed: the service says it itself, with code and ids."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Takes every other record."""
+        return not str(record.msg).startswith(_FAILED_JOB)
+
+
+class TextFormatter(logging.Formatter):
+    """`2026-01-31 12:00:00 INFO cow_service: message request_id=...`; a trace follows on lines of its own."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line. Control characters are escaped: no value can forge a second one."""
+        shown = "".join(f" {name}={value}" for name in _SHOWN if (value := getattr(record, name, None)) is not None)
+        told = _CONTROL.sub(lambda found: repr(found[0])[1:-1], record.getMessage() + shown)
+        name = record.name.removesuffix(".error")  # uvicorn's name for whatever is no request
+        line = f"{self.formatTime(record, '%Y-%m-%d %H:%M:%S')} {record.levelname} {name}: {told}"
+        trace = _trace_of(self, record)
+        return f"{line}\n{trace}" if trace else line
+
+
+class JsonFormatter(logging.Formatter):
+    """One object a line: time (RFC 3339, UTC), level, logger, message, exception, ids, and whatever was added."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line, whatever the record holds."""
+        told: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if trace := _trace_of(self, record):
+            told["exception"] = trace
+        extra = {name: value for name, value in vars(record).items() if name not in _NOT_EXTRA and value is not None}
+        return json.dumps(extra | told, default=str, ensure_ascii=False)
+
+
+def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None = None) -> None:
+    """Sends all logs of the process through one format. Setting up once more replaces what was set up before."""
+    formatter = JsonFormatter() if settings.log_format == "json" else TextFormatter()
+    level = settings.log_level.upper()
+    problems, requests = (_handler(stream, formatter) for stream in (err or sys.stderr, out or sys.stdout))
+    root = logging.getLogger()
+    root.handlers = [problems]
+    root.setLevel(max(logging.WARNING, logging.getLevelNamesMapping()[level]))  # libraries have much to tell below that
+    for name in ("uvicorn", "uvicorn.error", "cow_service"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [], True
+        logger.setLevel(level)
+    access = logging.getLogger(ACCESS)
+    access.handlers, access.propagate = [requests], False
+    # The job engine adds a handler of its own to a logger that has none.
+    engine = logging.getLogger("dbos")
+    engine.handlers, engine.propagate, engine.filters = [problems], False, [NoFailedJobs()]
+    engine.setLevel(logging.WARNING)
+    logging.captureWarnings(True)
+
+
+def _handler(stream: TextIO, formatter: logging.Formatter) -> logging.Handler:
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(formatter)
+    handler.addFilter(Ids())
+    return handler
+
+
+def _trace_of(formatter: logging.Formatter, record: logging.LogRecord) -> str:
+    parts = [formatter.formatException(record.exc_info) if record.exc_info else record.exc_text or ""]
+    parts += [formatter.formatStack(record.stack_info) if record.stack_info else ""]
+    return "\n".join(filter(None, parts))

@@ -1,0 +1,183 @@
+"""How families of multimodal LLMs write places, and the pixels of the upright image that they mean.
+
+The convention comes from the family's file in `models/families/`; nothing is inferred from the size of the numbers.
+Everything becomes pixels before any geometry: a direction read off numbers in thousandths of width and height is
+skewed by the aspect ratio of the image.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+from cow_service.readers.mllm.replies import ReplyError
+from cow_service.records import BBox, Point, Vector
+from cow_service.weights.manifests import Coordinates, ImageSize
+
+OVERSHOOT = 0.02  # of the image's side: so far outside a place is cut off at the edge, further out it is refused
+LEAST_SIDE = 1.0  # px of the upright image: a narrower box has no area
+LEAST_LENGTH = 2.0  # px of the upright image between the ends of a direction
+MAX_RATIO = 200  # of the sides: what rounds sides to multiples takes no narrower image
+NUMBER = r"[-+]?(?:\d{1,12}(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,2})?"
+_GAP = r"[\s\[\](){},;]"
+_NUMBERS = re.compile(rf"{_GAP}*{NUMBER}(?:{_GAP}+{NUMBER})*{_GAP}*")
+HUGE = 1e9  # no coordinate is that large
+_NAMED = (  # objects instead of lists; the names decide then, not the family's order
+    ("x0", "y0", "x1", "y1"),
+    ("x1", "y1", "x2", "y2"),
+    ("xmin", "ymin", "xmax", "ymax"),
+    ("x_min", "y_min", "x_max", "y_max"),
+    ("left", "top", "right", "bottom"),
+)
+_SIZED = (("x", "y", "width", "height"), ("x", "y", "w", "h"), ("left", "top", "width", "height"))
+_CORNERS = (("top_left", "bottom_right"), ("start", "end"), ("from", "to"), ("tail", "tip"), ("tail", "head"))
+
+
+def size_seen(width: int, height: int, rule: ImageSize) -> tuple[int, int]:
+    """Width and height (px) at which a model sees an image: sent at that size, it is not resized again.
+
+    Sides are rounded to multiples, then both are scaled until the area fits (transformers, `smart_resize` of Qwen2-VL).
+    Raises `ReplyError` for an image so narrow that no such size exists.
+    """
+    multiple = rule.multiple
+    if multiple > 1 and max(width, height) > MAX_RATIO * min(width, height):
+        raise ReplyError(f"the model takes no image of {width} x {height} px: its sides differ more than 200-fold")
+    longest = max(width, height)
+    if rule.max_side is not None and longest > rule.max_side:
+        width, height = (max(1, round(side * rule.max_side / longest)) for side in (width, height))
+    wide, high = (round(side / multiple) * multiple for side in (width, height))
+    if wide * high > rule.max_pixels:
+        shrink = math.sqrt(width * height / rule.max_pixels)
+        wide, high = (max(multiple, math.floor(side / shrink / multiple) * multiple) for side in (width, height))
+    elif wide * high < rule.min_pixels:
+        grow = math.sqrt(rule.min_pixels / (width * height))
+        wide, high = (math.ceil(side * grow / multiple) * multiple for side in (width, height))
+    return max(multiple, wide), max(multiple, high)
+
+
+@dataclass(frozen=True)
+class View:
+    """An upright image of `width` x `height` px as a model sees it: at `seen` px, in its family's coordinates."""
+
+    width: int
+    height: int
+    seen: tuple[int, int]
+    coordinates: Coordinates
+
+    @property
+    def _full(self) -> tuple[float, float]:
+        """What the family writes for the right and the lower edge."""
+        units = self.coordinates.units
+        if units == "pixels":
+            return float(self.seen[0]), float(self.seen[1])
+        return (1000.0, 1000.0) if units == "thousandths" else (1.0, 1.0)
+
+    def point(self, written: object) -> Point:
+        """A point in pixels. Raises `ReplyError` where two numbers inside the image are not what was written."""
+        return self._inside(*self._pairs(written, 1, "a point")[0])
+
+    def bbox(self, written: object) -> BBox:
+        """A box [x0, y0, x1, y1] in pixels, its corners sorted. Raises `ReplyError` for one outside or without area."""
+        (ax, ay), (bx, by) = (self._inside(*pair) for pair in self._pairs(written, 2, "a box"))
+        x0, y0, x1, y1 = min(ax, bx), min(ay, by), max(ax, bx), max(ay, by)
+        if x1 - x0 < LEAST_SIDE or y1 - y0 < LEAST_SIDE:
+            raise ReplyError(f"the box {_shown(written)} has no area; give two opposite corners of the object")
+        return x0, y0, x1, y1
+
+    def ends(self, written: object) -> tuple[Point, Point]:
+        """Where a line begins and ends, in pixels. Raises `ReplyError` for one outside or without length."""
+        start, end = (self._inside(*pair) for pair in self._pairs(written, 2, "a direction"))
+        if math.dist(start, end) < LEAST_LENGTH:
+            raise ReplyError(f"the direction {_shown(written)} has no length; give two different points")
+        return start, end
+
+    def direction(self, written: object) -> Vector:
+        """The unit vector from the first end to the second, in pixels. Raises as `ends` does."""
+        start, end = self.ends(written)
+        length = math.dist(start, end)
+        return (end[0] - start[0]) / length, (end[1] - start[1]) / length
+
+    def overshoots(self, written: object) -> bool:
+        """Whether a box reaches over the image's edge, so that it was cut off there."""
+        limits = self._full
+        pairs = self._pairs(written, 2, "a box")
+        return any(not 0 <= value <= limit for pair in pairs for value, limit in zip(pair, limits, strict=True))
+
+    def write(self, *points: Point) -> list[float]:
+        """Points as the family writes them, one after the other."""
+        numbers: list[float] = []
+        for x, y in points:
+            pair = x / self.width * self._full[0], y / self.height * self._full[1]
+            digits = 3 if self.coordinates.units == "fractions" else None
+            rounded = [round(value, digits) for value in pair]
+            numbers += rounded if self.coordinates.axes == "xy" else rounded[::-1]
+        return numbers
+
+    def _inside(self, x: float, y: float) -> Point:
+        """The pixel that is meant; what lies over the edge by a hair is moved onto it."""
+        for value, limit in ((x, self._full[0]), (y, self._full[1])):
+            if not -OVERSHOOT * limit <= value <= (1 + OVERSHOOT) * limit:
+                raise ReplyError(f"{value:g} lies outside the image: coordinates go from 0 to {limit:g}")
+        width, height = self._full
+        return min(max(x, 0.0), width) / width * self.width, min(max(y, 0.0), height) / height * self.height
+
+    def _pairs(self, written: object, count: int, what: str) -> list[tuple[float, float]]:
+        """(x, y) pairs in the family's units."""
+        meant = _corners(written) if count == 2 else written
+        named = _by_name(meant, count)
+        numbers = _numbers(meant) if named is None else named
+        if len(numbers) != 2 * count:
+            raise ReplyError(f"{what} is {2 * count} numbers, not {_shown(written)}")
+        pairs = list(zip(numbers[::2], numbers[1::2], strict=True))
+        return pairs if named is not None or self.coordinates.axes == "xy" else [(x, y) for y, x in pairs]
+
+
+def _numbers(written: object) -> list[float]:
+    """The finite numbers that were written, lists inside lists unfolded; none where anything else is among them."""
+    if isinstance(written, str):
+        return [float(found) for found in re.findall(NUMBER, written)] if _NUMBERS.fullmatch(written) else []
+    if isinstance(written, bool) or not isinstance(written, int | float | list | tuple):
+        return []
+    if isinstance(written, int | float):
+        return [float(written)] if abs(written) < HUGE else []  # NaN is not less than anything
+    held = cast("Sequence[Any]", written)
+    parts = [_numbers(part) for part in held]
+    return [number for part in parts for number in part] if all(parts) else []
+
+
+def _corners(written: object) -> object:
+    """The two points of an object such as {"start": ..., "end": ...}; anything else as it is."""
+    if isinstance(written, dict):
+        held = {str(name).lower(): value for name, value in cast("dict[object, Any]", written).items()}
+        return next(([held[a], held[b]] for a, b in _CORNERS if a in held and b in held), written)
+    return written
+
+
+def _by_name(written: object, count: int) -> list[float] | None:
+    """The numbers of an object such as {"x0": ..., "y0": ...}, x first; None where it is none."""
+    if isinstance(written, list) and len(cast("list[object]", written)) == count:
+        parts = [_by_name(part, 1) for part in cast("list[object]", written)]
+        return None if None in parts else [number for part in parts if part is not None for number in part]
+    if not isinstance(written, dict):
+        return None
+    held = {str(name).lower(): value for name, value in cast("dict[object, Any]", written).items()}
+    for x, y, width, height in _SIZED if count == 2 else ():
+        if {x, y, width, height} <= set(held):
+            left, top, wide, high = ((_numbers(held[name]) or [math.nan])[0] for name in (x, y, width, height))
+            return [left, top, left + wide, top + high]
+    for names in (("x", "y"),) if count == 1 else _NAMED:
+        if set(names) <= set(held):
+            return [number for name in names for number in _numbers(held[name])]
+    return None
+
+
+def names_corners(fields: Mapping[str, Any]) -> bool:
+    """Whether an object is itself a box, its corners or edges by name."""
+    return any(set(names) <= set(fields) for names in (*_NAMED, *_SIZED, _CORNERS[0]))
+
+
+def _shown(written: object) -> str:
+    return repr(written)[:80]

@@ -1,0 +1,1 @@
+"""What a what-if question says, without looking at the image."""

@@ -1,0 +1,189 @@
+"""Reads how something moves from the words behind its verb: kind, direction, depth, arrow, forward or backward.
+
+Places are not motion: "to the left of the vase" and "the ball on the left" say where something is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cow_service.readers.question import lexicon as lex
+from cow_service.readers.question.arrow_words import ArrowSense, has_opposite, is_arrow
+from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, phrase_at
+from cow_service.records import MotionKind, Vector
+
+SLIGHTLY = math.tan(math.pi / 8)  # "slightly up": half of a diagonal's 45 degrees
+_AIMS = lex.words("to toward towards into for and or then")
+_SIDES = lex.words("side hand direction corner edge half part end border far very most extreme")
+_NOT_AIMED = lex.words("parallel perpendicular relative next close opposite orthogonal according due contrary")
+_RIGHT_IDIOMS = lex.words("now away next behind in above below beside into at onto before after under off")
+_FAR_ENDS = lex.words("background distance depth depths horizon back rear")
+_NEAR_ENDS = lex.words("foreground front")
+_INSIDE_PICTURE = lex.words("scene picture image screen photo photograph")
+_KICKED = lex.words("kick hit knock strike push send flick tap go swing")
+_TIPPED = lex.words("knock push kick hit turn blow go")
+_RISING = lex.words("lift raise rise climb ascend")
+_SINKING = lex.words("lower descend sink")
+_FORWARD = lex.words("forward forwards ahead onward onwards")
+_BACKWARD = lex.words("backward backwards back")
+
+
+@dataclass(frozen=True)
+class MotionWords:
+    """How the question says that the mover moves; None and 0 where it does not say.
+
+    `direction` is a unit vector in image pixels, x right, y down. A fall has one only where it leaves the vertical
+    ("falls to the left"): its kind stays "fall". `depth` is the sine of the angle out of the image plane: -1 towards
+    the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
+    form, empty where no known verb of motion stands in the question. `towards` is the object that the motion aims at;
+    the direction to it is for the caller to measure.
+    """
+
+    kind: MotionKind | None
+    arrow: ArrowSense | None
+    direction: Vector | None
+    depth: float
+    forward: bool | None
+    verb: str
+    towards: ObjectPhrase | None = None
+
+
+def read_motion(
+    found: Sequence[Item],
+    verb: str,
+    kind: MotionKind | None,
+    arrow: ArrowSense | None,
+    mover: ObjectPhrase | None,
+    asked: bool = False,
+) -> MotionWords:
+    """The motion in a clause; `found` begins at its verb, `arrow` is what the whole question says of an arrow.
+
+    `asked`: the verb itself is in question, so where it gets to is not given ("will the ball roll into the vase?").
+    """
+    kind = _kind(found, verb, kind)
+    if arrow == "along" and _turns_around(found):
+        arrow = "against"
+    direction = _direction(found, verb, kind)
+    depth = _depth(found)
+    if direction is not None:
+        depth *= math.sqrt(0.5)
+    forward = _forward(found, verb, arrow)
+    return MotionWords(kind, arrow, direction, depth, forward, verb, _towards(found, asked or kind == "fall", mover))
+
+
+def _kind(found: Sequence[Item], verb: str, kind: MotionKind | None) -> MotionKind | None:
+    flat = flatten(found[:12])
+    if verb == "come" and "down" in flat[:3]:
+        return "fall"
+    if verb in _TIPPED and "over" in flat[1:3] and not any(item.phrase for item in found[2:3]):
+        return "fall"
+    if verb in _KICKED and "air" in flat:
+        return "projectile"
+    return kind
+
+
+def _turns_around(found: Sequence[Item]) -> bool:
+    """ "The arrow shows the way. If the ball moves in the opposite direction ..."."""
+    return not any(is_arrow(found, at) for at in range(len(found))) and has_opposite(flatten(found))
+
+
+def _direction(found: Sequence[Item], verb: str, kind: MotionKind | None) -> Vector | None:
+    x = y = 0.0
+    for at in range(1, len(found)):
+        step_x, step_y = _place_step(found, at) if found[at].phrase else _word_step(found, at)
+        x, y = x + step_x, y + step_y
+    if kind == "fall":
+        y = 0.0  # down is what a fall does; only what leads away from it is a direction
+    elif x == y == 0.0:
+        y = -1.0 if verb in _RISING else 1.0 if verb in _SINKING else 0.0
+    length = math.hypot(x, y)
+    return (x / length, y / length) if length > 1e-9 else None
+
+
+def _word_step(found: Sequence[Item], at: int) -> Vector:
+    key, before, after = found[at].key, key_at(found, at - 1), key_at(found, at + 1)
+    if key not in lex.DIRECTIONS or before in {"from", "on", "at"} or before in lex.BE:
+        return (0.0, 0.0)
+    if (key == "right" and after in _RIGHT_IDIOMS) or _is_beside(found, at):
+        return (0.0, 0.0)
+    along = at + 1 if after != "to" else at + 2
+    if key in {"up", "down"} and phrase_at(found, along) and not _place_words(found[along]):
+        return (0.0, 0.0)  # "down the ramp", "up to the vase"
+    return _weighed(found, at, lex.DIRECTIONS[key])
+
+
+def _is_beside(found: Sequence[Item], at: int) -> bool:
+    """ "to the left of the vase" is a place; "to the left of the image" is a direction."""
+    beside = phrase_at(found, at + 2)
+    known = beside is not None and (beside.head in lex.ABSTRACT or beside.head in lex.SCENERY)
+    return key_at(found, at + 1) == "of" and not known
+
+
+def _place_words(item: Item) -> list[str]:
+    words = [word for word in item.words if word not in lex.DETERMINERS and word != "and"]
+    return words if all(word in lex.PLACES or word in _SIDES for word in words) else []
+
+
+def _place_step(found: Sequence[Item], at: int) -> Vector:
+    words, before = _place_words(found[at]), key_at(found, at - 1)
+    aimed = before in _AIMS or lex.is_adverb(before)
+    aimed = aimed or (bool(words) and words[-1] == "direction" and before in {"in", "along"})
+    if not aimed or _is_beside(found, at):
+        return (0.0, 0.0)
+    steps = [lex.DIRECTIONS[word] for word in words if word in lex.DIRECTIONS]
+    return _weighed(found, at, (sum(step[0] for step in steps), sum(step[1] for step in steps)))
+
+
+def _weighed(found: Sequence[Item], at: int, step: Vector) -> Vector:
+    slight = "slightly" in {key_at(found, at - 1), key_at(found, at - 2)}
+    return (step[0] * SLIGHTLY, step[1] * SLIGHTLY) if slight else step
+
+
+def _depth(found: Sequence[Item]) -> float:
+    for at, item in enumerate(found):
+        viewer = item.key in {"us", "me", "you"} or (item.phrase and item.phrase.head in lex.VIEWERS)
+        before = [key_at(found, at - 1), key_at(found, at - 2), key_at(found, at - 3)]
+        if viewer and before[0] == "from" and {"away", "farther", "further", "far", "back"}.intersection(before):
+            return 1.0
+        approached = before[0] in {"to", "toward", "towards", "at"} or before[0].startswith("approach")
+        if viewer and approached and before[1] not in _NOT_AIMED:
+            return -1.0
+        head = item.words[-1] if item.words and before[0] in {"to", "toward", "towards", "into"} else ""
+        if head in _FAR_ENDS or (head in _INSIDE_PICTURE and before[0] == "into"):
+            return 1.0
+        if head in _NEAR_ENDS:
+            return -1.0
+    return 0.0
+
+
+def _forward(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> bool | None:
+    flat = flatten(found)
+    if not _FORWARD.isdisjoint(flat):
+        return True
+    back = not _BACKWARD.isdisjoint(flatten(item for item in found if not item.phrase))
+    if arrow is None and (back or verb == "reverse" or "reverse" in flat):
+        return False
+    faces = {lex.VERBS[word].lemma for word in flat[1:] if word in lex.VERBS} & {"face", "head", "point"}
+    if faces and arrow is None:
+        return not has_opposite(flat)
+    straight_on = "straight" in flat and verb in {"go", "move", "drive", "roll", "travel", "continue", "run"}
+    return True if straight_on and flat[-1] == "straight" else None
+
+
+def _towards(found: Sequence[Item], open_end: bool, mover: ObjectPhrase | None) -> ObjectPhrase | None:
+    preps = {"toward", "towards"} if open_end else {"toward", "towards", "to", "at", "into"}
+    for at, item in enumerate(found):
+        before, earlier = key_at(found, at - 1), phrase_at(found, at - 2)
+        aimed = before in preps and key_at(found, at - 2) not in _NOT_AIMED
+        aimed = aimed or (
+            before == "of" and earlier is not None and earlier.noun == "direction" and not has_opposite(flatten(found))
+        )
+        if item.phrase and aimed and item.phrase != mover and not _is_nowhere(item.phrase):
+            return item.phrase
+    return None
+
+
+def _is_nowhere(phrase: ObjectPhrase) -> bool:
+    return phrase.noun is None or phrase.head in lex.ABSTRACT or phrase.head in lex.SCENERY

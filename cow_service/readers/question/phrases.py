@@ -1,0 +1,100 @@
+"""What a noun phrase says of an object: its colour, its noun, its number, the mark that singles it out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from cow_service.readers.question import lexicon as lex
+
+PUNCTUATION = frozenset(".,;:?!()—–")
+_TOKEN = re.compile(r"no\.(?=\s{0,3}\d)|n't\b|'s\b|#\d+|\w+?(?=n't\b)|\w+|[.,;:?!()—–]", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class ObjectPhrase:
+    """An object as the question words it: `text` has no determiner, `noun` is the head noun, or a compound, singular.
+
+    It says nothing about where the object is in the image.
+    """
+
+    text: str
+    colour: str | None
+    noun: str | None
+    inside_box: bool = False
+    number: int | None = None
+
+    @property
+    def head(self) -> str | None:
+        """The last word of the noun: "car" of "toy car"."""
+        return self.noun.rsplit(" ", 1)[-1] if self.noun else None
+
+
+@dataclass(frozen=True)
+class Item:
+    """A word (`key`, lower case) or a whole noun phrase (`phrase`; then `words` are its words, determiner first)."""
+
+    key: str
+    start: int
+    end: int
+    phrase: ObjectPhrase | None = None
+    words: tuple[str, ...] = ()
+
+
+def tokens(text: str) -> list[Item]:
+    """The words and punctuation marks of a text; a typographic apostrophe counts as a plain one."""
+    plain = text.replace("’", "'")  # one character for one, so that positions stay those of the text
+    return [Item(found.group().lower(), found.start(), found.end()) for found in _TOKEN.finditer(plain)]
+
+
+def key_at(found: Sequence[Item], at: int) -> str:
+    """The word at a place; a full stop outside the text, nothing for a noun phrase."""
+    return found[at].key if 0 <= at < len(found) else "."
+
+
+def phrase_at(found: Sequence[Item], at: int) -> ObjectPhrase | None:
+    """The noun phrase at a place, if there is one."""
+    return found[at].phrase if 0 <= at < len(found) else None
+
+
+def flatten(found: Iterable[Item]) -> list[str]:
+    """The words of some items, those of their noun phrases too."""
+    return [word for item in found for word in (item.words or (item.key,))]
+
+
+def _number(keys: Sequence[str], head: str) -> int | None:
+    plural = head.endswith("s") and not head.endswith("ss") and head not in lex.UNCHANGED_PLURALS
+    for at, key in enumerate(keys):
+        digits = key.lstrip("#")
+        named = at > 0 and keys[at - 1] in {"number", "no", "no."}
+        counts = plural and at < len(keys) - 1 and not named and key == digits
+        if digits.isdecimal() and len(digits) <= 6 and not counts:
+            return int(digits)
+        if key in lex.NUMBER_WORDS and not counts and (named or key != "one"):
+            return lex.NUMBER_WORDS[key]
+    return None
+
+
+def is_count(key: str) -> bool:
+    """Whether a word numbers an object, or says that a number follows."""
+    numeral = key.lstrip("#").isdecimal() or (key in lex.NUMBER_WORDS and key != "one")
+    return numeral or key in {"number", "no", "no.", "numbered"}
+
+
+def object_phrase(text: str, keys: tuple[str, ...]) -> ObjectPhrase:
+    """The phrase with these lower case words, behind its determiners."""
+    content = [key for key in keys if not is_count(key) and key != "and"]
+    content = [key for key in content if len(key) > 1] or content  # "ball A" is a ball
+    nouns = [key for key in content[:-1] if not lex.is_modifier(key)]
+    head = content[-1] if content else ""
+    modifiers = content[:-1] or content
+    colour = next((lex.COLOURS[key] for key in modifiers if key in lex.COLOURS), None)
+    noun = " ".join([*nouns, lex.singular(head)]) if content and head not in {"one", "ones"} else None
+    return ObjectPhrase(
+        text=" ".join(text.split()),
+        colour=colour,
+        noun=noun,
+        inside_box=any(key in lex.MARKED for key in content[:-1]),
+        number=_number(keys, nouns[-1] if head.isdecimal() and nouns else head),
+    )

@@ -1,0 +1,52 @@
+"""Runs the HTTP server of one process: engine, readiness and a stop that loses nothing."""
+
+from __future__ import annotations
+
+import socket
+
+import uvicorn
+
+from cow_service.api.app import create_app
+from cow_service.jobs.engine import Engine
+from cow_service.jobs.readiness import Readiness
+from cow_service.service import Service
+
+AT_ONCE = 0.5  # seconds that loading may take before the server answers probes
+BEYOND = 5.0  # seconds that open connections are given after running jobs had their time
+
+
+class Server(uvicorn.Server):
+    """Tells the engine as soon as the server is to stop: those who wait for jobs must not keep it."""
+
+    def __init__(self, config: uvicorn.Config, engine: Engine) -> None:
+        super().__init__(config)
+        self._engine = engine
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Takes no more orders, then closes connections, then lets the app end."""
+        self._engine.drain()
+        await super().shutdown(sockets)
+
+
+def run_server(service: Service) -> None:
+    """Serves until a signal ends it. Raises the `CowError` for which the default request cannot be served."""
+    engine, readiness = Engine(service), Readiness(service)
+    settings = service.settings
+    config = uvicorn.Config(
+        create_app(engine, readiness),
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=int(settings.shutdown_grace + BEYOND),
+    )
+    server = Server(config, engine)
+
+    def failed() -> None:
+        server.should_exit = True
+
+    readiness.start(failed)
+    readiness.wait(AT_ONCE)
+    engine.start()
+    server.run()
+    readiness.wait(0)

@@ -1,0 +1,1 @@
+"""Manifests of models, and their weights on disk."""

@@ -1,0 +1,117 @@
+"""Reads the manifests in `models/`: what a backend or model is, what it needs, its defaults. No weights, no loading."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.util import find_spec
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, JsonValue
+
+from cow_service.records import Record
+from cow_service.weights.resources import family_names, manifest_names, read_family_text, read_manifest_text
+
+
+class Source(Record):
+    """Files of one repository on the hub. Revision and digests are recorded when they are downloaded, not here."""
+
+    repository: str = Field(pattern=r"^[\w.-]+/[\w.-]+$", description="owner/name")
+    files: tuple[str, ...] = Field(min_length=1, description="Glob patterns of the files that are used.")
+    licence: str
+
+
+class Manifest(Record):
+    """One backend or model as described by `models/<name>.yaml`."""
+
+    name: str
+    door: Literal["reader", "generator", "mllm"] = Field(
+        description="Which registry it stands in; an `mllm` is what the readers `mllm` and `local` ask."
+    )
+    summary: str
+    licence: str
+    weights: str | None = Field(default=None, description="Repository of the weights; null where there are none.")
+    extra: str | None = Field(default=None, description="The optional dependency group that it needs.")
+    modules: tuple[str, ...] = Field(default=(), description="Python modules that must be importable.")
+    settings: tuple[str, ...] = Field(default=(), description="Settings (COW_...) that it cannot do without.")
+    sources: dict[str, Source] = Field(default_factory=dict, description="What `cow models pull` downloads, by part.")
+    architecture: dict[str, int | float | str] = Field(
+        default_factory=dict,
+        description="Sizes of the model, named as in the configuration of its original checkpoint.",
+    )
+    parameters: dict[str, int] = Field(
+        default_factory=dict, description="Parameters of each part, computed from its sizes."
+    )
+    profiles: dict[str, dict[str, JsonValue]] = Field(default_factory=dict, description="Named ways to run it.")
+    defaults: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    family: str | None = Field(default=None, description="An MLLM's family: `models/families/<family>.yaml`.")
+    provider: str | None = Field(default=None, description="Who serves an MLLM; null where one runs one's own server.")
+    model: str | None = Field(default=None, description="The name under which an MLLM is served.")
+    also: tuple[str, ...] = Field(default=(), description="Other served names that mean it, with * and ?.")
+    local: dict[str, JsonValue] = Field(default_factory=dict, description="How an MLLM runs in-process.")
+
+    def missing_modules(self) -> tuple[str, ...]:
+        """Modules that are not installed. Nothing is imported to find out."""
+        return tuple(module for module in self.modules if find_spec(module) is None)
+
+    def install_line(self) -> str:
+        """The command that installs what this backend needs."""
+        return f'pip install "cow-service[{self.extra}]"' if self.extra else "pip install --force-reinstall cow-service"
+
+
+class Coordinates(Record):
+    """How a family of MLLMs writes places. Nothing infers it from the size of the numbers."""
+
+    units: Literal["thousandths", "fractions", "pixels"] = Field(
+        description="Of width and height, or absolute pixels of the image as the model sees it."
+    )
+    axes: Literal["xy", "yx"] = Field(default="xy", description="Which of a pair of numbers comes first.")
+    box: str = Field(default="bbox_2d", description="The key under which it writes a box.")
+    point: str = Field(default="point_2d", description="The key under which it writes a point.")
+
+
+class ImageSize(Record):
+    """At which size a family sees an image of a given size: its own rule, followed before sending."""
+
+    multiple: int = Field(default=1, ge=1, description="Sides are rounded to multiples of this, px.")
+    min_pixels: int = Field(default=0, ge=0)
+    max_pixels: int = Field(default=4_194_304, gt=0, description="What is larger is made smaller before it is sent.")
+    max_side: int | None = Field(default=None, gt=0, description="px; null for no limit.")
+
+
+class Family(Record):
+    """What MLLMs of one family have in common, as described by `models/families/<name>.yaml`."""
+
+    name: str
+    coordinates: Coordinates
+    image: ImageSize = ImageSize()
+    also: tuple[str, ...] = Field(
+        default=(), description="Served names of its models that have no manifest, in lower case, with * and ?."
+    )
+    structured_output: Literal["native", "prompted"] = Field(
+        description="Whether its servers hold replies to a JSON schema, or the prompt has to ask for the shape."
+    )
+
+
+@cache
+def load_families() -> dict[str, Family]:
+    """All shipped families by name."""
+    return {name: Family.model_validate(_parse(read_family_text(name))) for name in family_names()}
+
+
+@cache
+def find_manifest(name: str) -> Manifest | None:
+    """One shipped manifest; None where there is none of that name. Only its own file is read."""
+    return Manifest.model_validate(_parse(read_manifest_text(name))) if name in manifest_names() else None
+
+
+@cache
+def load_manifests() -> dict[str, Manifest]:
+    """All shipped manifests by name."""
+    found = {name: find_manifest(name) for name in manifest_names()}
+    return {name: manifest for name, manifest in found.items() if manifest is not None}
+
+
+def _parse(text: str) -> Any:
+    # libyaml where it is there: starting a server waits for this, and it is several times as fast.
+    return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
