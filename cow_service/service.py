@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import re
 import uuid
 from functools import partial
@@ -15,12 +13,12 @@ from cow_service.errors import (
     CowError,
     FieldError,
     GeneratorUnavailable,
-    ImageTypeUnsupported,
     InvalidRequest,
     ReaderUnavailable,
 )
 from cow_service.generators.base import Generator
 from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.data_urls import decode_data_url
 from cow_service.media.images import DecodedImage, decode
 from cow_service.net.images import ImageUrls
 from cow_service.observability.metrics import Metrics
@@ -38,7 +36,6 @@ from cow_service.weights.manifests import find_manifest, load_manifests
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
 Request = TypeVar("Request", bound=SimulateRequest)
 _OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)
-_DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)
 
 
 class Service:
@@ -225,30 +222,3 @@ def _check_modules(name: str, unavailable: type[CowError]) -> None:
         raise unavailable(
             f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
         )
-
-
-def decode_data_url(url: str) -> bytes:
-    """The bytes of a base64 data URL; blanks and line ends in it are skipped.
-
-    Raises `InvalidRequest` pointing at `/image`, and `ImageTypeUnsupported` where it declares something else.
-    """
-    head = _DATA_URL.match(url[:256])
-    if head is None or head["base64"] is None:
-        raise _bad_image("`image` must be a data URL with base64: data:image/png;base64,...")
-    declared = head["type"].lower()
-    if not declared.startswith("image/") and declared not in ("", "application/octet-stream"):
-        # Of the image types, what the bytes are counts, and not what they are declared to be.
-        raise ImageTypeUnsupported(
-            f"The data URL of `image` declares {declared[:80]}: send image/png, image/jpeg or image/webp."
-        )
-    try:
-        # Tools that write base64 break it into lines.
-        return base64.b64decode("".join(url[head.end() :].split()), validate=True)
-    except (binascii.Error, ValueError) as error:
-        raise _bad_image(
-            f"The base64 of `image` cannot be decoded ({error}): encode the file's bytes in the standard alphabet."
-        ) from error
-
-
-def _bad_image(detail: str) -> CowError:
-    return InvalidRequest(detail, errors=(FieldError("/image", detail),))
