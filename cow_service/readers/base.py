@@ -1,11 +1,11 @@
-"""The door for whoever looks at pictures. Stages know these Protocols, never an implementation."""
+"""The Protocol of readers: what reads an image for a question. Stages know this file, never an implementation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from cow_service.records import (
     MotionKind,
     Point,
     ReaderInfo,
+    Record,
     Simulation,
     Source,
     Usage,
@@ -28,16 +29,47 @@ from cow_service.records import (
 from cow_service.vision.scene import Scene
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What a reader is asked: the question, and for which stages it will be needed."""
+@dataclass
+class CallLog:
+    """What one stage sent to a multimodal LLM. Readers add to it, so that failed calls count, too."""
 
+    usage: Usage = Usage()
+    prompts: dict[str, int] = field(default_factory=dict[str, int])  # version by name
+
+    def add(self, usage: Usage) -> None:
+        """Counts a call."""
+        self.usage += usage
+
+
+def _never_canceled() -> None:
+    """Nobody cancels."""
+
+
+@dataclass(frozen=True)
+class ReaderInput:
+    """What every call of a reader is given. Readers keep nothing of it from one call to the next."""
+
+    scene: Scene
     question: str
-    stages: frozenset[str]
-    seed: int
-    still_wanted: Callable[[], None]  # called while the reader waits for others; raises `Canceled`
-    elsewhere: Callable[[], AbstractContextManager[None]] = nullcontext  # around such waits: others may compute
-    recalled: Grounding | None = None  # stage 1, where it was read before and this look is not asked for it
+    seed: int = 0
+    motion_wanted: bool = True  # stage 2 is left to the reader, too
+    calls: CallLog = field(default_factory=CallLog)
+    check_canceled: Callable[[], None] = _never_canceled  # to be called while waiting; raises `Canceled`
+    cpu: Callable[[], AbstractContextManager[None]] = nullcontext  # to be held around work on the CPU; not reentrant
+
+
+class MotionHints(Record):
+    """What a reader learned of the motion while it looked for the object, so that stage 2 needs no second look."""
+
+    kind: MotionKind | None = None
+    sentence: str | None = None
+    ends: tuple[Point, Point] | None = None  # of a line along the motion, px of the upright image
+    camera: Literal["towards", "away"] | None = None  # the motion leads straight to the camera, or from it
+    cue: Cue | None = None
+    along_arrow: bool | None = None
+    metres_per_pixel: MetresPerPixel | None = None
+    down: Vector = (0.0, 1.0)
+    scale_error: str | None = None  # code of the error for which the scale could not be read
 
 
 @dataclass(frozen=True)
@@ -49,6 +81,7 @@ class GroundingReading:
     point: Point | None = None  # where the reader pointed, if it gave no box; by default the centre of the box
     others: tuple[LocatedObject, ...] = ()
     warnings: tuple[str, ...] = ()
+    hints: MotionHints | None = None
 
 
 @dataclass(frozen=True)
@@ -84,42 +117,36 @@ class AnswerReading:
     notes: tuple[str, ...] = ()  # what the answer rests on or lacks, in whole sentences: warnings for the caller
 
 
-class Look(Protocol):
-    """One image and one question under one reader's eyes. It may remember what it saw, and serves one request."""
+class Reader(Protocol):
+    """Reads images for questions. Holds connections or weights, never a request; safe to use from several threads."""
 
     source: Source
+    info: ReaderInfo
+    """Name, model and revision. The run adds prompts and stages."""
+    fingerprint: str
+    """All that decides what it reads, besides what it is given: model, revision, prompts, options."""
 
-    def ground(self) -> GroundingReading:
+    def ground(self, given: ReaderInput) -> GroundingReading:
         """Which object moves and where it is. Raises `CannotGround` where that cannot be told."""
         ...
 
-    def read_motion(self, grounding: Grounding) -> MotionReading:
-        """How the grounded object moves. Raises `CannotReadDirection` where that cannot be told."""
+    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
+        """How the grounded object moves. `hints` are those of `ground`, where this reader grounded the object.
+
+        Raises `CannotReadDirection` where that cannot be told.
+        """
         ...
 
     def answer(
-        self, options: Sequence[AnswerOption], imagined: Imagined | None, votes: int
+        self,
+        given: ReaderInput,
+        options: Sequence[AnswerOption],
+        grounding: Grounding | None,
+        imagined: Imagined | None,
+        votes: int,
     ) -> tuple[AnswerReading, ...]:
-        """`votes` answers, fewer where some could not be read; without `imagined` from the image alone."""
-        ...
+        """`votes` answers, fewer where some could not be read; without `imagined` from the image alone.
 
-    @property
-    def info(self) -> ReaderInfo:
-        """Who reads, with what it has been asked so far."""
-        ...
-
-    @property
-    def usage(self) -> Usage:
-        """What has been asked of a multimodal LLM so far."""
-        ...
-
-
-class Reader(Protocol):
-    """Reads images for questions. Safe to use from several threads at once."""
-
-    fingerprint: str
-    """All that decides what it reads, besides what it is asked: model, revision, prompts, options."""
-
-    def look(self, scene: Scene, asked: Asked) -> Look:
-        """Begins to read an image for a question. Nothing is read yet."""
+        `grounding` is what stage 1 came to, also where a later stage failed and nothing was imagined.
+        """
         ...
