@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.media.images import encode_png
-from cow_service.readers.embedded.encounter_answers import choose_option, read_asked
+from cow_service.readers.embedded.answers import choose_option
 from cow_service.readers.question.choices import not_sure_option, option_saying, read_choices, says_not_sure
+from cow_service.readers.question.relations import read_relation
 from cow_service.readers.question.sentences import parse
 from cow_service.records import Answer
 from cow_service.requests import AnswerRequest
@@ -46,7 +47,7 @@ IF = "If the red ball rolls left, "
     ],
 )
 def test_what_is_asked(asked: str, relation: str, target: str | None) -> None:
-    told = read_asked(parse(IF + asked))
+    told = read_relation(parse(IF + asked))
     assert told is not None
     assert (told.relation, told.target.text if told.target else None) == (relation, target)
 
@@ -86,12 +87,12 @@ def test_what_is_asked(asked: str, relation: str, target: str | None) -> None:
     ],
 )
 def test_what_is_not_put_plainly_is_left_undecided(asked: str) -> None:
-    assert read_asked(parse(IF + asked)) is None
+    assert read_relation(parse(IF + asked)) is None
 
 
 @given(st.text(max_size=80))
 def test_no_question_breaks_the_reading(text: str) -> None:
-    read_asked(parse(text))
+    read_relation(parse(text))
     for option in read_choices(text, None):
         assert option.letter
 

@@ -8,17 +8,13 @@ from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
 
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import Asked
+from cow_service.readers.base import ReaderInput
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
 from cow_service.vision.scene import Scene, iou
 
 RED, BLUE, GREEN, ORANGE = (200, 30, 30), (50, 80, 200), (50, 150, 50), (235, 130, 40)
 reader = EmbeddedReader()
-
-
-def asked(question: str) -> Asked:
-    return Asked(question, frozenset(("grounding", "motion")), 0, lambda: None)
 
 
 def drawn(arrow: bool = True, against: bool = False) -> Scene:
@@ -30,11 +26,12 @@ def drawn(arrow: bool = True, against: bool = False) -> Scene:
 
 
 def read(scene: Scene, question: str):
-    reading = reader.look(scene, asked(question)).ground()
+    given = ReaderInput(scene, question)
+    reading = reader.ground(given)
     box = reading.bbox
     point = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
     grounding = Grounding(object=reading.object, point=point, bbox=box, others=reading.others, source="embedded")
-    return grounding, reader.look(scene, asked(question)).read_motion(grounding)
+    return grounding, reader.read_motion(given, grounding, reading.hints)
 
 
 def test_colour_and_arrow() -> None:

@@ -29,13 +29,13 @@ from mllm_server import MllmServer
 
 from cow_service.errors import ReaderUnavailable
 from cow_service.media.images import encode_png
-from cow_service.readers.base import Asked
-from cow_service.readers.mllm.choose import read_answer
+from cow_service.readers.base import ReaderInput
+from cow_service.readers.mllm.answer import read_answer
 from cow_service.readers.mllm.coordinates import View
 from cow_service.readers.mllm.identify import read_identified
 from cow_service.readers.mllm.locate import read_located
+from cow_service.readers.mllm.models import manifest_for
 from cow_service.readers.mllm.replies import ReplyError, values_in
-from cow_service.readers.mllm.serving import manifest_for
 from cow_service.readers.question.choices import read_choices
 from cow_service.records import Grounding
 from cow_service.service import Service
@@ -211,14 +211,14 @@ def test_directions_survive_every_aspect_ratio(family: str, ratio, mllm: MllmSer
     scene = Scene(floor(width, height))
     bbox = (0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height)
     grounding = Grounding(object="car", point=(width / 2, height / 2), bbox=bbox, source="request")
-    asked = Asked("Where does the car go?", frozenset(("motion",)), 0, lambda: None)
+    given = ReaderInput(scene, "Where does the car go?")
     reader = make(MANIFESTS[family]).readers.get("mllm")
     reach = 0.4 * min(width, height)
     for degrees in (0, 15, 45, 80, 135, 200, 290):
         dx, dy = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
         ends = [(width / 2 + sign * reach * dx, height / 2 + sign * reach * dy) for sign in (-1, 1)]
         mllm.say(partial(_say_line, family, mllm, ends, (width, height)))
-        direction = reader.look(scene, asked).read_motion(grounding).direction
+        direction = reader.read_motion(given, grounding, None).direction
         assert angle_between(direction, (dx, dy)) <= 0.5, degrees
 
 

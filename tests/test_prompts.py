@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jinja2.exceptions import SecurityError
 
-from cow_service.readers.mllm import choose, identify, locate, scale
+from cow_service.readers.mllm import answer, identify, locate, scale
 from cow_service.readers.mllm.coordinates import View
 from cow_service.readers.prompts import load_prompt, parse_prompt
 from cow_service.readers.question.choices import read_choices
@@ -81,7 +81,7 @@ SCHEMAS = {
     "identified": identify.schema(100),
     "located": locate.schema(VIEW, True, True, True, 100),
     "scaled": scale.schema(VIEW, 100),
-    "answered": choose.schema(read_choices("", ["Yes", "No"]), 100),
+    "answered": answer.schema(read_choices("", ["Yes", "No"]), 100),
 }
 
 

@@ -33,7 +33,7 @@ from cow_service.vision.scene import Scene
 class CallLog:
     """What one stage sent to a multimodal LLM. Readers add to it, so that failed calls count, too."""
 
-    usage: Usage = Usage()
+    usage: Usage = field(default_factory=Usage)
     prompts: dict[str, int] = field(default_factory=dict[str, int])  # version by name
 
     def add(self, usage: Usage) -> None:

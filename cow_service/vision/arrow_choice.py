@@ -1,4 +1,4 @@
-"""Whose arrow is whose: the drawn arrow that belongs to an object, and the object at which an arrow stands."""
+"""Which drawn arrow belongs to an object, and at which object an arrow stands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cow_service.vision.regions import Region
 from cow_service.vision.scene import SAME_OBJECT, Scene, iou
 
 REACH = 1.5  # sizes of an object: an arrow further away is not its own
-RIVAL = 0.6  # another one, nearer than this share of the distance, makes the choice unsure
+RIVAL = 0.6  # of a rival's distance: what is nearer than that is clearly the nearest
 
 
 def gap(arrow: Arrow, bbox: BBox) -> float:
@@ -25,29 +25,37 @@ def gap(arrow: Arrow, bbox: BBox) -> float:
 
 def arrows_near(scene: Scene, bbox: BBox) -> list[Arrow]:
     """Arrows that start or end close to a box and at no other object, nearest first."""
-    near = [arrow for arrow in scene.arrows if gap(arrow, bbox) <= REACH and not _stands_elsewhere(scene, arrow, bbox)]
+    near = [arrow for arrow in scene.arrows if gap(arrow, bbox) <= REACH and not _starts_elsewhere(scene, arrow, bbox)]
     return sorted(near, key=lambda arrow: gap(arrow, bbox))
 
 
+def arrow_at(scene: Scene, bbox: BBox) -> Arrow | None:
+    """The arrow of the object in a box: the only one near it, or the one clearly nearest; None where there is none."""
+    near = arrows_near(scene, bbox)
+    gaps = [gap(arrow, bbox) for arrow in near]
+    return near[0] if len(near) == 1 or (near and gaps[0] <= RIVAL * gaps[1]) else None
+
+
 def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
-    """The mover's arrow: the only one near it, or the one clearly nearest. Raises `CannotReadDirection`."""
+    """The mover's arrow. Raises `CannotReadDirection`, which ends with `remedy`, where it has none or several."""
+    arrow = arrow_at(scene, grounding.bbox)
+    if arrow is not None:
+        return arrow
     if not scene.arrows:
         raise CannotReadDirection(
             "The question speaks of an arrow, but no drawn arrow was found: looked for one flat colour with a straight "
             f"shaft and a head. {remedy}"
         )
-    own = arrows_near(scene, grounding.bbox)
-    if not own:
+    near = arrows_near(scene, grounding.bbox)
+    if not near:
         raise CannotReadDirection(
             f"The question speaks of an arrow, but what was found stands elsewhere than the {grounding.object}: "
-            f"{_places(scene.arrows)}. {remedy}"
+            f"{_ends_of(scene.arrows)}. {remedy}"
         )
-    if len(own) > 1 and gap(own[0], grounding.bbox) > RIVAL * gap(own[1], grounding.bbox):
-        raise CannotReadDirection(
-            f"The question speaks of one arrow, but {len(own)} were found, and none is clearly that of the "
-            f"{grounding.object}: {_places(own)}. {remedy}"
-        )
-    return own[0]
+    raise CannotReadDirection(
+        f"The question speaks of one arrow, but {len(near)} were found, and none is clearly that of the "
+        f"{grounding.object}: {_ends_of(near)}. {remedy}"
+    )
 
 
 def at_arrow(scene: Scene, regions: Sequence[Region]) -> list[Region]:
@@ -61,7 +69,7 @@ def at_arrow(scene: Scene, regions: Sequence[Region]) -> list[Region]:
     return [ranked[0]] if ranked[0] in regions and nearest <= REACH and alone else []
 
 
-def _stands_elsewhere(scene: Scene, arrow: Arrow, bbox: BBox) -> bool:
+def _starts_elsewhere(scene: Scene, arrow: Arrow, bbox: BBox) -> bool:
     """Whether an arrow's tail lies at another object and far from this one."""
     x, y = arrow.tail
     for region in scene.regions:
@@ -71,5 +79,5 @@ def _stands_elsewhere(scene: Scene, arrow: Arrow, bbox: BBox) -> bool:
     return False
 
 
-def _places(arrows: Sequence[Arrow]) -> str:
+def _ends_of(arrows: Sequence[Arrow]) -> str:
     return "; ".join(f"from ({a.tail[0]:.0f}, {a.tail[1]:.0f}) to ({a.tip[0]:.0f}, {a.tip[1]:.0f})" for a in arrows)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from cow_service.readers.mllm.replies import ReplyError
-from cow_service.records import BBox, Point, Vector
+from cow_service.records import BBox, Point
 from cow_service.weights.manifests import Coordinates, ImageSize
 
 OVERSHOOT = 0.02  # of the image's side: so far outside a place is cut off at the edge, further out it is refused
@@ -75,6 +75,26 @@ class View:
             return float(self.seen[0]), float(self.seen[1])
         return (1000.0, 1000.0) if units == "thousandths" else (1.0, 1.0)
 
+    @property
+    def units(self) -> str:
+        """What the numbers count, in words for a prompt."""
+        width, height = self.seen
+        return {
+            "thousandths": "integers from 0 to 1000, thousandths of the image's width and height",
+            "fractions": "fractions from 0 to 1 of the image's width and height, with three decimals",
+            "pixels": f"pixels of the image, which is {width} wide and {height} high, from its top left corner",
+        }[self.coordinates.units]
+
+    @property
+    def box_order(self) -> str:
+        """The order of a box's numbers, in words for a prompt."""
+        return "[x0, y0, x1, y1]" if self.coordinates.axes == "xy" else "[ymin, xmin, ymax, xmax]"
+
+    @property
+    def line_order(self) -> str:
+        """The order of the numbers of a line from one point to another, in words for a prompt."""
+        return "[x0, y0, x1, y1]" if self.coordinates.axes == "xy" else "[y0, x0, y1, x1]"
+
     def point(self, written: object) -> Point:
         """A point in pixels. Raises `ReplyError` where two numbers inside the image are not what was written."""
         return self._inside(*self._pairs(written, 1, "a point")[0])
@@ -93,12 +113,6 @@ class View:
         if math.dist(start, end) < LEAST_LENGTH:
             raise ReplyError(f"the direction {_shown(written)} has no length; give two different points")
         return start, end
-
-    def direction(self, written: object) -> Vector:
-        """The unit vector from the first end to the second, in pixels. Raises as `ends` does."""
-        start, end = self.ends(written)
-        length = math.dist(start, end)
-        return (end[0] - start[0]) / length, (end[1] - start[1]) / length
 
     def overshoots(self, written: object) -> bool:
         """Whether a box reaches over the image's edge, so that it was cut off there."""

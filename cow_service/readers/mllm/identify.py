@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast, get_args
 
-from cow_service.readers.mllm.prose import is_broken_json, names_nothing
+from cow_service.readers.mllm.client import PromptCall
+from cow_service.readers.mllm.free_text import is_broken_json, names_nothing
+from cow_service.readers.mllm.images import EncodedImage
 from cow_service.readers.mllm.replies import (
     ReplyError,
     fields_of,
@@ -42,6 +44,11 @@ class Identified:
     others: tuple[str, ...] = ()
     kind: MotionKind | None = None
     sentence: str | None = None
+
+
+def identify_call(question: str, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
+    """The call that asks which object moves, in words, and how."""
+    return PromptCall("identify", {"question": question}, (image.jpeg,), schema(reasoning_length), read_identified)
 
 
 def schema(reasoning_length: int) -> Schema:

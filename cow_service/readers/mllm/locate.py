@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from cow_service.readers.mllm.boxes import Place, chosen, places_in, same_words, tagged_places
+from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.directions import Line, line_in
 from cow_service.readers.mllm.identify import MAX_OTHERS
-from cow_service.readers.mllm.lines import Line, line_in
-from cow_service.readers.mllm.places import Place, chosen, places_in, same_words, tagged_places
+from cow_service.readers.mllm.images import EncodedImage
 from cow_service.readers.mllm.replies import ReplyError, fields_of, is_none, values_in, without_thinking
 from cow_service.readers.mllm.schemas import Schema, nullable, numbers, object_of, one_of, words
 from cow_service.records import BBox, LocatedObject, Point
@@ -27,9 +29,42 @@ class Located:
     bbox: BBox | None = None
     point: Point | None = None
     label: str = ""
-    cut_off: bool = False  # the box reached over the image's edge
+    clipped: bool = False  # the box reached over the image's edge
     others: tuple[LocatedObject, ...] = ()
     line: Line | None = None
+
+
+def locate_call(
+    question: str,
+    image: EncodedImage,
+    name: str,
+    bbox: BBox | None,
+    others: Sequence[str],
+    wants_direction: bool,
+    reasoning_length: int,
+) -> PromptCall[Located | None]:
+    """The call that asks where the object `name` is, unless its box is known, and which way it moves."""
+    view, wants_box = image.view, bbox is None
+    inputs: dict[str, object] = {
+        "question": question,
+        "object": " ".join(name.split()),
+        "others": tuple(others),
+        "bbox": "" if bbox is None else str(view.write((bbox[0], bbox[1]), (bbox[2], bbox[3]))),
+        "units": view.units,
+        "box_key": view.coordinates.box,
+        "box_order": view.box_order,
+        "line_order": view.line_order,
+        "wants_box": wants_box,
+        "wants_direction": wants_direction,
+    }
+    shape = schema(view, bool(others), wants_box, wants_direction, reasoning_length)
+    return PromptCall(
+        "locate",
+        inputs,
+        (image.jpeg,),
+        shape,
+        lambda reply: read_located(reply, view, name, others, wants_box, wants_direction),
+    )
 
 
 def schema(view: View, others: bool, wants_box: bool, wants_direction: bool, reasoning_length: int) -> Schema:

@@ -11,208 +11,199 @@ from typing import Any
 from cow_service import __version__
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import AnswerReading, Asked, GroundingReading, Imagined, MotionReading
-from cow_service.readers.mllm.asking import Asker, Question, Tally
-from cow_service.readers.mllm.geometry import doubt_box, follow_arrow
-from cow_service.readers.mllm.identify import Identified
-from cow_service.readers.mllm.lines import Line
-from cow_service.readers.mllm.locate import Located
-from cow_service.readers.mllm.places import shares_words
-from cow_service.readers.mllm.questions import Questions
-from cow_service.readers.mllm.scale import Scaled
-from cow_service.readers.mllm.serving import UNKNOWN, serve
-from cow_service.readers.question import sentences
-from cow_service.records import AnswerOption, BBox, Cue, Grounding, MotionKind, ReaderInfo, Source, Usage
+from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
+from cow_service.readers.mllm.answer import answer_calls
+from cow_service.readers.mllm.boxes import shares_words
+from cow_service.readers.mllm.checks import box_warnings, follow_arrow
+from cow_service.readers.mllm.client import MllmClient, PromptCall
+from cow_service.readers.mllm.identify import Identified, identify_call
+from cow_service.readers.mllm.images import EncodedImage, encode
+from cow_service.readers.mllm.locate import Located, locate_call
+from cow_service.readers.mllm.models import UNKNOWN, configure
+from cow_service.readers.mllm.scale import Scaled, scale_call
+from cow_service.readers.question.sentences import parse, parse_noun_phrase
+from cow_service.records import AnswerOption, BBox, Cue, Grounding, MotionKind, ReaderInfo, Source
 from cow_service.settings import Settings
-from cow_service.vision.scene import Scene
 from cow_service.weights.resources import prompt_names, read_prompt_text
 
 DIRECTED: tuple[MotionKind, ...] = ("linear", "projectile")
 FALLING: tuple[MotionKind, ...] = ("projectile", "fall")
-CAMERA = {"towards": -1.0, "away": 1.0}
+CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
+DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
 GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y down."
 GIVE_PLACE = "Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the request."
 
 
 class MllmReader:
-    """Asks one model for everything. It keeps its connections, and nothing of what it saw."""
+    """Asks one model for everything. It keeps its connections, and nothing of what it read."""
 
-    def __init__(self, name: str, asker: Asker, origin: str = "") -> None:
-        self.name = name
-        self.asker = asker
-        self._origin = origin  # which server, or which weights
+    source: Source = "mllm"
+
+    def __init__(self, name: str, client: MllmClient, origin: str = "") -> None:
+        """`origin` says which server, or which weights."""
+        self._client = client
+        self._model = client.model
+        self._origin = origin
+        self._subject = f"The multimodal LLM '{self._model.name}'"
+        self._reasoning = int(self._model.manifest.defaults.get("max_reasoning", DEFAULT_REASONING_LENGTH))
+        self.info = ReaderInfo(name=name, model=self._model.name)
 
     @cached_property
     def fingerprint(self) -> str:
         """The model, where it is served from, how its family is asked, and the words of all prompts."""
-        served = self.asker.served
-        prompts = "".join(read_prompt_text(name) for name in prompt_names())
-        told = (
-            __version__, self.name, served.name, self._origin,
-            served.manifest.model_dump_json(), served.family.model_dump_json(), prompts,
+        parts = (
+            __version__, self.info.name, self._model.name, self._origin, self._model.manifest.model_dump_json(),
+            self._model.family.model_dump_json(), *map(read_prompt_text, prompt_names()),
         )  # fmt: skip
-        return hashlib.sha256("\n".join(told).encode()).hexdigest()
-
-    def look(self, scene: Scene, asked: Asked) -> MllmLook:
-        """Begins to read an image for a question. Nothing is sent yet."""
-        return MllmLook(self, scene, asked)
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
     def close(self) -> None:
         """Closes its connections."""
-        self.asker.close()
+        self._client.close()
 
-
-class MllmLook:
-    """One image and one question: what was asked of the model, and what it said."""
-
-    source: Source = "mllm"
-
-    def __init__(self, reader: MllmReader, scene: Scene, asked: Asked) -> None:
-        self._reader = reader
-        self._scene = scene
-        self._asked = asked
-        self._questions = Questions(reader.asker.served, scene, asked)
-        self._who = f"The multimodal LLM '{reader.asker.served.name}'"
-        self._tally = Tally()
-        self._identified: Identified | None = None
-        self._line: Line | None = None
-        self._scaled: Scaled | CowError | None = None
-
-    @property
-    def info(self) -> ReaderInfo:
-        """The model as it is served, and the version of each prompt that it was sent."""
-        served = self._reader.asker.served
-        return ReaderInfo(name=self._reader.name, model=served.name, prompts=dict(sorted(self._tally.prompts.items())))
-
-    @property
-    def usage(self) -> Usage:
-        """Calls and tokens so far."""
-        return self._tally.usage
-
-    def ground(self) -> GroundingReading:
+    def ground(self, given: ReaderInput) -> GroundingReading:
         """Two calls: what moves, in words; then where it is and, in the same call, which way it moves.
 
         Raises `ObjectNotFound`, `MllmBadReply`, `MllmUnavailable`.
         """
-        identified = self._reader.asker.ask(self._questions.identify(), self._tally, self._asked)
+        image = self._encode(given)
+        identified = self._client.complete(identify_call(given.question, image, self._reasoning), given)
         if identified is None:
-            raise ObjectNotFound(f"{self._who} sees nothing in the image that the question could move. {GIVE_PLACE}")
-        self._identified = identified
-        located = self._locate(identified.object, None, identified.others)
+            raise ObjectNotFound(
+                f"{self._subject} sees nothing in the image that the question could move. {GIVE_PLACE}"
+            )
+        located, hints = self._locate(given, image, identified, identified.object, None)
         if located is None:
-            raise ObjectNotFound(f"{self._who} does not see '{identified.object}' in the image. {GIVE_PLACE}")
-        bbox = self._scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
+            raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image. {GIVE_PLACE}")
+        with given.cpu():
+            bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
+            phrase = parse_noun_phrase(identified.object)
+            warnings = box_warnings(given.scene, bbox, phrase.colour if phrase else None, located.clipped)
+        if located.label and not shares_words(located.label, identified.object):
+            mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
+            warnings = (*warnings, mismatch)
         return GroundingReading(
             object=identified.object,
             bbox=bbox,
             point=located.point,
             others=located.others,
-            warnings=(*self._doubts(identified, located, bbox), *self._unknown_family()),
+            warnings=(*warnings, *self._family_warnings()),
+            hints=hints if given.motion_wanted else None,
         )
 
-    def read_motion(self, grounding: Grounding) -> MotionReading:
-        """No call where `ground` asked already; one where the place came with the request, two where it was recalled.
+    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
+        """No call with hints; one without them where the request gave the place, else two.
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
         """
-        if grounding.source == "request":
-            self._locate(grounding.object, grounding.bbox, ())
-        elif self._identified is None:  # the place was read by another look: it stays, the words are asked for again
-            self._identified = self._reader.asker.ask(self._questions.identify(), self._tally, self._asked)
-            self._locate(grounding.object, grounding.bbox, ())
-        sentence = None if self._identified is None else self._identified.sentence
-        reading = MotionReading(self._kind, None, "text", sentence=sentence)
-        if self._kind in FALLING:
-            reading = self._with_scale(replace(reading, cue="gravity"))
-        return self._directed(reading, grounding) if self._kind in DIRECTED else reading
+        if hints is None:
+            image, identified = self._encode(given), None
+            if grounding.source != "request":
+                identified = self._client.complete(identify_call(given.question, image, self._reasoning), given)
+            _, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
+        kind = hints.kind or _kind(given, None)
+        reading = MotionReading(kind, None, "text", sentence=hints.sentence)
+        if kind in FALLING:
+            reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
+            if hints.scale_error:
+                warning = f"The scale of the scene could not be read ({hints.scale_error}): the default one was taken."
+                reading = replace(reading, warnings=(warning,))
+        return self._directed(given, grounding, reading, hints) if kind in DIRECTED else reading
 
     def answer(
-        self, options: Sequence[AnswerOption], imagined: Imagined | None, votes: int
+        self,
+        given: ReaderInput,
+        options: Sequence[AnswerOption],
+        grounding: Grounding | None,
+        imagined: Imagined | None,
+        votes: int,
     ) -> tuple[AnswerReading, ...]:
         """One call per vote, all at the same time. Raises `MllmBadReply`, `MllmUnavailable` where all of them fail."""
-        asked = self._questions.answers(options, imagined, votes)
-        told = self._reader.asker.ask_all(asked, self._tally, self._asked)
-        readings = tuple(each for each in told if not isinstance(each, CowError))
+        with given.cpu():
+            pixels = (given.scene.image, *(() if imagined is None else imagined.frames))
+            jpegs = tuple(encode(each, self._model.family).jpeg for each in pixels)
+        calls = answer_calls(given.question, options, jpegs, imagined, votes, self._reasoning)
+        results = self._client.complete_all(calls, given)
+        readings = tuple(each for each in results if not isinstance(each, CowError))
         if not readings:
-            raise next(each for each in told if isinstance(each, CowError))
+            raise next(each for each in results if isinstance(each, CowError))
         return readings
 
-    @cached_property
-    def _parsed(self) -> sentences.Question:
-        return sentences.parse(self._asked.question)
+    def _encode(self, given: ReaderInput) -> EncodedImage:
+        with given.cpu():
+            return encode(given.scene.image, self._model.family)
 
-    @property
-    def _kind(self) -> MotionKind:
-        """What the model said, else what the question's verb says."""
-        told = None if self._identified is None else self._identified.kind
-        return told or self._parsed.motion.kind or "linear"
+    def _locate(
+        self, given: ReaderInput, image: EncodedImage, identified: Identified | None, name: str, bbox: BBox | None
+    ) -> tuple[Located | None, MotionHints]:
+        """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
-    def _locate(self, name: str, bbox: BBox | None, others: Sequence[str]) -> Located | None:
-        """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once."""
-        moves = "motion" in self._asked.stages
-        wants_direction = moves and self._kind in DIRECTED
-        where = [self._questions.locate(name, bbox, others, wants_direction)] if bbox is None or wants_direction else []
-        scale = [self._questions.scale(name)] if moves and self._kind in FALLING else []
-        asked: list[Question[Any]] = [*where, *scale]
-        told = self._reader.asker.ask_all(asked, self._tally, self._asked)
-        if scale:
-            scaled = told.pop()
-            if isinstance(scaled, Scaled | CowError):
-                self._scaled = scaled
-        for located in told:
-            if isinstance(located, CowError):
-                raise located
-            if isinstance(located, Located):
-                self._line = located.line
-                return located
-        return None
+        None where the place was not asked for, or the object not seen. Raises `MllmBadReply`, `MllmUnavailable`.
+        """
+        kind = _kind(given, identified)
+        others = identified.others if identified is not None and bbox is None else ()
+        wants_direction = given.motion_wanted and kind in DIRECTED
+        wants_place = bbox is None or wants_direction
+        wants_scale = given.motion_wanted and kind in FALLING
+        calls: list[PromptCall[Any]] = []
+        if wants_place:
+            calls.append(locate_call(given.question, image, name, bbox, others, wants_direction, self._reasoning))
+        if wants_scale:
+            calls.append(scale_call(image, name, self._reasoning))
+        results = iter(self._client.complete_all(calls, given))
+        located: Located | CowError | None = next(results) if wants_place else None
+        scaled: Scaled | CowError | None = next(results) if wants_scale else None
+        if isinstance(located, CowError):
+            raise located
+        found: dict[str, Any] = {"kind": kind, "sentence": identified.sentence if identified else None}
+        if located is not None and located.line is not None:
+            found |= vars(located.line)
+        if isinstance(scaled, CowError):
+            found["scale_error"] = scaled.code
+        elif scaled is not None:
+            found |= vars(scaled)
+        return located, MotionHints(**found)
 
-    def _doubts(self, identified: Identified, located: Located, bbox: BBox) -> tuple[str, ...]:
-        """What speaks against the place that the model gave."""
-        phrase = sentences.parse(f"If the {identified.object.removeprefix('the ')} moves, what happens?").mover
-        doubts = doubt_box(self._scene, bbox, phrase, located.cut_off)
-        if located.label and not shares_words(located.label, identified.object):
-            told = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
-            return (*doubts, told)
-        return doubts
+    def _directed(
+        self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints
+    ) -> MotionReading:
+        """The reading with its direction, checked against the drawn arrow where the question speaks of one."""
+        if hints.ends is None and hints.camera is None:
+            raise CannotReadDirection(
+                f"{self._subject} found nothing in the image or the question that tells which way the "
+                f"{grounding.object} moves. {GIVE_DIRECTION}"
+            )
+        question = parse(given.question)
+        words = question.motion
+        guess: Cue = "arrow" if question.mentions_arrow else "text" if words.direction is not None else "orientation"
+        cue = hints.cue or guess
+        if hints.camera is not None:
+            direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
+            return replace(reading, direction=direction, depth=depth, cue=cue)
+        (x0, y0), (x1, y1) = hints.ends or ((0.0, 0.0), (1.0, 0.0))
+        along = hints.along_arrow if cue == "arrow" else None
+        reading = replace(reading, direction=(x1 - x0, y1 - y0), cue=cue, along_arrow=along)
+        if not question.mentions_arrow:
+            return reading
+        with given.cpu():
+            return follow_arrow(given.scene, grounding.bbox, reading, words.arrow)
 
-    def _unknown_family(self) -> tuple[str, ...]:
-        served = self._reader.asker.served
-        if served.manifest.name != UNKNOWN:
+    def _family_warnings(self) -> tuple[str, ...]:
+        manifest, family = self._model.manifest, self._model.family
+        if manifest.name != UNKNOWN:
             return ()
         taken = "coordinates were asked for as fractions, and a model that is used to others may have given those"
-        if served.family.name != UNKNOWN:
-            taken = f"by its name it was taken for one of the family '{served.family.name}'"
-        return (f"No manifest describes '{served.name}': {taken}.",)
-
-    def _with_scale(self, reading: MotionReading) -> MotionReading:
-        if isinstance(self._scaled, Scaled):
-            return replace(reading, metres_per_pixel=self._scaled.metres_per_pixel, down=self._scaled.down)
-        if isinstance(self._scaled, CowError):
-            told = f"The scale of the scene could not be read ({self._scaled.code}): the default one was taken."
-            return replace(reading, warnings=(*reading.warnings, told))
-        return reading
-
-    def _directed(self, reading: MotionReading, grounding: Grounding) -> MotionReading:
-        """The reading with its direction, checked against the drawn arrow where the question speaks of one."""
-        line, words = self._line, self._parsed.motion
-        if line is None or (line.ends is None and line.camera is None):
-            raise CannotReadDirection(
-                f"{self._who} found nothing in the image or the question that tells which way the {grounding.object} "
-                f"moves. {GIVE_DIRECTION}"
-            )
-        speaks_of_arrow = "arrow" in self._asked.question.lower()
-        guess: Cue = "arrow" if speaks_of_arrow else "text" if words.direction is not None else "orientation"
-        cue = line.cue or guess
-        if line.camera is not None:
-            direction, depth = depth_motion(CAMERA[line.camera])
-            return replace(reading, direction=direction, depth=depth, cue=cue)
-        (x0, y0), (x1, y1) = line.ends or ((0.0, 0.0), (1.0, 0.0))
-        along = line.along_arrow if cue == "arrow" else None
-        reading = replace(reading, direction=(x1 - x0, y1 - y0), cue=cue, along_arrow=along)
-        return follow_arrow(self._scene, grounding.bbox, reading, words.arrow) if speaks_of_arrow else reading
+        if family.name != UNKNOWN:
+            taken = f"by its name it was taken for one of the family '{family.name}'"
+        return (f"No manifest describes '{self._model.name}': {taken}.",)
 
 
 def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable` where COW_MLLM cannot be used."""
-    return MllmReader("mllm", Asker(serve(settings), settings), settings.mllm_base_url or "")
+    return MllmReader("mllm", MllmClient(configure(settings), settings), settings.mllm_base_url or "")
+
+
+def _kind(given: ReaderInput, identified: Identified | None) -> MotionKind:
+    """What the model said, else what the question's verb says."""
+    said = None if identified is None else identified.kind
+    return said or parse(given.question).motion.kind or "linear"

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.images import EncodedImage
 from cow_service.readers.mllm.replies import (
     ReplyError,
     fields_of,
@@ -30,6 +32,15 @@ class Scaled:
 
     metres_per_pixel: MetresPerPixel | None
     down: Vector
+
+
+def scale_call(image: EncodedImage, name: str, reasoning_length: int) -> PromptCall[Scaled]:
+    """The call that asks how large the scene is at the object `name`, and which way is down."""
+    view = image.view
+    inputs: dict[str, object] = {"object": " ".join(name.split()), "units": view.units, "line_order": view.line_order}
+    return PromptCall(
+        "scale", inputs, (image.jpeg,), schema(view, reasoning_length), lambda reply: read_scaled(reply, view)
+    )
 
 
 def schema(view: View, reasoning_length: int) -> Schema:

@@ -42,9 +42,10 @@ class _Clause:
 
 
 @dataclass(frozen=True)
-class Event:
-    """A verb of motion, or a condition without one (`verb` empty), at `at` in the clause that begins at `start`.
+class MotionCandidate:
+    """A motion that the question may be about: its verb is at `at`, in the clause that begins at `start`.
 
+    `verb` is empty for a condition without a verb of motion.
     Its subject is None where the clause has a pronoun, or nothing.
     """
 
@@ -62,39 +63,39 @@ class Event:
 
 
 @dataclass
-class Reading:
-    """What one pass over the clauses finds; `asked` are the subjects of its questions, with their places."""
+class Clauses:
+    """What one pass over the clauses finds; the subjects of its questions are given with their places."""
 
-    events: list[Event] = field(default_factory=list[Event])
-    asked: list[tuple[int, ObjectPhrase]] = field(default_factory=list[tuple[int, ObjectPhrase]])
+    candidates: list[MotionCandidate] = field(default_factory=list[MotionCandidate])
+    question_subjects: list[tuple[int, ObjectPhrase]] = field(default_factory=list[tuple[int, ObjectPhrase]])
 
 
-def read_clauses(found: Sequence[Item]) -> Reading:
+def read_clauses(found: Sequence[Item]) -> Clauses:
     """One pass over the clauses: every verb of motion with its subject, and the subjects of the questions."""
-    reading, clause = Reading(), _Clause("plain", 0)
+    clauses, clause = Clauses(), _Clause("plain", 0)
     for at, item in enumerate(found):
         opened = _opens(found, at, clause)
         if opened:
-            _close(reading, clause)
+            _close(clauses, clause)
             clause = _Clause(opened, at)
         elif item.phrase:
             if clause.kind == "question" and clause.subject is None and not is_vague(item):
-                reading.asked.append((at, item.phrase))
+                clauses.question_subjects.append((at, item.phrase))
             clause.offer(item.phrase)
-        event = None
+        candidate = None
         if not opened:
-            event = _free_fall(item, at, clause) if item.phrase else _event(found, at, clause)
-        if event:
-            reading.events.append(event)
+            candidate = _free_fall(item, at, clause) if item.phrase else _candidate(found, at, clause)
+        if candidate:
+            clauses.candidates.append(candidate)
         clause.verbs += item.key in lex.VERBS
-    _close(reading, clause)
-    return reading
+    _close(clauses, clause)
+    return clauses
 
 
-def _close(reading: Reading, clause: _Clause) -> None:
-    known = bool(reading.events) and reading.events[-1].start == clause.start
+def _close(clauses: Clauses, clause: _Clause) -> None:
+    known = bool(clauses.candidates) and clauses.candidates[-1].start == clause.start
     if clause.kind == "cond" and clause.subject and not known:
-        reading.events.append(Event(clause.start, clause.start, "", None, clause.subject, _UNKNOWN_VERB))
+        clauses.candidates.append(MotionCandidate(clause.start, clause.start, "", None, clause.subject, _UNKNOWN_VERB))
 
 
 def _is_subject(item: Item) -> bool:
@@ -126,18 +127,20 @@ def _is_inversion(found: Sequence[Item], at: int) -> bool:
     return key in lex.AUXILIARIES or (key in lex.BE and key != "'s" and not (at and _is_subject(found[at - 1])))
 
 
-def _free_fall(item: Item, at: int, clause: _Clause) -> Event | None:
+def _free_fall(item: Item, at: int, clause: _Clause) -> MotionCandidate | None:
     if item.words[-1] in {"fall", "freefall"} and "free" in item.words[-2:] + item.words[-1:]:
-        return Event(at, clause.start, "fall", "fall", clause.subject, _RANKS[clause.kind])
+        return MotionCandidate(at, clause.start, "fall", "fall", clause.subject, _RANKS[clause.kind])
     return None
 
 
-def _event(found: Sequence[Item], at: int, clause: _Clause) -> Event | None:
+def _candidate(found: Sequence[Item], at: int, clause: _Clause) -> MotionCandidate | None:
     key = found[at].key
     if key in lex.CAUSATIVES and key_at(found, at + 1) in {"go", "loose"}:
-        return Event(at, clause.start, "let go", "fall", _subject(found, at, "drop", clause), _RANKS[clause.kind])
+        return MotionCandidate(
+            at, clause.start, "let go", "fall", _subject(found, at, "drop", clause), _RANKS[clause.kind]
+        )
     if key in _STILL and key_at(found, at - 1) in lex.BE and clause.kind != "question":
-        return Event(at, clause.start, "stay", "static", clause.subject, _RANKS[clause.kind])
+        return MotionCandidate(at, clause.start, "stay", "static", clause.subject, _RANKS[clause.kind])
     verb = lex.VERBS.get(key)
     if verb is None or _is_idle(found, at, verb):
         return None
@@ -148,7 +151,7 @@ def _event(found: Sequence[Item], at: int, clause: _Clause) -> Event | None:
     kind = "static" if negated else kind or "linear"
     if verb.lemma == "keep" and (_STILL | {"in", "at"}).intersection({key_at(found, at + 1)}):
         kind = "static"
-    return Event(at, clause.start, verb.lemma, kind, _subject(found, at, verb.lemma, clause), rank)
+    return MotionCandidate(at, clause.start, verb.lemma, kind, _subject(found, at, verb.lemma, clause), rank)
 
 
 def _is_about_picture(found: Sequence[Item], at: int, clause: _Clause) -> bool:

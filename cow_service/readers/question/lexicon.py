@@ -93,7 +93,6 @@ BE = words("be is are was were been being am 's isn't aren't wasn't get gets got
 NEGATIONS = words("not never n't won't wouldn't doesn't don't didn't can't isn't aren't wasn't without cannot")
 CAUSATIVES = words("let lets letting make makes making made cause causes causing caused allow allows force forces see")
 MOVER_PRONOUNS = words("it they itself he she them")
-AGENT_PRONOUNS = words("i you we someone somebody anyone one people")
 FUNCTION_WORDS = (
     AUXILIARIES
     | BE

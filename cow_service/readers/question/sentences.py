@@ -5,65 +5,88 @@ No model and no list of nouns: verbs and function words are closed lists, the no
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.arrow_words import read_arrow
 from cow_service.readers.question.chunks import items
-from cow_service.readers.question.clauses import SENTENCE_END, Reading, clause_end, is_passive, is_vague, read_clauses
-from cow_service.readers.question.listed_options import Options, split_options
+from cow_service.readers.question.clauses import SENTENCE_END, Clauses, clause_end, is_passive, is_vague, read_clauses
+from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, read_motion
-from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, phrase_at
+from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, tokens
 
-Asks = Literal["touches", "occludes", "lands", "other"]
-
-_UNSEEN = lex.words("visible invisible unseen hidden seen sight occlusion")
-_MEETING = lex.words("collision contact impact")
-_COMES_DOWN = lex.words("fall drop tumble plunge come stop rest end")
-_ONTO = lex.words("on onto upon in into inside")
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
+)
+# Words that say which way, wherever they stand.
+_DIRECTION_WORDS = re.compile(
+    r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
+    r"|clockwise|counterclockwise|towards?|away|diagonal(ly)?|degrees?|sideways|back|backwards?|forwards?|other way)\b",
+    re.IGNORECASE,
 )
 
 
 @dataclass(frozen=True)
 class Question:
-    """A what-if question taken apart. `others` are the further objects it names, in order, without the mover."""
+    """A what-if question taken apart.
 
-    text: str
+    `others` are the further objects it names, in order, without the mover; `items`, all its words and noun phrases, but
+    for the options that it lists. `names_direction`: some word says which way, whether or not it was understood.
+    """
+
     mover: ObjectPhrase | None
     motion: MotionWords
     others: tuple[ObjectPhrase, ...]
-    asks: Asks
-    options: Options
+    items: tuple[Item, ...]
+    mentions_arrow: bool
+    names_direction: bool
 
 
+@lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    options, body = split_options(question)
-    found = _without_instructions(items(body))
-    reading = read_clauses(found)
-    event = max(reading.events, key=lambda event: event.rank, default=None)  # the first of the highest
-    at = event.at if event else len(found)
-    end = clause_end(found, at) if event else at
-    mover = (event.subject if event else None) or _antecedent(found, reading, at)
+    everything = items(split_options(question)[1])
+    found = _without_instructions(everything)
+    clauses = read_clauses(found)
+    best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
+    at = best.at if best else len(found)
+    end = clause_end(found, at) if best else at
+    mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
-    verb, kind = (event.verb, event.kind) if event else ("", None)
-    motion = read_motion(found[at:end], verb, kind, read_arrow(found), mover, asked=event is not None and event.asked)
-    clause = range(event.start if event else at, end)
-    return Question(question, mover, motion, _others(found, mover, clause), _asks(found, clause, at), options)
+    verb, kind = (best.verb, best.kind) if best else ("", None)
+    motion = read_motion(found[at:end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked)
+    clause = range(best.start if best else at, end)
+    words = {token.key for token in tokens(question)}
+    return Question(
+        mover=mover,
+        motion=motion,
+        others=_others(found, mover, clause),
+        items=tuple(everything),
+        mentions_arrow=any(word.startswith("arrow") for word in words),
+        names_direction=_DIRECTION_WORDS.search(question) is not None,
+    )
 
 
-def _antecedent(found: Sequence[Item], reading: Reading, at: int) -> ObjectPhrase | None:
+def parse_noun_phrase(text: str) -> ObjectPhrase | None:
+    """The first noun phrase of a text such as "the red toy car"; None where there is none."""
+    found = items("the " + text.removeprefix("the "))
+    phrase = next((item.phrase for item in found if item.phrase is not None), None)
+    if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
+        return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
+    return phrase
+
+
+def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhrase | None:
     """What a pronoun, or a clause without a subject, stands for: who acts in a passive question, else its subject."""
     for place, item in enumerate(found):
         acting = key_at(found, place - 1) == "by" and is_passive(found, place - 2) if place > 1 else False
         if acting and item.phrase and item.phrase.head not in lex.ABSTRACT | lex.AGENTS and not is_vague(item):
             return item.phrase
     named = [(place, item.phrase) for place, item in enumerate(found) if item.phrase and _is_thing(item)]
-    asked = [(place, phrase) for place, phrase in reading.asked if phrase.head not in lex.ABSTRACT]
+    asked = [(place, phrase) for place, phrase in clauses.question_subjects if phrase.head not in lex.ABSTRACT]
     before = [phrase for place, phrase in asked if place < at] + [phrase for place, phrase in named if place < at]
     return next(iter(before + [phrase for _, phrase in asked + named]), None)
 
@@ -117,33 +140,3 @@ def _repeats(phrase: ObjectPhrase, known: ObjectPhrase) -> bool:
     """Whether a later phrase means an earlier object: no word in it that the earlier one lacks."""
     words, earlier = set(phrase.text.lower().split()), set(known.text.lower().split())
     return phrase.head in {known.head, None} and words - {"one"} <= earlier
-
-
-def _asks(found: Sequence[Item], clause: range, verb: int) -> Asks:
-    """What is asked, from the first word that tells outside the clause of the motion, else inside it."""
-    outside = [at for at in range(len(found)) if at not in clause]
-    for at in [*outside, *(at for at in clause if at != verb)]:
-        asked = _asks_at(found, at)
-        if asked:
-            return asked
-    return "other"
-
-
-def _asks_at(found: Sequence[Item], at: int) -> Asks | None:
-    key, verb = found[at].key, lex.VERBS.get(found[at].key)
-    lemma = verb.lemma if verb else ""
-    after = [key_at(found, at + 1), key_at(found, at + 2)]
-    if lemma in lex.OCCLUDE or not _UNSEEN.isdisjoint(flatten(found[at : at + 1])) or _passes_before(found, at):
-        return "occludes"
-    if lemma in lex.LAND or (lemma in _COMES_DOWN and _ONTO.intersection(after)) or (key == "end" and "on" in after):
-        return "lands"
-    if lemma in lex.TOUCH or not _MEETING.isdisjoint(found[at].words):
-        return "touches"
-    return "touches" if verb and verb.kind == "linear" and after[0] == "into" and phrase_at(found, at + 2) else None
-
-
-def _passes_before(found: Sequence[Item], at: int) -> bool:
-    """ "pass in front of the vase", "go behind it"; but not "the vase behind the chair"."""
-    key, before = found[at].key, found[at - 1] if at else None
-    place = key == "behind" or (key == "in" and key_at(found, at + 1) == "front" and key_at(found, at + 2) == "of")
-    return place and before is not None and (before.key in lex.VERBS or before.key in {"be", "get"})

@@ -14,28 +14,11 @@ BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "
 POINT_KEYS = ("point_2d", "point", "center", "centre", "point2d")
 NO_PLACES = ("others", "direction", "motion_direction", "line", "vector")  # lists of numbers that are none
 _LABEL_KEYS = ("label", "object", "name", "class")
-_HEADINGS = frozenset(
-    [
-        "objects",
-        "object",
-        "result",
-        "results",
-        "answer",
-        "data",
-        "detections",
-        "detection",
-        "location",
-        "locations",
-        "output",
-        "response",
-        "places",
-        "items",
-        "boxes",
-        "bboxes",
-        "final_result",
-        "grounding",
-    ]
-)  # an object under one of these has no name yet
+# An object under one of these headings has no name yet.
+_HEADINGS = frozenset({
+    "objects", "object", "result", "results", "answer", "data", "detections", "detection", "location", "locations",
+    "output", "response", "places", "items", "boxes", "bboxes", "final_result", "grounding",
+})  # fmt: skip
 _PAIR = rf"\(\s*({NUMBER})\s*,\s*({NUMBER})\s*\)"
 _LABEL_TAG = r"(?:<(?:\|object_ref_start\||ref)>(?P<label>[^<]*)<(?:\|object_ref_end\||/ref)>\s*)?"
 _BOX_TAG = re.compile(

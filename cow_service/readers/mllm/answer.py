@@ -7,8 +7,9 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
-from cow_service.readers.base import AnswerReading
-from cow_service.readers.mllm.prose import MARKS, announced, is_broken_json, lines_of
+from cow_service.readers.base import AnswerReading, Imagined
+from cow_service.readers.mllm.client import PromptCall
+from cow_service.readers.mllm.free_text import MARKS, announced, is_broken_json, lines_of
 from cow_service.readers.mllm.replies import (
     ReplyError,
     fields_of,
@@ -19,17 +20,65 @@ from cow_service.readers.mllm.replies import (
     without_thinking,
 )
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
-from cow_service.readers.question.choices import not_sure_option, option_saying, plain, says_not_sure
-from cow_service.records import AnswerOption
+from cow_service.readers.question.choices import (
+    not_sure_option,
+    option_saying,
+    plain,
+    question_without,
+    says_not_sure,
+)
+from cow_service.records import MEETINGS, AnswerOption, Encounter
 
 MAX_ANSWER = 400  # characters of an open answer
 MAX_REASONING = 4000  # characters that are kept
 UNSURE_WORDS = 6  # an open answer that says "not sure" in more words says something besides
+VOTING_TEMPERATURE = 0.7  # without chance every vote would be the same
 _KEYS = ("answer", "final_answer", "choice", "option", "letter")
 _REASONING_KEYS = ("reasoning", "reason", "explanation", "rationale", "thought", "thoughts")
 _LETTER = re.compile(
     r"(?:option\s+|choice\s+)?[(\[]?(?P<letter>[A-Za-z])[)\]]?\s*[.:)\-]?\s*(?P<text>.*)", re.DOTALL | re.IGNORECASE
 )
+
+
+def answer_calls(
+    question: str,
+    options: Sequence[AnswerOption],
+    jpegs: tuple[bytes, ...],
+    imagined: Imagined | None,
+    votes: int,
+    reasoning_length: int,
+) -> list[PromptCall[AnswerReading]]:
+    """One call per vote. `jpegs` are the image, then the frames; what the mover would encounter is told in words."""
+    inputs: dict[str, object] = {"question": question_without(question, options), "options": tuple(options)}
+    return [
+        PromptCall(
+            "answer-from-image" if imagined is None else "answer-with-frames",
+            inputs if imagined is None else inputs | _hypothesis(imagined),
+            jpegs,
+            schema(options, reasoning_length),
+            lambda reply: read_answer(reply, options),
+            vote=vote,
+            temperature=VOTING_TEMPERATURE if votes > 1 else None,
+        )
+        for vote in range(votes)
+    ]
+
+
+def _hypothesis(imagined: Imagined) -> dict[str, object]:
+    """What the simulation found, as inputs of the prompt."""
+    simulation = imagined.simulation
+    trajectory = simulation.trajectory
+    return {
+        "sentence": simulation.motion.sentence,
+        "times": ", ".join(f"{frame.time:.2f} s" for frame in simulation.frames),
+        "encounters": tuple(_encounter_words(each, trajectory.fps) for each in trajectory.encounters),
+        "encounters_known": simulation.encounters_known,
+    }
+
+
+def _encounter_words(encounter: Encounter, fps: float) -> str:
+    name = " ".join(encounter.object.split())
+    return f"{MEETINGS[encounter.kind]} the {name.removeprefix('the ')}, {encounter.first_frame / fps:.2f} s in"
 
 
 def schema(options: Sequence[AnswerOption], reasoning_length: int) -> Schema:

@@ -1,6 +1,8 @@
-"""Images on their way to a multimodal LLM: at the size at which it sees them, as JPEG."""
+"""Images for a multimodal LLM: at the size at which it sees them, as JPEG."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,22 +19,26 @@ QUALITY = 95  # percent; fine lines such as drawn arrows stay clean
 _ENCODING = (cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
-def view_of(pixels: NDArray[np.uint8], family: Family) -> View:
-    """How a family sees an image [h, w, 3]. Raises `InvalidRequest` for a shape that it takes at no size."""
+@dataclass(frozen=True)
+class EncodedImage:
+    """An image as it is sent: JPEG, and how the model sees it."""
+
+    jpeg: bytes
+    view: View
+
+
+def encode(pixels: NDArray[np.uint8], family: Family) -> EncodedImage:
+    """RGB [h, w, 3] for a family of models. Raises `InvalidRequest` for a shape that it takes at no size."""
     height, width = pixels.shape[:2]
     try:
-        return View(width, height, size_seen(width, height, family.image), family.coordinates)
+        size = size_seen(width, height, family.image)
     except ReplyError as error:
         raise InvalidRequest(f"The image cannot be shown to the multimodal LLM: {error}.") from error
-
-
-def encode(pixels: NDArray[np.uint8], size: tuple[int, int]) -> bytes:
-    """RGB [h, w, 3] as JPEG of `size` (width, height) px."""
-    if size != (pixels.shape[1], pixels.shape[0]):
-        smaller = size[0] * size[1] < pixels.shape[0] * pixels.shape[1]
+    if size != (width, height):
+        smaller = size[0] * size[1] < width * height
         resized = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
         pixels = np.asarray(resized, np.uint8)
     done, data = cv2.imencode(".jpg", pixels[..., ::-1], _ENCODING)
     if not done:
         raise InternalError("The image could not be encoded for the multimodal LLM.")
-    return data.tobytes()
+    return EncodedImage(data.tobytes(), View(width, height, size, family.coordinates))

@@ -10,39 +10,35 @@ from typing import Any, TypeVar
 
 from pydantic_ai.models import Model
 
-PATIENCE = 5.0  # seconds that closing waits for connections
+CLOSE_SECONDS = 5.0  # that closing waits for connections
 
 T = TypeVar("T")
 
 
-class Loop:
-    """Runs coroutines that ask one model. Ends with the process, or earlier by `close`."""
+class EventLoopThread:
+    """Runs the coroutines that call one model. Ends with the process, or earlier by `close`."""
 
     def __init__(self, model: Model) -> None:
         self._model = model
         self._loop = asyncio.new_event_loop()
+        # A daemon, so that a reader that nobody closed does not keep the process alive.
         self._thread = Thread(target=self._loop.run_forever, name="mllm", daemon=True)
-        self._closing = False
+        self.closed = False
         self._thread.start()
-        self.submit(self._model.__aenter__()).result()
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether nothing can be submitted any more."""
-        return self._closing
+        self.submit(model.__aenter__()).result()
 
     def submit(self, work: Coroutine[Any, Any, T]) -> concurrent.futures.Future[T]:
-        """Starts a coroutine; its future may be cancelled."""
+        """Starts a coroutine; its future may be canceled."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def close(self) -> None:
-        """Gives up what is running, closes the connections and ends the thread. Once is enough, twice does no harm."""
-        if self._closing:
+        """Cancels what is running, closes the connections and ends the thread. May be called twice."""
+        if self.closed:
             return
-        self._closing = True
-        concurrent.futures.wait([self.submit(self._end())], PATIENCE)
+        self.closed = True
+        concurrent.futures.wait([self.submit(self._end())], CLOSE_SECONDS)
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(PATIENCE)
+        self._thread.join(CLOSE_SECONDS)
         if not self._thread.is_alive():
             self._loop.close()
 

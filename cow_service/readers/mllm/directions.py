@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, cast
 
+from cow_service.readers.mllm.boxes import BOX_KEYS, CORNER_PAIRS, POINT_KEYS, is_number
 from cow_service.readers.mllm.coordinates import LEAST_LENGTH, View
-from cow_service.readers.mllm.places import BOX_KEYS, CORNER_PAIRS, POINT_KEYS, is_number
 from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, is_none, text_of, truth_of
 from cow_service.records import Cue, Point
 

@@ -1,0 +1,137 @@
+"""The multimodal LLM of the settings: its manifest and family, and a client model of pydantic-ai to call it with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from typing import Any
+
+from pydantic_ai.exceptions import UserError
+from pydantic_ai.models import Model, infer_model
+from pydantic_ai.models.openai import OpenAIChatModel
+from pydantic_ai.profiles.openai import OpenAIModelProfile
+from pydantic_ai.providers import infer_provider_class
+from pydantic_ai.providers.openai_compatible import OpenAICompatibleProvider
+
+from cow_service.errors import ReaderUnavailable
+from cow_service.settings import Settings
+from cow_service.weights.manifests import Family, Manifest, load_families, load_manifests
+
+UNKNOWN = "generic"  # the manifest, and the family, for models that no other one describes
+OWN_PROTOCOL = ("anthropic", "google", "google-gla")  # these speak their own protocol at a base URL, too
+
+
+@dataclass(frozen=True)
+class ConfiguredModel:
+    """A model that can be called, and what is known of it."""
+
+    model: Model
+    name: str  # as it is served
+    manifest: Manifest
+    family: Family
+
+    @property
+    def supports_schema(self) -> bool:
+        """Whether a JSON schema can be sent along: the family's servers take one, and so does this model's client."""
+        native = self.family.structured_output == "native"
+        return native and bool(self.model.profile.get("supports_json_schema_output", False))
+
+
+def find_manifest(settings: Settings) -> tuple[Manifest, str | None, str]:
+    """The manifest that COW_MLLM means, the provider (null for one's own server) and the name as it is served.
+
+    Raises `ReaderUnavailable` where COW_MLLM is not set or names nothing.
+    """
+    name, manifests = settings.mllm, mllm_manifests()
+    if name is None:
+        raise ReaderUnavailable(
+            "Reader 'mllm' needs COW_MLLM, which is not set: a manifest's name such as qwen3-vl-8b with "
+            "COW_MLLM_BASE_URL, or provider:model such as openai:gpt-5."
+        )
+    if name in manifests:
+        manifest = manifests[name]
+        return manifest, manifest.provider, settings.mllm_model or manifest.model or name
+    provider, _, model = name.partition(":")
+    if not (provider and model):
+        close = get_close_matches(name, manifests, n=3, cutoff=0.5)
+        names = f"Did you mean {' or '.join(close)}?" if close else f"Manifests: {', '.join(manifests)}."
+        raise ReaderUnavailable(f"COW_MLLM={name!r} is no manifest and not provider:model. {names}")
+    return manifest_for(model), provider, settings.mllm_model or model
+
+
+def mllm_manifests() -> dict[str, Manifest]:
+    """The manifests of multimodal LLMs by name."""
+    return {name: manifest for name, manifest in load_manifests().items() if manifest.door == "mllm"}
+
+
+def manifest_for(model: str) -> Manifest:
+    """The manifest of a model by the name under which it is served; the generic one where none describes it."""
+    manifests = mllm_manifests()
+    for manifest in manifests.values():
+        patterns = (manifest.model or manifest.name, *manifest.also)
+        if any(fnmatchcase(model.lower(), pattern.lower()) for pattern in patterns):
+            return manifest
+    return manifests[UNKNOWN]
+
+
+def _family_of(manifest: Manifest, name: str) -> Family:
+    """The family of a model; of one that only the generic manifest fits, the one that its served name matches."""
+    families = load_families()
+    if manifest.name != UNKNOWN:
+        return families[manifest.family or UNKNOWN]
+    matching = (f for f in families.values() if any(fnmatchcase(name.lower(), pattern) for pattern in f.also))
+    return next(matching, families[UNKNOWN])
+
+
+def configure(settings: Settings) -> ConfiguredModel:
+    """The model of the settings, ready to be called; nothing is sent. Raises `ReaderUnavailable`."""
+    manifest, provider, name = find_manifest(settings)
+    family = _family_of(manifest, name)
+    base_url = settings.mllm_base_url
+    key = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
+    own_protocol = settings.mllm is not None and settings.mllm.startswith(tuple(f"{p}:" for p in OWN_PROTOCOL))
+    if base_url is not None and not own_protocol:
+        return ConfiguredModel(_openai_compatible(base_url, key, name, family), name, manifest, family)
+    if provider is None:
+        raise ReaderUnavailable(
+            f"COW_MLLM={settings.mllm!r} is served by no provider: set COW_MLLM_BASE_URL to the server that serves it "
+            "(vLLM, SGLang, Ollama...), or COW_READER=local to run it in this process."
+        )
+    try:
+        model = _model_of(provider, name, base_url, key)
+    except (ReaderUnavailable, UserError, ValueError, ImportError) as error:
+        reason = str(error).splitlines()[0]
+        raise ReaderUnavailable(f"COW_MLLM={settings.mllm!r} cannot be used: {reason}") from error
+    return ConfiguredModel(model, name, manifest, family)
+
+
+def _openai_compatible(base_url: str, key: str | None, name: str, family: Family) -> Model:
+    """A model behind OpenAI's protocol, whoever made it."""
+    profile = OpenAIModelProfile(
+        supports_json_schema_output=family.structured_output == "native",
+        # The older name is the one that every such server knows.
+        openai_chat_supports_max_completion_tokens=False,
+    )
+    provider = OpenAICompatibleProvider("mllm", base_url=base_url, api_key=key or "none")
+    return OpenAIChatModel(name, provider=provider, profile=profile)
+
+
+def _model_of(name: str, model: str, base_url: str | None, key: str | None) -> Model:
+    """A provider's model; what is not given comes from the provider's own variables.
+
+    Raises `ReaderUnavailable`, and `UserError`, `ValueError` and `ImportError` of pydantic-ai.
+    """
+    try:
+        provider_class = infer_provider_class(name)
+    except ValueError as error:
+        known = "Take openai, anthropic, google, mistral, groq, openrouter..."
+        raise ReaderUnavailable(f"there is no provider {name!r}. {known}") from error
+    given: dict[str, Any] = {"base_url": base_url, "api_key": key}
+    try:
+        provider = provider_class(**{field: value for field, value in given.items() if value is not None})
+    except UserError as error:
+        if key is not None:
+            raise
+        raise ReaderUnavailable("it needs a key: set COW_MLLM_API_KEY, or the provider's own variable.") from error
+    return infer_model(f"{name}:{model}", provider_factory=lambda _: provider)
