@@ -64,7 +64,7 @@ def batch(
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
     """
-    from cow_service.client.batches import PASSING  # noqa: PLC0415
+    from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
 
     asked = _read(questions, _defaults(request), kind)
     try:
@@ -79,7 +79,7 @@ def batch(
     except Unauthorized as error:
         error.detail += " Here: set COW_API_KEY."
         raise
-    except PASSING as error:
+    except TRANSIENT as error:
         error.detail += f" {AGAIN}"
         raise
     raise typer.Exit(_tell(out))

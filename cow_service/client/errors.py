@@ -17,95 +17,10 @@ from typing import Any
 
 import httpx
 
-from cow_service.errors import (
-    ArtifactNotFound,
-    BodyTooLarge,
-    BodyTooSlow,
-    BodyTypeUnsupported,
-    Canceled,
-    CannotGround,
-    CannotReadDirection,
-    CheckpointInvalid,
-    CowError,
-    FieldError,
-    GeneratorOutOfMemory,
-    GeneratorUnavailable,
-    IdempotencyKeyReused,
-    ImageTooLarge,
-    ImageTypeUnsupported,
-    ImageUnreadable,
-    ImageUrlNotAllowed,
-    ImageUrlUnreachable,
-    InternalError,
-    InvalidRequest,
-    JobNotFound,
-    MalformedBody,
-    MethodNotAllowed,
-    MllmBadReply,
-    MllmUnavailable,
-    ModelNotFound,
-    NotFound,
-    NotReady,
-    ObjectNotFound,
-    OriginNotAllowed,
-    QueueFull,
-    RangeNotSatisfiable,
-    RateLimited,
-    ReaderUnavailable,
-    ShuttingDown,
-    StorageUnavailable,
-    Unauthorized,
-    WebhookNotAllowed,
-    WeightsUnavailable,
-    kinds,
-)
+from cow_service.errors import *  # noqa: F403 - each class can be imported from here, too
+from cow_service.errors import CowError, FieldError, kinds
 
-__all__ = [
-    "ArtifactNotFound",
-    "BadResponse",
-    "BodyTooLarge",
-    "BodyTooSlow",
-    "BodyTypeUnsupported",
-    "Canceled",
-    "CannotGround",
-    "CannotReadDirection",
-    "CheckpointInvalid",
-    "CowError",
-    "FieldError",
-    "GeneratorOutOfMemory",
-    "GeneratorUnavailable",
-    "IdempotencyKeyReused",
-    "ImageTooLarge",
-    "ImageTypeUnsupported",
-    "ImageUnreadable",
-    "ImageUrlNotAllowed",
-    "ImageUrlUnreachable",
-    "InternalError",
-    "InvalidRequest",
-    "JobNotFound",
-    "MalformedBody",
-    "MethodNotAllowed",
-    "MllmBadReply",
-    "MllmUnavailable",
-    "ModelNotFound",
-    "NotFound",
-    "NotReady",
-    "ObjectNotFound",
-    "OriginNotAllowed",
-    "QueueFull",
-    "RangeNotSatisfiable",
-    "RateLimited",
-    "ReaderUnavailable",
-    "ServerUnreachable",
-    "ShuttingDown",
-    "StorageUnavailable",
-    "Unauthorized",
-    "WaitTimeout",
-    "WebhookNotAllowed",
-    "WeightsUnavailable",
-]
-
-SHOWN = 200  # characters of a response that is none of COW's
+MAX_BODY_SHOWN = 200  # characters of a response that is none of COW's
 
 
 class ServerUnreachable(CowError):
@@ -135,12 +50,7 @@ class BadResponse(CowError):
     code, status = "bad-response", 0
 
 
-OWN: dict[str, type[CowError]] = {kind.code: kind for kind in (ServerUnreachable, WaitTimeout, BadResponse)}
-
-
-def closed() -> ServerUnreachable:
-    """The error of a call of a client that is closed, such as for a picture that was not downloaded before."""
-    return ServerUnreachable("The client is closed. Call `load()` or `save()` on results before that.")
+_OWN: dict[str, type[CowError]] = {kind.code: kind for kind in (ServerUnreachable, WaitTimeout, BadResponse)}
 
 
 def unreachable(error: httpx.HTTPError) -> ServerUnreachable | BadResponse:
@@ -162,7 +72,7 @@ def error_of(response: httpx.Response) -> CowError:
         moved = response.headers.get("location")
         error: CowError = BadResponse(
             f"{response.request.method} {response.url.path} was answered with {response.status_code} "
-            f"{response.reason_phrase}, and with nothing of COW's: {body[:SHOWN] or 'no body'}. "
+            f"{response.reason_phrase}, and with nothing of COW's: {body[:MAX_BODY_SHOWN] or 'no body'}. "
             + (f"It points to {moved}: is that its address (COW_BASE_URL)?" if moved else "Does a proxy stand between?")
         )
         error.status = response.status_code
@@ -182,7 +92,7 @@ def known_by(error: CowError, response: httpx.Response) -> CowError:
 def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) -> CowError:
     """The error that a problem (RFC 9457) is. A code of a later version than this comes as a plain `CowError`."""
     code = _code(problem)
-    kind = (kinds() | OWN).get(code, CowError)
+    kind = (kinds() | _OWN).get(code, CowError)
     told = problem.get("errors")
     fields = [field for field in told if isinstance(field, dict)] if isinstance(told, list) else []
     error = kind(

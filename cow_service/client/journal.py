@@ -20,8 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
-from cow_service.client.calls import to_json
 from cow_service.client.questions import Question
+from cow_service.client.serialization import to_json
 from cow_service.errors import InvalidRequest
 from cow_service.records import JobKind
 

@@ -10,8 +10,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cow_service.client.calls import to_json
 from cow_service.client.inputs import ImageLike, Reference, image_input, is_url
+from cow_service.client.serialization import to_json
 from cow_service.errors import FieldError, InvalidRequest
 
 # A mapping has `image` and `question`, maybe `id` and `meta`, and else fields of the request; a pair has the first two.

@@ -22,7 +22,7 @@ from mcp.server.stdio import stdio_server
 from mcp.server.transport_security import TransportSecuritySettings
 
 from cow_service.client import AsyncClient, CowError
-from cow_service.client.settings import target_of
+from cow_service.client.settings import endpoint_of
 from cow_service.errors import StorageUnavailable, Unauthorized
 from cow_service.mcp.server import Caller, Connect, create_server
 from cow_service.service import Service
@@ -66,7 +66,7 @@ class Elsewhere:
 
     def __init__(self, url: str) -> None:
         try:
-            self._url = target_of(url, None, None).base_url
+            self._url = endpoint_of(url, None, None).base_url
         except ValueError as error:  # also for COW_API_KEY
             raise SettingsError(f"Bad settings: {error}.") from error
         self._http: httpx.AsyncClient | None = None
