@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, Mapping
 from contextlib import aclosing
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import httpx
@@ -29,12 +29,13 @@ class AsyncConnection(Operations):
 
     result_types: ClassVar[Mapping[JobKind, type[Any]]] = {"simulate": AsyncSimulation, "answer": AsyncAnswer}
     handle_type = AsyncJobHandle
-    http_type = httpx.AsyncClient
+    _http_type = httpx.AsyncClient
     _http: httpx.AsyncClient
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._shielded: set[asyncio.Task[None]] = set()
+    @cached_property
+    def _shielded(self) -> set[asyncio.Task[None]]:
+        """Tasks that outlive their callers."""
+        return set()
 
     async def close(self) -> None:
         """Closes the HTTP client, where it was made here, once the server knows which callers have left."""

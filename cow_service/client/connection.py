@@ -29,7 +29,7 @@ class Connection(Operations):
 
     result_types: ClassVar[Mapping[JobKind, type[Any]]] = {"simulate": Simulation, "answer": Answer}
     handle_type = JobHandle
-    http_type = httpx.Client
+    _http_type = httpx.Client
     _http: httpx.Client
 
     def close(self) -> None:

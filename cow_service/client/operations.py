@@ -48,7 +48,7 @@ class Operations:
 
     result_types: ClassVar[Mapping[JobKind, type[Any]]]
     handle_type: ClassVar[type[Any]]
-    http_type: ClassVar[type[Any]]
+    _http_type: ClassVar[type[Any]]
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Operations:
         self.endpoint = endpoint_of(base_url, api_key, timeout)
         self.retries = retries
         self._own_http = http is None
-        self._http = self.http_type(limits=httpx.Limits(max_connections=None)) if http is None else http
+        self._http = self._http_type(limits=httpx.Limits(max_connections=None)) if http is None else http
         self._ever_answered = False
         self._refused = 0
 
