@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cow_service.cli.terminal import printable
+from cow_service.cli.errors import printable
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
@@ -135,8 +135,8 @@ def _read(path: Path, defaults: dict[str, Any], kind: BatchKind) -> list[Questio
                 _check(question, kind)
                 items.append(item)
             except InvalidRequest as error:
-                told = error.detail.removeprefix("Question 1: ")
-                faults.append(f"{path.name}, line {number}: {told}")
+                told = [f"`{field.pointer.rpartition('/')[2]}` {field.detail}." for field in error.errors]
+                faults.append(f"{path.name}, line {number}: {' '.join(told) or error.detail}")
     if faults:
         more = f"\n... and {len(faults) - SHOWN_FAULTS} more" if len(faults) > SHOWN_FAULTS else ""
         raise InvalidRequest("\n".join(faults[:SHOWN_FAULTS]) + more)
