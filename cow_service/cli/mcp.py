@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import sys
-from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -20,17 +18,11 @@ class McpNotInstalled(CowError):
     code, status = "mcp-not-installed", 0
 
 
-class Transport(StrEnum):
-    """How the protocol is spoken."""
-
-    stdio = "stdio"
-    http = "http"
-
-
 def mcp(
     transport: Annotated[
-        Transport, typer.Option(help="stdio: with the program that starts this one; http: at --host and --port, /mcp.")
-    ] = Transport.stdio,
+        Literal["stdio", "http"],
+        typer.Option(help="stdio: with the program that starts this one; http: at --host and --port, /mcp."),
+    ] = "stdio",
     host: Annotated[str, typer.Option(help="Address to listen on, with --transport http.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on; 0 takes a free one.", min=0, max=65535)] = 8001,
     url: Annotated[
@@ -49,6 +41,8 @@ def mcp(
     ] = None,
 ) -> None:
     """Serve the tools `simulate` and `answer` over the Model Context Protocol."""
+    import logging  # noqa: PLC0415
+
     from cow_service.observability import logging as logs  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 
@@ -63,7 +57,7 @@ def mcp(
             raise
         raise McpNotInstalled(f"`cow mcp` needs the Python package `mcp`, 2.3 or later: {INSTALL}") from error
 
-    if transport is Transport.stdio:
+    if transport == "stdio":
         # The requests are the tools' own, and there is one caller.
         logging.getLogger(logs.ACCESS).setLevel(logging.WARNING)
         run_stdio(backend_for(for_its_owner(settings), url))

@@ -4,34 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from enum import StrEnum
 from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import typer
 
 from cow_service.errors import CowError, InvalidRequest
 
-
-class Policy(StrEnum):
-    """Which frames to keep as pictures."""
-
-    initial = "initial"
-    uniform = "uniform"
-    events = "events"
-
-
-class Kind(StrEnum):
-    """Kinds of motion."""
-
-    linear = "linear"
-    projectile = "projectile"
-    fall = "fall"
-    static = "static"
-
-
+Policy = Literal["initial", "uniform", "events"]
+Kind = Literal["linear", "projectile", "fall", "static"]
 Image = Annotated[
     Path, typer.Argument(metavar="IMAGE", help="PNG, JPEG or WebP.", exists=True, dir_okay=False, readable=True)
 ]
@@ -50,7 +33,7 @@ def request_body(
     direction: Annotated[str | None, typer.Option(help="DX,DY of the motion, px, x right, y down.")] = None,
     kind: Annotated[
         Kind, typer.Option(help="Kind of motion, with --direction (or alone for fall and static).")
-    ] = Kind.linear,
+    ] = "linear",
     speed: Annotated[float | None, typer.Option(help="px/s, with --direction.", show_default="0.26 widths/s")] = None,
     trajectory: Annotated[
         Path | None,
@@ -69,7 +52,7 @@ def request_body(
     num_frames: Annotated[int, typer.Option(help="Frames of the clip.")] = 81,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 16,
     seed: Annotated[int, typer.Option(help="For what draws random numbers.")] = 0,
-    frames: Annotated[Policy, typer.Option(help="Which frames to keep as pictures.")] = Policy.initial,
+    frames: Annotated[Policy, typer.Option(help="Which frames to keep as pictures.")] = "initial",
     count: Annotated[int, typer.Option(help="How many of them.")] = 3,
     max_side: Annotated[int, typer.Option(help="Their longest side, px; 0 for the clip's own size.")] = 512,
 ) -> dict[str, Any]:
@@ -84,7 +67,7 @@ def request_body(
         "num_frames": num_frames,
         "fps": fps,
         "seed": seed,
-        "frames": {"policy": frames.value, "count": count, "max_side": max_side or None},
+        "frames": {"policy": frames, "count": count, "max_side": max_side or None},
     }
     if point is not None or box is not None:
         body["grounding"] = {
@@ -94,13 +77,13 @@ def request_body(
         }
     elif name is not None and trajectory is None:
         raise InvalidRequest("--object goes with --point, --box or --trajectory; else the question names the object.")
-    if direction is not None or kind in (Kind.fall, Kind.static):
+    if direction is not None or kind in ("fall", "static"):
         body["motion"] = {
             "direction": None if direction is None else _numbers("--direction", direction, 2),
-            "kind": kind.value,
+            "kind": kind,
             "speed": speed,
         }
-    elif kind is not Kind.linear or speed is not None:
+    elif kind != "linear" or speed is not None:
         raise InvalidRequest("--kind and --speed go with --direction; without it the motion is read from the question.")
     if trajectory is not None:
         body["trajectory"] = path = _json(trajectory)
