@@ -38,10 +38,10 @@ from servers import IMAGE, QUESTION, Served, data_url, eventually, slow
 import cow_service.client
 from cow_service import records
 from cow_service.client import AsyncClient, Client, CowError, Event, Simulation, errors
+from cow_service.client.display import simulation_html
 from cow_service.client.inputs import Upload, image_input
 from cow_service.client.options import AnswerOptions, SimulateOptions
 from cow_service.client.progress import reporting
-from cow_service.client.display import simulation_html
 from cow_service.records import Job
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, SimulateRequest
 
@@ -641,7 +641,8 @@ def test_examples_in_the_docs_are_true(address: str, tmp_path: Path, monkeypatch
         own = {"client": client, "base_url": address, "asyncio": asyncio}
         found = {name: doctest.testmod(importlib.import_module(name), extraglobs=own) for name in names}
     assert not {name: each for name, each in found.items() if each.failed}
-    assert {name.rpartition(".")[2] for name, each in found.items() if each.attempted} >= {"client", "async_client", "base", "results"}
+    modules = {"client", "async_client", "base", "results"}
+    assert {name.rpartition(".")[2] for name, each in found.items() if each.attempted} >= modules
 
 
 USE = """

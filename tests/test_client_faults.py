@@ -37,7 +37,7 @@ from sdk import (
 from servers import IMAGE, QUESTION, Served, data_url, eventually, slow
 
 from cow_service.client import AsyncClient, CowError, errors
-from cow_service.client.retries import LONGEST_PAUSE
+from cow_service.client.retries import MAX_RETRY_AFTER_SECONDS
 from cow_service.errors import kinds
 
 __all__ = ["connect", "hurried"]  # fixtures
@@ -94,10 +94,10 @@ def test_refusals_at_the_door_are_tried_again(hurried: Connect, code: str) -> No
     [
         ("0", 0, 0.3),
         ("3", 3, 3.5),
-        ("3600", LONGEST_PAUSE, LONGEST_PAUSE + 0.3),
-        ("9" * 400, LONGEST_PAUSE, LONGEST_PAUSE + 0.3),
+        ("3600", MAX_RETRY_AFTER_SECONDS, MAX_RETRY_AFTER_SECONDS + 0.3),
+        ("9" * 400, MAX_RETRY_AFTER_SECONDS, MAX_RETRY_AFTER_SECONDS + 0.3),
         (30, 20, 31),
-        (4000, LONGEST_PAUSE, LONGEST_PAUSE + 0.3),
+        (4000, MAX_RETRY_AFTER_SECONDS, MAX_RETRY_AFTER_SECONDS + 0.3),
         (-50, 0, 0.3),
         ("soon", 0.3, 0.7),
         ("-5", 0.3, 0.7),

@@ -1,12 +1,12 @@
-"""What calls raise: the server's own errors, one class for each code, and those of the way to it.
+"""What calls raise: the server's own errors, one class for each code, and those of the connection.
 
     CowError                        everything here
     ├── (cow_service.errors)        one class for each problem code: CannotGround, QueueFull, Unauthorized...
     ├── ServerUnreachable           no connection, or it broke, more often than `retries`
     ├── WaitTimeout                 a job had not ended in time; it goes on, and `job_id` names it
-    └── BadResponse                 what answered speaks no COW: a proxy's page, a damaged artifact
+    └── BadResponse                 not a response of COW: a proxy's page, a damaged artifact
 
-Each has `code`, `status` (0 where no server told it), `detail` (what was wrong, with the value, and what to do),
+Each has `code`, `status` (0 where it is not the server's), `detail` (what was wrong, with the value, and what to do),
 `errors` (a JSON Pointer for each invalid field) and `request_id` (by which the server's log knows the request).
 """
 
@@ -20,7 +20,7 @@ import httpx
 from cow_service.errors import *  # noqa: F403 - each class can be imported from here, too
 from cow_service.errors import CowError, FieldError, kinds
 
-MAX_BODY_SHOWN = 200  # characters of a response that is none of COW's
+MAX_BODY_SHOWN = 200  # characters of a response that is not COW's
 
 
 class ServerUnreachable(CowError):
@@ -54,18 +54,18 @@ _OWN: dict[str, type[CowError]] = {kind.code: kind for kind in (ServerUnreachabl
 
 
 def unreachable(error: httpx.HTTPError) -> ServerUnreachable | BadResponse:
-    """The error of a request that no response came to, or none that can be read."""
+    """The error of a request without a response, or with one that cannot be decoded."""
     url = error.request.url
-    told = (
+    request = (
         f"{error.request.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}."
     )
     if isinstance(error, httpx.DecodingError):
-        return BadResponse(f"{told} Does a proxy stand between?")
-    return ServerUnreachable(f"{told} Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?")
+        return BadResponse(f"{request} Does a proxy stand between?")
+    return ServerUnreachable(f"{request} Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?")
 
 
 def error_of(response: httpx.Response) -> CowError:
-    """The error that a response tells; the body has been read."""
+    """The error that a response holds; its body has been read."""
     problem = _problem(response)
     if problem is None:
         body = " ".join(response.text.split())
@@ -78,11 +78,11 @@ def error_of(response: httpx.Response) -> CowError:
         error.status = response.status_code
     else:
         error = error_from(problem, response.headers)
-    return known_by(error, response)
+    return with_request_id(error, response)
 
 
-def known_by(error: CowError, response: httpx.Response) -> CowError:
-    """The same error, with the id by which the server's log knows its request; tracebacks show it."""
+def with_request_id(error: CowError, response: httpx.Response) -> CowError:
+    """The same error, with the id of its request in the server's log; tracebacks show it."""
     error.request_id = response.headers.get("x-request-id")
     if error.request_id is not None:
         error.add_note(f"request id: {error.request_id}")
@@ -93,8 +93,8 @@ def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) ->
     """The error that a problem (RFC 9457) is. A code of a later version than this comes as a plain `CowError`."""
     code = _code(problem)
     kind = (kinds() | _OWN).get(code, CowError)
-    told = problem.get("errors")
-    fields = [field for field in told if isinstance(field, dict)] if isinstance(told, list) else []
+    given = problem.get("errors")
+    fields = [field for field in given if isinstance(field, dict)] if isinstance(given, list) else []
     error = kind(
         str(problem.get("detail") or problem.get("title") or ""),
         errors=tuple(FieldError(str(field.get("pointer", "")), str(field.get("detail", ""))) for field in fields),
@@ -107,7 +107,7 @@ def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) ->
 
 
 def code_of(response: httpx.Response) -> str | None:
-    """The problem code that a response tells; None where it tells none."""
+    """The problem code of a response; None where it has none."""
     problem = _problem(response)
     return None if problem is None else _code(problem)
 

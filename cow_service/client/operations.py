@@ -19,8 +19,8 @@ from cow_service.client.errors import (
     WaitTimeout,
     error_from,
     error_of,
-    known_by,
     unreachable,
+    with_request_id,
 )
 from cow_service.client.events import EventCursor
 from cow_service.client.inputs import ImageLike
@@ -226,7 +226,7 @@ class Operations:
             return self.result(job.kind, body.get("result") or {})
         canceled = job.status == "canceled"
         error = Canceled(f"The job {job.id} was canceled.") if canceled else error_from(body.get("problem") or {})
-        raise known_by(error, response)
+        raise with_request_id(error, response)
 
     def _cancel_abandoned(self, request: JobRequest, job_id: str | None) -> Steps[None]:
         """Cancels the job of a caller who has left. Without retries: the server may be gone, too."""
