@@ -340,7 +340,7 @@ def case_of(arguments: argparse.Namespace) -> Case:
     models = {
         name: manifest
         for name, manifest in load_manifests().items()
-        if manifest.architecture and manifest.door == "generator"
+        if manifest.architecture and manifest.role == "generator"
     }
     name = arguments.model or ("tiny-ati" if device.type == "cpu" else "ati")
     if name not in models:

@@ -137,7 +137,7 @@ class Service:
         return Models(
             readers=tuple(self._describe("reader", name) for name in self.readers.names()),
             generators=tuple(self._describe("generator", name) for name in self.generators.names()),
-            mllms=tuple(name for name, manifest in load_manifests().items() if manifest.door == "mllm"),
+            mllms=tuple(name for name, manifest in load_manifests().items() if manifest.role == "mllm"),
         )
 
     def __enter__(self) -> Service:

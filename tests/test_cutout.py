@@ -10,15 +10,14 @@ from drawn import DrawnArrow, ball, block, floor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cow_service.generators.base import Shot
+from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import MAX_SIDE, CutoutGenerator, CutoutOptions
 from cow_service.records import Artifact, Grounding
 from cow_service.requests import GroundingRequest, MotionRequest
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import compute_trajectory
-from cow_service.vision.obstacles import obstacles_of
-from cow_service.vision.quilt import quilt
+from cow_service.vision.inpainting import exemplar_inpaint
 from cow_service.vision.scene import Scene
 
 RED, BLUE = (210, 20, 20), (50, 80, 200)
@@ -35,17 +34,17 @@ def no_reader():
     raise AssertionError("no reader is needed here")
 
 
-def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion) -> Shot:
+def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion) -> GeneratorInput:
     scene = Scene(image)
     grounding: Grounding
     grounding, _ = ground(scene, GroundingRequest(point=CENTRE), no_reader, lambda mask: ARTIFACT)
     moving, _ = read_motion(scene, grounding, MotionRequest(**motion), None, no_reader)
-    obstacles = obstacles_of(scene, grounding.bbox)
+    obstacles = scene.obstacles(grounding.bbox)
     trajectory = compute_trajectory(scene, grounding, moving, obstacles, None, frames, fps)
-    return Shot(scene, grounding, moving, trajectory, obstacles, 0, CutoutOptions(clean_cues=clean))
+    return GeneratorInput(scene, grounding, moving, trajectory, obstacles, 0, CutoutOptions(clean_cues=clean))
 
 
-def frame_of(filmed: Shot, index: int) -> np.ndarray:
+def frame_of(filmed: GeneratorInput, index: int) -> np.ndarray:
     return next(generator.render(filmed, [index], ignore))
 
 
@@ -183,6 +182,6 @@ def test_quilting_copies_what_is_around() -> None:
     hole[36:60, 36:60] = True
     damaged = np.where(hole[..., None], 0, source).astype(np.float32)
     shading = np.full_like(source, 130)
-    filled = quilt(damaged, hole, np.zeros_like(hole), shading)
+    filled = exemplar_inpaint(damaged, hole, np.zeros_like(hole), shading)
     assert np.abs(filled - source)[hole].mean() < 30
-    assert np.allclose(quilt(damaged, np.ones_like(hole), hole, shading), shading)
+    assert np.allclose(exemplar_inpaint(damaged, np.ones_like(hole), hole, shading), shading)

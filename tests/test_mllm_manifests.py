@@ -11,7 +11,7 @@ import torch
 from cow_service.weights.manifests import Manifest, load_families, load_manifests
 from cow_service.weights.resources import family_names, manifest_names
 
-ALL = {name: manifest for name, manifest in load_manifests().items() if manifest.door == "mllm"}
+ALL = {name: manifest for name, manifest in load_manifests().items() if manifest.role == "mllm"}
 # One without a name under which it is served is a toy, made from nothing.
 MLLMS = {name: manifest for name, manifest in ALL.items() if manifest.model}
 OPEN = {name: manifest for name, manifest in MLLMS.items() if manifest.provider is None}

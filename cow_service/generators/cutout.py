@@ -17,9 +17,9 @@ from cow_service.physics.camera import has_passed
 from cow_service.physics.encounters import box_at, stands_nearer
 from cow_service.records import BBox, GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.fill import crop_of, draw_in, fill_hole
+from cow_service.vision.inpainting import fill_hole, push_pull
+from cow_service.vision.masks import resized_mask, scaled_size, window_of
 from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.sizes import resized_mask
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
 EDGE_SIGMA = 0.8  # px of softness at the cut
@@ -66,8 +66,7 @@ class CutoutGenerator:
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """The image's own size, up to 1280 px on the longer side."""
-        factor = min(1.0, MAX_SIDE / max(width, height))
-        return max(1, round(width * factor)), max(1, round(height * factor))
+        return scaled_size(width, height, min(1.0, MAX_SIDE / max(width, height)))
 
     def render(
         self, given: GeneratorInput, indices: Sequence[int], progress: Callable[[float], None]
@@ -103,7 +102,7 @@ def _layers(given: GeneratorInput) -> _Layers:
     mover = resized_mask(scene.silhouette(given.grounding.bbox), size)
     others = np.zeros(mover.shape, bool)
     for obstacle in given.obstacles:
-        others |= obstacle.cutting.at(size)
+        others |= obstacle.mask.at(size)
     growth = 2 * max(2, round(HOLE_GROWTH * float(np.sqrt(mover.sum())))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (growth, growth))
     hole = cv2.dilate(mover.astype(np.uint8), kernel) > 0
@@ -111,7 +110,7 @@ def _layers(given: GeneratorInput) -> _Layers:
         hole |= resized_mask(scene.cues, size) & (cv2.dilate(hole.astype(np.uint8), kernel, iterations=3) > 0)
     hole &= ~(others & ~mover)
     sprite, origin = _sprite(image, mover)
-    occluders = tuple((obstacle.bbox, _soft(obstacle.cutting.at(size) & ~mover)) for obstacle in _near(given))
+    occluders = tuple((obstacle.bbox, _soft(obstacle.mask.at(size) & ~mover)) for obstacle in _near(given))
     return _Layers(fill_hole(image, hole, others & ~mover), sprite, origin, occluders, factor)
 
 
@@ -134,11 +133,11 @@ def _near(given: GeneratorInput) -> list[Obstacle]:
 
 def _sprite(image: Image, mover: Mask) -> tuple[Floats, tuple[float, float]]:
     """The mover with a soft edge, and where its corner lies. Colours at the edge are the mover's own, not mixed."""
-    inside = crop_of(mover, 4) or (slice(0, 1), slice(0, 1))
+    inside = window_of(mover, 4) or (slice(0, 1), slice(0, 1))
     mask, colours = mover[inside], image[inside].astype(np.float32)
     alpha = _soft(mask)
     core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
-    own = draw_in(colours, core) if core.any() else colours
+    own = push_pull(colours, core) if core.any() else colours
     blended = np.where((core | ~mask)[..., None], np.where(core[..., None], colours, own), 0.5 * colours + 0.5 * own)
     sprite = np.dstack([blended * alpha[..., None], alpha]).astype(np.float32)
     return sprite, (float(inside[1].start), float(inside[0].start))

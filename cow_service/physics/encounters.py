@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cow_service.physics.camera import PITCH
 from cow_service.records import BBox, Encounter, EncounterKind
+from cow_service.vision.masks import resized_mask
 from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.sizes import resized_mask
 
 WORKING_SIDE = 320  # px: masks are swept at this size
 LEAST_OVERLAP = 0.03  # of the smaller silhouette: less is a graze that nobody would call an encounter
@@ -48,7 +48,7 @@ def find_encounters(sweep: Sweep, obstacles: Sequence[Obstacle]) -> tuple[Encoun
     mover = resized_mask(sweep.mask, size)
     found: list[Encounter] = []
     for obstacle in obstacles:
-        other = obstacle.cutting.at(size)
+        other = obstacle.mask.at(size)
         seen: set[EncounterKind] = set()
         for frame, (point, scale, visible) in enumerate(zip(sweep.points, sweep.scale, sweep.visible, strict=True)):
             if not visible or not _boxes_meet(sweep, point, scale, obstacle.bbox):

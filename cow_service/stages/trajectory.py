@@ -47,7 +47,7 @@ def compute_trajectory(
     sweep = Sweep(mask, grounding.bbox, np.array(grounding.point), points, scale, visible, airborne)
     movable = swept_mask(sweep)
     for obstacle in obstacles:
-        obstacle.cutting.add_to(movable)
+        obstacle.mask.add_to(movable)
     if given is not None and given.tracks is not None:
         tracks = [_sampled(np.array(track), given.fps, times) for track in given.tracks]
     else:

@@ -25,8 +25,8 @@ class Manifest(Record):
     """One backend or model as described by `models/<name>.yaml`."""
 
     name: str
-    door: Literal["reader", "generator", "mllm"] = Field(
-        description="Which registry it stands in; an `mllm` is what the readers `mllm` and `local` ask."
+    role: Literal["reader", "generator", "mllm"] = Field(
+        description="Which registry it belongs to; an `mllm` is what the readers `mllm` and `local` ask."
     )
     summary: str
     licence: str

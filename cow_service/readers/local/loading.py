@@ -97,7 +97,7 @@ def _manifest(name: str | None) -> Manifest:
     if name is None:
         raise ReaderUnavailable(f"No multimodal LLM is chosen: set COW_MLLM to one of {_with_weights()}.")
     manifest = load_manifests().get(name)
-    if manifest is None or manifest.door != "mllm":
+    if manifest is None or manifest.role != "mllm":
         raise ReaderUnavailable(
             f"'{name}' is no multimodal LLM that runs in this process: set COW_MLLM to one of "
             f"{_with_weights()}, or take the reader 'mllm'."
@@ -107,7 +107,7 @@ def _manifest(name: str | None) -> Manifest:
 
 def _with_weights() -> str:
     found = load_manifests().values()
-    return ", ".join(one.name for one in found if one.door == "mllm" and (one.sources or one.architecture))
+    return ", ".join(one.name for one in found if one.role == "mllm" and (one.sources or one.architecture))
 
 
 def _from_folder(
