@@ -1,4 +1,4 @@
-"""The CPU compositor: the mover is cut out and drawn along its trajectory over the filled-in background."""
+"""The CPU compositor: the mover is cut out and drawn along its trajectory over the inpainted background."""
 
 from __future__ import annotations
 
@@ -14,19 +14,17 @@ from cow_service import __version__
 from cow_service.generators.base import GeneratorInput
 from cow_service.media.images import fit_within
 from cow_service.physics.camera import has_passed
-from cow_service.physics.encounters import box_at, stands_nearer
+from cow_service.physics.encounters import box_at, boxes_overlap, stands_nearer
 from cow_service.records import BBox, GeneratorInfo
 from cow_service.settings import Settings
 from cow_service.vision.inpainting import fill_hole, push_pull
-from cow_service.vision.masks import resized_mask, scaled_size, window_of
+from cow_service.vision.masks import Image, Mask, resized_mask, scaled_size, window_of
 from cow_service.vision.obstacles import Obstacle
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
-EDGE_SIGMA = 0.8  # px of softness at the cut
-HOLE_GROWTH = 0.03  # of the object's size: its rim is mixed with the background and must go too
+EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge
+HOLE_GROWTH = 0.03  # of the object's size: the rim, mixed with the background, is inpainted too
 
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 
@@ -50,7 +48,7 @@ class _Layers:
 
 
 class CutoutGenerator:
-    """Milliseconds per frame, no weights. It moves a picture: it does not turn, light or break things."""
+    """Milliseconds per frame, no weights. It moves a sprite: nothing turns, breaks or changes its lighting."""
 
     options_model = CutoutOptions
     concurrency = None
@@ -71,7 +69,7 @@ class CutoutGenerator:
     def render(
         self, given: GeneratorInput, indices: Sequence[int], progress: Callable[[float], None]
     ) -> Iterator[Image]:
-        """The frames of these indices, RGB [h, w, 3]; only where the mover is are they composed anew."""
+        """The frames of these indices, RGB [h, w, 3]; only the window of the mover is composed."""
         layers = _layers(given)
         start = np.array(given.grounding.point)
         airborne = given.motion.kind in ("projectile", "fall")
@@ -106,7 +104,7 @@ def _layers(given: GeneratorInput) -> _Layers:
     growth = 2 * max(2, round(HOLE_GROWTH * float(np.sqrt(mover.sum())))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (growth, growth))
     hole = cv2.dilate(mover.astype(np.uint8), kernel) > 0
-    if clean:  # what continued a cue next to the mover has the mover's colour in it
+    if clean:  # where a cue next to the mover was inpainted, the mover's colour has spread
         hole |= resized_mask(scene.cues, size) & (cv2.dilate(hole.astype(np.uint8), kernel, iterations=3) > 0)
     hole &= ~(others & ~mover)
     sprite, origin = _sprite(image, mover)
@@ -121,14 +119,7 @@ def _near(given: GeneratorInput) -> list[Obstacle]:
         box_at(bbox, start, np.array(point), scale)
         for point, scale in zip(given.trajectory.points, given.trajectory.scale, strict=True)
     ]
-    return [
-        other
-        for other in given.obstacles
-        if any(
-            b[0] < other.bbox[2] and other.bbox[0] < b[2] and b[1] < other.bbox[3] and other.bbox[1] < b[3]
-            for b in boxes
-        )
-    ]
+    return [other for other in given.obstacles if any(boxes_overlap(box, other.bbox) for box in boxes)]
 
 
 def _sprite(image: Image, mover: Mask) -> tuple[Floats, tuple[float, float]]:

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.vision.masks import Mask
+
 TRIES = 120  # circles through three points of the outline
 NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
 ON_CIRCLE = 0.55  # share of the outline
@@ -16,8 +18,6 @@ ON_EDGES = 0.8  # share of the circle
 FILLED, SPILLED = 0.72, 0.14  # share of the disc that the region fills; share of the region outside it
 SAMPLES = 72  # points tried on the circle
 LEAST_RADIUS = 5.0  # px
-
-Mask = NDArray[np.bool_]
 
 
 def as_disc(part: Mask, edges: NDArray[np.float32], edge_threshold: float) -> Mask | None:

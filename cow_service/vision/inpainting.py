@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import scaled_size, window_of
+from cow_service.vision.masks import Image, Mask, scaled_size, window_of
 
 INPAINT_RADIUS = 4  # px
 MARGIN = 8  # px around a drawing that the fill may look at
@@ -23,8 +23,6 @@ TILE = 9  # px at the coarse size: what one patch fills
 CONTEXT = 5  # px around a tile that must fit
 FEATHER = 3  # px over which patches overlap
 
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 

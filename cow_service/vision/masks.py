@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cow_service.records import BBox
 
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8]  # RGB [H, W, 3]
+Mask = NDArray[np.bool_]  # [H, W]
 
 
 def scaled(image: Image, scale: float) -> Image:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision.colours import colour_name, colour_names
 from cow_service.vision.discs import as_disc
-from cow_service.vision.masks import CroppedMask, enlarged, iou, outline_of, scaled
+from cow_service.vision.masks import CroppedMask, Mask, enlarged, iou, outline_of, scaled
 
 WORKING_SIDE = 512  # px: images are searched at this size
 CHROMA_STEP = 9.0  # Lab units from the surroundings
@@ -36,7 +36,6 @@ MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged ma
 
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
 
-Mask = NDArray[np.bool_]
 Channel = NDArray[np.float32]
 
 

@@ -8,22 +8,18 @@ from functools import cached_property
 from threading import RLock
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.arrows import Arrow, find_arrows
 from cow_service.vision.boxes import DrawnBox, find_boxes
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import bbox_of, iou
+from cow_service.vision.masks import Image, Mask, bbox_of, iou
 from cow_service.vision.obstacles import Obstacle, find_obstacles
 from cow_service.vision.regions import SAME_OBJECT, Region, find_regions, region_of
 from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
 
 __all__ = ["SAME_OBJECT", "Scene", "iou"]
-
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

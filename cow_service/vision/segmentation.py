@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
-from cow_service.vision.masks import bbox_of, outline_of, scaled
+from cow_service.vision.masks import Image, Mask, bbox_of, outline_of, scaled
 
 WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
 POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
@@ -20,9 +20,6 @@ GAMMA = 0.5  # brightens what is cut: dark hair on a dark wall differs by few gr
 MARGIN = 0.25  # of the box, kept around it as sure background
 STEADY = 0.6  # weight of a mask that stays the same when more is looked at
 POINT_REACHES = (0.07, 0.11, 0.16, 0.24, 0.34)  # half sides tried around a point, of the image's shorter side
-
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
-from cow_service.vision.masks import resized_mask, scaled
+from cow_service.vision.masks import Mask, resized_mask, scaled
 from cow_service.vision.scene import Scene
 
 WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
@@ -35,7 +35,6 @@ QUARTERS = (0.0, np.pi / 2, np.pi, -np.pi / 2)  # radians
 LEAST_PIXELS, MOST_PIXELS = 60, 700  # of the floor about a patch, at the working size
 STEPS = 8  # of the fit
 
-Mask = NDArray[np.bool_]
 Channel = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Ellipse = tuple[float, float, float, float]  # centre and half axes, px

@@ -158,9 +158,7 @@ def _listed(source: Source, revision: str | None, others: tuple[str, ...], endpo
     """The repository's files at a revision that match the source, and those that other sources of it have chosen."""
     hub = _hub(endpoint)
     with _hub_errors(source.repository, revision):
-        info = hub.model_info(
-            source.repository, revision=revision, files_metadata=True, timeout=_LISTING_SECONDS
-        )
+        info = hub.model_info(source.repository, revision=revision, files_metadata=True, timeout=_LISTING_SECONDS)
         siblings = {sibling.rfilename: sibling for sibling in info.siblings or ()}
         names: set[str] = set()
         for pattern in source.files:

@@ -25,7 +25,7 @@ from cow_service.readers.question import sentences
 from cow_service.records import AnswerOption, BBox, Cue, Grounding, MotionKind, ReaderInfo, Source, Usage
 from cow_service.settings import Settings
 from cow_service.vision.scene import Scene
-from cow_service.weights.resources import prompt_names, read_prompt_text
+from cow_service.weights.resources import PROMPTS
 
 DIRECTED: tuple[MotionKind, ...] = ("linear", "projectile")
 FALLING: tuple[MotionKind, ...] = ("projectile", "fall")
@@ -46,7 +46,7 @@ class MllmReader:
     def fingerprint(self) -> str:
         """The model, where it is served from, how its family is asked, and the words of all prompts."""
         served = self.asker.served
-        prompts = "".join(read_prompt_text(name) for name in prompt_names())
+        prompts = "".join(PROMPTS.read(name) for name in PROMPTS.names())
         told = (
             __version__, self.name, served.name, self._origin,
             served.manifest.model_dump_json(), served.family.model_dump_json(), prompts,
