@@ -277,7 +277,7 @@ def test_the_commands_of_the_comments_are_right(file: Path, monkeypatch: pytest.
             options = words[:at]
             given = [words[at + 1] for at, word in enumerate(options) if word == "-e"]
             settings = check_settings(monkeypatch, dict(one.split("=", 1) for one in given))
-            assert settings.generator in [name for name, found in load_manifests().items() if found.door == "generator"]
+            assert settings.generator in [name for name, found in load_manifests().items() if found.role == "generator"]
             published = [words[at + 1] for at, word in enumerate(options) if word == "-p"]
             assert all(port.startswith("127.0.0.1:") for port in published)
             mounted = {words[at + 1].split(":")[1] for at, word in enumerate(options) if word == "-v"}

@@ -61,7 +61,12 @@ def test_stages_and_pipeline_know_no_implementation() -> None:
     for name, path in modules().items():
         if name.startswith("stages.") or name == "pipeline":
             backends = {i for i in imports(path) if i.startswith(("readers.", "generators."))}
-            assert backends <= {"readers.base", "readers.question.wording", "readers.question.choices", "generators.base"}, name
+            assert backends <= {
+                "readers.base",
+                "readers.question.wording",
+                "readers.question.choices",
+                "generators.base",
+            }, name
 
 
 @pytest.mark.parametrize("name", sorted(modules()))

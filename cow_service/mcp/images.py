@@ -9,6 +9,7 @@ from urllib.request import url2pathname
 
 from cow_service.client import ImageLike
 from cow_service.errors import FieldError, InvalidRequest
+from cow_service.media.artifacts import media_type_of
 from cow_service.requests import ImageArtifact
 
 ARTIFACTS = "cow://artifacts/"
@@ -59,7 +60,7 @@ def _read(path: Path) -> bytes:
             raise _wrong(f"there is no file {_shown(str(path))}; give an absolute path")
         with path.open("rb") as file:
             head = file.read(_SIGNATURE_BYTES)
-            if media_type(head) not in ("image/png", "image/jpeg", "image/webp"):
+            if media_type_of(head) not in ("image/png", "image/jpeg", "image/webp"):
                 raise _wrong(f"{_shown(str(path))} is no PNG, JPEG or WebP")
             rest = file.read(MAX_FILE_BYTES)
             if len(head) + len(rest) > MAX_FILE_BYTES:
@@ -68,17 +69,6 @@ def _read(path: Path) -> bytes:
     except (OSError, RuntimeError, ValueError) as error:  # no home folder; NUL in the name
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise _wrong(f"{_shown(str(path))} cannot be read: {why or type(error).__name__}") from error
-
-
-def media_type(data: bytes) -> str:
-    """What the service's artifacts are, by their first bytes."""
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "image/png"
-    if data.startswith(b"\xff\xd8\xff"):
-        return "image/jpeg"
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        return "image/webp"
-    return "video/mp4" if data[4:8] == b"ftyp" else "application/octet-stream"
 
 
 def _shown(text: str) -> str:

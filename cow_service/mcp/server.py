@@ -41,12 +41,13 @@ from cow_service import __version__
 from cow_service.client import AsyncAnswer, AsyncClient, CowError
 from cow_service.errors import InternalError
 from cow_service.mcp.errors import error_text
-from cow_service.mcp.images import ARTIFACTS, HELP_WITH_PATHS, HELP_WITHOUT_PATHS, digest_of, image_of, media_type
+from cow_service.mcp.images import ARTIFACTS, HELP_WITH_PATHS, HELP_WITHOUT_PATHS, digest_of, image_of
 from cow_service.mcp.inputs import INPUTS, ToolName, input_schema, parsed
 from cow_service.mcp.pictures import pictures_of
 from cow_service.mcp.progress import result_of
 from cow_service.mcp.results import AnswerResult, Result, SimulateResult, answer_result, output_schema, simulate_result
 from cow_service.mcp.text import answer_text, simulation_text
+from cow_service.media.artifacts import media_type_of
 
 INSTRUCTIONS = """\
 COW imagines what would happen in a picture. Use it for what-if questions about one still image in which something \
@@ -209,7 +210,8 @@ class _Tools:
             code = INVALID_PARAMS if error.code == "artifact-not-found" else INTERNAL_ERROR
             raise MCPError(code=code, message=error_text(error)) from error
         blob = base64.b64encode(data).decode()
-        return ReadResourceResult(contents=[BlobResourceContents(uri=uri, mime_type=media_type(data), blob=blob)])
+        media_type = media_type_of(data) or "application/octet-stream"
+        return ReadResourceResult(contents=[BlobResourceContents(uri=uri, mime_type=media_type, blob=blob)])
 
 
 def _caller(context: ServerRequestContext[Any]) -> Caller:
