@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import atexit
 import tempfile
+import time
 from functools import cache
 from pathlib import Path
 
 from fastapi import FastAPI
 
 from cow_service.api.app import create_app
+from cow_service.jobs import reports
 from cow_service.jobs.engine import Engine
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -35,5 +37,19 @@ def running_engine() -> Engine:
 def app_for(service: Service) -> FastAPI:
     """An application whose jobs are this service's from now on. Only one service is at work at a time."""
     engine = running_engine()
+    end_jobs(engine)
     engine.use(service)
     return create_app(engine, closing=False)
+
+
+def end_jobs(engine: Engine, seconds: float = 30.0) -> None:
+    """Cancels the jobs that an earlier test left behind, and waits until nobody works on them.
+
+    Else they would go on with the next test's service, and ask its multimodal LLM about another image.
+    """
+    until = time.monotonic() + seconds
+    while (left := set(reports.open_jobs())) or engine.live.jobs():
+        for job_id in left:
+            engine.cancel(job_id, None)
+        assert time.monotonic() < until, "the work on an earlier test's job does not end"
+        time.sleep(0.01)
