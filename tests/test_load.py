@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import re
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ from mllm_server import MllmServer
 from numpy.typing import NDArray
 from servers import data_url
 
+from cow_service.jobs.registry import JobRegistry
 from cow_service.media.images import encode_png
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -46,9 +50,11 @@ class Witness:
 
     def __init__(self, server: MllmServer) -> None:
         self.wrong: list[tuple[int, list[int]]] = []
+        self.delay = 0.0  # seconds
         server.say(self.reply)
 
     def reply(self, handler: Any) -> None:
+        time.sleep(self.delay)
         asked = int(re.findall(r"picture (\d+)", say.text_of(handler.body))[-1])
         seen = [number_in(pixels) for pixels in say.images_of(handler.body)]
         if seen != [asked]:
@@ -96,3 +102,33 @@ def test_no_request_gets_the_picture_or_the_answer_of_another(served: tuple[Serv
     answers = asyncio.run(all_at_once())
     assert answers == [(number, str(number)) for number in range(REQUESTS)]
     assert witness.wrong == []
+
+
+def test_a_late_message_about_a_deleted_job_is_not_taken_for_the_next_one(
+    served: tuple[Service, Witness], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A key that is used again after a deletion has the same job id: what is said of the first job may come late."""
+    service, witness = served
+    transport = httpx.ASGITransport(app_for(service))
+    announce, held = JobRegistry.ended, threading.Event()
+
+    def late(registry: JobRegistry, job_id: str, outcome: Any, created_at: str | None = None) -> None:
+        if isinstance(outcome, str) and json.loads(outcome)["answer"] == "1":
+            held.wait(20)
+        announce(registry, job_id, outcome, created_at)
+
+    async def calls() -> str:
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
+            key = {"Idempotency-Key": "late"}
+            first = (await client.post("/answer", json=body(1), headers=key | {"Prefer": "respond-async"})).json()["id"]
+            while (await client.get(f"/jobs/{first}")).json()["status"] != "succeeded":
+                await asyncio.sleep(0.02)
+            await client.delete(f"/jobs/{first}")
+            witness.delay = 1.0
+            second = asyncio.create_task(client.post("/answer", json=body(2), headers=key))
+            await asyncio.sleep(0.5)
+            held.set()
+            return (await second).json()["answer"]
+
+    monkeypatch.setattr(JobRegistry, "ended", late)
+    assert asyncio.run(calls()) == "2"

@@ -66,10 +66,10 @@ def mcp(
         logging.getLogger(logs.ACCESS).setLevel(logging.WARNING)  # requests are the tools' own, and there is one caller
         mcp_serving.run_stdio(mcp_serving.house_of(mcp_serving.for_its_owner(settings), url))
         return
-    from cow_service.api.middleware.order import tell_if_open  # noqa: PLC0415
+    from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
 
     if not url:
-        tell_if_open(settings)
+        warn_if_open(settings)
     elif not mcp_serving.is_local(host):
         logging.getLogger("cow_service").warning(
             "Whoever reaches %s can use the COW server behind it, unless that asks for keys.", host

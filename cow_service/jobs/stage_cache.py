@@ -109,14 +109,14 @@ class JobCheckpoints:
                 result, job, artifacts = kept
                 self.service.metrics.stage_cache(stage, hit=job != self.job)
                 if job != self.job:
-                    self.database.hold(self.job, artifacts)
+                    self.database.add_references(self.job, artifacts)
                 return result, job != self.job
             self.service.metrics.stage_cache(stage, hit=False)
             return self._keep(stage, key, compute()), False
 
     def _keep(self, stage: Stage, key: str, result: Result) -> Result:
         text = result.model_dump_json()
-        self.database.keep(key, self.job, stage, text, artifacts_of(text))
+        self.database.save(key, self.job, stage, text, artifacts_of(text))
         return result
 
     def _kept(self, key: str, model: type[Result]) -> tuple[Result, str, list[str]] | None:

@@ -10,19 +10,19 @@ from typing import Any
 from dbos import DBOS
 
 from cow_service.errors import Canceled, CowError, InternalError
-from cow_service.jobs import reports
-from cow_service.jobs.ledger import Ledger
-from cow_service.jobs.live import Running
-from cow_service.jobs.orders import Order
+from cow_service.jobs import state
+from cow_service.jobs.active import ActiveJob
+from cow_service.jobs.registry import JobRegistry
+from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.stage_cache import Flights, JobCheckpoints, Left
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.observability import tracing
-from cow_service.observability.context import bound, parse_traceparent
+from cow_service.observability.context import bound
 from cow_service.pipeline import Stamp
 from cow_service.records import Answer, Simulation
-from cow_service.requests import AnswerRequest, Stage
+from cow_service.requests import AnswerRequest, ImageArtifact, Stage
 
-WAIT, WAITS = 0.1, 100  # seconds between looks, and how many, until a webhook's job has ended
+POLL_SECONDS, MAX_POLLS = 0.1, 100  # until the database has the end of a webhook's job
 
 log = logging.getLogger("cow_service")
 
@@ -30,24 +30,23 @@ log = logging.getLogger("cow_service")
 class Worker:
     """Does the work of an engine's jobs, in whatever threads it is called."""
 
-    def __init__(self, ledger: Ledger, webhooks: Webhooks, left: Callable[[str], None]) -> None:
-        self._ledger = ledger
+    def __init__(self, registry: JobRegistry, webhooks: Webhooks, left: Callable[[str], None]) -> None:
+        self._registry = registry
         self._webhooks = webhooks
         self._left = left  # the work on a job is over
         self._flights = Flights()
 
-    def run(self, job_id: str, order: dict[str, Any]) -> str:
-        """Does what an order says; returns the result as JSON.
+    def run(self, job_id: str, spec: dict[str, Any]) -> str:
+        """Does the work of a job; returns the result as JSON.
 
         Raises the `CowError` that the job fails with. `Left` where somebody wants it to end: then it has no outcome.
         """
-        told = Order.model_validate(order)
-        trace = None if told.traceparent is None else parse_traceparent(told.traceparent)
+        told = JobSpec.model_validate(spec)
         try:
             with (
-                bound(request=told.request_id, job=job_id, trace_context=trace),
+                bound(request=told.request_id, job=job_id),
                 tracing.span(f"job {told.kind}", parent=told.traceparent, job_id=job_id),
-                self._ledger.live.running(job_id) as running,
+                self._registry.active.running(job_id) as running,
             ):
                 return self._outcome(job_id, told, running)
         finally:
@@ -58,21 +57,21 @@ class Worker:
         # As a step: in a workflow, every question to the database would be one, and its answer kept.
         wait: float | None = DBOS.run_step({"name": "deliver"}, lambda: self._delivered(job_id, url, attempt))
         if wait is not None:
-            self._webhooks.attempt(job_id, url, attempt + 1, delay=wait)
+            self._webhooks.enqueue(job_id, url, attempt + 1, delay=wait)
 
     def _delivered(self, job_id: str, url: str, attempt: int) -> float | None:
         """Seconds until another attempt is to follow, where one is."""
-        for _ in range(WAITS):
-            found = reports.find(job_id, self._ledger.live)
+        for _ in range(MAX_POLLS):
+            found = state.find(job_id, self._registry.active)
             if found is None:
                 return None  # deleted: there is nothing to tell any more
             if found.ended is not None:
                 return self._webhooks.send(found.job, url, attempt)
-            time.sleep(WAIT)
+            time.sleep(POLL_SECONDS)
         return self._webhooks.wait_after(job_id, attempt, "the job had not ended")  # a crash came between
 
-    def _outcome(self, job_id: str, order: Order, running: Running) -> str:
-        metrics = self._ledger.service.metrics
+    def _outcome(self, job_id: str, order: JobSpec, running: ActiveJob) -> str:
+        metrics = self._registry.service.metrics
         try:
             result = self._result(job_id, order, running)
         except Canceled as error:
@@ -94,23 +93,25 @@ class Worker:
         self._webhooks.job_ended(job_id, order.webhook)
         return result.model_dump_json()
 
-    def _result(self, job_id: str, order: Order, running: Running) -> Simulation | Answer:
-        ledger = self._ledger
+    def _result(self, job_id: str, order: JobSpec, running: ActiveJob) -> Simulation | Answer:
+        registry = self._registry
 
         def progress(stage: Stage, done: float) -> None:
-            ledger.live.progress(job_id, running, stage, done)
+            registry.active.progress(job_id, running, stage, done)
 
-        request, image = order.parsed(), ledger.live.image(job_id)
+        request = order.parsed()
+        assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
+        image = registry.active.take_image(job_id, request.image.artifact)
         kept = JobCheckpoints(
             job=job_id,
             rank=order.created_at,
             fresh=order.fresh,
-            service=ledger.service,
-            database=ledger.database,
+            service=registry.service,
+            database=registry.database,
             flights=self._flights,
             still_wanted=running.check,
         )
         stamp = Stamp(job_id, order.created_at)
         if isinstance(request, AnswerRequest):
-            return ledger.service.answer(request, progress, image, kept, stamp, running.check)
-        return ledger.service.simulate(request, progress, image, kept, stamp, running.check)
+            return registry.service.answer(request, progress, image, kept, stamp, running.check)
+        return registry.service.simulate(request, progress, image, kept, stamp, running.check)

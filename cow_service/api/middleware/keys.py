@@ -1,4 +1,4 @@
-"""API keys: made at random, kept by the server as hashes only, found again in constant time."""
+"""API keys: made at random, stored as hashes only, compared in constant time."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from hashlib import sha256
 
 PREFIX = "cow_"  # lets scanners for leaked secrets know one
-ENTROPY = 32  # bytes
+ENTROPY_BYTES = 32
 
 
 def new_key() -> str:
     """A fresh key, random enough that guessing is hopeless and a plain SHA-256 hides it."""
-    return PREFIX + secrets.token_urlsafe(ENTROPY)
+    return PREFIX + secrets.token_urlsafe(ENTROPY_BYTES)
 
 
 def hash_of(key: str) -> str:
