@@ -22,7 +22,7 @@ class SettingsError(Exception):
 
 
 class Settings(BaseSettings):
-    """What a server or a command line run may be told."""
+    """The settings of a server or of a command line run."""
 
     model_config = SettingsConfigDict(env_prefix="COW_", env_ignore_empty=True, frozen=True, extra="ignore")
 

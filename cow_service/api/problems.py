@@ -54,7 +54,7 @@ def respond(error: CowError) -> JSONResponse:
 
 
 def install_problem_handlers(app: FastAPI) -> None:
-    """Makes every error of the app a problem, also those of the framework and those that nobody foresaw."""
+    """Makes every error of the app a problem, those of the framework and unforeseen ones included."""
 
     async def cow_error(_: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, CowError)

@@ -39,7 +39,7 @@ class Waiter:
     changed: asyncio.Event = field(default_factory=asyncio.Event)  # progress, or the end
     ended: asyncio.Event = field(default_factory=asyncio.Event)  # the database has the answer
     outcome: str | CowError | None = None  # the result as JSON, or the error, where this process has it at hand
-    outcome_of: str | None = None  # `created_at` of the job that it is of; None where it holds for any
+    outcome_of: str | None = None  # `created_at` of the job that it is of; None where it applies to any
 
     def notify(self, outcome: str | CowError | None, created_at: str | None) -> None:
         """The job has ended, or is not waited for any more."""
@@ -49,11 +49,11 @@ class Waiter:
         self.changed.set()
 
     def take(self) -> tuple[str | CowError | None, str | None]:
-        """The outcome of which it was told, and whose it is; another one may follow."""
-        told = self.outcome, self.outcome_of
+        """The outcome that was notified, and the creation time of its job; resets both, as another may follow."""
+        taken = self.outcome, self.outcome_of
         self.outcome = self.outcome_of = None
         self.ended.clear()
-        return told
+        return taken
 
 
 class ActiveJobs:

@@ -188,7 +188,7 @@ class JobEngine:
             starts_now = self.registry.count(spec.generator) < self.room
             self.registry.record(job_id, spec.generator)
         try:
-            # Before the job exists: its image must not be removed before somebody works on it.
+            # Before the job exists: its image must not be removed before work on it starts.
             self.database.add_references(job_id, [image.info.sha256])
             if starts_now:
                 self.active.put_image(job_id, image)

@@ -41,7 +41,7 @@ class ExecutorLease:
 
     @contextmanager
     def expired(self) -> Generator[list[str]]:
-        """The ids of processes that have ended. Nobody else can take them inside the block."""
+        """The ids of processes that have ended. No other process can acquire them inside the block."""
         locks: dict[int, FileLock] = {}
         try:
             for path in self._folder.glob("*.lock"):

@@ -22,7 +22,7 @@ OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own poll
 CANCEL_POLL_SECONDS = 1.0  # for jobs that run here and were canceled by another process
 RECOVERY_SECONDS = 10.0  # between checks for dead processes and stalled jobs
 GARBAGE_SECONDS = 600.0  # between garbage collections
-ARTIFACT_GRACE_SECONDS = 3600.0  # that an artifact is kept without a job: somebody may be about to send it with one
+ARTIFACT_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
 SUBMIT_SECONDS = 5.0  # within which a job is in the database after the reference to its image
 MAX_REMOVED_JOBS = 200  # at a time
 JOIN_TIMEOUT_SECONDS = 5.0
@@ -40,7 +40,7 @@ class Maintenance:
         self._has_finished = threading.Event()
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._idle: set[str] = set()  # jobs of this process on which nobody worked at the last check
+        self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
 
     def start(self) -> None:
         """Starts the threads."""
@@ -135,7 +135,7 @@ class Maintenance:
                 log.info("recovering %s", handle.get_workflow_id())
 
     def _resume_stalled(self) -> None:
-        """Resumes jobs of this process on which nobody works: because their outcome could not be written, say."""
+        """Resumes jobs of this process that no thread works on: their outcome could not be written, for example."""
         pending = DBOS.list_workflows(
             name=list(state.KINDS),
             status="PENDING",

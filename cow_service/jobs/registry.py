@@ -71,7 +71,7 @@ class JobRegistry:
         self.active.notify_ended(job_id, outcome, created_at)
 
     def remove(self, jobs: list[str], untouched_since: float) -> None:
-        """Removes jobs that have ended, and those of their artifacts that nobody has used since (seconds, Unix)."""
+        """Removes jobs that have ended, and those of their artifacts that were not used since (Unix time, s)."""
         with database_errors():
             DBOS.delete_workflows([*jobs, *(attempt for job_id in jobs for attempt in attempt_ids(job_id))])
         for sha256 in self.database.remove_jobs(jobs):

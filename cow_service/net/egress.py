@@ -1,4 +1,4 @@
-"""Outgoing HTTP to addresses that strangers name: nothing inside can be reached with it, and nobody can hold it up.
+"""Outgoing HTTP to URLs of callers, safe against requests into the private network (SSRF) and against slow servers.
 
 Every hop is checked in full before anything is sent: scheme, host, and every address that the name has now. The
 connection goes to the addresses that were checked, never to the name, so that a name server that answers otherwise the
@@ -35,15 +35,15 @@ _DEFAULT_PORTS = {"http": 80, "https": 443}
 
 
 class EgressError(Exception):
-    """Nothing came of it. The message is whole sentences and names no address that a host name led to."""
+    """The exchange failed. The message is whole sentences and names no address that a host name resolved to."""
 
 
 class NotAllowed(EgressError):
-    """The URL is none that may be asked."""
+    """The URL may not be requested."""
 
 
 class Unreachable(EgressError):
-    """Whoever was asked cannot be reached, or did not answer as it must."""
+    """The host cannot be reached, or did not answer as it must."""
 
 
 # What others raise, and what becomes of it. The first row that fits is taken.
@@ -79,12 +79,12 @@ def _translated(host: str) -> Generator[None]:
 
 
 def look_up(host: str, port: int) -> list[str]:
-    """Every address that a host name has, as the system's resolver tells. Raises `OSError`."""
+    """Every address that a host name has, from the system's resolver. Raises `OSError`."""
     return [str(found[4][0]) for found in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
 
 
 class Egress:
-    """Asks addresses that strangers name. Safe to use from several threads.
+    """Sends requests to URLs of callers. Safe to use from several threads.
 
     `allow` lists the hosts that may be asked, as `HostList` reads them; None allows every public host at every port.
     `seconds` is for a whole exchange with all redirects, `connect_seconds` for taking up one connection.
@@ -226,7 +226,7 @@ class Egress:
 
 @dataclass(frozen=True)
 class _Target:
-    """A URL that may be asked, as far as that can be told without looking up its host."""
+    """A URL that passed every check that needs no look-up of its host."""
 
     url: httpx.URL
     host: str  # normalised: lower case, IDNA, no trailing dot, no brackets

@@ -23,7 +23,7 @@ def hash_of(key: str) -> str:
 
 
 class KeyRing:
-    """The keys that a server knows, by the name of their owner. It holds hashes, never a key."""
+    """The hashes of a server's keys, by the name of their owner."""
 
     def __init__(self, hashes: Mapping[str, str]) -> None:
         self._hashes = {name: value.lower().encode() for name, value in hashes.items()}
@@ -35,7 +35,7 @@ class KeyRing:
         """The owner's name, or None where nobody has that key."""
         asked = hash_of(key).encode()
         owner = None
-        for name, known in self._hashes.items():  # all of them: how long it takes tells nothing
+        for name, known in self._hashes.items():  # all of them, so that the time is always the same
             if hmac.compare_digest(asked, known):
                 owner = name
         return owner

@@ -35,13 +35,13 @@ def chat_problem(problem: Problem) -> ChatProblem:
 
 
 class ChatProblems:
-    """ASGI middleware, around all others: whoever refuses a request under `/v1`, OpenAI's clients can read why."""
+    """ASGI middleware, the outermost: adds the member `error` to every problem under `/v1`."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes a request on; a problem that is answered waits here until it is whole."""
+        """Passes a request on; a response that is a problem is buffered and extended."""
         if scope["type"] != "http" or not scope["path"].startswith(ROOT):
             await self.app(scope, receive, send)
             return
