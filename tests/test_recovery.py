@@ -11,6 +11,8 @@ import sqlalchemy as sa
 from dbos import DBOS
 from engines import running_engine
 
+from cow_service.jobs import workflows
+
 REMEDY = """
 Maintenance._recover relies on DBOS._recover_pending_workflows(executor_ids), which is private. If it is gone or acts
 otherwise: look for a public function that returns PENDING workflows of named executors to the queue, without reviving
@@ -28,9 +30,6 @@ def rows() -> Iterator[SimpleNamespace]:
     executor = f"dead-{uuid.uuid4().hex}"
     ids = {status: str(uuid.uuid4()) for status in ("PENDING", "CANCELLED")}
     with engine.begin() as connection:
-        version = (
-            connection.execute(sa.select(table.c.application_version).limit(1)).scalar() or DBOS.application_version
-        )
         for status, job in ids.items():
             connection.execute(
                 sa.insert(table).values(
@@ -38,7 +37,7 @@ def rows() -> Iterator[SimpleNamespace]:
                     status=status,
                     name="nobody runs this",
                     executor_id=executor,
-                    application_version=version,
+                    application_version=workflows.VERSION,
                     recovery_attempts=3,
                     queue_name=f"nobody-reads-{executor}",
                 )
