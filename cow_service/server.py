@@ -7,7 +7,7 @@ import socket
 import uvicorn
 
 from cow_service.api.app import create_app
-from cow_service.jobs.engine import Engine
+from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
 
@@ -18,7 +18,7 @@ CLOSE_SECONDS = 5.0  # for open connections, after the grace period of running j
 class Server(uvicorn.Server):
     """Tells the engine as soon as the server is to stop, so that requests that wait for jobs do not hold it up."""
 
-    def __init__(self, config: uvicorn.Config, engine: Engine) -> None:
+    def __init__(self, config: uvicorn.Config, engine: JobEngine) -> None:
         super().__init__(config)
         self._engine = engine
 
@@ -30,7 +30,7 @@ class Server(uvicorn.Server):
 
 def run_server(service: Service) -> None:
     """Serves until a signal ends it. Raises the `CowError` for which the default request cannot be served."""
-    engine, readiness = Engine(service), Readiness(service)
+    engine, readiness = JobEngine(service), Readiness(service)
     settings = service.settings
     config = uvicorn.Config(
         create_app(engine, readiness),
@@ -38,6 +38,7 @@ def run_server(service: Service) -> None:
         port=settings.port,
         log_config=None,
         access_log=False,
+        http="h11",  # whatever is installed: parsers differ on which headers they refuse
         timeout_graceful_shutdown=int(settings.shutdown_grace + CLOSE_SECONDS),
     )
     server = Server(config, engine)

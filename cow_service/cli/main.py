@@ -123,10 +123,10 @@ def serve(
 
     logs.set_up(service.settings)
     tracing.start()
-    from cow_service.api.middleware.order import tell_if_open  # noqa: PLC0415
+    from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
     from cow_service.server import run_server  # noqa: PLC0415
 
-    tell_if_open(service.settings)
+    warn_if_open(service.settings)
     run_server(service)
 
 
@@ -148,9 +148,9 @@ def openapi() -> None:
     import yaml  # noqa: PLC0415
 
     from cow_service.api.app import create_app  # noqa: PLC0415
-    from cow_service.jobs.engine import Engine  # noqa: PLC0415
+    from cow_service.jobs.engine import JobEngine  # noqa: PLC0415
 
-    document = create_app(Engine(_service())).openapi()
+    document = create_app(JobEngine(_service())).openapi()
     typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
 
 

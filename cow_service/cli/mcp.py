@@ -62,11 +62,11 @@ def mcp(
         logging.getLogger(logs.ACCESS).setLevel(logging.WARNING)
         run_stdio(backend_for(for_its_owner(settings), url))
         return
-    from cow_service.api.middleware.order import tell_if_open  # noqa: PLC0415
+    from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
     from cow_service.api.middleware.origins import is_loopback  # noqa: PLC0415
 
     if not url:
-        tell_if_open(settings)
+        warn_if_open(settings)
     elif not is_loopback(host):
         logging.getLogger("cow_service").warning(
             "Whoever reaches %s can use the COW server behind it, unless that asks for keys.", host

@@ -33,7 +33,6 @@ from cow_service.errors import (
     StorageUnavailable,
     Unauthorized,
 )
-from cow_service.problems import problem_of
 from cow_service.records import JobKind
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ class Outcome(Generic[R_co]):
         """What is kept of it."""
         head = {"status": self.status, "seconds": round(self.seconds, 3)}
         if self.error is not None:
-            problem = {"code": self.error.code, **problem_of(self.error).model_dump(mode="json")}
+            problem = {"code": self.error.code, **self.error.as_problem()}
             job = {"job_id": self.error.job_id} if isinstance(self.error, WaitTimeout) else {}
             return {**head, "problem": {**problem, "request_id": self.error.request_id, **job}}
         assert self.result is not None

@@ -24,7 +24,7 @@ from cow_service.settings import Settings, SettingsError
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from cow_service.jobs.engine import Engine
+    from cow_service.jobs.engine import JobEngine
 
 CANCEL_TIMEOUT_SECONDS = 5.0  # for telling the server that a caller has left
 
@@ -68,7 +68,7 @@ class LocalService:
 
     def __init__(self, settings: Settings) -> None:
         self._service = Service(settings)
-        self._engine: Engine | None = None
+        self._engine: JobEngine | None = None
         self._app: Future[FastAPI] | None = None
 
     @asynccontextmanager
@@ -101,12 +101,12 @@ class LocalService:
     def _start(self) -> FastAPI:
         # These take longer to import than all else: clients need not wait for them to see the tools.
         from cow_service.api.app import create_app  # noqa: PLC0415
-        from cow_service.jobs.engine import Engine  # noqa: PLC0415
+        from cow_service.jobs.engine import JobEngine  # noqa: PLC0415
         from cow_service.observability import tracing  # noqa: PLC0415
 
         try:
             tracing.start()
-            engine = Engine(self._service)
+            engine = JobEngine(self._service)
             engine.start()
         except SettingsError as error:
             log.error("%s", error)
