@@ -1,4 +1,4 @@
-"""The limits of the layout: files at the root, rooms, lines, and what stays light. import-linter holds who imports whom."""
+"""The limits of the layout: files at the root, rooms, lines, and what stays light. import-linter holds the layers."""
 
 from __future__ import annotations
 
