@@ -87,7 +87,8 @@ def test_a_real_server_keeps_the_contract(server: Server) -> None:
         "--generation-database", "none", "--continue-on-failure", "--report-dir", str(server.data / "fuzz"),
     ]  # fmt: skip
     hooks = os.environ | {"SCHEMATHESIS_HOOKS": "fuzz_hooks", "PYTHONPATH": str(Path(__file__).parent)}
-    told = subprocess.run(command, env=hooks, cwd=ROOT, capture_output=True, text=True, check=False, timeout=380 * SCALE)
+    limit = 380 * SCALE
+    told = subprocess.run(command, env=hooks, cwd=ROOT, capture_output=True, text=True, check=False, timeout=limit)
     assert told.returncode == 0, told.stdout[-6000:] + told.stderr[-2000:]
     assert "Stateful" in told.stdout
 
