@@ -24,7 +24,9 @@ from conftest import SCALE, Server
 from hypothesis import given
 from hypothesis import strategies as st
 from servers import BODY, IMAGE, QUESTION, Served, eventually
+from typer.testing import CliRunner
 
+from cow_service.cli.main import app
 from cow_service.client import AsyncClient, Client, errors
 from cow_service.client.batch_progress import Tally, duration, pace
 from cow_service.client.batches import Patience
@@ -506,8 +508,11 @@ def test_a_file_that_cannot_be_asked_is_refused_before_anything_is_sent(
 ) -> None:
     path = tmp_path / "questions.jsonl"
     path.write_text(text)
-    result = run(path, "-o", tmp_path / "out", "--url", "http://127.0.0.1:1", *options)
-    assert result.returncode == 1
+    result = CliRunner().invoke(
+        app, ["batch", str(path), "-o", str(tmp_path / "out"), "--url", "http://127.0.0.1:1", *options]
+    )
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
     assert says in result.stderr
     assert "Traceback" not in result.stderr
     assert not (tmp_path / "out").exists()
