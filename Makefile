@@ -41,11 +41,14 @@ bench: $(VENV)/.base ## the figures of the README
 clean: ## remove what the other targets made
 	rm -rf $(VENV) demo dist build
 
-$(VENV)/.base: pyproject.toml
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.base: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable .
 	touch $@
 
-$(VENV)/.test: pyproject.toml tests/constraints.txt $(VENV)/.base
+# Most of these packages' modules are never imported: they are not compiled beforehand.
+$(VENV)/.test: pyproject.toml tests/constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --no-compile --editable ".[test]" --constraint tests/constraints.txt
-	touch $@
+	touch $(VENV)/.base $@

@@ -35,7 +35,7 @@ EXAMPLE = ROOT / "examples" / "ball-and-mug"
 QUESTION = "If the yellow ball moves to the left, will it hit the blue mug?"
 ENDED = ("succeeded", "failed", "canceled")
 UP = (0.3, 2.5)  # seconds that a server lives between ready and its end
-FIRST_UP = (0.0, 0.2)  # seconds from the beginning of the first slow clip, of 0.3 s, to the first kill: it is cut off
+FIRST_UP = (0.0, 0.1)  # seconds from the beginning of the first slow clip, of 0.3 s, to the first kill: it is cut off
 CALLERS = 4
 PATIENCE = 900.0  # seconds for all jobs to end after the last kill
 
