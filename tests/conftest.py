@@ -33,14 +33,14 @@ from numpy.typing import NDArray
 from cow_service.service import Service
 from cow_service.settings import Settings
 
-settings.register_profile("cow", deadline=None, derandomize=True, database=None)
+# How much the crash, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
+SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
+settings.register_profile("cow", deadline=None, derandomize=True, database=None, max_examples=20 * SCALE)
 settings.load_profile("cow")
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 SHARED_SCENES = ROOT.parent / "shared" / "scenes"
-# How much the crash, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
-SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
 FIRST = ("test_docs.py", "test_crash.py")  # the longest files: begun last, they would keep one process alone at work
 
 
@@ -81,7 +81,11 @@ def all_scenes() -> list[Path]:
     return folders + sorted(path.parent for path in SHARED_SCENES.glob("*/meta.json"))
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
+            item.add_marker(pytest.mark.soak)
     items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
 
 
