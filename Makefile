@@ -2,8 +2,10 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo serve test test-fast lint openapi bench clean
+.PHONY: demo serve test test-fast soak lint openapi bench clean
 
 demo: $(VENV)/.base ## run the main job on an example
 	$(BIN)/cow simulate examples/ball-and-mug/image.jpg \
@@ -14,14 +16,18 @@ serve: $(VENV)/.base ## start the server on 127.0.0.1:8000
 	$(BIN)/cow serve
 
 test: $(VENV)/.test ## all tests, slow ones included
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-fast: $(VENV)/.test ## the tests that take seconds
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
-lint: $(VENV)/.test ## style and types
+soak: $(VENV)/.test ## the crash, fuzz and state-machine tests, ten times as long as in `make test`
+	COW_TEST_SCALE=10 $(PYTEST) -m soak
+
+lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 openapi: $(VENV)/.base ## write openapi.yaml from the app
@@ -35,11 +41,14 @@ bench: $(VENV)/.base ## the figures of the README
 clean: ## remove what the other targets made
 	rm -rf $(VENV) demo dist build
 
-$(VENV)/.base: pyproject.toml
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.base: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable .
 	touch $@
 
-$(VENV)/.test: pyproject.toml tests/constraints.txt $(VENV)/.base
-	$(BIN)/python -m pip install --quiet --editable ".[test]" --constraint tests/constraints.txt
-	touch $@
+# Most of these packages' modules are never imported: they are not compiled beforehand.
+$(VENV)/.test: pyproject.toml tests/constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --no-compile --editable ".[test]" --constraint tests/constraints.txt
+	touch $(VENV)/.base $@

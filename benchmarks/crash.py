@@ -35,6 +35,7 @@ EXAMPLE = ROOT / "examples" / "ball-and-mug"
 QUESTION = "If the yellow ball moves to the left, will it hit the blue mug?"
 ENDED = ("succeeded", "failed", "canceled")
 UP = (0.3, 2.5)  # seconds that a server lives between ready and its end
+FIRST_UP = (0.0, 0.1)  # seconds from the beginning of the first slow clip, of 0.3 s, to the first kill: it is cut off
 CALLERS = 4
 PATIENCE = 900.0  # seconds for all jobs to end after the last kill
 
@@ -188,8 +189,10 @@ def crash(jobs: int, kills: int, database: str | None = None, seed: int = 0, fol
                     report.ready_s.append(ground.start())
                     for _ in range(CALLERS):
                         pool.submit(callers.run)
-                    for _ in range(kills):
-                        time.sleep(chance.uniform(*UP))
+                    for number in range(kills):
+                        while number == 0 and not ground.begun():
+                            time.sleep(0.01)
+                        time.sleep(chance.uniform(*(UP if number else FIRST_UP)))
                         _one_kill(ground, callers, report)
                     _wait_for_all(ground, callers, jobs)
                 finally:

@@ -1,12 +1,22 @@
-"""Shared fixtures: examples with known truth, a service on an empty data folder, a real server process."""
+"""Shared fixtures: examples with known truth, a service on an empty data folder, a real server process, a wheel.
+
+The tests run in several processes (pytest-xdist). Each has its own servers, data folders and temporary files; what is
+expensive and the same for all is made by the first process that needs it (`made_once`).
+"""
 
 from __future__ import annotations
 
 import json
 import os
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # One thread per process: those of torch and OpenCV would compete for the same cores. Must precede their import.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,18 +26,22 @@ import cv2
 import httpx
 import numpy as np
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 from numpy.typing import NDArray
 
 from cow_service.service import Service
 from cow_service.settings import Settings
 
-settings.register_profile("cow", deadline=None, derandomize=True)
+# How much the crash, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
+SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
+settings.register_profile("cow", deadline=None, derandomize=True, database=None, max_examples=20 * SCALE)
 settings.load_profile("cow")
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 SHARED_SCENES = ROOT.parent / "shared" / "scenes"
+FIRST = ("test_docs.py", "test_crash.py")  # the longest files: begun last, they would keep one process alone at work
 
 
 @dataclass(frozen=True)
@@ -65,6 +79,49 @@ def all_scenes() -> list[Path]:
     """Our own examples, and the larger shared set where it is at hand."""
     folders = sorted(path.parent for path in EXAMPLES.glob("*/meta.json"))
     return folders + sorted(path.parent for path in SHARED_SCENES.glob("*/meta.json"))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
+            item.add_marker(pytest.mark.soak)
+    items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder that the first process to ask for it fills by calling `make`; the others wait, and share it."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    done = folder / ".done"
+    with FileLock(f"{folder}.lock"):
+        if not done.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            done.touch()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project's wheel, built from this checkout."""
+
+    def build(folder: Path) -> None:
+        command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+        subprocess.run(command, check=True, capture_output=True)
+
+    (built,) = made_once(tmp_path_factory, "wheel", build).glob("*.whl")
+    return built
+
+
+def new_environment(folder: Path, *packages: str | Path) -> Path:
+    """A virtual environment with nothing but these packages and what they need; returns its folder of programs."""
+    # Installed by the pip of the tests and not compiled beforehand: a new pip and unused bytecode take half the time.
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+    pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python"), "install", "--quiet"]
+    subprocess.run([*pip, "--no-compile", "--disable-pip-version-check", *packages], check=True)
+    return folder / "bin"
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from conftest import all_scenes, example
+from conftest import SCALE, all_scenes, example
 from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,7 +24,7 @@ COLOURS = {
 }
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=20 * SCALE, deadline=None, derandomize=True)
 @given(
     angle=st.floats(0, 2 * np.pi),
     length=st.floats(60, 180),

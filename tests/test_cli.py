@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 from drawn import ball, block, floor, png_bytes
 from PIL import Image
+from typer.testing import CliRunner
 
 from cow_service import __version__
+from cow_service.cli.main import app
 from cow_service.records import Models, Simulation
 
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
@@ -95,9 +97,14 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         ([], 2, "QUESTION"),
     ],
 )
-def test_errors_are_told_in_words(tmp_path: Path, picture: Path, arguments: list[str], code: int, told: str) -> None:
-    result = cow(tmp_path, "simulate", str(picture), *arguments)
-    assert result.returncode == code
+def test_errors_are_told_in_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, picture: Path, arguments: list[str], code: int, told: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    environment = {"COW_DATA_DIR": str(tmp_path / "data"), "NO_COLOR": "1", "TERM": "dumb"}
+    result = CliRunner().invoke(app, ["simulate", str(picture), *arguments], env=environment)
+    assert result.exit_code == code
+    assert isinstance(result.exception, SystemExit)
     assert told in " ".join(result.stderr.split())
     assert "Traceback" not in result.stderr
 

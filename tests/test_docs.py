@@ -9,15 +9,15 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import site
 import socket
 import stat
 import subprocess
+import sys
 import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
@@ -37,10 +37,11 @@ DOCKER = """#!/bin/sh
 echo "$@" >> "$DOCKER_ASKED"
 """
 PIP = """#!/bin/sh
-# Downloads, and installs from downloads, are only taken apart; all else is pip's.
+# What it is told is looked at later. Downloads, and installs from downloads, are not done; all else is pip's.
+echo "$@" >> "$PIP_ASKED"
 case " $* " in
-  *" download "*|*" --no-index "*) echo "$@" >> "$PIP_ASKED" ;;
-  *) exec "$REAL_PIP" "$@" ;;
+  *" download "*|*" --no-index "*) ;;
+  *) exec python -m pip "$@" ;;
 esac
 """
 
@@ -65,6 +66,18 @@ class Checkout:
     folder: Path
     environment: dict[str, str]
     port: int
+    server: ExitStack = field(default_factory=ExitStack)  # of the programs and commands that start none themselves
+    is_serving: bool = False
+
+    def serve(self) -> None:
+        """Sees to it that `cow serve` runs."""
+        if not self.is_serving:
+            self.server.enter_context(self.serving("cow serve"))
+            self.is_serving = True
+
+    def stop(self) -> None:
+        self.server.close()
+        self.is_serving = False
 
     def adapted(self, text: str) -> str:
         return text.replace("127.0.0.1:8000", f"127.0.0.1:{self.port}")
@@ -160,8 +173,9 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Checkout]:
         "COW_BASE_URL": f"http://127.0.0.1:{port}",
         "DOCKER_ASKED": str(aside / "docker-asked"),
         "PIP_ASKED": str(aside / "pip-asked"),
-        "REAL_PIP": str(venv / "pip"),
-        "PIP_CONSTRAINT": str(ROOT / "tests" / "constraints.txt"),
+        # All packages are here already: pip only sets up the project, with the build backend of the tests.
+        "PIP_NO_DEPS": "1",
+        "PIP_NO_BUILD_ISOLATION": "0",  # 0 is what turns the isolation off
     }
     with ExitStack() as stack:
         hub = stack.enter_context(hub_running())
@@ -169,12 +183,13 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Checkout]:
             hub.commit(repository, files)
         environment["HF_ENDPOINT"] = hub.address
         checkout = Checkout(folder, environment, port)
-        first = checkout.run("make demo")
-        assert first.returncode == 0, first.stdout + first.stderr
-        # What the extras bring is here already: gigabytes need not be installed once more.
+        # The packages that the tests run with: test_wheel.py installs those of the project anew.
+        subprocess.run([sys.executable, "-m", "venv", folder / ".venv"], check=True)
         (packages,) = (folder / ".venv" / "lib").glob("python*/site-packages")
-        (packages / "already-here.pth").write_text("\n".join(site.getsitepackages()) + "\n")
+        here = [path for path in sys.path if path.endswith("site-packages")]
+        (packages / "already-here.pth").write_text("\n".join(here) + "\n")
         yield checkout
+        checkout.stop()
 
 
 def test_every_block_has_a_language_that_is_known() -> None:
@@ -220,8 +235,8 @@ def test_commands_and_programs_run_as_they_stand_there(checkout: Checkout, page:
         elif block.language == "python":
             program = checkout.folder / f"block{number}.py"
             program.write_text(checkout.adapted(block.text))
-            with checkout.serving("cow serve"):
-                succeeded(checkout.run(f"python -W error::DeprecationWarning {program.name}"), block.text)
+            checkout.serve()
+            succeeded(checkout.run(f"python -W error::DeprecationWarning {program.name}"), block.text)
             ran += 1
         elif block.language == "sh":
             run_commands(checkout, block.text)
@@ -235,19 +250,20 @@ def run_commands(checkout: Checkout, text: str) -> None:
         serves = False
         for part in parts(text):
             if NEEDS_A_GPU in part:
+                checkout.stop()
                 refused = checkout.run(part)  # here, a GPU and the real weights are what is missing
                 assert refused.returncode != 0
                 assert re.search("checkpoint-invalid|generator-unavailable|weights-unavailable", refused.stderr), (
                     refused
                 )
             elif SERVE.search(part):
+                checkout.stop()
                 running.close()
                 running.enter_context(checkout.serving(part))
                 serves = True
             else:
                 if not serves and ("127.0.0.1:8000" in part or "cow batch" in part):
-                    running.enter_context(checkout.serving("cow serve"))
-                    serves = True
+                    checkout.serve()
                 succeeded(checkout.run(part), part)
 
 
@@ -275,7 +291,8 @@ def test_what_docker_and_pip_were_told_exists(checkout: Checkout) -> None:
     wanted = [block.text for block in blocks("docs/operating.md") if re.search("docker |pip download", block.text)]
     run_commands(checkout, "\n".join(wanted))
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    told_pip = Path(checkout.environment["PIP_ASKED"]).read_text()
+    shown = [block.text for page in PAGES for block in blocks(page) if block.language == "sh"]
+    told_pip = "\n".join([Path(checkout.environment["PIP_ASKED"]).read_text(), *shown])
     named = {name for found in re.findall(r"\.\[([\w,]+)\]", told_pip) for name in found.split(",")}
     assert {"wan", "providers"} <= named <= set(extras)
     asked = Path(checkout.environment["DOCKER_ASKED"]).read_text().splitlines()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import schemathesis
-from conftest import ROOT, Server
+from conftest import ROOT, SCALE, Server
 from engines import app_for
 from fuzz_hooks import POSTED, doable
 from hypothesis import HealthCheck, given, settings
@@ -24,7 +24,7 @@ from schemathesis.specs.openapi.checks import (
 from cow_service.service import Service
 from cow_service.settings import Settings
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
+pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.filterwarnings("default")]
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 
 
@@ -63,7 +63,7 @@ def test_every_answer_is_in_the_contract(contract, method: str, path: str, mode:
     operation = contract[path][method]
 
     @given(case=operation.as_strategy(generation_mode=mode))
-    @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=6 * SCALE, deadline=None, suppress_health_check=list(HealthCheck))
     def check(case) -> None:
         if mode is GenerationMode.POSITIVE and isinstance(case.body, dict) and case.media_type == "application/json":
             case.body = doable(path, case.body, case.body.get("num_frames", 9) % 20 + 2)
@@ -75,19 +75,20 @@ def test_every_answer_is_in_the_contract(contract, method: str, path: str, mode:
         assert reached & {200, 202}, f"no generated request got past the checks: {reached}"
 
 
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(400 * SCALE)
 def test_a_real_server_keeps_the_contract(server: Server) -> None:
     """Examples, coverage of every constraint, fuzzing, and chains of calls along the links of `openapi.yaml`."""
     command = [
         str(Path(sys.executable).with_name("schemathesis")), "run", str(ROOT / "openapi.yaml"), "--url", server.address,
-        "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", "4", "--seed", "1",
-        "--suppress-health-check", "all", "--max-time", "45",
+        "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", str(2 * SCALE), "--seed", "1",
+        "--suppress-health-check", "all", "--max-time", str(20 * SCALE),
         "--checks", ",".join(check.__name__ for check in CHECKS), "--request-timeout", "60",
         "--no-color", "--no-shrink",
         "--generation-database", "none", "--continue-on-failure", "--report-dir", str(server.data / "fuzz"),
     ]  # fmt: skip
     hooks = os.environ | {"SCHEMATHESIS_HOOKS": "fuzz_hooks", "PYTHONPATH": str(Path(__file__).parent)}
-    told = subprocess.run(command, env=hooks, cwd=ROOT, capture_output=True, text=True, check=False, timeout=380)
+    limit = 380 * SCALE
+    told = subprocess.run(command, env=hooks, cwd=ROOT, capture_output=True, text=True, check=False, timeout=limit)
     assert told.returncode == 0, told.stdout[-6000:] + told.stderr[-2000:]
     assert "Stateful" in told.stdout
 

@@ -10,9 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import SCALE
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+from hypothesis.stateful import (
+    Bundle,
+    RuleBasedStateMachine,
+    consumes,
+    initialize,
+    invariant,
+    multiple,
+    precondition,
+    rule,
+)
 from servers import BODY, TERMINAL, Served, problem, slow
 
 WANTED = {"cutout": BODY, "quick": slow(0.2), "long": slow(3)}
@@ -36,12 +46,15 @@ class Jobs(RuleBasedStateMachine):
     def start(self) -> None:
         self.folder = tempfile.TemporaryDirectory(prefix="cow-states-")
         self.served = Served(Path(self.folder.name), COW_SHUTDOWN_GRACE="1", COW_CONCURRENCY="1")
-        self.served.start()
         self.known: dict[str, Known] = {}
+        self.changed = False  # whether anything was asked for since the server started
         self.deleted: set[str] = set()
 
     @rule(target=jobs, body=st.sampled_from(sorted(WANTED)), key=st.sampled_from([None, None, "a", "b"]))
     def submit(self, body: str, key: str | None) -> Any:
+        if self.served.process is None:  # hypothesis drops many examples before their first step: they start none
+            self.served.start()
+        self.changed = True
         headers = {"Prefer": "respond-async"} | ({} if key is None else {"Idempotency-Key": key})
         response = self.served.http.post("/simulate", json=WANTED[body], headers=headers)
         same = next((job for job, known in self.known.items() if key is not None and known.key == key), None)
@@ -72,6 +85,7 @@ class Jobs(RuleBasedStateMachine):
 
     @rule(job=jobs)
     def cancel(self, job: str) -> None:
+        self.changed = True
         response = self.served.http.post(f"/jobs/{job}/cancel")
         if job in self.known:
             assert response.json()["status"] in TERMINAL
@@ -81,6 +95,7 @@ class Jobs(RuleBasedStateMachine):
 
     @rule(job=consumes(jobs))
     def delete(self, job: str) -> None:
+        self.changed = True
         response = self.served.http.delete(f"/jobs/{job}")
         if self.known.pop(job, None) is None:
             problem(response, 404, "job-not-found")
@@ -88,15 +103,19 @@ class Jobs(RuleBasedStateMachine):
             assert response.status_code == 204
         self.deleted.add(job)
 
+    @precondition(lambda self: self.changed)
     @rule()
     def crash(self) -> None:
         self.served.kill()
         self.served.start()
+        self.changed = False
 
+    @precondition(lambda self: self.changed)
     @rule()
     def stop(self) -> None:
         self.served.stop()
         self.served.start()
+        self.changed = False
 
     def look(self, job: dict[str, Any]) -> None:
         """What has ended stays as it ended."""
@@ -113,7 +132,7 @@ class Jobs(RuleBasedStateMachine):
 
     @invariant()
     def all_are_there(self) -> None:
-        if not hasattr(self, "served"):
+        if not self.known and not self.deleted:
             return
         listed = {job["id"]: job for job in self.served.http.get("/jobs", params={"limit": 500}).json()["jobs"]}
         assert set(listed) == set(self.known)
@@ -132,5 +151,5 @@ class Jobs(RuleBasedStateMachine):
 
 
 TestJobs = Jobs.TestCase
-TestJobs.settings = settings(max_examples=4, stateful_step_count=10, suppress_health_check=list(HealthCheck))
-TestJobs.pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+TestJobs.settings = settings(max_examples=3 * SCALE, stateful_step_count=12, suppress_health_check=list(HealthCheck))
+TestJobs.pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.timeout(600 * SCALE)]

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
+from conftest import new_environment
 from drawn import ball, floor, png_bytes
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-def test_the_wheel_runs_in_a_clean_environment(tmp_path: Path) -> None:
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)]
-    subprocess.run(build, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
+def test_the_wheel_runs_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
     assert "cow_service/_shipped/prompts/motion-sentence.md" in names
     assert "cow_service/_shipped/models/cutout.yaml" in names
     assert "cow_service/py.typed" in names
     assert not [name for name in names if name.startswith(("tests", "examples", "benchmarks"))]
-    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True)
-    binaries = tmp_path / "venv" / "bin"
-    subprocess.run([binaries / "python", "-m", "pip", "install", "--quiet", wheel], check=True)
+    binaries = new_environment(tmp_path / "venv", wheel)
     (tmp_path / "a.png").write_bytes(png_bytes(ball(floor(), (150, 200), 40, (210, 20, 20))))
     command = [binaries / "cow", "simulate", "a.png", "If the red ball moves left, what happens?", "--out", "out"]
     environment = {"COW_DATA_DIR": str(tmp_path / "data"), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}

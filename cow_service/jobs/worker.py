@@ -43,7 +43,7 @@ class Worker:
     def run(self, job_id: str, spec: dict[str, Any]) -> str:
         """Does the work of a job; returns the result as JSON.
 
-        Raises the `CowError` that the job fails with. `JobAborted` where somebody wants it to end: then it has no outcome.
+        Raises the `CowError` that the job fails with, and `JobAborted` where it was canceled: then it has no outcome.
         """
         job = JobSpec.model_validate(spec)
         try:
