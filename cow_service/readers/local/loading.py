@@ -17,7 +17,7 @@ from pydantic_ai.settings import ModelSettings
 from transformers import AutoModelForImageTextToText, PreTrainedModel, ProcessorMixin
 
 from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
-from cow_service.readers.local.engine import Engine
+from cow_service.readers.local.batch_generator import BatchGenerator
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.processors import load_processor
 from cow_service.readers.local.tiny import make_tiny
@@ -30,7 +30,7 @@ from cow_service.weights.manifests import Manifest, load_manifests
 SHOWN = 4  # weights in an error
 
 # Seeds and lazy initialisation are the whole process's: two models made at once would get into each other's weights.
-_one_at_a_time = Lock()
+_loading = Lock()
 
 
 class LocalOptions(Record):
@@ -67,18 +67,18 @@ def load_local(settings: Settings) -> LocalModel:
         places = ", ".join(".".join(str(part) for part in found["loc"]) for found in error.errors())
         raise ReaderUnavailable(f"The manifest of '{manifest.name}' is wrong in `local`: {places}.") from error
     places = device_map(settings.device, options.device_map)
-    with _one_at_a_time, _told(manifest.name):
+    with _loading, _translated(manifest.name):
         if own is None and not manifest.sources:
             model, processor = make_tiny(manifest.architecture)
             torch.nn.Module.to(model, torch.device(places[""] if isinstance(places, dict) else "cuda"))
         else:
             folder = own or verify(manifest.sources["weights"], settings.weights_dir, manifest.name)
             model, processor = _from_folder(folder, manifest, options, places)
-        engine = Engine(model, processor)
+        generator = BatchGenerator(model, processor)
     defaults: Any = {name: value for name, value in manifest.defaults.items() if name in ModelSettings.__annotations__}
     return LocalModel(
         manifest.name,
-        engine,
+        generator,
         max_batch=options.max_batch,
         max_new_tokens=options.max_new_tokens,
         threads=options.threads,
@@ -165,7 +165,7 @@ def _letters(name: str) -> str:
 
 
 @contextmanager
-def _told(name: str) -> Generator[None]:
+def _translated(name: str) -> Generator[None]:
     """Whatever transformers, safetensors or PyTorch raise becomes a `CowError` with the reason, without folders."""
     try:
         yield
