@@ -109,7 +109,7 @@ class Ground:
         try:
             with engine.connect() as connection:
                 query = sa.text("SELECT result FROM cow_stage_results WHERE stage = 'generation'")
-                made = [json.loads(text)["generator"] for text in connection.execute(query).scalars()]
+                made = [json.loads(text)["value"]["generator"] for text in connection.execute(query).scalars()]
         finally:
             engine.dispose()
         return {one["seed"] for one in made if one["name"] == "slow"}

@@ -24,7 +24,7 @@ import numpy as np
 from cow_service.jobs.engine import Engine, new_job_id
 from cow_service.jobs.orders import Order
 from cow_service.media.images import DecodedImage, encode_png
-from cow_service.pipeline import now
+from cow_service.stages.run import now
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings

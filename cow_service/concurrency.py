@@ -1,4 +1,4 @@
-"""Who may work next where only so many may at the same time: who asked first, however often that was interrupted."""
+"""A semaphore that serves the lowest priority value first and whose waits can be canceled."""
 
 from __future__ import annotations
 
@@ -9,79 +9,71 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-LOOK = 0.1  # seconds between looks at whether somebody who waits is still wanted
+CANCEL_POLL_SECONDS = 0.1  # how often a waiting thread checks whether it was canceled
 
 
 @dataclass(order=True)
-class _Waiting:
-    rank: str
+class _Waiter:
+    priority: str
     number: int
-    called: threading.Event = field(compare=False, default_factory=threading.Event)
+    granted: threading.Event = field(compare=False, default_factory=threading.Event)
 
 
-def _wanted() -> None:
-    """Nobody ends it."""
+def _never_canceled() -> None:
+    """Nobody cancels."""
 
 
-class Turns:
-    """Like a semaphore, but the lowest rank comes first and nobody who comes later takes a turn that was promised.
+class PrioritySemaphore:
+    """Lets `permits` threads in at the same time. Of those that wait, the lowest priority comes first, then FIFO.
 
-    Ranks are texts that sort, such as the times at which requests came.
+    Priorities are strings that sort, such as the RFC 3339 times at which requests came. A released permit is granted to
+    a waiter at once, so that no later thread can take it first.
     """
 
-    def __init__(self, at_once: int) -> None:
-        self._free = at_once
+    def __init__(self, permits: int) -> None:
+        self._permits = permits
         self._lock = threading.Lock()
-        self._waiting: list[_Waiting] = []
+        self._waiting: list[_Waiter] = []
         self._numbers = itertools.count()
 
-    def take(self, rank: str = "", still_wanted: Callable[[], None] = _wanted) -> None:
-        """Waits for a turn. What `still_wanted` raises in the meantime ends the wait."""
+    def acquire(self, priority: str = "", check_canceled: Callable[[], None] = _never_canceled) -> None:
+        """Waits for a permit. What `check_canceled` raises meanwhile ends the wait."""
         with self._lock:
-            if self._free and not self._waiting:
-                self._free -= 1
+            if self._permits and not self._waiting:
+                self._permits -= 1
                 return
-            mine = _Waiting(rank, next(self._numbers))
-            heapq.heappush(self._waiting, mine)
-            self._call()
+            waiter = _Waiter(priority, next(self._numbers))
+            heapq.heappush(self._waiting, waiter)
+            self._grant()
         try:
-            while not mine.called.wait(LOOK):
-                still_wanted()
+            while not waiter.granted.wait(CANCEL_POLL_SECONDS):
+                check_canceled()
         except BaseException:
             with self._lock:
-                if mine.called.is_set():
-                    self._free += 1
+                if waiter.granted.is_set():
+                    self._permits += 1
                 else:
-                    self._waiting.remove(mine)
+                    self._waiting.remove(waiter)
                     heapq.heapify(self._waiting)
-                self._call()
+                self._grant()
             raise
 
-    def give(self) -> None:
-        """Gives a turn back."""
+    def release(self) -> None:
+        """Gives a permit back."""
         with self._lock:
-            self._free += 1
-            self._call()
+            self._permits += 1
+            self._grant()
 
     @contextmanager
-    def held(self, rank: str = "", still_wanted: Callable[[], None] = _wanted) -> Generator[None]:
-        """A turn around the block."""
-        self.take(rank, still_wanted)
+    def held(self, priority: str = "", check_canceled: Callable[[], None] = _never_canceled) -> Generator[None]:
+        """Holds a permit around the block. Not reentrant."""
+        self.acquire(priority, check_canceled)
         try:
             yield
         finally:
-            self.give()
+            self.release()
 
-    @contextmanager
-    def left(self, rank: str = "") -> Generator[None]:
-        """Leaves a held turn to others around the block."""
-        self.give()
-        try:
-            yield
-        finally:
-            self.take(rank)
-
-    def _call(self) -> None:
-        while self._free and self._waiting:
-            self._free -= 1
-            heapq.heappop(self._waiting).called.set()
+    def _grant(self) -> None:
+        while self._permits and self._waiting:
+            self._permits -= 1
+            heapq.heappop(self._waiting).granted.set()

@@ -129,6 +129,9 @@ class Trajectory(Record):
     )
     anchors: tuple[Point, ...] = Field(description="Static points that hold the camera still, px.")
     encounters: tuple[Encounter, ...] = ()
+    encounters_known: bool = Field(
+        default=True, description="False where the surroundings could not be told apart: then nothing is listed."
+    )
 
 
 class Frame(Record):
@@ -151,17 +154,6 @@ class Video(Record):
     num_frames: int = Field(gt=0)
     width: int = Field(gt=0, description="Pixels.")
     height: int = Field(gt=0, description="Pixels.")
-
-
-class Clip(Record):
-    """Stage 4: the frames that were asked for and, where wanted, the whole clip as video."""
-
-    fps: float = Field(gt=0)
-    num_frames: int = Field(gt=0)
-    width: int = Field(gt=0, description="Pixels.")
-    height: int = Field(gt=0, description="Pixels.")
-    frames: tuple[Frame, ...]
-    video: Video | None = None
 
 
 class ReaderInfo(Record):
@@ -214,7 +206,15 @@ MEETINGS: dict[EncounterKind, str] = {
     "occludes": "passes in front of",
     "occluded-by": "passes behind",
 }  # what the mover does with the other object, in words
-ENCOUNTERS_UNKNOWN = "encounters were not computed"  # part of the warning that says so
+
+
+class Clip(Record):
+    """Stage 4: the frames chosen for reasoning, the whole clip as video where it is wanted, and the overlay."""
+
+    frames: tuple[Frame, ...]
+    video: Video | None = None
+    overlay: Artifact
+    generator: GeneratorInfo
 
 
 class Simulation(Record):
@@ -243,7 +243,7 @@ class Simulation(Record):
     @property
     def encounters_known(self) -> bool:
         """Whether an empty list of encounters means that nothing is met."""
-        return not any(ENCOUNTERS_UNKNOWN in warning for warning in self.warnings)
+        return self.trajectory.encounters_known
 
 
 class AnswerOption(Record):

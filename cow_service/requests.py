@@ -224,6 +224,19 @@ class SimulateRequest(Record):
         "secret for it.",
     )
 
+    @property
+    def place(self) -> GroundingRequest | None:
+        """Where the object is, as far as the request says: a given trajectory begins on it, so it grounds it, too."""
+        if self.grounding is None and self.trajectory is not None:
+            return GroundingRequest(point=self.trajectory.points[0])
+        return self.grounding
+
+    @property
+    def left_to_reader(self) -> frozenset[str]:
+        """The stages of a simulation that the request leaves to the reader."""
+        needed = {"grounding"} if self.place is None else set[str]()
+        return frozenset(needed if self.motion is not None or self.trajectory is not None else needed | {"motion"})
+
     @field_validator("options")
     @classmethod
     def _differ(cls, options: tuple[str, ...] | None) -> tuple[str, ...] | None:

@@ -2,59 +2,52 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 import re
-from collections.abc import Generator as Steps
-from contextlib import contextmanager
+import uuid
 from functools import partial
 from threading import Lock
+from typing import TypeVar
 
-from cow_service.concurrency import Turns
+from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import (
     CowError,
     FieldError,
     GeneratorUnavailable,
-    ImageTypeUnsupported,
     InvalidRequest,
     ReaderUnavailable,
 )
 from cow_service.generators.base import Generator
 from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.data_urls import decode_data_url
 from cow_service.media.images import DecodedImage, decode
 from cow_service.net.images import ImageUrls
 from cow_service.observability.metrics import Metrics
-from cow_service.pipeline import Backends, Progress, Stamp, StillWanted, answer, ignore_progress, simulate
+from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader
 from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulation
 from cow_service.registry import Registry
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, SimulateRequest
 from cow_service.settings import Settings, SettingsError
-from cow_service.stages.checks import check_frames, read_options
-from cow_service.stages.results import Checkpoints, keep_nothing
-from cow_service.weights.lock import ready, weights_identity
+from cow_service.stages.checks import check_request
+from cow_service.stages.run import Backends, Progress, Run, Step, compute_directly, ignore_progress, now
+from cow_service.weights.lock import ready
 from cow_service.weights.manifests import find_manifest, load_manifests
 
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
+Request = TypeVar("Request", bound=SimulateRequest)
 _OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)
-_DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)
-
-
-def always_wanted() -> None:
-    """Nobody ends it."""
 
 
 class Service:
     """Everything a server or a command line needs, made once. Safe to use from several threads.
 
-    `COW_CONCURRENCY` of them compute at the same time; whoever waits for a multimodal LLM lets another one compute.
+    `COW_CONCURRENCY` of them compute on the CPU at the same time; waits for a multimodal LLM do not count.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.slots = Turns(settings.concurrency)  # who computes
-        self._turns: dict[str, Turns] = {}  # of generators that take only so many clips at the same time
-        self._identities: dict[str, str] = {}
+        self.cpu = PrioritySemaphore(settings.concurrency)  # held around work on the CPU
+        self._devices: dict[str, PrioritySemaphore] = {}  # of generators that make only so many clips at the same time
         self._guard = Lock()
         self.metrics = Metrics()
         self._image_urls = ImageUrls(settings)
@@ -79,42 +72,36 @@ class Service:
         return self.artifacts.put(data, image.media_type), image
 
     def simulate(
-        self,
-        request: SimulateRequest,
-        progress: Progress = ignore_progress,
-        image: DecodedImage | None = None,
-        checkpoints: Checkpoints = keep_nothing,
-        stamp: Stamp | None = None,
-        still_wanted: StillWanted = always_wanted,
+        self, request: SimulateRequest, progress: Progress = ignore_progress, image: DecodedImage | None = None
     ) -> Simulation:
-        """One simulation, start to end; `image` is that of the request where it was decoded before.
-
-        Who asked first computes first; `still_wanted` may end the wait. Raises any `CowError` of its stages.
-        """
-        stamp = stamp or Stamp()
-        backends = self._backends(request, stamp.created_at)
-        with self.slots.held(stamp.created_at, still_wanted):
-            image = image or self.image_of(request.image)[1]
-            return simulate(request, image, backends, progress, checkpoints, stamp)
+        """One simulation, start to end. Raises any `CowError` of its stages. Arguments as for `prepare`."""
+        return simulate(self.prepare(request, progress, image))
 
     def answer(
+        self, request: AnswerRequest, progress: Progress = ignore_progress, image: DecodedImage | None = None
+    ) -> Answer:
+        """One answer, start to end. Raises any `CowError` that leaves no answer. Arguments as for `prepare`."""
+        return answer(self.prepare(request, progress, image))
+
+    def prepare(
         self,
-        request: AnswerRequest,
+        request: Request,
         progress: Progress = ignore_progress,
         image: DecodedImage | None = None,
-        checkpoints: Checkpoints = keep_nothing,
-        stamp: Stamp | None = None,
-        still_wanted: StillWanted = always_wanted,
-    ) -> Answer:
-        """One answer, start to end; `image` is that of the request where it was decoded before.
+        step: Step = compute_directly,
+        run_id: str | None = None,
+        created_at: str | None = None,
+    ) -> Run[Request]:
+        """A run of the request, with its backends and its image, decoded here unless `image` is given.
 
-        Who asked first computes first; `still_wanted` may end the wait. Raises any `CowError` that leaves no answer.
+        Runs compute first in, first out by `created_at` (RFC 3339, by default now). Raises `InvalidRequest` for names
+        of backends that nobody has, the errors of `image_of`, and whatever `progress` raises.
         """
-        stamp = stamp or Stamp()
-        backends = self._backends(request, stamp.created_at)
-        with self.slots.held(stamp.created_at, still_wanted):
+        backends = self._backends(request)
+        created_at = created_at or now()
+        with self.cpu.held(created_at, partial(progress, None, 0.0)):
             image = image or self.image_of(request.image)[1]
-            return answer(request, image, backends, progress, checkpoints, stamp)
+        return Run(request, image, backends, progress, step, run_id or str(uuid.uuid4()), created_at)
 
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
         """Says at once what is wrong with a request as far as that costs nothing; returns its reader and generator.
@@ -127,9 +114,7 @@ class Service:
         _check_modules(reader, ReaderUnavailable)
         _check_modules(name, GeneratorUnavailable)
         if self.generators.is_made(name) or name == self.settings.generator:
-            generator = self._generator(name)
-            read_options(generator, request.generator_options)
-            check_frames(generator, request)
+            check_request(self._generator(name), request)
         return reader, name
 
     def models(self) -> Models:
@@ -157,35 +142,26 @@ class Service:
         self._reader(self.settings.reader)
         self._generator(self.settings.generator)
 
-    def _backends(self, request: SimulateRequest, rank: str) -> Backends:
+    def _backends(self, request: SimulateRequest) -> Backends:
         """Who does the work of a request. Raises `InvalidRequest` for a name that nobody has."""
         reader = self._known("reader", request.reader or self.settings.reader, self.readers)
         generator = self._known("generator", request.generator or self.settings.generator, self.generators)
         return Backends(
             reader_name=reader,
-            reader=lambda: self._reader(reader),
-            generator=lambda: self._generator(generator),
+            reader=partial(self._reader, reader),
+            generator=partial(self._generator, generator),
             artifacts=self.artifacts,
-            weights=partial(self._weights, generator),
-            elsewhere=partial(self.slots.left, rank),
-            rendering=partial(self._rendering, generator, rank),
+            cpu=self.cpu,
+            device=partial(self._device, generator),
         )
 
-    def _weights(self, name: str) -> str:
-        """What told a generator's weights from others when they were loaded: files may have changed since."""
-        return self._identities.get(name, "")
-
-    @contextmanager
-    def _rendering(self, name: str, rank: str, still_wanted: StillWanted) -> Steps[None]:
-        """Holds a generator's turn. While waiting for it, and while it works, the slot is left to others."""
-        at_once = self.settings.generator_concurrency.get(name, getattr(self._generator(name), "concurrency", None))
-        if at_once is None:
-            yield
-            return
+    def _device(self, name: str) -> PrioritySemaphore:
+        """Held while a generator works: one of its own where it has a device or a limit, else that of the CPU."""
+        permits = self.settings.generator_concurrency.get(name, getattr(self._generator(name), "concurrency", None))
+        if permits is None:
+            return self.cpu
         with self._guard:
-            turns = self._turns.setdefault(name, Turns(at_once))
-        with self.slots.left(rank), turns.held(rank, still_wanted):
-            yield
+            return self._devices.setdefault(name, PrioritySemaphore(permits))
 
     def _reader(self, name: str) -> Reader:
         _check_modules(name, ReaderUnavailable)
@@ -193,9 +169,6 @@ class Service:
 
     def _generator(self, name: str) -> Generator:
         _check_modules(name, GeneratorUnavailable)
-        manifest = find_manifest(name)
-        if manifest is not None and not self.generators.is_made(name):
-            self._identities[name] = weights_identity(manifest, self.settings)
         return self.generators.get(name)
 
     def image_of(self, ref: ImageRef) -> tuple[str, DecodedImage]:
@@ -249,30 +222,3 @@ def _check_modules(name: str, unavailable: type[CowError]) -> None:
         raise unavailable(
             f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
         )
-
-
-def decode_data_url(url: str) -> bytes:
-    """The bytes of a base64 data URL; blanks and line ends in it are skipped.
-
-    Raises `InvalidRequest` pointing at `/image`, and `ImageTypeUnsupported` where it declares something else.
-    """
-    head = _DATA_URL.match(url[:256])
-    if head is None or head["base64"] is None:
-        raise _bad_image("`image` must be a data URL with base64: data:image/png;base64,...")
-    declared = head["type"].lower()
-    if not declared.startswith("image/") and declared not in ("", "application/octet-stream"):
-        # Of the image types, what the bytes are counts, and not what they are declared to be.
-        raise ImageTypeUnsupported(
-            f"The data URL of `image` declares {declared[:80]}: send image/png, image/jpeg or image/webp."
-        )
-    try:
-        # Tools that write base64 break it into lines.
-        return base64.b64decode("".join(url[head.end() :].split()), validate=True)
-    except (binascii.Error, ValueError) as error:
-        raise _bad_image(
-            f"The base64 of `image` cannot be decoded ({error}): encode the file's bytes in the standard alphabet."
-        ) from error
-
-
-def _bad_image(detail: str) -> CowError:
-    return InvalidRequest(detail, errors=(FieldError("/image", detail),))

@@ -9,43 +9,36 @@ import pytest
 from drawn import DrawnArrow, ball, block, floor
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from runs import run_of
 
-from cow_service.generators.base import Shot
+from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import MAX_SIDE, CutoutGenerator, CutoutOptions
-from cow_service.records import Artifact, Grounding
-from cow_service.requests import GroundingRequest, MotionRequest
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import compute_trajectory
 from cow_service.vision.obstacles import obstacles_of
 from cow_service.vision.quilt import quilt
-from cow_service.vision.scene import Scene
 
 RED, BLUE = (210, 20, 20), (50, 80, 200)
 CENTRE, RADIUS = (160.0, 200.0), 40.0
 generator = CutoutGenerator()
-ARTIFACT = Artifact(sha256="0" * 64, url="/artifacts/0", media_type="image/png", size=1)
 
 
 def ignore(done: float) -> None:
     """Nobody listens."""
 
 
-def no_reader():
-    raise AssertionError("no reader is needed here")
+def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion) -> GeneratorInput:
+    run = run_of(image, grounding={"point": CENTRE}, motion=motion, num_frames=frames, fps=fps)
+    grounding = ground(run).value
+    moving = read_motion(run, grounding).value
+    trajectory = compute_trajectory(run, grounding, moving).value
+    obstacles = obstacles_of(run.scene, grounding.bbox)
+    options = CutoutOptions(clean_cues=clean)
+    return GeneratorInput(run.scene, grounding, moving, trajectory, obstacles, 0, options)
 
 
-def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion) -> Shot:
-    scene = Scene(image)
-    grounding: Grounding
-    grounding, _ = ground(scene, GroundingRequest(point=CENTRE), no_reader, lambda mask: ARTIFACT)
-    moving, _ = read_motion(scene, grounding, MotionRequest(**motion), None, no_reader)
-    obstacles = obstacles_of(scene, grounding.bbox)
-    trajectory = compute_trajectory(scene, grounding, moving, obstacles, None, frames, fps)
-    return Shot(scene, grounding, moving, trajectory, obstacles, 0, CutoutOptions(clean_cues=clean))
-
-
-def frame_of(filmed: Shot, index: int) -> np.ndarray:
+def frame_of(filmed: GeneratorInput, index: int) -> np.ndarray:
     return next(generator.render(filmed, [index], ignore))
 
 

@@ -14,9 +14,10 @@ from drawn import DrawnArrow, angle_between, ball, block, floor, png_bytes
 from PIL import Image
 
 from cow_service.errors import ArtifactNotFound, CannotReadDirection, ImageUrlNotAllowed, InvalidRequest
+from cow_service.media.data_urls import decode_data_url
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
-from cow_service.service import Service, decode_data_url
+from cow_service.service import Service
 from cow_service.vision.regions import MAX_REGIONS
 from cow_service.vision.scene import Scene, iou
 

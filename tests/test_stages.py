@@ -9,15 +9,16 @@ import pytest
 from drawn import ball, floor
 from hypothesis import given
 from hypothesis import strategies as st
+from runs import run_of
 
 from cow_service.errors import InvalidRequest
 from cow_service.readers.base import MotionReading
-from cow_service.records import Artifact, Encounter, Grounding, Motion, Trajectory
-from cow_service.requests import FramesRequest, GroundingRequest, MotionRequest, SimulateRequest, TrajectoryRequest
+from cow_service.records import Encounter, Grounding, Motion, Trajectory
+from cow_service.requests import FramesRequest, SimulateRequest, TrajectoryRequest
 from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
-from cow_service.stages.trajectory import compute_trajectory
+from cow_service.stages.trajectory import trajectory_of
 from cow_service.vision.cuttings import cutting_of
 from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
@@ -25,8 +26,7 @@ from cow_service.vision.scene import Scene
 RED = (200, 30, 30)
 
 
-def no_reader():
-    raise AssertionError("the request said it all: no reader may be made")
+POINT = {"point": (200, 200)}
 
 
 @pytest.fixture(scope="module")
@@ -34,18 +34,21 @@ def scene() -> Scene:
     return Scene(ball(floor(640, 400), (200, 200), 40, RED))
 
 
-def grounded(scene: Scene, **given) -> Grounding:
-    artifact = Artifact(sha256="0" * 64, url="/artifacts/0", media_type="image/png", size=1)
-    return ground(scene, GroundingRequest(**given), no_reader, lambda mask: artifact)[0]
+def run(scene: Scene, **request):
+    return run_of(scene.image, **request)
 
 
-def moved(scene: Scene, path: TrajectoryRequest | None = None, **given) -> Motion:
-    request = MotionRequest(**given) if given else None
-    return read_motion(scene, grounded(scene, point=(200, 200)), request, path, no_reader)[0]
+def grounded(scene: Scene, **place) -> Grounding:
+    return ground(run(scene, grounding=place)).value
+
+
+def moved(scene: Scene, path: TrajectoryRequest | None = None, **motion) -> Motion:
+    given = ({"motion": motion} if motion else {}) | ({} if path is None else {"trajectory": path})
+    return read_motion(run(scene, **given), grounded(scene, **POINT)).value
 
 
 def rolled(scene: Scene, motion: Motion, path: TrajectoryRequest | None = None, frames=81, fps=16.0) -> Trajectory:
-    return compute_trajectory(scene, grounded(scene, point=(200, 200)), motion, (), path, frames, fps)
+    return trajectory_of(scene, grounded(scene, **POINT), motion, (), path, frames, fps)
 
 
 def test_a_point_grounds_the_object_under_it(scene: Scene) -> None:
@@ -128,7 +131,7 @@ def test_anchors_keep_off_where_they_would_else_stand(scene: Scene) -> None:
     here[int(y) - 15 : int(y) + 15, int(x) - 15 : int(x) + 15] = True
     obstacle = Obstacle("vase", (x - 15, y - 15, x + 15, y + 15), cutting_of(here))
     grounding = grounded(scene, point=(200, 200))
-    kept = compute_trajectory(scene, grounding, moved(scene, kind="static"), (obstacle,), None, 5, 16).anchors
+    kept = trajectory_of(scene, grounding, moved(scene, kind="static"), (obstacle,), None, 5, 16).anchors
     assert (x, y) not in kept
     assert all(not here[int(b), int(a)] for a, b in kept)
     away = rolled(scene, moved(scene, direction=(x - 200, y - 200), speed=300)).anchors
@@ -219,13 +222,15 @@ def test_requests_that_cannot_be_meant(body, told) -> None:
 
 
 def test_a_reader_is_asked_where_the_request_is_silent(scene: Scene) -> None:
-    class OneLook:
+    class OneReader:
         source = "embedded"
 
-        def read_motion(self, grounding):
+        def read_motion(self, given, grounding, hints):
+            assert given.question == "Where to?"
+            assert hints is None
             return MotionReading("linear", (0.0, -2.0), "text", warnings=("careful",))
 
-    motion, warnings = read_motion(scene, grounded(scene, point=(200, 200)), None, None, OneLook)
-    assert motion.direction == (0, -1)
-    assert motion.source == "embedded"
-    assert warnings == ("careful",)
+    result = read_motion(run(scene, reader=OneReader, question="Where to?"), grounded(scene, **POINT))
+    assert result.value.direction == (0, -1)
+    assert result.value.source == "embedded"
+    assert result.warnings == ("careful",)

@@ -21,9 +21,9 @@ from cow_service.jobs.orders import Order
 from cow_service.jobs.reports import Found
 from cow_service.media.images import DecodedImage
 from cow_service.observability import context
-from cow_service.pipeline import now
 from cow_service.records import TERMINAL, JobKind
 from cow_service.requests import ImageArtifact, SimulateRequest
+from cow_service.stages.run import now
 
 LOOK = 3.0  # seconds between looks at the database: another process may have run the job
 AT_ONCE = 4  # bodies that are decoded at the same time

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.images import DecodedImage
-from cow_service.records import ENCOUNTERS_UNKNOWN, BackendInfo, Models, Simulation
+from cow_service.records import BackendInfo, Models, Simulation
 from cow_service.requests import SimulateRequest, Stage
 from cow_service.service import Service
 
@@ -95,14 +95,16 @@ def read_request(service: Service, image: Path, body: dict[str, Any], model: typ
 
 
 @contextmanager
-def stages_shown(console: Console) -> Generator[Callable[[Stage, float], None]]:
+def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], None]]:
     """Bars for the stages, as they run."""
     columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[Stage, TaskID] = {}
         loading = bars.add_task("loading", total=None)  # a model takes its time before the first stage
 
-        def show(stage: Stage, done: float) -> None:
+        def show(stage: Stage | None, done: float) -> None:
+            if stage is None:
+                return
             bars.update(loading, visible=False)
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=1.0)
@@ -189,7 +191,7 @@ def _told(simulation: Simulation) -> dict[Stage, str]:
     return {
         "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
         "motion": f"{motion.kind}{way}, {motion.speed:.0f} px/s, from {motion.cue}",
-        "trajectory": met or ("meets nothing" if simulation.encounters_known else ENCOUNTERS_UNKNOWN),
+        "trajectory": met or ("meets nothing" if simulation.encounters_known else "encounters were not computed"),
         "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
     }
 

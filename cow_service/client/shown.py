@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from cow_service.records import ENCOUNTERS_UNKNOWN, MEETINGS, Answer, Frame, Simulation, Verdict
+from cow_service.records import MEETINGS, Answer, Frame, Simulation, Verdict
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,7 +51,7 @@ def met(simulation: Simulation) -> str:
     """What the mover encounters, in words."""
     fps = simulation.trajectory.fps
     told = [f"{MEETINGS[e.kind]} {e.object} at {e.first_frame / fps:.1f} s" for e in simulation.trajectory.encounters]
-    return ", ".join(told) or ("meets nothing" if simulation.encounters_known else ENCOUNTERS_UNKNOWN)
+    return ", ".join(told) or ("meets nothing" if simulation.encounters_known else "encounters were not computed")
 
 
 def answered(answer: Verdict) -> str:

@@ -1,4 +1,4 @@
-"""The door for whoever makes frames. Stages know this Protocol, never an implementation."""
+"""The Protocol of generators: what makes the frames of a clip. Stages know this file, never an implementation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cow_service.vision.scene import Scene
 
 
 @dataclass(frozen=True)
-class Shot:
+class GeneratorInput:
     """All that a generator may know. Clip length and rate are those of the trajectory."""
 
     scene: Scene
@@ -32,9 +32,11 @@ class Generator(Protocol):
     """Makes the frames of a clip."""
 
     options_model: type[BaseModel]  # what `generator_options` of a request may hold
-    concurrency: int | None  # clips at the same time; None where a clip is computed like everything else
+    concurrency: int | None  # clips at the same time on a device of its own; None where it computes on the CPU
+    fingerprint: str
+    """All that decides a clip, besides what it is given: model, revision, weights, profile."""
 
-    def describe(self, shot: Shot) -> GeneratorInfo:
+    def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """Who would make this clip, and what would have to be the same to make it again."""
         ...
 
@@ -47,9 +49,9 @@ class Generator(Protocol):
         ...
 
     def render(
-        self, shot: Shot, wanted: Sequence[int], progress: Callable[[float], None]
+        self, given: GeneratorInput, indices: Sequence[int], progress: Callable[[float], None]
     ) -> Iterator[NDArray[np.uint8]]:
-        """The wanted clip frames, RGB [h, w, 3] of `size`, in the order of their ascending indices.
+        """The clip frames of these ascending indices, RGB [h, w, 3] of `size`, in their order.
 
         `progress` hears 0 to 1 after each step of the work, and may raise `Canceled`: then no more is computed.
         """

@@ -41,6 +41,13 @@ _holds = sa.Table(
     sa.Column("sha256", sa.String(64), primary_key=True),
     sa.Column("job_id", sa.String(64), primary_key=True, index=True),
 )
+# The stages of each job that are done, whoever computed their results.
+_stages = sa.Table(
+    "cow_job_stages",
+    _metadata,
+    sa.Column("job_id", sa.String(64), primary_key=True),
+    sa.Column("stage", sa.String(32), primary_key=True),
+)
 # These run several times in every job: as plain text they take a fifth of the time that expressions do.
 _FIND = "SELECT job_id, result FROM cow_stage_results WHERE key = ?"
 # A result that lost its artifacts is made anew, and replaces the one that was there.
@@ -49,6 +56,7 @@ _KEEP = (
     "ON CONFLICT (key) DO UPDATE SET job_id = excluded.job_id, result = excluded.result, "
     "created_at = excluded.created_at"
 )
+_DONE = "INSERT INTO cow_job_stages (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
 _HOLD = "INSERT INTO cow_holds (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
 
 
@@ -98,18 +106,30 @@ class Database:
         finally:
             os.close(descriptor)
 
-    def find(self, key: str) -> tuple[str, str] | None:
-        """The job that came to a stage's result, and the result as JSON."""
+    def find_result(self, key: str) -> tuple[str, str] | None:
+        """The job that computed a stage's result, and the result as JSON."""
         with self._cursor() as cursor:
             cursor.execute(self._plain(_FIND), (key,))
             row = cursor.fetchone()
         return None if row is None else (row[0], row[1])
 
-    def keep(self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str]) -> None:
-        """Holds a stage's artifacts for the job, then keeps its result: in this order, each may stand alone."""
+    def store_result(self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str]) -> None:
+        """Holds a stage's artifacts for the job, then stores its result: in this order, each may stand alone."""
         with self._cursor() as cursor:
             self._hold(cursor, job, artifacts)
             cursor.execute(self._plain(_KEEP), (key, job, stage, result, time.time()))
+            cursor.execute(self._plain(_DONE), (job, stage))
+
+    def reuse_result(self, job: str, stage: str, artifacts: Iterable[str]) -> None:
+        """Holds the artifacts of a result that another job had computed."""
+        with self._cursor() as cursor:
+            self._hold(cursor, job, artifacts)
+            cursor.execute(self._plain(_DONE), (job, stage))
+
+    def finished_stages(self, job: str) -> set[str]:
+        """The stages of a job that are done."""
+        with database_errors(), self._reading.connect() as connection:
+            return set(connection.execute(sa.select(_stages.c.stage).where(_stages.c.job_id == job)).scalars())
 
     def hold(self, job: str, artifacts: Iterable[str]) -> None:
         """Holds artifacts for a job."""
@@ -125,6 +145,7 @@ class Database:
                 loose |= set(connection.execute(mine).scalars())
                 connection.execute(sa.delete(_holds).where(_holds.c.job_id.in_(some)))
                 connection.execute(sa.delete(_results).where(_results.c.job_id.in_(some)))
+                connection.execute(sa.delete(_stages).where(_stages.c.job_id.in_(some)))
         held = self.held(loose)
         return [sha256 for sha256 in loose if sha256 not in held]
 

@@ -44,9 +44,8 @@ from cow_service.jobs.maintenance import Upkeep
 from cow_service.jobs.orders import Order
 from cow_service.jobs.reports import CREATED, GENERATOR, Filters, Found
 from cow_service.jobs.serializer import JsonSerializer
-from cow_service.jobs.stage_cache import Left
 from cow_service.jobs.webhooks import Webhooks
-from cow_service.jobs.worker import Worker
+from cow_service.jobs.worker import Left, Worker
 from cow_service.media.images import DecodedImage
 from cow_service.records import TERMINAL, JobPage
 from cow_service.service import Service

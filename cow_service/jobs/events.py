@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from anyio import to_thread
 
 from cow_service.errors import JobNotFound
-from cow_service.jobs import reports
 from cow_service.jobs.engine import Engine
 from cow_service.jobs.live import share_done
 from cow_service.jobs.reports import Found
 from cow_service.records import TERMINAL, Job
 
+TOLD = ("grounding", "generation", "answering")  # stages whose end is an event; the others take milliseconds
 QUEUED, RUNNING, FIRST_STAGE, END = 1, 2, 3, 100
 LOOK = 1.0  # seconds between looks at the database: another process may run the job
 
@@ -40,7 +40,7 @@ async def follow(engine: Engine, job_id: str, owner: str | None, after: int) -> 
     with engine.live.waiting(job_id) as waiting:
         while True:
             waiting.changed.clear()
-            for event in await to_thread.run_sync(_durable, found):
+            for event in await to_thread.run_sync(_durable, engine, found):
                 if event.number is not None and event.number > sent:
                     sent = event.number
                     yield event
@@ -59,19 +59,20 @@ async def follow(engine: Engine, job_id: str, owner: str | None, after: int) -> 
                 return
 
 
-def _durable(found: Found) -> list[Event]:
+def _durable(engine: Engine, found: Found) -> list[Event]:
     """What has happened to a job so far, by number."""
     job = found.job
     begun = job.model_copy(
         update={"status": "running", "progress": 0.0, "stage": None, "problem": None, "finished_at": None}
     )
     events = [Event("queued", QUEUED, begun.model_copy(update={"status": "queued"}))]
-    stages = reports.finished_stages(job.id)
+    done = engine.database.finished_stages(job.id)
+    stages = [stage for stage in TOLD if stage in done]
     if job.status == "running" or stages or job.status in ("succeeded", "failed"):
         events.append(Event("running", RUNNING, begun))
     for place, stage in enumerate(stages):
-        done = begun.model_copy(update={"stage": stage, "progress": share_done(job.kind, stage, 1.0)})
-        events.append(Event("stage", FIRST_STAGE + place, done))
+        at_end = begun.model_copy(update={"stage": stage, "progress": share_done(job.kind, stage, 1.0)})
+        events.append(Event("stage", FIRST_STAGE + place, at_end))
     if job.status in TERMINAL:
         events.append(Event(job.status, END, job))
     return events

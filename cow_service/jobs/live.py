@@ -72,10 +72,10 @@ class Live:
                 self._images.pop(job, None)
                 one.over = True
 
-    def progress(self, job: str, one: Running, stage: Stage, done: float) -> None:
+    def progress(self, job: str, one: Running, stage: Stage | None, done: float) -> None:
         """The work on a job got so far. Raises `Canceled` where somebody wants it to end."""
         one.check()
-        if stage != one.stage or done > one.done:
+        if stage is not None and (stage != one.stage or done > one.done):
             one.stage, one.done = stage, done
             self._wake(job)
 

@@ -13,7 +13,7 @@ from dbos import DBOS, WorkflowStatus
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest
 from cow_service.jobs.database import database_errors
-from cow_service.jobs.live import STAGES, Live, share_done
+from cow_service.jobs.live import Live, share_done
 from cow_service.problems import problem_of
 from cow_service.records import Job, JobKind, JobPage, JobStatus
 
@@ -141,14 +141,6 @@ def existing(jobs: list[str], owner: str | None = None) -> set[str]:
     with database_errors():
         found = DBOS.list_workflows(workflow_ids=jobs, user=owner, load_input=False, load_output=False)
     return {one.workflow_id for one in found}
-
-
-def finished_stages(job_id: str) -> list[str]:
-    """The stages of a job that are steps and are done, in order."""
-    with database_errors():
-        steps = DBOS.list_workflow_steps(job_id)
-    done = sorted(steps, key=lambda step: step["function_id"])
-    return [step["function_name"] for step in done if step["function_name"] in STAGES and step["error"] is None]
 
 
 def _found(status: WorkflowStatus, live: Live) -> Found:

@@ -14,17 +14,21 @@ from cow_service.jobs import reports
 from cow_service.jobs.ledger import Ledger
 from cow_service.jobs.live import Running
 from cow_service.jobs.orders import Order
-from cow_service.jobs.stage_cache import Flights, JobCheckpoints, Left
+from cow_service.jobs.stage_cache import KeyLocks, StoredStep
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.observability import tracing
 from cow_service.observability.context import bound, parse_traceparent
-from cow_service.pipeline import Stamp
+from cow_service.pipeline import answer, simulate
 from cow_service.records import Answer, Simulation
 from cow_service.requests import AnswerRequest, Stage
 
 WAIT, WAITS = 0.1, 100  # seconds between looks, and how many, until a webhook's job has ended
 
 log = logging.getLogger("cow_service")
+
+
+class Left(BaseException):
+    """The work on a job ends here without an outcome. No `Exception`: DBOS must not record it as one."""
 
 
 class Worker:
@@ -34,7 +38,7 @@ class Worker:
         self._ledger = ledger
         self._webhooks = webhooks
         self._left = left  # the work on a job is over
-        self._flights = Flights()
+        self._locks = KeyLocks()
 
     def run(self, job_id: str, order: dict[str, Any]) -> str:
         """Does what an order says; returns the result as JSON.
@@ -97,20 +101,18 @@ class Worker:
     def _result(self, job_id: str, order: Order, running: Running) -> Simulation | Answer:
         ledger = self._ledger
 
-        def progress(stage: Stage, done: float) -> None:
+        def progress(stage: Stage | None, done: float) -> None:
             ledger.live.progress(job_id, running, stage, done)
 
-        request, image = order.parsed(), ledger.live.image(job_id)
-        kept = JobCheckpoints(
-            job=job_id,
-            rank=order.created_at,
+        step = StoredStep(
+            job_id=job_id,
             fresh=order.fresh,
-            service=ledger.service,
             database=ledger.database,
-            flights=self._flights,
-            still_wanted=running.check,
+            artifacts=ledger.service.artifacts,
+            metrics=ledger.service.metrics,
+            locks=self._locks,
+            check_canceled=running.check,
         )
-        stamp = Stamp(job_id, order.created_at)
-        if isinstance(request, AnswerRequest):
-            return ledger.service.answer(request, progress, image, kept, stamp, running.check)
-        return ledger.service.simulate(request, progress, image, kept, stamp, running.check)
+        image = ledger.live.image(job_id)
+        run = ledger.service.prepare(order.parsed(), progress, image, step, job_id, order.created_at)
+        return answer(run) if isinstance(run.request, AnswerRequest) else simulate(run)

@@ -4,31 +4,64 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 
-from cow_service.errors import CowError, MllmBadReply
+from cow_service.errors import MllmBadReply
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode_own
-from cow_service.readers.base import AnswerReading, Imagined, Look
-from cow_service.records import AnswerOption, Simulation, Verdict
+from cow_service.readers.base import AnswerReading, Imagined, Reader, ReaderInput
+from cow_service.readers.question.choices import read_choices
+from cow_service.records import AnswerOption, Grounding, Simulation, Verdict
+from cow_service.requests import AnswerRequest
+from cow_service.stages.results import StageResult, Verdicts
+from cow_service.stages.run import Run
 
 NOT_SURE = "not sure"  # the name of that vote where no option says so
 
 
-def answer(
-    look: Look, options: Sequence[AnswerOption], imagined: Imagined | None, votes: int
-) -> tuple[Verdict, tuple[str, ...]]:
-    """The most frequent of `votes` answers, of several equally frequent ones the first that was given; and warnings.
+def answer_question(
+    run: Run[AnswerRequest], grounding: Grounding | None, simulation: Simulation | None
+) -> StageResult[Verdicts]:
+    """The answer after looking at a simulation, or from the image alone; and the baseline where it is wanted.
 
-    Raises what the reader raises where it gives none at all.
+    Raises what the reader raises where it gives no answer at all.
     """
-    readings = look.answer(options, imagined, votes)
+    request = run.request
+    options = read_choices(request.question, request.options)
+    given = run.reader_input("answering")
+    imagined = None
+    if simulation is not None:
+        with run.cpu():
+            imagined = _with_frames(simulation, run.backends.artifacts)
+    answer = partial(_answer, run.reader, given, options, grounding, votes=request.votes)
+    verdict, warnings = answer(imagined)
+    baseline = None
+    if request.baseline and imagined is None:
+        baseline = verdict
+    elif request.baseline:
+        try:
+            baseline, _ = answer(None)
+        except MllmBadReply as error:
+            warnings = (f"There is no baseline: {error.detail}", *warnings)
+    return StageResult(value=Verdicts(verdict=verdict, baseline=baseline), warnings=warnings)
+
+
+def _answer(
+    reader: Reader,
+    given: ReaderInput,
+    options: Sequence[AnswerOption],
+    grounding: Grounding | None,
+    imagined: Imagined | None,
+    votes: int,
+) -> tuple[Verdict, tuple[str, ...]]:
+    """The most frequent of `votes` answers, of several equally frequent ones the first that was given; and warnings."""
+    readings = reader.answer(given, options, grounding, imagined, votes)
     counted = Counter(_named(reading) for reading in readings)
     most = max(counted.values())
     winner = next(reading for reading in readings if counted[_named(reading)] == most)
-    option = next((option.text for option in options if option.letter == winner.answer), None)
     verdict = Verdict(
         answer=winner.answer,
-        option=option,
+        option=next((option.text for option in options if option.letter == winner.answer), None),
         not_sure=winner.not_sure,
         reasoning=winner.reasoning,
         votes=dict(counted),
@@ -36,15 +69,7 @@ def answer(
     return verdict, (*winner.notes, *_split(verdict, votes))
 
 
-def baseline(look: Look, options: Sequence[AnswerOption], votes: int) -> Verdict | CowError:
-    """The answer from the image alone, for comparison, or the error that it came to."""
-    try:
-        return answer(look, options, None, votes)[0]
-    except MllmBadReply as error:
-        return error
-
-
-def frames_of(simulation: Simulation, artifacts: ArtifactStore) -> Imagined:
+def _with_frames(simulation: Simulation, artifacts: ArtifactStore) -> Imagined:
     """A simulation with the pixels of its chosen frames."""
     return Imagined(simulation, tuple(decode_own(artifacts.read(frame.sha256)) for frame in simulation.frames))
 

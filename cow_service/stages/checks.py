@@ -1,4 +1,4 @@
-"""Checks, before any work is done, what only the chosen generator or several fields together can tell."""
+"""Checks of a request that need the generator: made before any work is done."""
 
 from __future__ import annotations
 
@@ -11,23 +11,13 @@ from cow_service.generators.base import Generator
 from cow_service.requests import SimulateRequest
 
 
-def read_options(generator: Generator, given: dict[str, Any]) -> BaseModel:
-    """The generator's own options. Raises `InvalidRequest` with a JSON Pointer for each that it does not take."""
-    try:
-        return generator.options_model.model_validate(given)
-    except ValidationError as error:
-        known = ", ".join(sorted(generator.options_model.model_fields)) or "none"
-        fields = tuple(
-            FieldError("/generator_options/" + "/".join(pointer_part(part) for part in item["loc"]), item["msg"])
-            for item in error.errors()
-        )
-        raise InvalidRequest(
-            f"`generator_options` are not valid for this generator. It takes: {known}.", errors=fields
-        ) from error
+def check_request(generator: Generator, request: SimulateRequest) -> BaseModel:
+    """The generator's own options, checked, as is the length of the clip.
 
-
-def check_frames(generator: Generator, request: SimulateRequest) -> None:
-    """Raises `InvalidRequest` where the generator has no clip of that length, or the clip not the frames asked for."""
+    Raises `InvalidRequest` with a JSON Pointer for each option that the generator does not take, for a clip that it
+    cannot make, and for frames that the clip does not have.
+    """
+    options = _read_options(generator, request.generator_options)
     if request.num_frames not in (legal := generator.nearest_lengths(request.num_frames)):
         detail = f"this generator makes no clip of {request.num_frames} frames; take {' or '.join(map(str, legal))}"
         raise InvalidRequest(f"`num_frames`: {detail}.", errors=(FieldError("/num_frames", detail),))
@@ -41,3 +31,18 @@ def check_frames(generator: Generator, request: SimulateRequest) -> None:
         raise InvalidRequest(
             f"`frames.indices` names frames that the clip does not have: it has 0 to {last}.", errors=errors
         )
+    return options
+
+
+def _read_options(generator: Generator, given: dict[str, Any]) -> BaseModel:
+    try:
+        return generator.options_model.model_validate(given)
+    except ValidationError as error:
+        known = ", ".join(sorted(generator.options_model.model_fields)) or "none"
+        fields = tuple(
+            FieldError("/generator_options/" + "/".join(pointer_part(part) for part in item["loc"]), item["msg"])
+            for item in error.errors()
+        )
+        raise InvalidRequest(
+            f"`generator_options` are not valid for this generator. It takes: {known}.", errors=fields
+        ) from error

@@ -7,12 +7,16 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.generators.base import Generator, Shot
+from cow_service.generators.base import Generator, GeneratorInput
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import encode_png, fit_within
+from cow_service.media.overlay import draw_overlay
 from cow_service.media.video import write_mp4
-from cow_service.records import Clip, Frame, Trajectory, Video
-from cow_service.requests import FramesRequest
+from cow_service.records import Clip, Frame, Grounding, Motion, Trajectory, Video
+from cow_service.requests import FramesRequest, SimulateRequest
+from cow_service.stages.results import StageResult
+from cow_service.stages.run import Run
+from cow_service.vision.obstacles import obstacles_of
 
 Image = NDArray[np.uint8]
 
@@ -49,50 +53,59 @@ def _at_events(trajectory: Trajectory, count: int) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def generate(
-    shot: Shot,
+def generate(run: Run, grounding: Grounding, motion: Motion, trajectory: Trajectory) -> StageResult[Clip]:
+    """Renders the clip once, storing the chosen frames, the overlay and, where it is wanted, the video.
+
+    Raises `InvalidRequest`, `GeneratorOutOfMemory`, `Canceled`.
+    """
+    request, scene, artifacts = run.request, run.scene, run.backends.artifacts
+    with run.cpu():
+        obstacles = obstacles_of(scene, grounding.bbox, grounding.others)
+    given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, request.seed, run.options)
+    with run.device():
+        frames, video = _render(given, run.generator, request, artifacts, run.report_share)
+    with run.cpu():
+        overlay = artifacts.put(encode_png(draw_overlay(scene.image, grounding, motion, trajectory)), "image/png")
+    clip = Clip(frames=frames, video=video, overlay=overlay, generator=run.generator.describe(given))
+    stored = (*(frame.sha256 for frame in frames), *([] if video is None else [video.sha256]), overlay.sha256)
+    return StageResult(value=clip, artifacts=stored)
+
+
+def _render(
+    given: GeneratorInput,
     generator: Generator,
-    wanted: FramesRequest,
-    video: bool,
+    request: SimulateRequest,
     artifacts: ArtifactStore,
     progress: Callable[[float], None],
-) -> Clip:
-    """Renders the clip once, keeping the chosen frames and, where wanted, the video. `progress` hears 0..1."""
-    trajectory = shot.trajectory
+) -> tuple[tuple[Frame, ...], Video | None]:
+    """The chosen frames, and the video of all of them. Only those that are needed are rendered."""
+    trajectory, wanted = given.trajectory, request.frames
     chosen = choose_frames(wanted, trajectory)
-    width, height = generator.size(shot.scene.width, shot.scene.height)
-    indices = tuple(range(len(trajectory.points))) if video else chosen
+    size = generator.size(given.scene.width, given.scene.height)
+    indices = tuple(range(len(trajectory.points))) if request.video else chosen
     frames: list[Frame] = []
 
     def rendered() -> Iterator[Image]:
-        keep = set(chosen)
-        for index, pixels in zip(indices, generator.render(shot, indices, progress), strict=True):
-            if index in keep:
-                frames.append(_keep(pixels, index, trajectory.fps, wanted.max_side, artifacts))
+        for index, pixels in zip(indices, generator.render(given, indices, progress), strict=True):
+            if index in chosen:
+                frames.append(_store_frame(pixels, index, trajectory.fps, wanted.max_side, artifacts))
             yield pixels
 
-    made = _keep_video(rendered(), trajectory.fps, (width, height), artifacts) if video else None
-    if made is None:
+    video = _store_video(rendered(), trajectory.fps, size, artifacts) if request.video else None
+    if video is None:
         for _ in rendered():
             pass
-    return Clip(
-        fps=trajectory.fps,
-        num_frames=len(trajectory.points),
-        width=width,
-        height=height,
-        frames=tuple(frames),
-        video=made,
-    )
+    return tuple(frames), video
 
 
-def _keep(pixels: Image, index: int, fps: float, max_side: int | None, artifacts: ArtifactStore) -> Frame:
+def _store_frame(pixels: Image, index: int, fps: float, max_side: int | None, artifacts: ArtifactStore) -> Frame:
     picture = fit_within(pixels, max_side)
     artifact = artifacts.put(encode_png(picture), "image/png")
     height, width = picture.shape[:2]
     return Frame(index=index, time=index / fps, url=artifact.url, sha256=artifact.sha256, width=width, height=height)
 
 
-def _keep_video(frames: Iterator[Image], fps: float, size: tuple[int, int], artifacts: ArtifactStore) -> Video:
+def _store_video(frames: Iterator[Image], fps: float, size: tuple[int, int], artifacts: ArtifactStore) -> Video:
     with artifacts.scratch() as path:
         count = write_mp4(frames, path, fps=fps, width=size[0], height=size[1])
         artifact = artifacts.put_file(path, "video/mp4")

@@ -2,72 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import numpy as np
-from numpy.typing import NDArray
-
 from cow_service.errors import FieldError, InvalidRequest
-from cow_service.readers.base import Look
-from cow_service.records import Artifact, BBox, Grounding, Point
+from cow_service.media.images import decode_own, encode_png
+from cow_service.readers.base import GroundingReading
+from cow_service.records import BBox, Grounding, Point
 from cow_service.requests import GroundingRequest
+from cow_service.stages.results import StageResult
+from cow_service.stages.run import Run
 from cow_service.vision.scene import Scene
 
 DEFAULT_NAME = "object"
 
 
-def ground(
-    scene: Scene,
-    given: GroundingRequest | None,
-    look: Callable[[], Look],
-    keep_mask: Callable[[NDArray[np.bool_]], Artifact],
-) -> tuple[Grounding, tuple[str, ...]]:
-    """The mover, from the request where it says so, else from a reader's look; and warnings.
-
-    Its mask [H, W] is kept.
+def ground(run: Run) -> StageResult[Grounding]:
+    """The mover, from the request where it says so, else from the reader; its mask [H, W] is stored as PNG.
 
     Raises `InvalidRequest` for a place outside the image, and what the reader raises.
     """
-    if given is not None:
-        bbox = _bbox_given(scene, given)
-        name, others, point, source = given.object or DEFAULT_NAME, (), None, "request"
-        warnings = _guessed(scene, given, bbox)
-    else:
-        reading = look().ground()
-        bbox, name, others, point, source = (
-            reading.bbox,
-            reading.object,
-            reading.others,
-            reading.point,
-            look().source,
-        )
-        warnings = reading.warnings
+    place, source = run.request.place, "request"
+    if place is None:
+        reading, source = run.reader.ground(run.reader_input("grounding")), run.reader.source
+    with run.cpu():
+        if place is not None:
+            reading = _given(run.scene, place)
+        mask = run.backends.artifacts.put(encode_png(run.scene.silhouette(reading.bbox)), "image/png")
     grounding = Grounding(
-        object=name,
-        point=point or _centre(bbox),
-        bbox=bbox,
-        mask=keep_mask(scene.silhouette(bbox)),
-        others=others,
+        object=reading.object,
+        point=reading.point or _centre(reading.bbox),
+        bbox=reading.bbox,
+        mask=mask,
+        others=reading.others,
         source=source,
     )
-    return grounding, warnings
+    return StageResult(value=grounding, warnings=reading.warnings, artifacts=(mask.sha256,), hints=reading.hints)
 
 
-def _guessed(scene: Scene, given: GroundingRequest, bbox: BBox) -> tuple[str, ...]:
-    """A doubt about an outline that was drawn around a point in a cluttered place."""
-    if given.point is None or scene.region_of(bbox) is not None:
-        return ()
-    box = ", ".join(f"{value:.0f}" for value in bbox)
-    return (f"The object around the point was guessed to be [{box}]; `grounding.bbox` says it for certain.",)
+def recall_mask(run: Run, grounding: Grounding) -> None:
+    """Has the scene use the stored mask of a grounding that was found again.
+
+    A mask cut again from its box may differ from one that was cut around a point.
+    """
+    mask = grounding.mask
+    if mask is not None:
+        read = run.backends.artifacts.read
+        run.scene.recall(grounding.bbox, lambda: decode_own(read(mask.sha256))[..., 0] > 0)
 
 
-def _bbox_given(scene: Scene, given: GroundingRequest) -> BBox:
-    if given.point is not None:
-        x, y = given.point
+def _given(scene: Scene, place: GroundingRequest) -> GroundingReading:
+    """What a request says of the object, and a warning where its outline had to be guessed around a point."""
+    bbox = _bbox_of(scene, place)
+    warnings: tuple[str, ...] = ()
+    if place.point is not None and scene.region_of(bbox) is None:
+        box = ", ".join(f"{value:.0f}" for value in bbox)
+        warnings = (f"The object around the point was guessed to be [{box}]; `grounding.bbox` says it for certain.",)
+    return GroundingReading(place.object or DEFAULT_NAME, bbox, warnings=warnings)
+
+
+def _bbox_of(scene: Scene, place: GroundingRequest) -> BBox:
+    if place.point is not None:
+        x, y = place.point
         if not (0 <= x < scene.width and 0 <= y < scene.height):
-            raise _outside("/grounding/point", list(given.point), scene)
-        return scene.bbox_at(given.point)
-    x0, y0, x1, y1 = given.bbox or (0.0, 0.0, 0.0, 0.0)
+            raise _outside("/grounding/point", list(place.point), scene)
+        return scene.bbox_at(place.point)
+    x0, y0, x1, y1 = place.bbox or (0.0, 0.0, 0.0, 0.0)
     clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
     if clipped[2] - clipped[0] < 2 or clipped[3] - clipped[1] < 2:
         raise _outside("/grounding/bbox", [x0, y0, x1, y1], scene)

@@ -3,50 +3,48 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
-from cow_service.readers.base import Look, MotionReading
+from cow_service.readers.base import MotionReading
 from cow_service.readers.question.wording import motion_sentence
 from cow_service.records import Grounding, MetresPerPixel, Motion, Source, Vector
 from cow_service.requests import MotionRequest, TrajectoryRequest
-from cow_service.vision.scene import Scene
+from cow_service.stages.results import StageResult
+from cow_service.stages.run import Run
 
 MOVING = ("linear", "projectile")
 FALLING = ("projectile", "fall")
 
 
-def read_motion(
-    scene: Scene,
-    grounding: Grounding,
-    given: MotionRequest | None,
-    path: TrajectoryRequest | None,
-    look: Callable[[], Look],
-) -> tuple[Motion, tuple[str, ...]]:
-    """The motion, from the request where it gives one or a whole path, else from a reader's look; and its warnings."""
-    speed = None
+def read_motion(run: Run, grounding: Grounding) -> StageResult[Motion]:
+    """The motion, from the request where it gives one or a whole path, else from the reader.
+
+    Raises what the reader raises.
+    """
+    given, path = run.request.motion, run.request.trajectory
+    speed, source = None, "request"
     if given is not None:
-        speed = given.speed
-        scale = (
-            None if given.metres_per_pixel is None else MetresPerPixel(value=given.metres_per_pixel, source="request")
-        )
-        reading = MotionReading(given.kind, given.direction, "request", depth=given.depth, metres_per_pixel=scale)
-        source: Source = "request"
+        reading, speed = _given(given), given.speed
     elif path is not None:
         reading, speed = _along(path)
-        source = "request"
     else:
-        reading, source = look().read_motion(grounding), look().source
-    motion = _complete(scene, grounding, reading, speed, source)
-    return motion, (*reading.warnings, *_assumed(motion, speed))
+        reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, run.hints), run.reader.source
+    motion = _complete(run.scene.width, grounding, reading, speed, source)
+    return StageResult(value=motion, warnings=(*reading.warnings, *_assumed(motion, speed)))
+
+
+def _given(motion: MotionRequest) -> MotionReading:
+    metres = motion.metres_per_pixel
+    scale = None if metres is None else MetresPerPixel(value=metres, source="request")
+    return MotionReading(motion.kind, motion.direction, "request", depth=motion.depth, metres_per_pixel=scale)
 
 
 def _complete(
-    scene: Scene, grounding: Grounding, reading: MotionReading, speed: float | None, source: Source
+    image_width: int, grounding: Grounding, reading: MotionReading, speed: float | None, source: Source
 ) -> Motion:
     """Adds what a reading leaves open: scale, speed, gravity and the sentence."""
     scale = reading.metres_per_pixel or MetresPerPixel(
-        value=DEFAULT_SCENE_WIDTH / scene.width,
+        value=DEFAULT_SCENE_WIDTH / image_width,
         source="default",
         note=f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object",
     )
@@ -59,7 +57,7 @@ def _complete(
         depth=depth,
         cue=reading.cue,
         along_arrow=reading.along_arrow,
-        speed=(DEFAULT_SPEED * scene.width if speed is None else speed) if moves else 0.0,
+        speed=(DEFAULT_SPEED * image_width if speed is None else speed) if moves else 0.0,
         gravity=_gravity(reading.down, scale) if reading.kind in FALLING else (0.0, 0.0),
         metres_per_pixel=scale,
         sentence=motion_sentence(grounding.object, reading.kind, direction, depth, reading.sentence),
@@ -74,7 +72,7 @@ def _gravity(down: Vector, scale: MetresPerPixel) -> Vector:
 
 
 def _assumed(motion: Motion, speed: float | None) -> tuple[str, ...]:
-    """A doubt about a throw, whose reach hangs on a speed that nobody gave."""
+    """A warning for a throw, whose reach depends on a speed that nobody gave."""
     if motion.kind != "projectile" or speed is not None:
         return ()
     return (

@@ -1,102 +1,46 @@
-"""What each stage leaves behind, and the seam where whoever runs a request may keep it.
-
-A stage's result is decided by its inputs alone: the image, what the request gives, the results of the stages before it,
-and who does the work (`fingerprint`). Records hold no pixels, so that a result can be kept and found again.
-"""
+"""What a stage returns: one generic record, which can be stored as JSON and read again."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from collections.abc import Mapping
+from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel
 
-from cow_service.records import (
-    Artifact,
-    Frame,
-    GeneratorInfo,
-    Grounding,
-    Motion,
-    ReaderInfo,
-    Record,
-    Trajectory,
-    Usage,
-    Verdict,
-    Video,
-)
+from cow_service.readers.base import MotionHints
+from cow_service.records import Clip, Grounding, Motion, ReaderInfo, Record, Sha256, Trajectory, Usage, Verdict
 from cow_service.requests import Stage
 
-Result = TypeVar("Result", bound=Record)
+Value = TypeVar("Value")
 
 
-class Reading(Record):
-    """What a stage had a reader do; a stage that the request decides has none."""
+class StageResult(Record, Generic[Value]):
+    """The value of a stage, and what belongs to it. It holds no pixels: bytes are artifacts, named by SHA-256."""
 
-    reader: ReaderInfo | None = None
+    value: Value
+    warnings: tuple[str, ...] = ()
+    reader: ReaderInfo | None = None  # null where the stage asked none
     usage: Usage = Usage()
+    artifacts: tuple[Sha256, ...] = ()  # those that the value names
+    hints: MotionHints | None = None  # of stage 1 for stage 2
 
 
-class Grounded(Record):
-    """Stage 1 and its doubts."""
-
-    grounding: Grounding
-    warnings: tuple[str, ...]
-    reading: Reading
-
-
-class Moved(Record):
-    """Stage 2 and its doubts."""
-
-    motion: Motion
-    warnings: tuple[str, ...]
-    reading: Reading
-
-
-class Traced(Record):
-    """Stage 3 and what to doubt of the scene as a whole."""
-
-    trajectory: Trajectory
-    warnings: tuple[str, ...]
-
-
-class Rendered(Record):
-    """Stage 4: the frames as artifacts."""
-
-    frames: tuple[Frame, ...]
-    video: Video | None
-    overlay: Artifact
-    generator: GeneratorInfo
-
-
-class Answered(Record):
-    """Stage 5 and its doubts."""
+class Verdicts(Record):
+    """The value of stage 5: the answer, and the one from the image alone where the request wants it for comparison."""
 
     verdict: Verdict
-    baseline: Verdict | None
-    warnings: tuple[str, ...]
-    reading: Reading
+    baseline: Verdict | None = None
 
 
-class Checkpoints(Protocol):
-    """Keeps the results of one request's stages."""
-
-    def __call__(
-        self, stage: Stage, inputs: Mapping[str, Any] | None, model: type[Result], compute: Callable[[], Result]
-    ) -> tuple[Result, bool]:
-        """The stage's result, computed or kept, and whether it is that of another request.
-
-        `inputs` are JSON values that decide the result; None where they are not known, so that it is nobody else's.
-        """
-        ...
-
-
-def keep_nothing(
-    stage: Stage, inputs: Mapping[str, Any] | None, model: type[Result], compute: Callable[[], Result]
-) -> tuple[Result, bool]:
-    """Computes every time: for runs that nobody has to pick up again."""
-    return compute(), False
+RESULT_TYPES: dict[Stage, type[StageResult[Any]]] = {
+    "grounding": StageResult[Grounding],
+    "motion": StageResult[Motion],
+    "trajectory": StageResult[Trajectory],
+    "generation": StageResult[Clip],
+    "answering": StageResult[Verdicts],
+}
 
 
 def digest_of(value: BaseModel | Mapping[str, Any]) -> str:

@@ -13,13 +13,27 @@ from cow_service.physics.dynamics import roll_out
 from cow_service.physics.encounters import Sweep, find_encounters, swept_mask
 from cow_service.records import Grounding, Motion, Trajectory
 from cow_service.requests import TrajectoryRequest
-from cow_service.vision.obstacles import Obstacle
+from cow_service.stages.results import StageResult
+from cow_service.stages.run import Run
+from cow_service.stages.warnings import warnings_of
+from cow_service.vision.obstacles import Obstacle, obstacles_of
 from cow_service.vision.scene import Scene
 
 Floats = NDArray[np.float64]
 
 
-def compute_trajectory(
+def compute_trajectory(run: Run, grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
+    """The path over the whole clip, rolled out from the motion or taken from the request, and what it meets."""
+    request = run.request
+    with run.cpu():
+        obstacles = obstacles_of(run.scene, grounding.bbox, grounding.others)
+        trajectory = trajectory_of(
+            run.scene, grounding, motion, obstacles, request.trajectory, request.num_frames, request.fps
+        )
+        return StageResult(value=trajectory, warnings=warnings_of(run.scene, request, grounding, trajectory))
+
+
+def trajectory_of(
     scene: Scene,
     grounding: Grounding,
     motion: Motion,
@@ -64,6 +78,7 @@ def compute_trajectory(
         tracks_visible=_seen(given, times),
         anchors=anchors,
         encounters=find_encounters(sweep, obstacles),
+        encounters_known=bool(scene.regions or obstacles),
     )
 
 

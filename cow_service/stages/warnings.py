@@ -1,24 +1,22 @@
-"""What a caller should know before trusting a simulation: what was taken one way and could be meant another."""
+"""Warnings about a simulation as a whole: what was understood in one way and could be meant in another."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
-from cow_service.records import ENCOUNTERS_UNKNOWN, Grounding
+from cow_service.records import Grounding, Trajectory
 from cow_service.requests import SimulateRequest
-from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
 
 OFF_CENTRE = 0.25  # of the object's size: a given path that begins further from its centre is remarked on
 
 
-def doubts(
-    scene: Scene, request: SimulateRequest, grounding: Grounding, obstacles: Sequence[Obstacle]
+def warnings_of(
+    scene: Scene, request: SimulateRequest, grounding: Grounding, trajectory: Trajectory
 ) -> tuple[str, ...]:
     """Warnings, in whole sentences; empty where there is nothing to say."""
     found = (
-        _no_surroundings(scene, obstacles),
+        _no_surroundings(trajectory),
         _cues_not_spoken_of(scene, request),
         _motion_beside_path(request),
         _path_off_object(request, grounding),
@@ -27,11 +25,11 @@ def doubts(
     return tuple(told for told in found if told is not None)
 
 
-def _no_surroundings(scene: Scene, obstacles: Sequence[Obstacle]) -> str | None:
-    if scene.regions or obstacles:
+def _no_surroundings(trajectory: Trajectory) -> str | None:
+    if trajectory.encounters_known:
         return None
     return (
-        f"The surroundings could not be separated into objects, so {ENCOUNTERS_UNKNOWN}: "
+        "The surroundings could not be separated into objects, so encounters were not computed: "
         "an empty list does not mean that nothing is hit."
     )
 

@@ -1,0 +1,213 @@
+"""One request being worked on: its inputs and backends, and how each stage is timed, stored and accounted for."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
+from typing import Any, Generic, Protocol, TypeVar
+
+from pydantic import BaseModel
+
+from cow_service.concurrency import PrioritySemaphore
+from cow_service.generators.base import Generator
+from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.images import DecodedImage
+from cow_service.readers.base import CallLog, MotionHints, Reader, ReaderInput
+from cow_service.records import Grounding, ReaderInfo, Record, Usage
+from cow_service.requests import AnswerRequest, SimulateRequest, Stage
+from cow_service.stages.checks import check_request
+from cow_service.stages.keys import Backend, key_of
+from cow_service.stages.results import StageResult, Value
+from cow_service.vision.scene import Scene
+
+ALMOST_DONE = 0.999  # of a stage whose end has not been reported
+
+Request_co = TypeVar("Request_co", bound=SimulateRequest, covariant=True)
+Progress = Callable[[Stage | None, float], None]
+"""Hears how far a stage is, 0 to 1; the stage is None while the run waits to begin. What it raises ends the run."""
+
+
+class Step(Protocol):
+    """Runs a stage: directly, or as a step whose result is stored and found again."""
+
+    def __call__(
+        self, stage: Stage, key: str | None, compute: Callable[[], StageResult[Any]]
+    ) -> tuple[StageResult[Any], bool]:
+        """The stage's result, and whether another request had computed it. `key` is None for one of no other's use."""
+        ...
+
+
+def ignore_progress(stage: Stage | None, done: float) -> None:
+    """Nobody listens."""
+
+
+def compute_directly(
+    stage: Stage, key: str | None, compute: Callable[[], StageResult[Any]]
+) -> tuple[StageResult[Any], bool]:
+    """Computes every time: for runs that are not resumed."""
+    return compute(), False
+
+
+def now() -> str:
+    """RFC 3339, UTC."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+@dataclass(frozen=True)
+class Backends:
+    """Who does the work of one request. Reader and generator are loaded when a stage first needs them."""
+
+    reader_name: str
+    reader: Callable[[], Reader]
+    generator: Callable[[], Generator]
+    artifacts: ArtifactStore
+    cpu: PrioritySemaphore
+    device: Callable[[], PrioritySemaphore]  # of the generator: its own, or `cpu`
+
+
+@dataclass
+class Run(Generic[Request_co]):
+    """One request, its image, and what its stages have come to."""
+
+    request: Request_co
+    image: DecodedImage
+    backends: Backends
+    progress: Progress = ignore_progress
+    step: Step = compute_directly
+    id: str = field(default_factory=lambda: str(uuid.uuid4()))
+    created_at: str = field(default_factory=now)
+    results: dict[Stage, StageResult[Any]] = field(default_factory=dict[Stage, StageResult[Any]])
+    timings: dict[str, float] = field(default_factory=dict[str, float])  # seconds per stage
+    reused: list[Stage] = field(default_factory=list[Stage])  # results that another request had computed
+    _calls: dict[Stage, CallLog] = field(default_factory=dict[Stage, CallLog])  # of the stages that asked the reader
+    _current: tuple[Stage | None, float] = (None, 0.0)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The image, and what is measured in it when first asked for."""
+        return Scene(self.image.pixels)
+
+    @property
+    def reader(self) -> Reader:
+        """Loads the reader where it was not loaded before."""
+        return self.backends.reader()
+
+    @property
+    def generator(self) -> Generator:
+        """Loads the generator where it was not loaded before."""
+        return self.backends.generator()
+
+    @cached_property
+    def options(self) -> BaseModel:
+        """The generator's options, once the request was found to be one that it can do. Raises `InvalidRequest`."""
+        return check_request(self.generator, self.request)
+
+    def check_options(self) -> None:
+        """Raises `InvalidRequest` for what the generator cannot do, before any work is done."""
+        _ = self.options
+
+    @property
+    def simulation_id(self) -> str:
+        """The id of the simulation: inside an answer the same each time that the answer is computed again."""
+        answering = isinstance(self.request, AnswerRequest)
+        return str(uuid.uuid5(uuid.NAMESPACE_OID, self.id)) if answering else self.id
+
+    def stage(self, name: Stage, function: Callable[..., StageResult[Value]], *inputs: Record | None) -> Value:
+        """Runs one stage, `function(run, *inputs)`, through `step`, with its time, warnings and usage noted."""
+        started = time.perf_counter()
+        self.report(name, 0.0)
+        key = key_of(name, self.image.info.sha256, self.request, inputs, self._identity)
+        result, reused = self.step(name, key, lambda: self._compute(name, function, inputs))
+        self.results[name] = result
+        if reused:
+            self.reused.append(name)
+        self.timings[name] = round(time.perf_counter() - started, 4)
+        self.report(name, 1.0)
+        return result.value
+
+    def report(self, name: Stage | None, done: float) -> None:
+        """Says how far a stage is, 0 to 1. Raises `Canceled` where nobody wants the result any more."""
+        self._current = name, done
+        self.progress(name, done)
+
+    def report_share(self, done: float) -> None:
+        """As `report`, of the current stage before its end."""
+        self.report(self._current[0], min(done, ALMOST_DONE))
+
+    def check_canceled(self) -> None:
+        """Raises `Canceled` where nobody wants the result any more."""
+        self.progress(*self._current)
+
+    def cpu(self) -> AbstractContextManager[None]:
+        """To be held around work on the CPU. First in, first out by the time of the request; not reentrant."""
+        return self.backends.cpu.held(self.created_at, self.check_canceled)
+
+    def device(self) -> AbstractContextManager[None]:
+        """To be held around the work of the generator."""
+        return self.backends.device().held(self.created_at, self.check_canceled)
+
+    def reader_input(self, stage: Stage) -> ReaderInput:
+        """What the reader is given on behalf of a stage."""
+        self._calls[stage] = CallLog()
+        return ReaderInput(
+            scene=self.scene,
+            question=self.request.question,
+            seed=self.request.seed,
+            motion_wanted="motion" in self.request.left_to_reader,
+            calls=self._calls[stage],
+            check_canceled=self.check_canceled,
+            cpu=self.cpu,
+        )
+
+    @property
+    def grounding(self) -> Grounding | None:
+        """What stage 1 came to, also where a later stage failed."""
+        return self.results["grounding"].value if "grounding" in self.results else None
+
+    @property
+    def hints(self) -> MotionHints | None:
+        """What stage 1 learned for stage 2."""
+        return self.results["grounding"].hints if "grounding" in self.results else None
+
+    @property
+    def usage(self) -> Usage:
+        """What this request asked of a multimodal LLM, by stages that failed and before a restart, too."""
+        before = [
+            result.usage
+            for stage, result in self.results.items()
+            if stage not in self._calls and stage not in self.reused
+        ]
+        return sum(before, sum((calls.usage for calls in self._calls.values()), Usage()))
+
+    def reader_info(self, *stages: Stage) -> ReaderInfo:
+        """Who read for some stages; a reader that none of them needed is named but was never loaded."""
+        infos = [result.reader for result in self.results.values() if result.reader is not None]
+        if not infos:
+            return ReaderInfo(name=self.backends.reader_name)
+        prompts = {name: version for info in infos for name, version in info.prompts.items()}
+        read = tuple(stage for stage in stages if stage in self.results and self.results[stage].reader is not None)
+        return infos[-1].model_copy(update={"prompts": dict(sorted(prompts.items())), "stages": read})
+
+    def warnings(self, *stages: Stage) -> tuple[str, ...]:
+        """The warnings of some stages."""
+        return tuple(warning for stage in stages for warning in self.results[stage].warnings)
+
+    def _identity(self, backend: Backend) -> dict[str, Any] | None:
+        """All that decides the work of a backend; None where one of another package does not say."""
+        fingerprint = getattr(self.reader if backend == "reader" else self.generator, "fingerprint", None)
+        if fingerprint is None or backend == "reader":
+            return None if fingerprint is None else {"reader": fingerprint}
+        return {"generator": fingerprint, "options": self.options.model_dump(mode="json")}
+
+    def _compute(self, name: Stage, function: Callable[..., StageResult[Any]], inputs: tuple[Any, ...]) -> Any:
+        result = function(self, *inputs)
+        if name not in self._calls:
+            return result
+        calls = self._calls[name]
+        info = self.reader.info.model_copy(update={"prompts": dict(sorted(calls.prompts.items()))})
+        return result.model_copy(update={"reader": info, "usage": calls.usage})

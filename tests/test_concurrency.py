@@ -1,0 +1,95 @@
+"""The priority semaphore: never more holders than permits, lowest priority first, no permit lost."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from cow_service.concurrency import PrioritySemaphore
+
+
+class CanceledError(Exception):
+    """A wait was canceled."""
+
+
+def waiting(semaphore: PrioritySemaphore, priority: str, order: list[str]) -> threading.Thread:
+    def work() -> None:
+        with semaphore.held(priority):
+            order.append(priority)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    return thread
+
+
+def until_waiting(semaphore: PrioritySemaphore, count: int) -> None:
+    while len(semaphore._waiting) < count:
+        time.sleep(0.001)
+
+
+def test_the_lowest_priority_comes_first_and_ties_in_their_order() -> None:
+    semaphore, order = PrioritySemaphore(1), []
+    semaphore.acquire()
+    threads = []
+    for place, priority in enumerate(("c", "a", "b", "a")):
+        threads.append(waiting(semaphore, priority, order))
+        until_waiting(semaphore, place + 1)
+    semaphore.release()
+    for thread in threads:
+        thread.join(5)
+    assert order == ["a", "a", "b", "c"]
+
+
+def test_a_released_permit_goes_to_a_waiter_and_not_to_a_later_thread() -> None:
+    semaphore, order = PrioritySemaphore(1), []
+    semaphore.acquire("z")
+    thread = waiting(semaphore, "m", order)
+    until_waiting(semaphore, 1)
+    semaphore.release()
+    semaphore.acquire("a")  # asked later: "m" was granted the permit already
+    assert order == ["m"]
+    semaphore.release()
+    thread.join(5)
+
+
+def test_a_canceled_wait_leaves_its_permit_to_others() -> None:
+    semaphore = PrioritySemaphore(1)
+    semaphore.acquire()
+
+    def canceled() -> None:
+        raise CanceledError
+
+    with pytest.raises(CanceledError):
+        semaphore.acquire("a", canceled)
+    semaphore.release()
+    semaphore.acquire("b")
+    semaphore.release()
+
+
+@pytest.mark.parametrize("permits", [1, 3])
+def test_never_more_holders_than_permits(permits: int) -> None:
+    semaphore, lock, holders, most = PrioritySemaphore(permits), threading.Lock(), 0, 0
+
+    def counted(change: int) -> None:
+        nonlocal holders, most
+        with lock:
+            holders += change
+            most = max(most, holders)
+
+    def work(priority: str) -> None:
+        for _ in range(30):
+            with semaphore.held(priority):
+                counted(1)
+                time.sleep(0.0002)
+                counted(-1)
+
+    threads = [threading.Thread(target=work, args=(str(i),)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert holders == 0
+    assert 1 <= most <= permits
+    assert semaphore._permits == permits
