@@ -652,7 +652,7 @@ def test_what_is_no_model_of_this_process(tmp_path: Path, name: str | None) -> N
 def with_manifest(monkeypatch: pytest.MonkeyPatch, **rest: Any) -> None:
     toy = load_manifests()[NAME]
     changed = Manifest.model_validate(toy.model_dump() | {"name": "other"} | rest)
-    monkeypatch.setattr(loading, "load_manifests", lambda: {NAME: toy, "other": changed})
+    monkeypatch.setattr(loading, "mllm_manifests", lambda: {NAME: toy, "other": changed})
 
 
 def test_a_model_that_only_others_serve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, saved: Path) -> None:

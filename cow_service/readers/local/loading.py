@@ -1,4 +1,4 @@
-"""Makes the multimodal LLM of this process: its manifest found, its weights checked and loaded, foreign errors told."""
+"""Loads the multimodal LLM of this process: finds its manifest, checks its weights, translates foreign errors."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.processors import load_processor
 from cow_service.readers.local.tiny import make_tiny
 from cow_service.readers.local.worker import is_out_of_memory
+from cow_service.readers.mllm.models import mllm_manifests
 from cow_service.records import Record
 from cow_service.settings import Settings
 from cow_service.weights.lock import verify
-from cow_service.weights.manifests import Manifest, load_manifests
+from cow_service.weights.manifests import Manifest
 
 SHOWN = 4  # weights in an error
 
@@ -103,8 +104,8 @@ def device_map(device: str, spread: str) -> str | dict[str, str]:
 def _manifest(name: str | None) -> Manifest:
     if name is None:
         raise ReaderUnavailable(f"No multimodal LLM is chosen: set COW_MLLM to one of {_with_weights()}.")
-    manifest = load_manifests().get(name)
-    if manifest is None or manifest.door != "mllm":
+    manifest = mllm_manifests().get(name)
+    if manifest is None:
         raise ReaderUnavailable(
             f"'{name}' is no multimodal LLM that runs in this process: set COW_MLLM to one of "
             f"{_with_weights()}, or take the reader 'mllm'."
@@ -113,8 +114,8 @@ def _manifest(name: str | None) -> Manifest:
 
 
 def _with_weights() -> str:
-    found = load_manifests().values()
-    return ", ".join(one.name for one in found if one.door == "mllm" and (one.sources or one.architecture))
+    manifests = mllm_manifests().values()
+    return ", ".join(manifest.name for manifest in manifests if manifest.sources or manifest.architecture)
 
 
 def _from_folder(

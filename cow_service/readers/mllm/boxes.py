@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from cow_service.readers.mllm.coordinates import NUMBER, View, names_corners
-from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, name_words, text_of
+from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, is_number, name_words, text_of
 
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
 POINT_KEYS = ("point_2d", "point", "center", "centre", "point2d")
@@ -54,7 +54,7 @@ def places_in(value: object, view: View, name: str = "") -> Iterator[Place]:
     boxes, points = (view.coordinates.box, *BOX_KEYS), (view.coordinates.point, *POINT_KEYS)
     named = any(key in fields for key in (*boxes, *points))
     if named or names_corners(fields):
-        label = next((told for key in _LABEL_KEYS if (told := text_of(fields.get(key)))), name)
+        label = next((label for key in _LABEL_KEYS if (label := text_of(fields.get(key)))), name)
         yield Place(label, first_of(fields, *boxes) if named else value, first_of(fields, *points))
         return
     for key, held in fields.items():
@@ -92,8 +92,3 @@ def chosen(places: Sequence[Place], wanted: str) -> Place:
         labels = ", ".join(f"'{place.label}'" for place in distinct)
         raise ReplyError(f"{len(distinct)} places are given ({labels}); give one box, that of '{wanted}'")
     return named[0]
-
-
-def is_number(value: object) -> bool:
-    """Whether a value is a number; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool)

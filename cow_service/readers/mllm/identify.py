@@ -120,9 +120,9 @@ def _in_prose(said: str) -> list[str]:
     """A name told in words: behind "the moving object is", or the whole reply if it is nothing but a phrase."""
     if is_broken_json(said):
         return []
-    told = [_unquoted(found["name"]) for found in _SAID.finditer(said)]
-    if told:
-        return told[-1:]
+    names = [_unquoted(found["name"]) for found in _SAID.finditer(said)]
+    if names:
+        return names[-1:]
     phrase = _unquoted(said)
     is_phrase = "\n" not in said and len(phrase.split()) <= 12 and not re.search(r"[.!?:;{}\[\]]", phrase)
     return [phrase] if is_phrase and not _SENTENCE.search(phrase) else []

@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any, cast
+from typing import Any, TypeGuard, cast
 
 from json_repair import repair_json
 
@@ -72,6 +72,11 @@ def first_of(fields: dict[str, Any], *names: str) -> Any:
 def is_none(value: object) -> bool:
     """Whether a field says that there is nothing: null, an empty list, or a word for it."""
     return value is None or value == [] or (isinstance(value, str) and value.strip().lower() in _NOTHING)
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether a value is a number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def truth_of(value: object) -> bool | None:

@@ -36,8 +36,11 @@ def is_arrow(found: Sequence[Item], at: int) -> bool:
 
 def read_arrow(found: Sequence[Item]) -> ArrowSense | None:
     """Along or against the drawn arrow; None where none is named, or where it only marks an object."""
-    senses = (_arrow_sense(found, at) for at in range(len(found)) if is_arrow(found, at))
-    return next((sense for sense in senses if sense), None)
+    for at in range(len(found)):
+        sense = _arrow_sense(found, at) if is_arrow(found, at) else None
+        if sense is not None:
+            return sense
+    return None
 
 
 def _arrow_sense(found: Sequence[Item], at: int) -> ArrowSense | None:
