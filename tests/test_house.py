@@ -49,8 +49,8 @@ def test_the_pipeline_is_read_at_a_glance() -> None:
         "import cow_service",
         "import cow_service.cli.main",
         "from cow_service.api.app import create_app; from cow_service.service import Service; "
-        "from cow_service.jobs.engine import Engine; from cow_service.settings import Settings; "
-        "s = Service(Settings(data_dir='x')); create_app(Engine(s)); s.models()",
+        "from cow_service.jobs.engine import JobEngine; from cow_service.settings import Settings; "
+        "s = Service(Settings(data_dir='x')); create_app(JobEngine(s)); s.models()",
     ],
 )
 def test_nothing_heavy_is_imported(statement: str) -> None:

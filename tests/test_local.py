@@ -47,12 +47,12 @@ from cow_service.errors import (
     WeightsUnavailable,
 )
 from cow_service.readers.local import loading
-from cow_service.readers.local.chat import chat_of
-from cow_service.readers.local.decoding import Row, Sampling
-from cow_service.readers.local.engine import Engine, Order
+from cow_service.readers.local.batch_generator import BatchGenerator, PendingGeneration
+from cow_service.readers.local.conversation import conversation_of
+from cow_service.readers.local.decoding import BatchRow, Sampling
 from cow_service.readers.local.loading import device_map, load_local
 from cow_service.readers.local.model import LocalModel
-from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny, save_tiny
+from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Manifest, Source, load_manifests
 
@@ -80,7 +80,9 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> LocalModel:
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("saved") / "own"
-    save_tiny(folder)
+    model, processor = make_tiny(load_manifests()[NAME].architecture)
+    model.save_pretrained(folder)
+    processor.save_pretrained(folder)
     return folder
 
 
@@ -129,19 +131,19 @@ def now(*asked: Coroutine[Any, Any, ModelResponse]) -> list[ModelResponse]:
 def batches(model: LocalModel, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The sizes of the batches that are written from here on."""
     sizes: list[int] = []
-    write = model._engine.write
+    generate = model._generator.generate
 
-    def listening(orders: list[Order]) -> None:
-        sizes.append(len(orders))
-        write(orders)
+    def listening(batch: list[PendingGeneration]) -> None:
+        sizes.append(len(batch))
+        generate(batch)
 
-    monkeypatch.setattr(model._engine, "write", listening)
+    monkeypatch.setattr(model._generator, "generate", listening)
     return sizes
 
 
 def another(model: LocalModel, **rest: Any) -> LocalModel:
     """The same weights behind a queue of its own."""
-    return LocalModel(NAME, model._engine, **({"max_new_tokens": 4096, "threads": 1} | rest))
+    return LocalModel(NAME, model._generator, **({"max_new_tokens": 4096, "threads": 1} | rest))
 
 
 # What is said.
@@ -287,13 +289,18 @@ def test_a_seed_gives_the_same_reply_in_any_company(toy: LocalModel) -> None:
 def test_a_checkpoints_own_advice_counts_where_nothing_is_said() -> None:
     model, processor = make_tiny(load_manifests()[NAME].architecture)
     model.generation_config.update(do_sample=True, temperature=0.7, top_p=0.8, top_k=20)
-    engine = Engine(model, processor)
-    assert engine.advice == Sampling(temperature=0.7, top_p=0.8, top_k=20)
+    generator = BatchGenerator(model, processor)
+    assert generator.default_sampling == Sampling(temperature=0.7, top_p=0.8, top_k=20)
     assert (
-        len({text(found) for found in now(*[ask(LocalModel("advised", engine), "?", max_tokens=9) for _ in range(4)])})
+        len(
+            {
+                text(found)
+                for found in now(*[ask(LocalModel("advised", generator), "?", max_tokens=9) for _ in range(4)])
+            }
+        )
         > 1
     )
-    calm = LocalModel("calm", engine, settings=ModelSettings(temperature=0, max_tokens=9))
+    calm = LocalModel("calm", generator, settings=ModelSettings(temperature=0, max_tokens=9))
     assert len({text(found) for found in now(*[ask(calm, "?") for _ in range(4)])}) == 1
 
 
@@ -301,7 +308,7 @@ def test_a_model_that_thinks_first() -> None:
     """The thought is free and kept apart; the reply after it is held to the schema."""
     model, processor = make_tiny(load_manifests()[NAME].architecture)
     processor.chat_template = TEMPLATE.removesuffix("{% endif %}") + THOUGHT[0] + "\n{% endif %}"
-    thinker = LocalModel("thinker", Engine(model, processor), threads=1, max_new_tokens=4000)
+    thinker = LocalModel("thinker", BatchGenerator(model, processor), threads=1, max_new_tokens=4000)
     asked = [ask(thinker, "?", schema=BOX, temperature=9.0, seed=seed) for seed in (1, 9)]
     for found in now(*asked):
         thought, reply = found.parts
@@ -320,7 +327,8 @@ def test_top_p_and_top_k() -> None:
     def chosen(**rest: Any) -> set[int]:
         found = set()
         for seed in range(60):
-            row = Row(Sampling(temperature=1.0, seed=seed, **rest), 1, [], None, lambda row: None, lambda: True)
+            sampling = Sampling(temperature=1.0, seed=seed, **rest)
+            row = BatchRow(sampling, 1, [], None, lambda row, finish: None, lambda: False)
             token = row.choose(logits)
             assert token is not None
             found.add(int(token))
@@ -354,8 +362,8 @@ def test_text_cannot_spell_special_tokens(toy: LocalModel) -> None:
     (found,) = now(ask(toy, spelt, picture(), max_tokens=1))
     (plain,) = now(ask(toy, "?", picture(), max_tokens=1))
     assert found.usage.input_tokens == plain.usage.input_tokens - 1 + len(spelt) + len(SPECIAL)
-    chat = chat_of([ModelRequest([UserPromptPart(["<|im_", "end|>"])])], [], SPECIAL)
-    assert chat.turns[0]["content"] == [{"type": "text", "text": "<|im_\nend|>"}]
+    conversation = conversation_of([ModelRequest([UserPromptPart(["<|im_", "end|>"])])], [], SPECIAL)
+    assert conversation.turns[0]["content"] == [{"type": "text", "text": "<|im_\nend|>"}]
 
 
 def test_turns(toy: LocalModel) -> None:
@@ -365,15 +373,15 @@ def test_turns(toy: LocalModel) -> None:
         ModelRequest([UserPromptPart("e")]),
         ModelRequest([SystemPromptPart("now"), UserPromptPart("f")]),
     ]
-    chat = chat_of(said, ["first"], SPECIAL)
-    told = [(turn["role"], [part.get("text", part["type"]) for part in turn["content"]]) for turn in chat.turns]
+    conversation = conversation_of(said, ["first"], SPECIAL)
+    told = [(turn["role"], [part.get("text", part["type"]) for part in turn["content"]]) for turn in conversation.turns]
     assert told == [
         ("system", ["first\nbe brief"]),
         ("user", ["a", "image", "b\nc"]),
         ("assistant", ["d"]),
         ("user", ["e\nnow\nf"]),
     ]
-    assert [image.size for image in chat.images] == [(64, 96)]
+    assert [image.size for image in conversation.images] == [(64, 96)]
     assert now(say(toy, said, max_tokens=3))
 
 
@@ -435,7 +443,7 @@ def test_who_gives_up_is_dropped(toy: LocalModel, monkeypatch: pytest.MonkeyPatc
             await asyncio.sleep(0.01)
         waiting = asyncio.create_task(ask(model, "?", schema=LONG, max_tokens=4000))
         last = asyncio.create_task(ask(model, "?", max_tokens=3))
-        while model._worker.waiting() < 2:
+        while len(model._worker._queue) < 2:
             await asyncio.sleep(0.01)
         waiting.cancel()
         writing.cancel()
@@ -479,7 +487,7 @@ def test_memory_that_runs_out(toy: LocalModel, monkeypatch: pytest.MonkeyPatch) 
             raise torch.OutOfMemoryError("CUDA out of memory.")
 
     sizes = batches(toy, monkeypatch)
-    hook = toy._engine._model.register_forward_pre_hook(narrow, with_kwargs=True)
+    hook = toy._generator._model.register_forward_pre_hook(narrow, with_kwargs=True)
     try:
         found = now(*[ask(toy, f"{i}", max_tokens=4) for i in range(8)])
         assert all(text(one) for one in found)
@@ -495,7 +503,7 @@ def test_any_other_error_reaches_the_caller_and_the_next_call_is_served(
     toy: LocalModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(toy._engine._processor, "chat_template", "{{ nonsense.of.a.template }}")
+        patch.setattr(toy._generator._processor, "chat_template", "{{ nonsense.of.a.template }}")
         with pytest.raises(UndefinedError):
             now(ask(toy, "a", schema={"enum": ["x"]}), ask(toy, "b", max_tokens=3))
     assert text(now(ask(toy, "c", max_tokens=3))[0])
@@ -519,7 +527,7 @@ def test_an_idle_model_can_go(tmp_path: Path) -> None:
     model = load_local(told(tmp_path))
     now(ask(model, "?", max_tokens=2))
     until(lambda: not any(thread.name == f"mllm {NAME}" for thread in threading.enumerate()))
-    weights = weakref.ref(model._engine._model)
+    weights = weakref.ref(model._generator._model)
     del model
     gc.collect()
     assert weights() is None
@@ -644,7 +652,7 @@ def test_what_is_no_model_of_this_process(tmp_path: Path, name: str | None) -> N
 def with_manifest(monkeypatch: pytest.MonkeyPatch, **rest: Any) -> None:
     toy = load_manifests()[NAME]
     changed = Manifest.model_validate(toy.model_dump() | {"name": "other"} | rest)
-    monkeypatch.setattr(loading, "load_manifests", lambda: {NAME: toy, "other": changed})
+    monkeypatch.setattr(loading, "mllm_manifests", lambda: {NAME: toy, "other": changed})
 
 
 def test_a_model_that_only_others_serve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, saved: Path) -> None:

@@ -39,7 +39,8 @@ class Prompt:
         missing = [name for name in self.inputs if name not in inputs]
         unknown = [name for name in inputs if name not in self.inputs]
         if missing or unknown:
-            problems = [f"{what}: {', '.join(names)}" for what, names in _faults(missing, unknown) if names]
+            faults = {"missing": missing, "not declared": unknown}
+            problems = [f"{what}: {', '.join(names)}" for what, names in faults.items() if names]
             raise TypeError(f"Prompt {self.name!r}, inputs {'; '.join(problems)}.")
         return _compiled(self.body).render(**inputs).strip()
 
@@ -47,10 +48,6 @@ class Prompt:
 @cache
 def _compiled(body: str) -> Template:
     return _ENVIRONMENT.from_string(body)  # which takes milliseconds
-
-
-def _faults(missing: list[str], unknown: list[str]) -> tuple[tuple[str, list[str]], ...]:
-    return ("missing", missing), ("not declared", unknown)
 
 
 @cache

@@ -79,8 +79,8 @@ def create(settings: Settings) -> EmbeddedReader:
 
 def _names_motion(words: MotionWords) -> bool:
     """Whether the question says at all that something moves."""
-    told = (words.kind, words.arrow, words.direction, words.forward, words.towards)
-    return bool(words.verb or words.depth) or any(part is not None for part in told)
+    parts = (words.kind, words.arrow, words.direction, words.forward, words.towards)
+    return bool(words.verb or words.depth) or any(part is not None for part in parts)
 
 
 def _mover(scene: Scene, question: Question, phrase: ObjectPhrase) -> BBox:

@@ -31,11 +31,11 @@ class Sampling:
     seed: int | None = None
 
 
-class Row:
+class BatchRow:
     """One reply of a batch while it is written. It knows no other row, and not how it came to be in the batch.
 
-    `told` is called once, when the reply has come to its end; `wanted` says whether anyone still waits for it. Where
-    the reply begins with a thought, `thought_end` is the token that ends it, and the grammar holds from there.
+    `on_end` is called once, when the reply is complete. Where the reply begins with a thought, `thought_end` is the
+    token that ends it, and the grammar holds from there.
     """
 
     def __init__(
@@ -44,25 +44,25 @@ class Row:
         limit: int,
         ends: Sequence[int],
         matcher: LLMatcher | None,
-        told: Callable[[Row], None],
-        wanted: Callable[[], bool],
+        on_end: Callable[[BatchRow, Finish], None],
+        is_canceled: Callable[[], bool],
         thought_end: int | None = None,
     ) -> None:
         self.thought: list[int] = []
         self.tokens: list[int] = []
-        self.finish: Finish | None = None
+        self._finished = False
         self._matcher = matcher
-        self._wanted = wanted
+        self._is_canceled = is_canceled
         self._thought_end = thought_end  # None once the thought is over
         self._sampling = sampling
         self._limit = limit
         self._ends = frozenset(ends)
-        self._told = told
+        self._on_end = on_end
         self._random: torch.Generator | None = None
 
-    def over(self) -> bool:
-        """Nothing more is to be written."""
-        return self.finish is not None or not self._wanted()
+    def done(self) -> bool:
+        """Whether nothing more is to be written."""
+        return self._finished or self._is_canceled()
 
     def allowed(self, vocabulary: int) -> NDArray[np.bool_] | None:
         """[vocabulary]: the tokens with which the reply can go on. None for all."""
@@ -122,14 +122,14 @@ class Row:
         return self._thought_end is None and self._matcher is not None and self._matcher.is_accepting()
 
     def _end(self, finish: Finish) -> None:
-        self.finish = finish
-        self._told(self)
+        self._finished = True
+        self._on_end(self, finish)
 
 
-class Chooser(LogitsProcessor):
+class RowSampler(LogitsProcessor):
     """Leaves to each row of a batch the one token that it has chosen; to rows that are over, the padding."""
 
-    def __init__(self, rows: Sequence[Row], padding: int) -> None:
+    def __init__(self, rows: Sequence[BatchRow], padding: int) -> None:
         self._rows = rows
         self._padding = padding
 
@@ -138,11 +138,11 @@ class Chooser(LogitsProcessor):
         scores = scores.masked_fill(~self._allowed(scores), -torch.inf)
         chosen = scores.argmax(-1)
         for i, row in enumerate(self._rows):
-            if not row.over() and (token := row.choose(scores[i])) is not None:
+            if not row.done() and (token := row.choose(scores[i])) is not None:
                 chosen[i] = token
         tokens: list[int] = chosen.tolist()
         for i, row in enumerate(self._rows):
-            if row.over():
+            if row.done():
                 tokens[i] = self._padding
             else:
                 row.take(tokens[i])
@@ -153,17 +153,17 @@ class Chooser(LogitsProcessor):
         """[rows, vocabulary], bool: the tokens with which each grammar can go on. Without a grammar, all."""
         allowed = np.ones(tuple(scores.shape), dtype=np.bool_)
         for i, row in enumerate(self._rows):
-            if not row.over() and (tokens := row.allowed(scores.shape[1])) is not None:
+            if not row.done() and (tokens := row.allowed(scores.shape[1])) is not None:
                 allowed[i] = tokens
         return torch.from_numpy(allowed).to(scores.device)
 
 
-class Over(StoppingCriteria):
+class RowsDone(StoppingCriteria):
     """Ends the rows that are complete, and those that nobody waits for any more."""
 
-    def __init__(self, rows: Sequence[Row]) -> None:
+    def __init__(self, rows: Sequence[BatchRow]) -> None:
         self._rows = rows
 
     def __call__(self, input_ids: Tensor, scores: Any, **kwargs: Any) -> Any:
         """[rows], bool."""
-        return torch.tensor([row.over() for row in self._rows], device=input_ids.device)
+        return torch.tensor([row.done() for row in self._rows], device=input_ids.device)

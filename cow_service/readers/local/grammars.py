@@ -30,9 +30,9 @@ class Grammars:
         Raises `UserError` for a schema that is wrong or that says what cannot be held to, such as `uniqueItems`.
         """
         grammar = LLMatcher.grammar_from_json_schema(json.dumps(_closed(schema)), overrides=_LAYOUT)
-        wrong, told = LLMatcher.validate_grammar_with_warnings(grammar, self._tokens)
-        if wrong:
-            raise UserError(f"Replies cannot be held to this JSON schema: {told[0]}")
+        is_error, messages = LLMatcher.validate_grammar_with_warnings(grammar, self._tokens)
+        if is_error:
+            raise UserError(f"Replies cannot be held to this JSON schema: {messages[0]}")
         return grammar
 
     def matcher(self, grammar: str) -> LLMatcher:

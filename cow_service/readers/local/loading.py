@@ -1,4 +1,4 @@
-"""Makes the multimodal LLM of this process: its manifest found, its weights checked and loaded, foreign errors told."""
+"""Loads the multimodal LLM of this process: finds its manifest, checks its weights, translates foreign errors."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from pydantic_ai.settings import ModelSettings
 from transformers import AutoModelForImageTextToText, PreTrainedModel, ProcessorMixin
 
 from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
-from cow_service.readers.local.engine import Engine
+from cow_service.readers.local.batch_generator import BatchGenerator
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.processors import load_processor
 from cow_service.readers.local.tiny import make_tiny
+from cow_service.readers.mllm.models import mllm_manifests
 from cow_service.records import Record
 from cow_service.settings import Settings
 from cow_service.weights.device import choose_device, is_out_of_memory
 from cow_service.weights.lock import verify
-from cow_service.weights.manifests import Manifest, load_manifests
+from cow_service.weights.manifests import Manifest
 
 SHOWN = 4  # weights in an error
 
 # Seeds and lazy initialisation are the whole process's: two models made at once would get into each other's weights.
-_one_at_a_time = Lock()
+_loading = Lock()
 
 
 class LocalOptions(Record):
@@ -67,18 +68,18 @@ def load_local(settings: Settings) -> LocalModel:
         places = ", ".join(".".join(str(part) for part in found["loc"]) for found in error.errors())
         raise ReaderUnavailable(f"The manifest of '{manifest.name}' is wrong in `local`: {places}.") from error
     places = device_map(settings.device, options.device_map)
-    with _one_at_a_time, _told(manifest.name):
+    with _loading, _translated(manifest.name):
         if own is None and not manifest.sources:
             model, processor = make_tiny(manifest.architecture)
             torch.nn.Module.to(model, torch.device(places[""] if isinstance(places, dict) else "cuda"))
         else:
             folder = own or verify(manifest.sources["weights"], settings.weights_dir, manifest.name)
             model, processor = _from_folder(folder, manifest, options, places)
-        engine = Engine(model, processor)
+        generator = BatchGenerator(model, processor)
     defaults: Any = {name: value for name, value in manifest.defaults.items() if name in ModelSettings.__annotations__}
     return LocalModel(
         manifest.name,
-        engine,
+        generator,
         max_batch=options.max_batch,
         max_new_tokens=options.max_new_tokens,
         threads=options.threads,
@@ -96,8 +97,8 @@ def device_map(device: str, spread: str) -> str | dict[str, str]:
 def _manifest(name: str | None) -> Manifest:
     if name is None:
         raise ReaderUnavailable(f"No multimodal LLM is chosen: set COW_MLLM to one of {_with_weights()}.")
-    manifest = load_manifests().get(name)
-    if manifest is None or manifest.role != "mllm":
+    manifest = mllm_manifests().get(name)
+    if manifest is None:
         raise ReaderUnavailable(
             f"'{name}' is no multimodal LLM that runs in this process: set COW_MLLM to one of "
             f"{_with_weights()}, or take the reader 'mllm'."
@@ -106,8 +107,8 @@ def _manifest(name: str | None) -> Manifest:
 
 
 def _with_weights() -> str:
-    found = load_manifests().values()
-    return ", ".join(one.name for one in found if one.role == "mllm" and (one.sources or one.architecture))
+    manifests = mllm_manifests().values()
+    return ", ".join(manifest.name for manifest in manifests if manifest.sources or manifest.architecture)
 
 
 def _from_folder(
@@ -158,7 +159,7 @@ def _letters(name: str) -> str:
 
 
 @contextmanager
-def _told(name: str) -> Generator[None]:
+def _translated(name: str) -> Generator[None]:
     """Whatever transformers, safetensors or PyTorch raise becomes a `CowError` with the reason, without folders."""
     try:
         yield

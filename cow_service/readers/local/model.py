@@ -12,10 +12,10 @@ from pydantic_ai.settings import ModelSettings
 from pydantic_ai.usage import RequestUsage
 
 from cow_service.errors import MllmUnavailable
-from cow_service.readers.local.chat import chat_of
+from cow_service.readers.local.batch_generator import BatchGenerator, GenerationRequest
+from cow_service.readers.local.conversation import conversation_of
 from cow_service.readers.local.decoding import Sampling
-from cow_service.readers.local.engine import Engine, Wish
-from cow_service.readers.local.worker import Worker
+from cow_service.readers.local.worker import BatchWorker
 
 PROFILE = ModelProfile(
     supports_tools=False,
@@ -49,7 +49,7 @@ class LocalModel(Model[None]):
     def __init__(
         self,
         name: str,
-        engine: Engine,
+        generator: BatchGenerator,
         *,
         max_batch: int = 4,
         max_new_tokens: int = 1024,
@@ -62,8 +62,8 @@ class LocalModel(Model[None]):
         """
         super().__init__(profile=PROFILE, settings=settings)
         self._name = name
-        self._engine = engine
-        self._worker = Worker(engine, name, max_batch, threads)
+        self._generator = generator
+        self._worker = BatchWorker(generator, name, max_batch, threads)
         self._max_new_tokens = max_new_tokens
 
     @property
@@ -91,13 +91,13 @@ class LocalModel(Model[None]):
         settings, parameters = self.prepare_request(model_settings, model_request_parameters)
         settings = settings or ModelSettings()
         # Decoding images takes long enough to hold up an event loop.
-        wish = await asyncio.to_thread(self._wish, messages, settings, parameters)
+        request = await asyncio.to_thread(self._generation_request, messages, settings, parameters)
         timeout = settings.get("timeout")
         seconds = timeout if isinstance(timeout, int | float) else None
         try:
             # Giving up cancels the future, and so takes the call out of the queue or ends its reply.
             async with asyncio.timeout(seconds):
-                reply = await asyncio.wrap_future(self._worker.submit(wish))
+                reply = await asyncio.wrap_future(self._worker.submit(request))
         except TimeoutError as error:
             raise MllmUnavailable(
                 f"'{self._name}' gave no reply in {seconds:g} s. Allow it more (COW_MLLM_TIMEOUT), send fewer requests "
@@ -111,26 +111,28 @@ class LocalModel(Model[None]):
             finish_reason=reply.finish,
         )
 
-    def _wish(self, messages: list[ModelMessage], settings: ModelSettings, parameters: ModelRequestParameters) -> Wish:
+    def _generation_request(
+        self, messages: list[ModelMessage], settings: ModelSettings, parameters: ModelRequestParameters
+    ) -> GenerationRequest:
         if parameters.function_tools:
             raise UserError("A model in this process takes no tools.")
-        if any(part.part_kind in _UNPREPARED for said in messages for part in said.parts):
+        if any(part.part_kind in _UNPREPARED for message in messages for part in message.parts):
             messages = self.prepare_messages(messages, parameters)  # as agents do before they ask
         output = parameters.output_object if parameters.output_mode == "native" else None
-        instructions = self._get_instruction_parts(messages, parameters) or []
-        return Wish(
-            chat=chat_of(messages, [part.content for part in instructions], self._engine.special()),
-            sampling=_sampling(settings, self._engine.advice),
+        instructions = [part.content for part in self._get_instruction_parts(messages, parameters) or []]
+        return GenerationRequest(
+            conversation=conversation_of(messages, instructions, self._generator.special_tokens),
+            sampling=_sampling(settings, self._generator.default_sampling),
             limit=min(settings.get("max_tokens", self._max_new_tokens), self._max_new_tokens),
-            grammar=None if output is None else self._engine.grammar(output.json_schema),
+            grammar=None if output is None else self._generator.grammars.grammar(output.json_schema),
         )
 
 
-def _sampling(settings: ModelSettings, advice: Sampling) -> Sampling:
+def _sampling(settings: ModelSettings, default: Sampling) -> Sampling:
     found = Sampling(
-        temperature=settings.get("temperature", advice.temperature),
-        top_p=settings.get("top_p", advice.top_p),
-        top_k=settings.get("top_k", advice.top_k),
+        temperature=settings.get("temperature", default.temperature),
+        top_p=settings.get("top_p", default.top_p),
+        top_k=settings.get("top_k", default.top_k),
         seed=settings.get("seed"),
     )
     if found.temperature < 0 or not 0 < found.top_p <= 1 or found.top_k < 0 or settings.get("max_tokens", 1) < 1:

@@ -7,7 +7,6 @@ deployment out.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,7 +22,6 @@ from transformers import (
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 from cow_service.readers.local.processors import still
-from cow_service.weights.manifests import load_manifests
 
 NAME = "tiny-qwen3-vl"
 SEED = 0
@@ -56,13 +54,6 @@ def make_tiny(architecture: Mapping[str, Any]) -> tuple[Qwen3VLForConditionalGen
     patch = architecture["vision_config.patch_size"]
     images = Qwen2VLImageProcessorPil(patch_size=patch, temporal_patch_size=2, merge_size=2, size=PIXELS)
     return model, still(Qwen3VLProcessor)(images, tokenizer, chat_template=TEMPLATE)
-
-
-def save_tiny(folder: Path) -> None:
-    """Writes the toy of the manifest as a checkpoint, as its real sisters are published."""
-    model, processor = make_tiny(load_manifests()[NAME].architecture)
-    model.save_pretrained(folder)
-    processor.save_pretrained(folder)
 
 
 def _configuration(architecture: Mapping[str, Any], tokenizer: PreTrainedTokenizerFast) -> Qwen3VLConfig:

@@ -133,17 +133,14 @@ def _in_prose(said: str, options: Sequence[AnswerOption]) -> list[AnswerReading]
     """Answers that are announced as such in a text; else its first or last line, where that is one."""
     if is_broken_json(said):
         return []
-    told = announced(said)
-    lines = lines_of(said)
+    answers, lines = announced(said), lines_of(said)
     if options:
-        found = [option for each in told if (option := _option(each, options))]
-        if not found and not told:
-            found = [option for line in lines if (option := _option(line, options))]
-        if not found and told:
-            raise ReplyError(f"the answer '{told[-1][:80]}' is none of the options; {_remedy(options)}")
-        return [_of(option, "" if said == option.letter else said[:MAX_REASONING]) for option in found]
-    if told:
-        return [_read_open(answer, said[:MAX_REASONING]) for answer in told]
+        found = [option for each in answers or lines if (option := _option(each, options))]
+        if answers and not found:
+            raise ReplyError(f"the answer '{answers[-1][:80]}' is none of the options; {_remedy(options)}")
+        return [_reading_of(option, "" if said == option.letter else said[:MAX_REASONING]) for option in found]
+    if answers:
+        return [_read_open(answer, said[:MAX_REASONING]) for answer in answers]
     return [_read_open(said, "")] if len(lines) == 1 and not said.startswith(("{", "[")) else []
 
 
@@ -153,14 +150,14 @@ def _read(answer: Any, reasoning: str, options: Sequence[AnswerOption]) -> Answe
     text = text_of(answer)
     option = _option(text, options)
     if option is None and text:
-        told = [found for each in announced(text) if (found := _option(each, options))]
-        option = told[0] if len({found.letter for found in told}) == 1 else None
+        found = {option.letter: option for each in announced(text) if (option := _option(each, options))}
+        option = next(iter(found.values())) if len(found) == 1 else None
     if option is None:
         raise ReplyError(f"the answer '{str(answer)[:80]}' is none of the options; {_remedy(options)}")
-    return _of(option, reasoning)
+    return _reading_of(option, reasoning)
 
 
-def _of(option: AnswerOption, reasoning: str) -> AnswerReading:
+def _reading_of(option: AnswerOption, reasoning: str) -> AnswerReading:
     return AnswerReading(option.letter, says_not_sure(option.text), reasoning)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from cow_service.readers.mllm.coordinates import NUMBER, View, names_corners
-from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, text_of
+from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, is_number, name_words, text_of
 
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
 POINT_KEYS = ("point_2d", "point", "center", "centre", "point2d")
@@ -30,7 +30,6 @@ _POINT_TAG = re.compile(
 # Two pairs are corners where nothing but these stands between; in a sentence they may be two objects.
 CORNER_PAIRS = re.compile(rf"{_PAIR}\s*(?:,|-|–|→|to|and|through)?\s*{_PAIR}")
 _FOUR = re.compile(rf"[(\[]?\s*({NUMBER})\s*,\s*({NUMBER})\s*,\s*({NUMBER})\s*,\s*({NUMBER})\s*[)\]]?")
-_DETERMINERS = frozenset({"the", "a", "an", "this", "that"})
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ def places_in(value: object, view: View, name: str = "") -> Iterator[Place]:
     boxes, points = (view.coordinates.box, *BOX_KEYS), (view.coordinates.point, *POINT_KEYS)
     named = any(key in fields for key in (*boxes, *points))
     if named or names_corners(fields):
-        label = next((told for key in _LABEL_KEYS if (told := text_of(fields.get(key)))), name)
+        label = next((label for key in _LABEL_KEYS if (label := text_of(fields.get(key)))), name)
         yield Place(label, first_of(fields, *boxes) if named else value, first_of(fields, *points))
         return
     for key, held in fields.items():
@@ -85,30 +84,11 @@ def chosen(places: Sequence[Place], wanted: str) -> Place:
     distinct = list({repr((place.box, place.point)): place for place in places}.values())
     if len(distinct) == 1:
         return distinct[0]
-    named = [place for place in distinct if same_words(place.label, wanted)]
+    named = [place for place in distinct if name_words(place.label) == name_words(wanted)]
     if not named:
-        shared = [len(set(_words(place.label)) & set(_words(wanted))) for place in distinct]
+        shared = [len(set(name_words(place.label)) & set(name_words(wanted))) for place in distinct]
         named = [place for place, count in zip(distinct, shared, strict=True) if count == max(shared) > 0]
     if len(named) != 1:
         labels = ", ".join(f"'{place.label}'" for place in distinct)
         raise ReplyError(f"{len(distinct)} places are given ({labels}); give one box, that of '{wanted}'")
     return named[0]
-
-
-def same_words(one: str, other: str) -> bool:
-    """Whether two names are the same but for articles, case and punctuation."""
-    return _words(one) == _words(other)
-
-
-def shares_words(one: str, other: str) -> bool:
-    """Whether two names have a word in common."""
-    return bool(set(_words(one)) & set(_words(other)))
-
-
-def is_number(value: object) -> bool:
-    """Whether a value is a number; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _words(name: str) -> list[str]:
-    return [word for word in re.findall(r"\w+", name.lower()) if word not in _DETERMINERS]

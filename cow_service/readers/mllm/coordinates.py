@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from cow_service.readers.mllm.replies import ReplyError
+from cow_service.readers.mllm.replies import ReplyError, fields_of, is_number
 from cow_service.records import BBox, Point
 from cow_service.weights.manifests import Coordinates, ImageSize
 
@@ -153,21 +153,16 @@ def _numbers(written: object) -> list[float]:
     """The finite numbers that were written, lists inside lists unfolded; none where anything else is among them."""
     if isinstance(written, str):
         return [float(found) for found in re.findall(NUMBER, written)] if _NUMBERS.fullmatch(written) else []
-    if isinstance(written, bool) or not isinstance(written, int | float | list | tuple):
-        return []
-    if isinstance(written, int | float):
+    if is_number(written):
         return [float(written)] if abs(written) < HUGE else []  # NaN is not less than anything
-    held = cast("Sequence[Any]", written)
-    parts = [_numbers(part) for part in held]
+    parts = [_numbers(part) for part in cast("Sequence[object]", written)] if isinstance(written, list | tuple) else []
     return [number for part in parts for number in part] if all(parts) else []
 
 
 def _corners(written: object) -> object:
     """The two points of an object such as {"start": ..., "end": ...}; anything else as it is."""
-    if isinstance(written, dict):
-        held = {str(name).lower(): value for name, value in cast("dict[object, Any]", written).items()}
-        return next(([held[a], held[b]] for a, b in _CORNERS if a in held and b in held), written)
-    return written
+    fields = fields_of(written)
+    return next(([fields[a], fields[b]] for a, b in _CORNERS if a in fields and b in fields), written)
 
 
 def _by_name(written: object, count: int) -> list[float] | None:
@@ -175,9 +170,7 @@ def _by_name(written: object, count: int) -> list[float] | None:
     if isinstance(written, list) and len(cast("list[object]", written)) == count:
         parts = [_by_name(part, 1) for part in cast("list[object]", written)]
         return None if None in parts else [number for part in parts if part is not None for number in part]
-    if not isinstance(written, dict):
-        return None
-    held = {str(name).lower(): value for name, value in cast("dict[object, Any]", written).items()}
+    held = fields_of(written)
     for x, y, width, height in _SIZED if count == 2 else ():
         if {x, y, width, height} <= set(held):
             left, top, wide, high = ((_numbers(held[name]) or [math.nan])[0] for name in (x, y, width, height))

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, cast
 
-from cow_service.readers.mllm.boxes import BOX_KEYS, CORNER_PAIRS, POINT_KEYS, is_number
+from cow_service.readers.mllm.boxes import BOX_KEYS, CORNER_PAIRS, POINT_KEYS
 from cow_service.readers.mllm.coordinates import LEAST_LENGTH, View
-from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, is_none, text_of, truth_of
+from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, is_none, is_number, text_of, truth_of
 from cow_service.records import Cue, Point
 
 CameraSense = Literal["towards", "away"]
@@ -76,10 +76,10 @@ def _lines(value: object, view: View) -> Iterator[Line]:
                 yield from _lines(cast("dict[str, object]", held), view)
         return
     written = first_of(fields, *_DIRECTION_KEYS) if any(key in fields for key in _DIRECTION_KEYS) else value
-    told = text_of(fields.get("cue")).lower()
-    cue: Cue | None = next((cue for word, cue in _CUE_WORDS if word in told), None)
+    named = text_of(fields.get("cue")).lower()
+    cue: Cue | None = next((cue for word, cue in _CUE_WORDS if word in named), None)
     yield Line(
-        ends=None if told == "none" and _is_zero(written) else _ends(written, view),
+        ends=None if named == "none" and _is_zero(written) else _ends(written, view),
         cue=cue,
         along_arrow=truth_of(fields.get("along_arrow")),
         camera=_CAMERA.get(text_of(fields.get("camera")).lower().strip(" .")),

@@ -10,7 +10,7 @@ _DENIAL = re.compile(
     re.IGNORECASE,
 )
 _POINTING = frozenset({"it", "this", "that", "them", "they", "object", "the object", "moving object"})
-_TOLD = re.compile(r"\b(?:final\s+)?answer\b[\s*_\"'`]*(?:is|:|=)[\s*_\"'`]*(?P<said>[^\n]*)", re.IGNORECASE)
+_ANSWER_IS = re.compile(r"\b(?:final\s+)?answer\b[\s*_\"'`]*(?:is|:|=)[\s*_\"'`]*(?P<said>[^\n]*)", re.IGNORECASE)
 _TAGGED = re.compile(r"<answer>(?P<said>.*?)(?:</answer>|$)", re.IGNORECASE | re.DOTALL)
 _BOXED = re.compile(r"\\boxed\{(?:\\\w+\{)*(?P<said>[^{}]*)\}")
 # A letter alone behind such words; with a word after it, it may be an article.
@@ -36,11 +36,11 @@ def is_broken_json(said: str) -> bool:
 def announced(said: str) -> list[str]:
     """Answers that a text announces as such, the surest kind of announcement alone."""
     text = _SPECIAL.sub(" ", said)
-    for pattern in (_BOXED, _TAGGED, _TOLD, _CHOSEN):
-        told = [next(group for group in found.groups() if group is not None) for found in pattern.finditer(text)]
-        told = [answer.strip(MARKS) for answer in told if answer.strip(MARKS)]
-        if told:
-            return told
+    for pattern in (_BOXED, _TAGGED, _ANSWER_IS, _CHOSEN):
+        groups = [next(group for group in found.groups() if group is not None) for found in pattern.finditer(text)]
+        answers = [group.strip(MARKS) for group in groups if group.strip(MARKS)]
+        if answers:
+            return answers
     return []
 
 

@@ -15,19 +15,22 @@ from cow_service.readers.mllm.replies import (
     fields_of,
     first_of,
     is_none,
+    name_words,
     text_of,
     values_in,
     without_thinking,
 )
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
+from cow_service.readers.question.choices import plain
 from cow_service.records import MotionKind
 
 MAX_OBJECT = 120  # characters
 MAX_OTHERS = 4
-MAX_SENTENCE = 240  # characters
+MIN_SENTENCE, MAX_SENTENCE = 8, 240  # characters
 KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
 _NAMES = ("object", "moving_object", "mover", "object_name", "final_result", "result")
 _INNER = ("name", "label", "object", "description")  # of an object that is an object itself
+_ANSWERS = frozenset({"yes", "no", "not sure", "unsure", "true", "false", "unknown", "maybe"})
 _SENTENCE = re.compile(r"\b(?:I|am|is|are|was|were|will|would|has|have|does|do)\b")
 _LETTERED = re.compile(r"\W*[(\[]?[A-Za-z][)\].:](\s|$)|\W*[A-Za-z]\W*$")
 _SAID = re.compile(
@@ -75,7 +78,7 @@ def read_identified(reply: str) -> Identified | None:
         raise ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
     for named in found:
         _check(named.object)
-    if len({_plain(named.object) for named in found}) > 1:
+    if len({tuple(name_words(named.object)) for named in found}) > 1:
         raise ReplyError(f"several objects are named ({', '.join(n.object for n in found)}); name the one that moves")
     return found[-1]
 
@@ -92,8 +95,14 @@ def _named(value: object) -> Iterator[Identified]:
         if any(key in inner for key in _NAMES) and "kind" in inner:  # the whole reply, under a heading
             yield from _named(each)
             continue
+        kind, sentence = text_of(fields.get("kind")).lower(), text_of(fields.get("sentence"))
         for named in _as_words(first_of(inner, *_INNER) if inner else each):
-            yield Identified(named.object, _others(fields, named.object), _kind(fields), _sentence(fields))
+            yield Identified(
+                object=named.object,
+                others=_others(fields, named.object),
+                kind=next((known for known in KINDS if known == kind), None),
+                sentence=sentence if MIN_SENTENCE <= len(sentence) <= MAX_SENTENCE else None,
+            )
 
 
 def _as_words(value: object) -> Iterator[Identified]:
@@ -111,12 +120,12 @@ def _in_prose(said: str) -> list[str]:
     """A name told in words: behind "the moving object is", or the whole reply if it is nothing but a phrase."""
     if is_broken_json(said):
         return []
-    told = [_unquoted(found["name"]) for found in _SAID.finditer(said)]
-    if told:
-        return told[-1:]
+    names = [_unquoted(found["name"]) for found in _SAID.finditer(said)]
+    if names:
+        return names[-1:]
     phrase = _unquoted(said)
-    plain = "\n" not in said and len(phrase.split()) <= 12 and not re.search(r"[.!?:;{}\[\]]", phrase)
-    return [phrase] if plain and not _SENTENCE.search(phrase) else []
+    is_phrase = "\n" not in said and len(phrase.split()) <= 12 and not re.search(r"[.!?:;{}\[\]]", phrase)
+    return [phrase] if is_phrase and not _SENTENCE.search(phrase) else []
 
 
 def _unquoted(text: str) -> str:
@@ -126,7 +135,7 @@ def _unquoted(text: str) -> str:
 def _check(name: str) -> None:
     if len(name) > MAX_OBJECT:
         raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
-    if _LETTERED.match(name) or (len(name.split()) <= 3 and _is_answer(name)):
+    if _LETTERED.match(name) or (len(name.split()) <= 3 and plain(name) in _ANSWERS):
         raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
     if names_nothing(name):
         raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
@@ -134,30 +143,10 @@ def _check(name: str) -> None:
         raise ReplyError(f"'{name}' names no object; say in words what moves")
 
 
-def _is_answer(name: str) -> bool:
-    plain = re.sub(r"[^\w\s]", " ", name.lower()).split()
-    return " ".join(plain) in {"yes", "no", "not sure", "unsure", "true", "false", "unknown", "maybe"}
-
-
 def _others(fields: dict[str, Any], mover: str) -> tuple[str, ...]:
     held = fields.get("others")
     parts = cast("list[object]", held) if isinstance(held, list) else [held]
     inner = [first_of(fields_of(part), *_INNER) if isinstance(part, dict) else part for part in parts]
     names = [text_of(each)[:MAX_OBJECT] for each in inner if not is_none(each)]
-    kept = [name for name in names if name and _plain(name) != _plain(mover)]
+    kept = [name for name in names if name and name_words(name) != name_words(mover)]
     return tuple(dict.fromkeys(kept))[:MAX_OTHERS]
-
-
-def _kind(fields: dict[str, Any]) -> MotionKind | None:
-    told = text_of(fields.get("kind")).lower()
-    return next((kind for kind in KINDS if kind == told), None)
-
-
-def _sentence(fields: dict[str, Any]) -> str | None:
-    told = text_of(fields.get("sentence"))
-    return told if 8 <= len(told) <= MAX_SENTENCE else None
-
-
-def _plain(name: str) -> str:
-    kept = [word for word in re.findall(r"\w+", name.lower()) if word not in {"the", "a", "an"}]
-    return " ".join(kept)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cow_service.readers.mllm.boxes import Place, chosen, places_in, same_words, tagged_places
+from cow_service.readers.mllm.boxes import Place, chosen, places_in, tagged_places
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import View
 from cow_service.readers.mllm.directions import Line, line_in
 from cow_service.readers.mllm.identify import MAX_OTHERS
 from cow_service.readers.mllm.images import EncodedImage
-from cow_service.readers.mllm.replies import ReplyError, fields_of, is_none, values_in, without_thinking
+from cow_service.readers.mllm.replies import ReplyError, fields_of, is_none, name_words, values_in, without_thinking
 from cow_service.readers.mllm.schemas import Schema, nullable, numbers, object_of, one_of, words
 from cow_service.records import BBox, LocatedObject, Point
 
@@ -120,7 +120,7 @@ def _others(values: Sequence[object], view: View, wanted: Sequence[str]) -> tupl
     found: dict[str, LocatedObject] = {}
     for value in values:
         for place in places_in(fields_of(value).get("others"), view):
-            name = next((name for name in wanted if same_words(name, place.label)), None)
+            name = next((name for name in wanted if name_words(name) == name_words(place.label)), None)
             if name is not None and place.box is not None:
                 try:
                     found.setdefault(name, LocatedObject(object=name, bbox=view.bbox(place.box)))

@@ -13,13 +13,13 @@ from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.mllm.answer import answer_calls
-from cow_service.readers.mllm.boxes import shares_words
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.identify import Identified, identify_call
 from cow_service.readers.mllm.images import EncodedImage, encode
 from cow_service.readers.mllm.locate import Located, locate_call
 from cow_service.readers.mllm.models import UNKNOWN, configure
+from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.mllm.scale import Scaled, scale_call
 from cow_service.readers.question.sentences import parse, parse_noun_phrase
 from cow_service.records import AnswerOption, BBox, Cue, Grounding, MotionKind, ReaderInfo, Source
@@ -79,7 +79,7 @@ class MllmReader:
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
             phrase = parse_noun_phrase(identified.object)
             warnings = box_warnings(given.scene, bbox, phrase.colour if phrase else None, located.clipped)
-        if located.label and not shares_words(located.label, identified.object):
+        if located.label and set(name_words(located.label)).isdisjoint(name_words(identified.object)):
             mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
             warnings = (*warnings, mismatch)
         return GroundingReading(

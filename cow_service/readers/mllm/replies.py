@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from typing import Any, cast
+from contextlib import suppress
+from typing import Any, TypeGuard, cast
 
 from json_repair import repair_json
 
@@ -19,6 +20,8 @@ _THOUGHT = re.compile(r"</(?:think|thinking|thought|reasoning|seed:think)>|◁/t
 _THINKING = re.compile(r"<(?:think|thinking|thought|seed:think)>|◁think▷|<\|channel\|>analysis")
 _OPENING = {"{": "}", "[": "]"}
 _NOTHING = frozenset({"", "none", "null", "n/a", "not found", "nothing"})
+_NO_JSON = object()
+_DETERMINERS = frozenset({"the", "a", "an", "this", "that"})
 _BEFORE_STRING = frozenset("{[,:(")
 _AFTER_STRING = frozenset("}],:)")
 
@@ -46,8 +49,9 @@ def values_in(text: str) -> tuple[Any, ...]:
     Numbers, words and null are values only where they are the whole reply.
     """
     whole = _parsed(text)
-    if whole is not None:
-        return _unwrapped(whole.value)
+    if whole is not _NO_JSON:
+        inner = _parsed(whole) if isinstance(whole, str) else _NO_JSON  # a string may hold the JSON that was meant
+        return (whole if inner is _NO_JSON else inner,)
     fenced = [value for block in _FENCE.findall(text) for value in _bracketed(block)]
     return tuple(fenced or _bracketed(text))
 
@@ -70,6 +74,11 @@ def is_none(value: object) -> bool:
     return value is None or value == [] or (isinstance(value, str) and value.strip().lower() in _NOTHING)
 
 
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether a value is a number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def truth_of(value: object) -> bool | None:
     """A field that should hold true or false, also as a word; None where it holds neither."""
     words = {"true": True, "yes": True, "false": False, "no": False}
@@ -81,41 +90,24 @@ def text_of(value: object) -> str:
     return " ".join(value.split()) if isinstance(value, str) else ""
 
 
-class _Parsed:
-    """A value that may be None, told apart from no value."""
-
-    def __init__(self, value: object) -> None:
-        self.value = value
+def name_words(name: str) -> list[str]:
+    """The words of an object's name without determiners, lower case."""
+    return [word for word in re.findall(r"\w+", name.lower()) if word not in _DETERMINERS]
 
 
-def _parsed(text: str) -> _Parsed | None:
+def _parsed(text: str) -> Any:
     try:
-        return _Parsed(json.loads(text))
+        return json.loads(text)
     except (ValueError, RecursionError):
-        return None
-
-
-def _unwrapped(value: object) -> tuple[Any, ...]:
-    """A JSON string may hold the JSON that was meant."""
-    inner = _parsed(value) if isinstance(value, str) else None
-    return (value if inner is None else inner.value,)
+        return _NO_JSON
 
 
 def _bracketed(text: str) -> list[Any]:
     values: list[Any] = []
     for span in _spans(text):
-        strict = _parsed(span)
-        value = _repaired(span) if strict is None else strict.value
-        if isinstance(value, dict | list):
-            values.append(value)
-    return values
-
-
-def _repaired(span: str) -> object:
-    try:
-        return repair_json(span, return_objects=True, skip_json_loads=True)
-    except (ValueError, RecursionError):
-        return None
+        with suppress(ValueError, RecursionError):
+            values.append(repair_json(span, return_objects=True))  # which leaves well-formed JSON as it is
+    return [value for value in values if isinstance(value, dict | list)]
 
 
 def _spans(text: str) -> Iterator[str]:

@@ -13,6 +13,7 @@ from cow_service.readers.mllm.replies import (
     fields_of,
     first_of,
     is_none,
+    is_number,
     text_of,
     values_in,
     without_thinking,
@@ -74,23 +75,23 @@ def read_scaled(reply: str, view: View) -> Scaled:
     return Scaled(MetresPerPixel(value=metres / span, source="reference", note=note), down)
 
 
-def _down(told: object) -> Vector:
-    if is_none(told):
+def _down(written: object) -> Vector:
+    if is_none(written):
         return DOWN["bottom"]
-    side = _SIDES.get(text_of(told).lower().removesuffix(" side"))
+    side = _SIDES.get(text_of(written).lower().removesuffix(" side"))
     if side is None:
-        raise ReplyError(f"`down` is {told!r}; give the side of the image to which things fall: {', '.join(DOWN)}")
+        raise ReplyError(f"`down` is {written!r}; give the side of the image to which things fall: {', '.join(DOWN)}")
     return DOWN[side]
 
 
-def _metres(told: object) -> float | None:
+def _metres(written: object) -> float | None:
     """A length in metres, also as text."""
-    if is_none(told):
+    if is_none(written):
         return None
     try:
-        metres = float(told) if isinstance(told, int | float | str) and not isinstance(told, bool) else math.nan
+        metres = float(written) if is_number(written) or isinstance(written, str) else math.nan
     except (ValueError, OverflowError):
         metres = math.nan
     if not METRES[0] <= metres <= METRES[1]:
-        raise ReplyError(f"`metres` is {str(told)[:40]}; give the length in metres as a number from 0.001 to 1000")
+        raise ReplyError(f"`metres` is {str(written)[:40]}; give the length in metres as a number from 0.001 to 1000")
     return metres

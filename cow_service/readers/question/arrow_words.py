@@ -19,6 +19,9 @@ _OPPOSITE = lex.words(
 _ARROW_CUES = lex.words(
     "along direction way path trajectory where as per according toward towards follow follows following"
 )
+_STOPS = frozenset(".,;:?!")
+_FROM_ITS_END = lex.words("from where the a direction of way tip head point arrow that in which") | lex.COLOURS.keys()
+_BESIDE = lex.words("with near beside under above below at behind")
 _SHOWN = lex.words("indicated shown marked drawn depicted pointed specified given")
 
 
@@ -34,19 +37,18 @@ def is_arrow(found: Sequence[Item], at: int) -> bool:
 def read_arrow(found: Sequence[Item]) -> ArrowSense | None:
     """Along or against the drawn arrow; None where none is named, or where it only marks an object."""
     for at in range(len(found)):
-        if is_arrow(found, at):
-            sense = _arrow_sense(found, at)
-            if sense:
-                return sense
+        sense = _arrow_sense(found, at) if is_arrow(found, at) else None
+        if sense is not None:
+            return sense
     return None
 
 
 def _arrow_sense(found: Sequence[Item], at: int) -> ArrowSense | None:
     begin = at
-    while begin > 0 and at - begin < 12 and found[begin - 1].key not in set(".,;:?!"):
+    while begin > 0 and at - begin < 12 and found[begin - 1].key not in _STOPS:
         begin -= 1
     end = at + 1
-    while end < len(found) and end - at < 7 and found[end].key not in lex.AUXILIARIES | set(".,;:?!"):
+    while end < len(found) and end - at < 7 and found[end].key not in lex.AUXILIARIES | _STOPS:
         end += 1
     own = list(found[at].words)
     before, after = flatten(found[begin:at]) + own, flatten(found[at + 1 : end])
@@ -56,13 +58,10 @@ def _arrow_sense(found: Sequence[Item], at: int) -> ArrowSense | None:
         return None
     if not _ARROW_CUES.isdisjoint(before) or key_at(found, at - 1) in {"by", "in"}:
         return "along"
-    points_at = "point" in {lex.VERBS[word].lemma for word in after if word in lex.VERBS} and "at" in after
-    shows = any(word in lex.VERBS and lex.VERBS[word].lemma in {"show", "indicate", "point"} for word in after[:2])
-    return "along" if shows and not points_at and _is_first(found, at, begin) else None
-
-
-def _is_first(found: Sequence[Item], at: int, begin: int) -> bool:
-    return at == begin or key_at(found, at - 1) in lex.CONDITIONALS or key_at(found, at - 1) == "that"
+    points_at = "point" in map(lex.lemma, after) and "at" in after
+    shows = any(lex.lemma(word) in {"show", "indicate", "point"} for word in after[:2])
+    first = at == begin or key_at(found, at - 1) in lex.CONDITIONALS | {"that"}
+    return "along" if shows and first and not points_at else None
 
 
 def has_opposite(flat: Sequence[str]) -> bool:
@@ -74,18 +73,13 @@ def _flees(before: Sequence[str]) -> bool:
     """ "away from where the arrow points", but not "away from the camera along the arrow"."""
     if "away" not in before:
         return False
-    rest = before[before.index("away") + 1 :]
-    plain = lex.words("from where the a direction of way tip head point arrow that in which")
-    return all(word in plain or word in lex.COLOURS for word in rest)
+    return all(word in _FROM_ITS_END for word in before[before.index("away") + 1 :])
 
 
 def _only_marks(found: Sequence[Item], at: int) -> bool:
     """ "the ball indicated by the arrow", "the ball next to the arrow": the arrow singles an object out."""
     before = key_at(found, at - 1)
-    if (
-        before in {"with", "near", "beside", "under", "above", "below", "at", "behind"}
-        or key_at(found, at - 2) == "next"
-    ):
+    if before in _BESIDE or key_at(found, at - 2) == "next":
         return True
     marked = before == "by" and key_at(found, at - 2) in lex.VERBS
     noun = phrase_at(found, at - 3)

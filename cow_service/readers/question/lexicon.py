@@ -59,6 +59,7 @@ _NOT_ADJECTIVES = words(
     "bed sled seed weed shed reed feed steed ring king string wing swing thing sling earring building painting",
     "ceiling dumpling clothing housing railing bearing pudding morning evening",
 )
+_NOT_ADVERBS = words("butterfly family jelly belly bully trolly")
 MARKED = words("highlighted marked circled boxed outlined encircled")
 
 _IRREGULAR_PLURALS = {"knives": "knife", "shelves": "shelf", "men": "man", "women": "woman", "children": "child"}
@@ -136,6 +137,7 @@ ABSTRACT = (
         "border force fall toss possible likely true sure going visible rest unison parabola arc",
     )
 )
+NO_THINGS = ABSTRACT | SCENERY
 MEASURES = words(
     "cm mm m km meter meters metre metres centimeter centimeters centimetre centimetres inch inches feet",
     " ft degrees pixels px units steps times seconds",
@@ -214,24 +216,24 @@ def _verbs() -> dict[str, Verb]:
 VERBS: dict[str, Verb] = _verbs()
 
 
+def lemma(word: str) -> str:
+    """The base form of a lower case verb; empty for a word that is none."""
+    return VERBS[word].lemma if word in VERBS else ""
+
+
 def is_modifier(word: str) -> bool:
     """Whether a lower case word describes a noun and is none: a colour, an adjective, a participle, a place."""
     if word in _NOT_ADJECTIVES:
         return False
     participle = word in VERBS and VERBS[word].form in {"past", "ing"}
-    known = (
-        participle or word in COLOURS or word in ADJECTIVES or word in PLACES or word in NUMBER_WORDS or word in MARKED
-    )
-    return known or word.isdecimal() or (len(word) > 4 and word.endswith(("ed", "ing", "ish", "ful", "less", "ous")))
+    known = any(word in listed for listed in (COLOURS, ADJECTIVES, PLACES, NUMBER_WORDS, MARKED))
+    ending = len(word) > 4 and word.endswith(("ed", "ing", "ish", "ful", "less", "ous"))
+    return participle or known or word.isdecimal() or ending
 
 
 def is_adverb(word: str) -> bool:
     """Whether a lower case word is an adverb by its ending, such as "freely"."""
-    return (
-        len(word) > 4
-        and word.endswith("ly")
-        and word not in {"butterfly", "family", "jelly", "belly", "bully", "trolly"}
-    )
+    return len(word) > 4 and word.endswith("ly") and word not in _NOT_ADVERBS
 
 
 def singular(noun: str) -> str:

@@ -26,6 +26,8 @@ _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
 _SINKING = lex.words("lower descend sink")
+_FACES = lex.words("face head point")
+_GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
 _FORWARD = lex.words("forward forwards ahead onward onwards")
 _BACKWARD = lex.words("backward backwards back")
 
@@ -92,8 +94,8 @@ def _turns_around(found: Sequence[Item]) -> bool:
 def _direction(found: Sequence[Item], verb: str, kind: MotionKind | None) -> Vector | None:
     x = y = 0.0
     for at in range(1, len(found)):
-        step_x, step_y = _place_step(found, at) if found[at].phrase else _word_step(found, at)
-        x, y = x + step_x, y + step_y
+        step = _place_step(found, at) if found[at].phrase else _word_step(found, at)
+        x, y = x + step[0], y + step[1]
     if kind == "fall":
         y = 0.0  # down is what a fall does; only what leads away from it is a direction
     elif x == y == 0.0:
@@ -117,8 +119,7 @@ def _word_step(found: Sequence[Item], at: int) -> Vector:
 def _is_beside(found: Sequence[Item], at: int) -> bool:
     """ "to the left of the vase" is a place; "to the left of the image" is a direction."""
     beside = phrase_at(found, at + 2)
-    known = beside is not None and (beside.head in lex.ABSTRACT or beside.head in lex.SCENERY)
-    return key_at(found, at + 1) == "of" and not known
+    return key_at(found, at + 1) == "of" and (beside is None or beside.head not in lex.NO_THINGS)
 
 
 def _place_words(item: Item) -> list[str]:
@@ -165,25 +166,19 @@ def _forward(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> bool
     back = not _BACKWARD.isdisjoint(flatten(item for item in found if not item.phrase))
     if arrow is None and (back or verb == "reverse" or "reverse" in flat):
         return False
-    faces = {lex.VERBS[word].lemma for word in flat[1:] if word in lex.VERBS} & {"face", "head", "point"}
-    if faces and arrow is None:
+    if arrow is None and not _FACES.isdisjoint(map(lex.lemma, flat[1:])):
         return not has_opposite(flat)
-    straight_on = "straight" in flat and verb in {"go", "move", "drive", "roll", "travel", "continue", "run"}
-    return True if straight_on and flat[-1] == "straight" else None
+    return True if verb in _GOES_STRAIGHT and flat[-1:] == ["straight"] else None
 
 
 def _towards(found: Sequence[Item], open_end: bool, mover: ObjectPhrase | None) -> ObjectPhrase | None:
     preps = {"toward", "towards"} if open_end else {"toward", "towards", "to", "at", "into"}
     for at, item in enumerate(found):
         before, earlier = key_at(found, at - 1), phrase_at(found, at - 2)
-        aimed = before in preps and key_at(found, at - 2) not in _NOT_AIMED
-        aimed = aimed or (
-            before == "of" and earlier is not None and earlier.noun == "direction" and not has_opposite(flatten(found))
-        )
-        if item.phrase and aimed and item.phrase != mover and not _is_nowhere(item.phrase):
+        if before == "of":  # "in the direction of the vase"
+            aimed = earlier is not None and earlier.noun == "direction" and not has_opposite(flatten(found))
+        else:
+            aimed = before in preps and key_at(found, at - 2) not in _NOT_AIMED
+        if item.phrase and aimed and item.phrase != mover and item.phrase.is_thing:
             return item.phrase
     return None
-
-
-def _is_nowhere(phrase: ObjectPhrase) -> bool:
-    return phrase.noun is None or phrase.head in lex.ABSTRACT or phrase.head in lex.SCENERY

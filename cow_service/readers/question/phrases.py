@@ -30,6 +30,11 @@ class ObjectPhrase:
         """The last word of the noun: "car" of "toy car"."""
         return self.noun.rsplit(" ", 1)[-1] if self.noun else None
 
+    @property
+    def is_thing(self) -> bool:
+        """Whether it names a thing: not a place, the arrow or the image, and not the floor."""
+        return self.head is not None and self.head not in lex.NO_THINGS
+
 
 @dataclass(frozen=True)
 class Item:

@@ -148,6 +148,6 @@ def _named(relation: Relation, target: Item) -> AskedRelation | None:
         return None
     if set(target.words) & _ANYTHING and phrase.colour is None and phrase.number is None:
         return AskedRelation(relation, None)
-    if is_vague(target) or phrase.head in lex.ABSTRACT | lex.SCENERY:
+    if is_vague(target) or phrase.head in lex.NO_THINGS:
         return None
     return AskedRelation(relation, phrase)

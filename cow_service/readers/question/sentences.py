@@ -16,7 +16,7 @@ from cow_service.readers.question.chunks import items
 from cow_service.readers.question.clauses import SENTENCE_END, Clauses, clause_end, is_passive, is_vague, read_clauses
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, read_motion
-from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, tokens
+from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
 
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
@@ -85,15 +85,11 @@ def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhras
         acting = key_at(found, place - 1) == "by" and is_passive(found, place - 2) if place > 1 else False
         if acting and item.phrase and item.phrase.head not in lex.ABSTRACT | lex.AGENTS and not is_vague(item):
             return item.phrase
-    named = [(place, item.phrase) for place, item in enumerate(found) if item.phrase and _is_thing(item)]
+    things = [(place, item.phrase) for place, item in enumerate(found) if item.phrase and not is_vague(item)]
+    named = [(place, phrase) for place, phrase in things if phrase.is_thing]
     asked = [(place, phrase) for place, phrase in clauses.question_subjects if phrase.head not in lex.ABSTRACT]
     before = [phrase for place, phrase in asked if place < at] + [phrase for place, phrase in named if place < at]
     return next(iter(before + [phrase for _, phrase in asked + named]), None)
-
-
-def _is_thing(item: Item) -> bool:
-    head = item.phrase.head if item.phrase else None
-    return head is not None and head not in lex.ABSTRACT and head not in lex.SCENERY and not is_vague(item)
 
 
 def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:
@@ -108,8 +104,8 @@ def _without_instructions(found: list[Item]) -> list[Item]:
     for item in [*found, Item(".", 0, 0)]:
         sentence.append(item)
         if item.key in SENTENCE_END:
-            first = [word for told in sentence[:2] for word in (told.words or (told.key,)) if word != "please"]
-            if first and first[0] not in _INSTRUCTIONS:
+            first = next((word for word in flatten(sentence[:2]) if word != "please"), None)
+            if first is not None and first not in _INSTRUCTIONS:
                 kept += sentence
             sentence = []
     return kept
@@ -133,7 +129,7 @@ def _is_object(phrase: ObjectPhrase) -> bool:
     """Whether a phrase names an object of its own: not the floor or the arrow, not a bare "object"."""
     if phrase.head in lex.GENERIC or phrase.noun is None:
         return phrase.colour is not None or phrase.inside_box or phrase.number is not None
-    return phrase.head not in lex.ABSTRACT and phrase.head not in lex.SCENERY
+    return phrase.is_thing
 
 
 def _repeats(phrase: ObjectPhrase, known: ObjectPhrase) -> bool:

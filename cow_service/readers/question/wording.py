@@ -42,13 +42,13 @@ def _flat_words(direction: Vector | None) -> str:
 
 
 def motion_sentence(
-    object: str, kind: MotionKind, direction: Vector | None, depth: float, told: str | None = None
+    object: str, kind: MotionKind, direction: Vector | None, depth: float, sentence: str | None = None
 ) -> str:
-    """The motion in one line: a declarative sentence, `told` by a reader or made here; and that the camera stays."""
+    """The motion in one line: a declarative `sentence` of a reader, or one made here; and that the camera stays."""
     name = " ".join(object.split())[:MAX_OBJECT].rstrip()
     determiner = next((word for word in _DETERMINERS if name.lower().startswith(word)), "")
     words = direction_words(direction, depth)
-    told = "" if told is None else told.strip().rstrip(".") + "."
+    told = "" if sentence is None else sentence.strip().rstrip(".") + "."
     prompt = load_prompt("motion-sentence")
     text = prompt.render(object=name[len(determiner) :], kind=kind, words=words, told=told)
     return " ".join(text.split())

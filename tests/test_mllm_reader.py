@@ -1,0 +1,146 @@
+"""The reader `mllm` by itself: what it asks in each stage, what it hands on, what it holds while it waits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import mllm_server as say
+import pytest
+from drawn import ball, floor
+from mllm_server import MllmServer
+
+from cow_service.errors import Canceled, MllmUnavailable
+from cow_service.readers.base import CallLog, MotionHints, ReaderInput
+from cow_service.readers.mllm.reader import MllmReader, create
+from cow_service.records import Grounding
+from cow_service.settings import Settings
+from cow_service.vision.scene import Scene
+
+QUESTION = "If the ball rolls along the arrow, what does it hit?"
+BALL = {"object": "red ball", "others": [], "kind": "linear", "sentence": "The red ball rolls."}
+PLACE = {"label": "red ball", "bbox_2d": [172, 390, 297, 590], "cue": "arrow", "direction": [230, 500, 600, 500]}
+
+
+@pytest.fixture(scope="module")
+def mllm() -> Iterator[MllmServer]:
+    with say.mllm_server() as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def reader(mllm: MllmServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[MllmReader]:
+    data = tmp_path_factory.mktemp("data")
+    made = create(Settings(data_dir=data, mllm="qwen3-vl-8b", mllm_base_url=mllm.address, mllm_budget=1.5))
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(ball(floor(), (150, 200), 40, (200, 30, 30)))
+
+
+def grounding(source: str) -> Grounding:
+    return Grounding.model_validate(
+        {"object": "red ball", "point": (150, 200), "bbox": (110, 156, 190, 236), "source": source}
+    )
+
+
+def test_what_was_read_with_the_place_needs_no_second_call(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
+    """Also after a restart, from hints that were stored."""
+    mllm.say(json.dumps(BALL), json.dumps(PLACE))
+    given = ReaderInput(scene, QUESTION)
+    reading = reader.ground(given)
+    assert reading.object == "red ball"
+    assert len(mllm.asked) == 2
+    assert reading.hints is not None
+    stored = MotionHints.model_validate_json(reading.hints.model_dump_json())
+    motion = reader.read_motion(ReaderInput(scene, QUESTION), grounding("mllm"), stored)
+    assert len(mllm.asked) == 2
+    assert (motion.kind, motion.cue, motion.sentence) == ("linear", "arrow", "The red ball rolls.")
+    assert motion.direction == pytest.approx((0.37 * scene.width, 0), abs=1)
+
+
+@pytest.mark.parametrize(("source", "prompts"), [("request", {"locate"}), ("mllm", {"identify", "locate"})])
+def test_without_hints_the_motion_is_asked_for_with_the_box_that_is_known(
+    source: str, prompts: set[str], mllm: MllmServer, reader: MllmReader, scene: Scene
+) -> None:
+    mllm.say(*([json.dumps(BALL)] if "identify" in prompts else []), json.dumps(PLACE))
+    given = ReaderInput(scene, QUESTION)
+    assert reader.read_motion(given, grounding(source), None).direction is not None
+    assert given.calls.prompts.keys() == prompts | {"looking"}
+    assert given.calls.usage.calls == len(mllm.asked) == len(prompts)
+    assert "in the box [" in mllm.text(-1)
+    assert "bbox_2d" not in mllm.asked[-1]["response_format"]["json_schema"]["schema"]["properties"]
+
+
+def test_a_motion_that_the_request_gives_is_not_asked_for(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
+    mllm.say(json.dumps(BALL), json.dumps(PLACE))
+    assert reader.ground(ReaderInput(scene, QUESTION, motion_wanted=False)).hints is None
+    assert "direction" not in mllm.asked[-1]["response_format"]["json_schema"]["schema"]["properties"]
+
+
+def test_calls_that_fail_count_too(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
+    mllm.say(say.status(429, retry_after="0"))
+    calls = CallLog()
+    with pytest.raises(MllmUnavailable):
+        reader.ground(ReaderInput(scene, QUESTION, calls=calls))
+    assert calls.usage.calls == len(mllm.asked) > 1
+    assert calls.prompts.keys() == {"identify", "looking"}
+
+
+def test_the_cpu_is_held_for_work_and_never_while_the_model_is_waited_for(
+    mllm: MllmServer, reader: MllmReader, scene: Scene
+) -> None:
+    held = 0
+    seen: list[int] = []
+
+    @contextmanager
+    def cpu() -> Iterator[None]:
+        nonlocal held
+        held += 1
+        seen.append(held)
+        yield
+        held -= 1
+
+    def reply(handler) -> None:
+        seen.append(-held)
+        prompt = mllm.text(-1)
+        text = {"answer": "B"} if "`answer`" in prompt else BALL if "sets in motion" in prompt else PLACE
+        handler.send(200, say.completion(json.dumps(text)))
+
+    mllm.say(reply)
+    given = ReaderInput(scene, QUESTION, cpu=cpu)
+    hints = reader.ground(given).hints
+    reader.read_motion(given, grounding("mllm"), hints)
+    reader.answer(given, (), None, None, votes=2)
+    assert held == 0
+    assert set(seen) == {0, 1}  # no call while it was held, and not taken twice
+    assert seen.count(0) == len(mllm.asked) == 4
+
+
+def test_a_canceled_run_waits_no_longer(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
+    mllm.say(say.slow(5))
+
+    def canceled() -> None:
+        if mllm.asked:
+            raise Canceled("The caller left.")
+
+    with pytest.raises(Canceled):
+        reader.ground(ReaderInput(scene, QUESTION, check_canceled=canceled))
+
+
+def test_requests_at_the_same_time_do_not_mix(mllm: MllmServer, reader: MllmReader) -> None:
+    """A reader keeps nothing of a request: one image is never sent for the other."""
+    wide, tall = Scene(floor(320, 160)), Scene(floor(160, 320))
+    mllm.say('{"answer": "B"}')
+    requests = [ReaderInput(wide, "Is it wide?"), ReaderInput(tall, "Is it tall?")] * 3
+    with ThreadPoolExecutor(max_workers=6) as pool:
+        list(pool.map(lambda given: reader.answer(given, (), None, None, votes=3), requests))
+    assert len(mllm.asked) == 18
+    for call in range(18):
+        height, width = mllm.images(call)[0].shape[:2]
+        assert ("Is it wide?" in mllm.text(call)) == (width > height)
