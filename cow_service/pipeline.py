@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cow_service.errors import Canceled, CowError, InvalidRequest, MllmUnavailable, ReaderUnavailable
 from cow_service.readers.question.choices import read_choices
-from cow_service.records import Answer, Simulation
+from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.stages.answering import answer_question
 from cow_service.stages.generation import generate
@@ -52,7 +52,7 @@ def answer(run: Run[AnswerRequest]) -> Answer:
     A simulation that fails does not lose the answer: it is then given from the image alone, with a warning.
     Raises `InvalidRequest`, `Canceled`, `ReaderUnavailable`, `MllmBadReply`, `MllmUnavailable`.
     """
-    simulation, failure = _imagine(run) if run.request.imagine == "always" else (None, ())
+    simulation, failure = _imagine(run) if run.request.imagine == "always" else (None, None)
     verdicts = run.stage("answering", answer_question, run.grounding, simulation)
     return Answer(
         **dict(verdicts.verdict),
@@ -62,20 +62,27 @@ def answer(run: Run[AnswerRequest]) -> Answer:
         options=read_choices(run.request.question, run.request.options),
         image=run.image.info,
         simulation=simulation,
+        simulation_problem=None if failure is None else Problem(**failure.as_problem()),
         baseline=verdicts.baseline,
         reader=run.reader_info("grounding", "motion", "answering"),
         usage=run.usage,
         timings=dict(run.timings),
         reused=tuple(run.reused),
-        warnings=(*failure, *run.warnings("answering")),
+        warnings=(*_not_imagined(failure), *run.warnings("answering")),
     )
 
 
-def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, tuple[str, ...]]:
-    """The simulation, or none and a warning that says why. Raises what leaves no answer either."""
+def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, CowError | None]:
+    """The simulation, or the error for which there is none. Raises what leaves no answer either."""
     try:
-        return simulate(run), ()
+        return simulate(run), None
     except (InvalidRequest, Canceled, MllmUnavailable, ReaderUnavailable):
         raise
     except CowError as error:
-        return None, (f"Nothing was imagined, the answer is from the image alone. {error.code}: {error.detail}",)
+        return None, error
+
+
+def _not_imagined(failure: CowError | None) -> tuple[str, ...]:
+    if failure is None:
+        return ()
+    return (f"Nothing was imagined, the answer is from the image alone. {failure.code}: {failure.detail}",)

@@ -246,6 +246,28 @@ class Simulation(Record):
         return self.trajectory.encounters_known
 
 
+class ProblemField(BaseModel):
+    """One invalid field."""
+
+    pointer: str = Field(description="JSON Pointer (RFC 6901) into the request.")
+    detail: str
+
+
+class Problem(BaseModel):
+    """Why a request failed (RFC 9457)."""
+
+    type: str = Field(description="Stable URI; its last segment is the code.")
+    title: str = Field(description="The kind of error, the same for every occurrence.")
+    status: int
+    detail: str = Field(description="What was wrong, with the value, and what to do.")
+    errors: list[ProblemField] = Field(default_factory=list[ProblemField])
+
+    @property
+    def code(self) -> str:
+        """The last segment of the type, such as `cannot-ground`."""
+        return self.type.rpartition(":")[2]
+
+
 class AnswerOption(Record):
     """One of the answers that a question offers."""
 
@@ -277,6 +299,7 @@ class Answer(Verdict):
     options: tuple[AnswerOption, ...] = Field(description="From the request or the question; empty where it is open.")
     image: ImageInfo
     simulation: Simulation | None = Field(description="Null where nothing was imagined, or that failed.")
+    simulation_problem: Problem | None = Field(default=None, description="Why imagining failed, where it did.")
     baseline: Verdict | None = Field(description="The answer without frames, where it was asked for.")
     reader: ReaderInfo
     usage: Usage = Field(description="Of everything together: simulation, votes and baseline.")
@@ -313,23 +336,6 @@ class Models(Record):
     readers: tuple[BackendInfo, ...]
     generators: tuple[BackendInfo, ...]
     mllms: tuple[str, ...] = Field(default=(), description="Manifests of multimodal LLMs: what `COW_MLLM` may name.")
-
-
-class ProblemField(BaseModel):
-    """One invalid field."""
-
-    pointer: str = Field(description="JSON Pointer (RFC 6901) into the request.")
-    detail: str
-
-
-class Problem(BaseModel):
-    """Why a request failed (RFC 9457)."""
-
-    type: str = Field(description="Stable URI; its last segment is the code.")
-    title: str = Field(description="The kind of error, the same for every occurrence.")
-    status: int
-    detail: str = Field(description="What was wrong, with the value, and what to do.")
-    errors: list[ProblemField] = Field(default_factory=list[ProblemField])
 
 
 JobKind = Literal["simulate", "answer"]

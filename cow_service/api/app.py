@@ -13,11 +13,11 @@ from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.middleware.order import LayeredApp, install_layers
 from cow_service.api.openai.errors import ChatProblems
 from cow_service.api.openai.routes import chat_routes
+from cow_service.api.openapi import contract
 from cow_service.api.problems import install_problem_handlers
 from cow_service.api.routes.artifacts import artifact_routes
 from cow_service.api.routes.health import health_routes
 from cow_service.api.routes.jobs import job_routes
-from cow_service.api.routes.openapi import contract
 from cow_service.api.routes.simulate import simulate_routes
 from cow_service.api.submission import Submitter
 from cow_service.jobs.engine import JobEngine

@@ -59,9 +59,8 @@ def run_answer(service: Service, image: Path, body: dict[str, Any], out: Path | 
         console.print(f"[dim]reasoning[/]: {escape(answer.reasoning)}")
     simulated = () if answer.simulation is None else answer.simulation.warnings
     print_warnings(console, (*simulated, *answer.warnings))
-    for code, hint in HINTS.items():
-        if any(f" {code}: " in warning for warning in answer.warnings):
-            console.print(hint)
+    if answer.simulation_problem is not None and (hint := HINTS.get(answer.simulation_problem.code)):
+        console.print(hint)
     if out is not None:
         console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
 

@@ -11,7 +11,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cow_service.api.openai.records import ChatError, ChatProblem
 from cow_service.api.problems import MEDIA_TYPE
-from cow_service.errors import TYPE_PREFIX
 from cow_service.records import Problem
 
 ROOT = "/v1/"
@@ -29,7 +28,7 @@ def chat_problem(problem: Problem) -> ChatProblem:
         message=problem.detail,
         type=TYPES.get(HTTPStatus(problem.status), other),
         param=_parameter(problem.errors[0].pointer) if problem.errors else None,
-        code=problem.type.removeprefix(TYPE_PREFIX),
+        code=problem.code,
     )
     return ChatProblem(**dict(problem), error=error)
 
@@ -67,12 +66,12 @@ class ChatProblems:
 
 def document_problems(document: dict[str, Any]) -> None:
     """Puts their shape into the contract."""
-    reference = {"$ref": f"#/components/schemas/{ChatProblem.__name__}"}
+    reference = f"#/components/schemas/{ChatProblem.__name__}"
     for path, operations in document["paths"].items():
         for operation in operations.values() if path.startswith(ROOT) else ():
             for response in operation["responses"].values():
                 if problem := response.get("content", {}).get(MEDIA_TYPE):
-                    problem["schema"] = reference
+                    problem["schema"] = {"$ref": reference}
 
 
 def _is_problem(start: Message) -> bool:
