@@ -23,7 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.errors import ImageUrlNotAllowed, ImageUrlUnreachable
-from cow_service.net.egress import TRANSLATED, Egress, EgressError, NotAllowed, Unreachable, _told, look_up
+from cow_service.net.egress import TRANSLATED, Egress, EgressError, NotAllowed, Unreachable, _translated, look_up
 from cow_service.net.hosts import HostList, host_name, is_public
 from cow_service.net.images import ImageUrls
 from cow_service.settings import Settings, SettingsError, load_settings
@@ -754,7 +754,7 @@ FOREIGN = {
 @pytest.mark.parametrize("kind", sorted(FOREIGN, key=lambda kind: f"{kind.__module__}.{kind.__name__}"))
 def test_every_foreign_exception_is_translated(kind: type[Exception]) -> None:
     arguments = {UnicodeEncodeError: ("ascii", "ü", 0, 1, "no"), UnicodeDecodeError: ("ascii", b"\xff", 0, 1, "no")}
-    with pytest.raises(EgressError, match=r"images\.test.*\.$"), _told("images.test"):
+    with pytest.raises(EgressError, match=r"images\.test.*\.$"), _translated("images.test"):
         raise kind(*arguments.get(kind, ("secret 10.0.0.1",)))
 
 
@@ -764,7 +764,7 @@ def test_no_row_of_the_table_is_hidden_by_one_above() -> None:
 
 
 def test_faults_of_our_own_are_not_hidden() -> None:
-    with pytest.raises(KeyError), _told("images.test"):
+    with pytest.raises(KeyError), _translated("images.test"):
         raise KeyError("x")
 
 
