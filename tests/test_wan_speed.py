@@ -138,7 +138,7 @@ class TestTheScript:
 def test_the_real_size_is_refused_without_a_gpu(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(wan_speed, "choose_device", lambda name: CPU)
+    monkeypatch.setattr(wan_speed, "choose_device", lambda name, unavailable: CPU)
     monkeypatch.setattr(sys, "argv", ["wan_speed.py", "--model", "ati"])
     assert wan_speed.main() == 2
     told = capsys.readouterr()

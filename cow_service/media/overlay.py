@@ -1,4 +1,4 @@
-"""Draws what was understood over the input image: box, point, direction, path and encounters."""
+"""Draws the results over the input image: box, point, direction, path and encounters."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.records import Grounding, Motion, Trajectory
+from cow_service.records import BBox, Grounding, Motion, Trajectory
 
 BOX, PATH, ARROW, LIGHT, DARK = (255, 196, 0), (0, 229, 255), (255, 64, 129), (255, 255, 255), (20, 20, 20)
 ENCOUNTERS = {"touches": (255, 82, 82), "occludes": (190, 120, 255), "occluded-by": (120, 200, 255)}  # RGB
@@ -25,8 +25,8 @@ def draw_overlay(image: Image, grounding: Grounding, motion: Motion, trajectory:
     _draw_path(canvas, trajectory, thin)
     _rectangle(canvas, grounding.bbox, BOX, 2 * thin)
     for encounter in trajectory.encounters:
-        told = f"{encounter.kind} {encounter.object} {encounter.first_frame / trajectory.fps:.1f} s"
-        _label(canvas, told, encounter.bbox, ENCOUNTERS[encounter.kind], unit, below=True)
+        text = f"{encounter.kind} {encounter.object} {encounter.first_frame / trajectory.fps:.1f} s"
+        _label(canvas, text, encounter.bbox, ENCOUNTERS[encounter.kind], unit, below=True)
     _label(canvas, grounding.object, grounding.bbox, BOX, unit, below=False)
     if motion.direction is not None:
         start = np.array(grounding.point)
@@ -53,9 +53,7 @@ def _draw_path(canvas: Image, trajectory: Trajectory, thin: int) -> None:
             cv2.circle(canvas, centre, round(2.5 * thin * 2**SUBPIXEL), PATH, -1, cv2.LINE_AA, SUBPIXEL)
 
 
-def _rectangle(
-    canvas: Image, bbox: tuple[float, float, float, float], colour: tuple[int, int, int], width: int
-) -> None:
+def _rectangle(canvas: Image, bbox: BBox, colour: tuple[int, int, int], width: int) -> None:
     corners = _fixed(bbox[:2]), _fixed(bbox[2:])
     cv2.rectangle(canvas, *corners, DARK, width + 2, cv2.LINE_AA, SUBPIXEL)
     cv2.rectangle(canvas, *corners, colour, width, cv2.LINE_AA, SUBPIXEL)
@@ -64,7 +62,7 @@ def _rectangle(
 def _label(
     canvas: Image,
     text: str,
-    bbox: tuple[float, float, float, float],
+    bbox: BBox,
     colour: tuple[int, int, int],
     unit: float,
     *,

@@ -1,8 +1,8 @@
 """Finds arrows drawn over an image: one flat colour, a straight shaft, a head that is open or filled.
 
-The image is read as it is; nothing is learnt. A candidate is a connected patch of one colour; it is an arrow when its
-width along its own axis is that of a shaft followed by a head that tapers to a tip, and when an ideal arrow of those
-measures covers the patch. Objects of a scene (bottles, cones, pencils) fail one of the two.
+No trained model is used. A candidate is a connected patch of one colour; it is an arrow if its width along its own axis
+is that of a shaft followed by a head that tapers to a tip, and if an ideal arrow of those measures covers the patch.
+Objects of a scene (bottles, cones, pencils) fail one of the two.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask, full_size
 
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
-SURE = 0.88  # a fit that needs no second look at the same place
+CERTAIN_FIT = 0.88  # from here on, later strokes at the same place are skipped
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,6 @@ class Arrow:
 
     tail: tuple[float, float]
     tip: tuple[float, float]
-    thickness: float
-    head_width: float
     colour: tuple[int, int, int]  # RGB
     filled: bool
     mask: NDArray[np.bool_]  # [H, W]: the drawing with its outline and its fringe
@@ -40,19 +38,11 @@ class Arrow:
         length = float(np.hypot(dx, dy))
         return dx / length, dy / length
 
-    @property
-    def length(self) -> float:
-        """Pixels from tail to tip."""
-        return float(np.hypot(self.tip[0] - self.tail[0], self.tip[1] - self.tail[1]))
-
 
 @dataclass(frozen=True)
 class _Shape:
     tail: NDArray[np.float64]
     tip: NDArray[np.float64]
-    thickness: float
-    head_width: float
-    head_length: float
     filled: bool
     fit: float
 
@@ -77,7 +67,7 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int,
     """Drawn arrows among the strokes of an image whose full size is [height, width]; overlapping findings are one."""
     found: list[tuple[_Shape, Stroke]] = []
     for stroke in strokes:
-        if any(shape.fit > SURE and _same_place(stroke, other) for shape, other in found):
+        if any(shape.fit > CERTAIN_FIT and _same_place(stroke, other) for shape, other in found):
             continue
         shape = fit_arrow(stroke.patch)
         if shape is not None:
@@ -97,8 +87,6 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int,
             Arrow(
                 tail=(float(tail[0]), float(tail[1])),
                 tip=(float(tip[0]), float(tip[1])),
-                thickness=shape.thickness / image.scale,
-                head_width=shape.head_width / image.scale,
                 colour=stroke.colour,
                 filled=shape.filled,
                 mask=full_size(mask, size),
@@ -148,7 +136,7 @@ def _measure(
     head_length = len(profile.extent) - 1 - profile.peak
     fits = {filled: _overlap(patch, tail, tip, thickness, head_width, head_length, filled) for filled in (True, False)}
     filled = fits[True] >= fits[False]
-    return _Shape(tail, tip, thickness, head_width, float(head_length), filled, fits[filled])
+    return _Shape(tail, tip, filled, fits[filled])
 
 
 def _profile(points: NDArray[np.float64], centre: NDArray[np.float64], axis: NDArray[np.float64]) -> _Profile | None:

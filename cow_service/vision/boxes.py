@@ -18,7 +18,7 @@ COVERED = 0.85  # share of that rectangle's outline that the stroke covers: dash
 
 @dataclass(frozen=True)
 class DrawnBox:
-    """A rectangle drawn over the image. It marks something; it does not say what."""
+    """A rectangle drawn over the image to mark something. It does not say what."""
 
     bbox: tuple[float, float, float, float]  # x0, y0, x1, y1, px: inside the line
     colour: tuple[int, int, int]  # RGB

@@ -22,7 +22,11 @@ HUES = (
     (360.0, "pink"),
 )
 
-HUE_MARGIN, CHROMA_MARGIN, LIGHTNESS_MARGIN = 7.0, 2.5, 5.0  # how far a border may be for both its names to do
+HUE_MARGIN, CHROMA_MARGIN, LIGHTNESS_MARGIN = (
+    7.0,
+    2.5,
+    5.0,
+)  # near a border, both names are valid
 
 
 def colour_name(lightness: float, a: float, b: float) -> str:

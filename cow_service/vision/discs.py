@@ -1,6 +1,6 @@
-"""Completes balls: a region most of whose outline lies on one circle, all of which lies on edges, is that disc.
+"""Completes balls: a region is a disc if most of its outline lies on one circle and the circle lies on edges.
 
-Colour alone loses a ball's highlight and wins its contact shadow; the circle does neither.
+By colour alone, a ball's region lacks its highlight and includes its contact shadow; the circle does neither.
 """
 
 from __future__ import annotations

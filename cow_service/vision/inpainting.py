@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from cow_service.vision.masks import Image, Mask, scaled_size, window_of
 
 INPAINT_RADIUS = 4  # px
-MARGIN = 8  # px around a drawing that the fill may look at
+MARGIN = 8  # px around a drawing that inpainting may use
 TEXTURE_SIGMA = 3.0  # px: finer detail than this is texture, coarser is shading
-VARIED = 18.0  # grey levels of standard deviation around a hole
+VARIED = 18.0  # grey levels: standard deviation around a hole from which exemplars are used
 RIM, RIM_LEAST = 0.04, 3.0  # of the hole's size, px: next to it the fill fades out, and nothing is learnt
 SHADOW_STEP = 14.0  # grey levels
 LEAST_WEIGHT = 1e-3  # of a pyramid cell known: with less, the coarser level says more

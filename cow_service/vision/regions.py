@@ -1,9 +1,8 @@
 """Finds the objects of an uncluttered image: coloured, white or black things on a floor, a table or a wall.
 
-What differs from its wide surroundings in colour, stands out brighter, or is nearly black, is part of an object; a
-patch enclosed by edges below a bright top is the shaded side of a white one. Shadows are darker and keep the hue:
-left out. Where the surroundings themselves vary too much (most photographs), nothing is reported instead of something
-wrong.
+A pixel that differs from its wide surroundings in colour, is brighter, or is nearly black, belongs to an object; so
+does a patch enclosed by edges below a bright top: the shaded side of a white object. Shadows, darker but of the same
+hue, are left out. Where the surroundings vary too much (most photographs), no region is returned instead of wrong ones.
 """
 
 from __future__ import annotations
@@ -41,13 +40,13 @@ Channel = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Region:
-    """One object of the image as seen, without a noun: where it is and what colour. Not what moves."""
+    """One object of the image: its place and its colour. Not what kind of object it is, nor whether it moves."""
 
     mask: CroppedMask
     colour: str
-    colours: frozenset[str]  # other names that would do for it included
+    colours: frozenset[str]  # all names that people may use for its colour
     roundness: float  # 0..1: how much of the smallest circle around it the region fills
-    is_disc: bool  # its outline was measured as a circle: the mask is exact, no cut can better it
+    is_disc: bool  # its outline was fitted by a circle: the mask is exact, segmenting it again would not improve it
 
     @property
     def bbox(self) -> BBox:

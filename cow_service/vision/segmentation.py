@@ -14,18 +14,18 @@ POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
 ITERATIONS = 2
 GROW, SHRINK = 0.05, 0.04  # of its size: how far a guess may be from the object, outwards and inwards
 LEAST_BACKGROUND = 0.15  # of a crop, to learn the background from
-CORE, LARGE_CORE = 0.25, 0.6  # of the box: the ellipse in its middle that is surely the object
-SPAN = 0.7  # of the box's sides: a box is tight, so a cut that spans less is tried again with the large core
+CORE, LARGE_CORE = 0.25, 0.6  # of the box: the central ellipse that is labelled as sure foreground
+SPAN = 0.7  # of the box's sides: boxes are tight, so a mask that spans less is cut again with the large core
 GAMMA = 0.5  # brightens what is cut: dark hair on a dark wall differs by few grey levels
 MARGIN = 0.25  # of the box, kept around it as sure background
-STEADY = 0.6  # weight of a mask that stays the same when more is looked at
+STABILITY_WEIGHT = 0.6  # in the score: how much a mask stays the same when more of the image is used
 POINT_REACHES = (0.07, 0.11, 0.16, 0.24, 0.34)  # half sides tried around a point, of the image's shorter side
 
 
 def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
     """Mask [H, W] of the object in a box, by GrabCut; a guess [H, W] of it makes the cut surer and faster.
 
-    Falls back to the ellipse in the box where colour tells nothing apart. Never empty.
+    Falls back to the ellipse in the box where colour does not separate the object. Never empty.
     """
     height, width = image.shape[:2]
     x0, y0, x1, y1 = _inside(bbox, width, height)
@@ -64,9 +64,9 @@ def mask_from_point(image: Image, point: tuple[float, float]) -> Mask:
     for (score, mask), (_, larger) in zip(tries, [*tries[1:], (0.0, None)], strict=True):
         if mask is None:
             continue
-        steady = 0.0 if larger is None else float((mask & larger).sum() / (mask | larger).sum())
-        if best is None or score + STEADY * steady > best[0] + 0.02:
-            best = score + STEADY * steady, mask
+        stability = 0.0 if larger is None else float((mask & larger).sum() / (mask | larger).sum())
+        if best is None or score + STABILITY_WEIGHT * stability > best[0] + 0.02:
+            best = score + STABILITY_WEIGHT * stability, mask
     if best is None:
         half = POINT_REACHES[0] * min(height, width)
         box = (point[0] - half, point[1] - half, point[0] + half, point[1] + half)
@@ -75,7 +75,7 @@ def mask_from_point(image: Image, point: tuple[float, float]) -> Mask:
 
 
 def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[float, Mask | None]:
-    """One try around a point: the mask [H, W] of a thing about `half` px in reach, and how well edges bear it out."""
+    """One try around a point: how well its outline lies on edges, and the mask [H, W], about `half` px in radius."""
     height, width = image.shape[:2]
     outer = 1.6 * half
     rows = slice(max(0, int(point[1] - outer)), min(height, int(point[1] + outer) + 1))
@@ -121,7 +121,7 @@ def _spans(cut: Mask, box: NDArray[np.float64]) -> bool:
 
 
 def _labels_from_box(height: int, width: int, box: NDArray[np.float64], core: float) -> NDArray[np.uint8]:
-    """GrabCut's labels: outside the box is background, the ellipse in it perhaps the object, its `core` surely."""
+    """GrabCut's labels: background outside the box, probable foreground in its ellipse, sure in the `core` of that."""
     labels = np.full((height, width), cv2.GC_BGD, np.uint8)
     x0, y0, x1, y1 = (int(v) for v in np.round(box))
     labels[max(0, y0) : y1, max(0, x0) : x1] = cv2.GC_PR_BGD

@@ -1,7 +1,7 @@
 """Finds the shadow that a ball in the air casts on the floor: a patch of ellipse shape, darker than the floor about it.
 
-The floor keeps its hue in a shade and only darkens. What is of another hue, joined to an object, of another shape or
-size, or one of several such patches is not told to be the shadow: nothing is reported instead of something wrong.
+In a shadow the floor keeps its hue and only darkens. A patch of another hue, shape or size, one that touches an object,
+or one of several alike is not taken for the shadow: None is returned instead of a guess.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from cow_service.vision.masks import Mask, resized_mask, scaled
 from cow_service.vision.scene import Scene
 
 WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
-LEAST_WIDTH = 14.0  # px in the image: the shadow of something smaller is lost in the floor's grain
+LEAST_WIDTH = 14.0  # px in the image: a smaller shadow is lost in the floor's texture
 LIKELY_WIDTH = 0.95  # of the object's width: shadows looked for; the fit settles the rest
 FLATNESS = (0.25, 0.36, 0.5, 0.66)  # of their own width: their heights, on a floor seen at a slant
 RING = (1.15, 1.5)  # of the ellipse: the floor about it that it is compared with
-SLANT = 1.1  # px sideways per px down: light lower than this is none of a room's
+SLANT = 1.1  # px sideways per px down: light indoors falls steeper
 NEAREST = 0.6  # of the object's width, from its foot down to the shadow's middle: nearer, it may touch the floor
 LEAST_SHADE, MOST_SHADE = 0.025, 0.6  # of the floor's lightness that a shadow takes away; more is an object
-TRIES, CANDIDATES = 40, 3  # the darkest patches are looked at, and so many that stand alone measured
-RIVAL = 0.6  # of the darkest patch's shade: another one as dark leaves it open which is the shadow
+MAX_TRIES, MAX_CANDIDATES = 40, 3  # the darkest patches are looked at, and so many that stand alone measured
+RIVAL_SHADE = 0.6  # of the darkest patch's shade: another one as dark leaves it open which is the shadow
 EXPLAINED = 0.5  # of what a smooth floor leaves unexplained around the patch, by a soft ellipse in it
 SOFTNESS = (0.02, 0.3)  # of the ellipse: the width of its edge. An object's is sharper, a smear of light wider
 SAME_HUE = 5.0  # Lab units in the a*b* plane, by which a shade may differ from the floor about it, darkened
-EVEN = 0.35  # of the mean step up to the floor on the four sides: the least of them
+MIN_EVENNESS = 0.35  # of the mean step up to the floor on the four sides: the least of them
 QUARTERS = (0.0, np.pi / 2, np.pi, -np.pi / 2)  # radians
 LEAST_PIXELS, MOST_PIXELS = 60, 700  # of the floor about a patch, at the working size
-STEPS = 8  # of the fit
+MAX_ITERATIONS = 8  # of the fit
 
 Channel = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -69,9 +69,9 @@ def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
         return None
     scale = min(1.0, WORKING_WIDTH / width)
     floor = _floor(scene, bbox, scale)
-    fits = [shadow for shadow in (_fitted(floor, ellipse) for ellipse in _seen(floor)) if shadow is not None]
+    fits = [shadow for shadow in (_fit_ellipse(floor, ellipse) for ellipse in _candidates(floor)) if shadow is not None]
     fits.sort(key=lambda fit: -fit.shade)
-    if not fits or (len(fits) > 1 and fits[1].shade > RIVAL * fits[0].shade):
+    if not fits or (len(fits) > 1 and fits[1].shade > RIVAL_SHADE * fits[0].shade):
         return None
     shadow = fits[0]
     fx, fy = floor.stretch
@@ -95,7 +95,7 @@ def _floor(scene: Scene, bbox: BBox, scale: float) -> _Floor:
     return _Floor(lab[top:], ~grown[top:], box, top, (scene.width / width, scene.height / height))
 
 
-def _seen(floor: _Floor) -> Iterator[Ellipse]:
+def _candidates(floor: _Floor) -> Iterator[Ellipse]:
     """Upright ellipses below the object that stand out from the ring about them, the clearest first."""
     left, top, right, bottom = floor.box
     width = right - left
@@ -112,9 +112,9 @@ def _seen(floor: _Floor) -> Iterator[Ellipse]:
         best[better], which[better] = contrast[better], i
     best[~below] = 0
     least, alone = 0.6 * LEAST_SHADE, 0
-    for _ in range(TRIES):
+    for _ in range(MAX_TRIES):
         y, x = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
-        if best[y, x] < least or alone == CANDIDATES:
+        if best[y, x] < least or alone == MAX_CANDIDATES:
             return
         a, b = sizes[int(which[y, x])]
         if _stands_alone(floor, (float(x), float(y), a, b)):
@@ -138,7 +138,7 @@ def _stands_alone(floor: _Floor, seen: Ellipse) -> bool:
     ring = free & (radius > RING[0]) & (radius < RING[1])
     sides = [ring & (np.abs((angle - turn + np.pi) % (2 * np.pi) - np.pi) < np.pi / 4) for turn in QUARTERS]
     steps = [float(light[side].mean()) - middle for side in sides if side.any()]
-    return min(steps) > EVEN * float(np.mean(steps))
+    return min(steps) > MIN_EVENNESS * float(np.mean(steps))
 
 
 def _contrast(floor: _Floor, a: float, b: float) -> Channel:
@@ -159,7 +159,7 @@ def _contrast(floor: _Floor, a: float, b: float) -> Channel:
     return np.where(whole, dark, 0).astype(np.float32)
 
 
-def _fitted(floor: _Floor, seen: Ellipse) -> Shadow | None:
+def _fit_ellipse(floor: _Floor, seen: Ellipse) -> Shadow | None:
     """A soft tilted ellipse on a smooth floor, fitted to the lightness around what was seen."""
     x, y, a, b = seen
     rows = slice(max(0, round(y - 2.2 * b - 2)), round(y + 2.2 * b + 3))
@@ -232,7 +232,7 @@ def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats)
     parameters, damping = start, 1e-2
     rest, dark = residual(parameters)
     step = np.array([0.1, 0.1, 0.02, 0.02, 0.02, 0.05])
-    for _ in range(STEPS):
+    for _ in range(MAX_ITERATIONS):
         slopes = np.stack(list(_slopes(lambda p: residual(p)[0], parameters, rest, step)), axis=1)
         normal = slopes.T @ slopes
         move = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), slopes.T @ rest)

@@ -1,6 +1,6 @@
-"""Finds what was drawn over an image: patches of one flat colour with sharp ends, narrow somewhere.
+"""Finds strokes drawn over an image: patches of one flat colour with sharp edges and a narrow part.
 
-Arrows and boxes are told apart from these by their shape, in `arrows.py` and `boxes.py`. Nothing here knows a shape.
+`arrows.py` and `boxes.py` classify them by their shape.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ FLAT = 14  # grey levels: median distance of a drawing's pixels from its colour
 SHARP = 56  # grey levels between a drawing and what lies beside it
 SHARP_SHARE = 0.85  # of what lies beside it
 FRINGE = 4  # px around a drawing that compression has mixed with it
-OUTLINE_MOST = 5  # px: the widest outline looked for
+OUTLINE_MOST = 5  # px: maximum width of an outline
 MIN_LENGTH = 18.0  # px at the working size
-ALIKE = 0.04  # of its area: a patch that differs less is the same one, found with another tolerance
+ALIKE = 0.04  # of the area: patches that differ less are the same, found with another tolerance
 BIN = 16  # grey levels: colours this close are tried as one
 MAX_COLOURS = 36  # flat colours tried per thin structure
 
@@ -33,7 +33,7 @@ _SQUARE = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True)
 class Stroke:
-    """A connected patch of one flat colour, at the working size. It may be an arrow, a box, a letter, or nothing."""
+    """A connected patch of one flat colour, at the working size: an arrow, a box, a letter, or something else."""
 
     x: int
     y: int
@@ -56,7 +56,7 @@ def working_image(image: Image) -> WorkingImage:
 
 
 def find_strokes(image: Image) -> Iterator[Stroke]:
-    """Candidates in an RGB image [h, w, 3] of working size. The same drawing can come twice, a little different."""
+    """Candidates in an RGB image [h, w, 3] of working size. A drawing can be found twice, with slight differences."""
     for (bx, by, bw, bh), thin in _patches(_thin_structures(image), most=1.0):
         window = image[by : by + bh, bx : bx + bw]
         allowed = thin.astype(np.uint8) * np.uint8(255)
@@ -74,7 +74,7 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
 
 
 def _is_known(known: dict[tuple[int, int, int, int], int], box: tuple[int, int, int, int], area: int) -> bool:
-    """Whether a patch of this box and nearly this area was looked at before; if not, it now is."""
+    """Whether a patch of this box and nearly this area was seen before; records it if not."""
     before = known.get(box)
     if before is not None and abs(area - before) <= ALIKE * before:
         return True
@@ -128,7 +128,7 @@ def _thin_structures(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _is_drawn(image: Image, stroke: Stroke) -> bool:
-    """Whether the patch is flat inside and ends sharply all around, as paint does and shading does not."""
+    """Whether the patch has one colour and a sharp edge all around, unlike shading."""
     x, y, (h, w) = stroke.x, stroke.y, stroke.patch.shape
     inner = image[y : y + h, x : x + w][stroke.patch].astype(np.int16)
     flat = (np.abs(inner - np.array(stroke.colour, np.int16)) <= FLAT).all(axis=1)

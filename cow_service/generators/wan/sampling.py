@@ -48,11 +48,6 @@ class Sampling(Record):
         """Whether any step takes the second pass."""
         return any(self.guides(step) for step in range(self.steps))
 
-    @property
-    def passes(self) -> int:
-        """Passes through the transformer for the whole clip."""
-        return self.steps + sum(self.guides(step) for step in range(self.steps))
-
     def schedule(self, device: torch.device) -> FlowMatchEulerDiscreteScheduler | UniPCMultistepScheduler:
         """A fresh scheduler with its steps set; it holds the state of one clip.
 
