@@ -144,12 +144,12 @@ def print_models(models: Models, *, as_json: bool) -> None:
         print(models.model_dump_json(indent=2))
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("door", "name", "ready", "what it is"):
+    for heading in ("kind", "name", "ready", "what it is"):
         table.add_column(heading)
-    for door, backends in (("reader", models.readers), ("generator", models.generators)):
+    for kind, backends in (("reader", models.readers), ("generator", models.generators)):
         for backend in backends:
             table.add_row(
-                door, backend.name + (" (default)" if backend.default else ""), _readiness(backend), backend.summary
+                kind, backend.name + (" (default)" if backend.default else ""), _readiness(backend), backend.summary
             )
     console = Console()
     console.print(table)
