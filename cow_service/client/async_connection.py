@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, Mapping
 from contextlib import aclosing
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import httpx
@@ -45,18 +45,17 @@ class AsyncConnection(Operations):
 
     async def run(self, steps: Steps[T]) -> T:
         """The result of steps."""
-        resume = partial(next, steps)
-        while True:
-            try:
-                step = resume()
-            except StopIteration as end:
-                return end.value
-            try:
-                result = await self._perform(step)
-            except (asyncio.CancelledError, Exception) as error:  # noqa: BLE001 - the steps raise it again, see `Client`
-                resume = partial(steps.throw, error)
-            else:
-                resume = partial(steps.send, result)
+        try:
+            step = next(steps)
+            while True:
+                try:
+                    result = await self._perform(step)
+                except (asyncio.CancelledError, Exception) as error:  # noqa: BLE001 - as in `Connection`
+                    step = steps.throw(error)
+                else:
+                    step = steps.send(result)
+        except StopIteration as end:
+            return end.value
 
     async def _perform(self, step: Step) -> Any:
         if isinstance(step, Shielded):

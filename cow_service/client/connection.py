@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Generator, Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import httpx
@@ -43,18 +42,17 @@ class Connection(Operations):
 
     def _run(self, steps: Steps[T], stop: threading.Event | None) -> T:
         """The same; once `stop` is set, the steps are ended by `Stopped`."""
-        resume = partial(next, steps)
-        while True:
-            try:
-                step = resume()
-            except StopIteration as end:
-                return end.value
-            try:
-                result = self._perform(step, stop)
-            except BaseException as error:  # noqa: BLE001 - the steps raise it again, after what they have to tidy up
-                resume = partial(steps.throw, error)
-            else:
-                resume = partial(steps.send, result)
+        try:
+            step = next(steps)
+            while True:
+                try:
+                    result = self._perform(step, stop)
+                except BaseException as error:  # noqa: BLE001 - the steps raise it again, after they have cleaned up
+                    step = steps.throw(error)
+                else:
+                    step = steps.send(result)
+        except StopIteration as end:
+            return end.value
 
     def _perform(self, step: Step, stop: threading.Event | None) -> Any:
         if isinstance(step, Shielded):
