@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from cow_service.jobs.engine import Engine, new_job_id
-from cow_service.jobs.orders import Order
+from cow_service.jobs.engine import JobEngine, new_job_id
+from cow_service.jobs.spec import JobSpec
 from cow_service.media.images import DecodedImage, encode_png
-from cow_service.stages.run import now
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
+from cow_service.stages.run import now
 
 
 class Bench:
@@ -36,7 +36,7 @@ class Bench:
     def __init__(self, folder: Path, database: str | None) -> None:
         url: dict[str, Any] = {"database_url": database} if database else {}
         self.service = Service(Settings(data_dir=folder, **url))
-        self.engine = Engine(self.service)
+        self.engine = JobEngine(self.service)
         self.engine.start()
         self._loop = asyncio.new_event_loop()
         pixels = np.full((64, 96, 3), 200, np.uint8)
@@ -62,14 +62,13 @@ class Bench:
     async def _job(self) -> None:
         job_id = new_job_id(None, None)
         asked = self.request.model_dump(mode="json", exclude_defaults=True)
-        order = Order(
+        spec = JobSpec(
             kind="simulate", request=asked, reader="embedded", generator="cutout", created_at=now(), fresh=True
         )
-        with self.engine.live.waiting(job_id) as waiting:
-            submit = (order, "cutout", None, None, _again(self.image), job_id)
-            await asyncio.to_thread(self.engine.submit, *submit)
-            outcome = await waiting.settled
-        assert isinstance(outcome, str), outcome
+        with self.engine.active.waiting(job_id) as waiter:
+            await asyncio.to_thread(self.engine.submit, job_id, spec, None, None, _again(self.image))
+            await waiter.ended.wait()
+        assert isinstance(waiter.outcome, str), waiter.outcome
 
 
 def _again(image: DecodedImage) -> DecodedImage:

@@ -3,7 +3,9 @@
     python benchmarks/latency.py [--runs N] [--image FILE --question TEXT] [--json FILE]
 
 A real server runs in its own process with an empty data folder. Times are medians in milliseconds; a run of each kind
-is made first and not counted. Peak memory is the largest resident set of the server process.
+is made first and not counted. Of commands the CPU time (user and system) is told, too: other load on the machine
+changes it less, and that of an empty Python is there to compare. Peak memory is the largest resident set of the server
+process.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import argparse
 import base64
 import json
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -25,7 +28,8 @@ import httpx
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "ball-and-mug"
-FRESH = {"Cache-Control": "no-cache"}  # what an earlier run came to must not be found again
+USE = "from cow_service.client import Client; Client()"
+FRESH = {"Cache-Control": "no-cache"}  # no results of earlier runs
 
 
 def timed(run: Callable[[], object], runs: int) -> dict[str, float]:
@@ -41,6 +45,19 @@ def timed(run: Callable[[], object], runs: int) -> dict[str, float]:
         "min_ms": round(min(times), 1),
         "max_ms": round(max(times), 1),
     }
+
+
+def timed_command(command: list[str], runs: int) -> dict[str, float]:
+    """The same of a command, and its median CPU time."""
+    used: list[float] = []
+
+    def run() -> None:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(command, check=True, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        used.append(1000 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime))
+
+    return {**timed(run, runs), "cpu_p50_ms": round(statistics.median(used[1:]), 1)}
 
 
 def cow(*arguments: str) -> list[str]:
@@ -74,10 +91,9 @@ def peak_memory_mb(pid: int) -> float:
 def measure(image: Path, question: str, runs: int) -> dict[str, Any]:
     """All figures."""
     figures: dict[str, Any] = {"cores": os.cpu_count(), "image": image.name, "runs": runs}
-    figures["cow --help"] = timed(lambda: subprocess.run(cow("--help"), check=True, capture_output=True), min(runs, 7))
-    for line in ("import cow_service.client", "from cow_service.client import Client"):
-        command = [sys.executable, "-W", "error", "-c", line]
-        figures[line] = timed(lambda command=command: subprocess.run(command, check=True), min(runs, 7))
+    figures["cow --help"] = timed_command(cow("--help"), runs)
+    for line in ("pass", "import cow_service.client", "from cow_service.client import Client", USE):
+        figures[line] = timed_command([sys.executable, "-W", "error", "-c", line], runs)
     with tempfile.TemporaryDirectory() as data:
         starts: list[float] = []
         for _ in range(3):

@@ -25,10 +25,10 @@ from PIL import Image
 from torch import nn
 from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModel, UMT5Config, UMT5EncoderModel
 
-from cow_service.generators.wan import methods
+from cow_service.generators.wan import conditioning
 from cow_service.generators.wan.acceleration import accelerate
 from cow_service.generators.wan.checkpoints import diffusers_config
-from cow_service.generators.wan.pipeline import Guide, WanTrackPipeline, latent_shape
+from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, latent_shape
 from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tiny import make_tiny
@@ -215,14 +215,14 @@ def film_tracks(pipeline: WanTrackPipeline, case: Case, clock: Clock, sampling: 
     drawn = torch.Generator().manual_seed(SEED)
     noise = torch.randn(latent_shape(case.width, case.height, case.num_frames), generator=drawn)
     try:
-        picture = pipeline.embed_picture(case.picture, case.width, case.height, case.num_frames)
+        image = pipeline.embed_image(case.picture, case.width, case.height, case.num_frames)
         with clock.part("condition"):
-            method = methods.wan_move if "wan-move" in case.manifest.name else methods.ati
-            guided, plain = method(picture.condition, case.tracks, case.width, case.height)
+            method = conditioning.wan_move if "wan-move" in case.manifest.name else conditioning.ati
+            guided, plain = method(image.condition, case.tracks, case.width, case.height)
         texts = pipeline.embed_text(PROMPT), pipeline.embed_text(case.negative)
         moments = [clock.now()]
-        guide = Guide(*texts, picture.embeds, guided, plain)
-        latents = pipeline.denoise(noise, guide, sampling, lambda done, steps: moments.append(clock.now()))
+        given = Conditioning(*texts, image.embeds, guided, plain)
+        latents = pipeline.denoise(noise, given, sampling, lambda done, steps: moments.append(clock.now()))
         with clock.part("decode"):
             pipeline.decode(latents)
     finally:

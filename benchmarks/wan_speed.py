@@ -38,13 +38,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from wan_models import Case, Clock, Studio, Timing, do_without_ftfy
 
-from cow_service.errors import CowError
-from cow_service.generators.wan.acceleration import look, refusals
+from cow_service.errors import CowError, GeneratorUnavailable
+from cow_service.generators.wan.capabilities import detect_capabilities, refusals
 from cow_service.generators.wan.checkpoints import diffusers_config
-from cow_service.generators.wan.device import choose_device, on_threads, within_memory
+from cow_service.generators.wan.execution import within_memory
 from cow_service.generators.wan.pipeline import TEXT_LENGTH, latent_shape
 from cow_service.generators.wan.profiles import Profile, profile_of
 from cow_service.generators.wan.tracks import nearest_lengths
+from cow_service.weights.device import choose_device, cpu_threads
 from cow_service.weights.manifests import load_manifests
 
 PLAIN = "plain"
@@ -115,13 +116,13 @@ def measure(name: str, case: Case, peak: float) -> Result:
     profile = profile_of(case.manifest, next(iter(case.manifest.profiles)) if name == PLAIN else name)
     if name == PLAIN:  # of the first profile it takes the sampling alone
         profile = Profile(summary="", sampling=profile.sampling)
-    sentences = refusals(profile.acceleration, look(case.device))
+    sentences = refusals(profile.acceleration, detect_capabilities(case.device))
     if sentences:
         return Result(name, "refused", " ".join(sentences))
     defaults = case.manifest.defaults
     try:
         with (
-            on_threads(int(defaults["threads"]) if "threads" in defaults else None),
+            cpu_threads(int(defaults["threads"]) if "threads" in defaults else None),
             within_memory(case.device, lambda: None, f"Profile '{name}'"),
         ):
             return Result(name, "measured", None, _notes(name, profile), _figures(name, profile, case, peak))
@@ -241,7 +242,7 @@ def _compared(results: list[Result]) -> list[Result]:
 
 def _surroundings(case: Case) -> dict[str, Any]:
     """Machine, versions and clip."""
-    machine = look(case.device)
+    machine = detect_capabilities(case.device)
     return {
         "machine": {
             "device": machine.device,
@@ -335,11 +336,11 @@ def _words(results: list[dict[str, Any]]) -> list[str]:
 
 def case_of(arguments: argparse.Namespace) -> Case:
     """What was asked for. Raises `ValueError` with a sentence for what cannot be measured here."""
-    device = choose_device("auto")
+    device = choose_device("auto", GeneratorUnavailable)
     models = {
         name: manifest
         for name, manifest in load_manifests().items()
-        if manifest.architecture and manifest.door == "generator"
+        if manifest.architecture and manifest.role == "generator"
     }
     name = arguments.model or ("tiny-ati" if device.type == "cpu" else "ati")
     if name not in models:

@@ -45,8 +45,10 @@ it never holds a path, a trace or a secret. The SDK raises the same classes for 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
+TYPE_PREFIX = "urn:cow:problem:"  # of the URI that a problem's code is part of: a name, not an address
 MAX_DETAIL = 2000  # characters
 MAX_FIELDS = 50  # of one error
 MAX_KEY = 80  # characters
@@ -75,7 +77,7 @@ class CowError(Exception):
 
     code: str = "internal-error"
     status: int = 500
-    request_id: str | None = None  # of the response that told it, where there was one
+    request_id: str | None = None  # of the response that carried it, if any
 
     def __init__(
         self, detail: str, *, errors: tuple[FieldError, ...] = (), headers: dict[str, str] | None = None
@@ -83,12 +85,22 @@ class CowError(Exception):
         self.detail = shortened(detail, MAX_DETAIL)
         super().__init__(self.detail)
         self.errors = errors[:MAX_FIELDS]
-        self.headers = headers or {}  # of the HTTP response, where the error calls for some
+        self.headers = headers or {}  # of the HTTP response
 
     @property
     def title(self) -> str:
         """The kind of error in one sentence, the same for every occurrence."""
         return (type(self).__doc__ or "").strip()
+
+    def as_problem(self) -> dict[str, Any]:
+        """The members of an RFC 9457 problem, as `records.Problem` has them."""
+        return {
+            "type": TYPE_PREFIX + self.code,
+            "title": self.title,
+            "status": self.status,
+            "detail": self.detail,
+            "errors": [asdict(field) for field in self.errors],
+        }
 
 
 class InvalidRequest(CowError):

@@ -1,4 +1,4 @@
-"""Finds backends by name among the installed entry points and loads one only when it is asked for.
+"""Finds backends by name among the installed entry points and loads each when it is first used.
 
 The built-in backends are registered in `pyproject.toml` exactly as those of a third party would be.
 """
@@ -15,7 +15,7 @@ from typing import Generic, Protocol, TypeVar, cast, runtime_checkable
 from cow_service.errors import CowError
 from cow_service.settings import Settings
 
-RETRY = 30.0  # seconds before one that failed to load is tried again: checking tens of gigabytes takes that long
+RETRY_SECONDS = 30.0  # before a backend that failed to load is tried again: checking its weights takes long
 
 Backend = TypeVar("Backend")
 
@@ -25,7 +25,7 @@ class Closable(Protocol):
     """A backend that holds something open, such as connections."""
 
     def close(self) -> None:
-        """Lets go of it."""
+        """Closes it."""
         ...
 
 
@@ -40,7 +40,7 @@ class Registry(Generic[Backend]):
         self._unavailable = unavailable
         self._settings = settings
         self._made: dict[str, Backend] = {}
-        # When, and why: not the error itself, whose traceback would keep what was half loaded.
+        # When, and why; not the error itself: its traceback would keep half-loaded tensors alive.
         self._failed: dict[str, tuple[float, type[CowError], str]] = {}
         self._guard = Lock()
         self._locks: dict[str, Lock] = {}
@@ -61,13 +61,13 @@ class Registry(Generic[Backend]):
         point = self._points[name]
         with self._guard:
             lock = self._locks.setdefault(name, Lock())
-        with lock:  # one that takes minutes to load keeps nobody from the others
+        with lock:  # one per name: a backend that takes minutes to load does not delay the others
             if name not in self._made:
                 self._made[name] = self._make(name, point)
             return self._made[name]
 
     def is_made(self, name: str) -> bool:
-        """Whether the backend of that name is at hand."""
+        """Whether the backend of that name is loaded."""
         return name in self._made
 
     def close(self) -> None:
@@ -81,7 +81,7 @@ class Registry(Generic[Backend]):
     def _make(self, name: str, point: EntryPoint) -> Backend:
         if name in self._failed:
             since, kind, detail = self._failed[name]
-            if time.monotonic() < since + RETRY:
+            if time.monotonic() < since + RETRY_SECONDS:
                 raise kind(detail)
         try:
             factory = cast(Callable[[Settings], Backend], point.load())

@@ -1,4 +1,4 @@
-"""Runs the HTTP server of one process: engine, readiness and a stop that loses nothing."""
+"""Runs the HTTP server of one process: engine, readiness and a graceful shutdown."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ import socket
 import uvicorn
 
 from cow_service.api.app import create_app
-from cow_service.jobs.engine import Engine
+from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
 
-AT_ONCE = 0.5  # seconds that loading may take before the server answers probes
-BEYOND = 5.0  # seconds that open connections are given after running jobs had their time
+LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
+CLOSE_SECONDS = 5.0  # for open connections, after the grace period of running jobs
 
 
 class Server(uvicorn.Server):
-    """Tells the engine as soon as the server is to stop: those who wait for jobs must not keep it."""
+    """Tells the engine as soon as the server is to stop, so that requests that wait for jobs do not hold it up."""
 
-    def __init__(self, config: uvicorn.Config, engine: Engine) -> None:
+    def __init__(self, config: uvicorn.Config, engine: JobEngine) -> None:
         super().__init__(config)
         self._engine = engine
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Takes no more orders, then closes connections, then lets the app end."""
+        """Accepts no more jobs, then closes connections, then lets the app end."""
         self._engine.drain()
         await super().shutdown(sockets)
 
 
 def run_server(service: Service) -> None:
     """Serves until a signal ends it. Raises the `CowError` for which the default request cannot be served."""
-    engine, readiness = Engine(service), Readiness(service)
+    engine, readiness = JobEngine(service), Readiness(service)
     settings = service.settings
     config = uvicorn.Config(
         create_app(engine, readiness),
@@ -38,7 +38,8 @@ def run_server(service: Service) -> None:
         port=settings.port,
         log_config=None,
         access_log=False,
-        timeout_graceful_shutdown=int(settings.shutdown_grace + BEYOND),
+        http="h11",  # whatever is installed: parsers differ on which headers they refuse
+        timeout_graceful_shutdown=int(settings.shutdown_grace + CLOSE_SECONDS),
     )
     server = Server(config, engine)
 
@@ -46,7 +47,7 @@ def run_server(service: Service) -> None:
         server.should_exit = True
 
     readiness.start(failed)
-    readiness.wait(AT_ONCE)
+    readiness.wait(LOAD_WAIT_SECONDS)
     engine.start()
     server.run()
     readiness.wait(0)

@@ -122,7 +122,7 @@ class Service:
         return Models(
             readers=tuple(self._describe("reader", name) for name in self.readers.names()),
             generators=tuple(self._describe("generator", name) for name in self.generators.names()),
-            mllms=tuple(name for name, manifest in load_manifests().items() if manifest.door == "mllm"),
+            mllms=tuple(name for name, manifest in load_manifests().items() if manifest.role == "mllm"),
         )
 
     def __enter__(self) -> Service:
@@ -186,15 +186,15 @@ class Service:
         artifact, image = self.keep_image(decode_data_url(ref))
         return artifact.sha256, image
 
-    def _known(self, door: str, name: str, registry: Registry[Reader] | Registry[Generator]) -> str:
+    def _known(self, role: str, name: str, registry: Registry[Reader] | Registry[Generator]) -> str:
         if name not in registry.names():
-            detail = f"There is no {door} '{name}'. There are: {', '.join(registry.names()) or 'none'}."
-            raise InvalidRequest(detail, errors=(FieldError(f"/{door}", detail),))
+            detail = f"There is no {role} '{name}'. There are: {', '.join(registry.names()) or 'none'}."
+            raise InvalidRequest(detail, errors=(FieldError(f"/{role}", detail),))
         return name
 
-    def _describe(self, door: str, name: str) -> BackendInfo:
+    def _describe(self, role: str, name: str) -> BackendInfo:
         manifest = find_manifest(name)
-        default = name == (self.settings.reader if door == "reader" else self.settings.generator)
+        default = name == (self.settings.reader if role == "reader" else self.settings.generator)
         if manifest is None:
             return BackendInfo(name=name, default=default, ready=None, summary="Registered by another package.")
         modules = manifest.missing_modules()

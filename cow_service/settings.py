@@ -22,7 +22,7 @@ class SettingsError(Exception):
 
 
 class Settings(BaseSettings):
-    """What a server or a command line run may be told."""
+    """The settings of a server or of a command line run."""
 
     model_config = SettingsConfigDict(env_prefix="COW_", env_ignore_empty=True, frozen=True, extra="ignore")
 
@@ -52,7 +52,7 @@ class Settings(BaseSettings):
     )
     mllm_concurrency: int = Field(default=8, ge=1, le=1024, description="Calls of it at the same time; others wait.")
     reader: str = Field(
-        default_factory=lambda told: "mllm" if told.get("mllm") else "embedded",
+        default_factory=lambda values: "mllm" if values.get("mllm") else "embedded",
         description="Reader where a request names none; `mllm` where COW_MLLM is set.",
     )
     generator: str = Field(default="cutout", description="Generator where a request names none.")
@@ -179,7 +179,7 @@ class Settings(BaseSettings):
         return ("transformer", "base") if (checkpoint / "vae").is_dir() else ("transformer",)
 
 
-def _told(item: Any) -> str:
+def _message(item: Any) -> str:
     """One bad setting. A key or an address may hold a secret, and is not repeated."""
     name = str(item["loc"][0])
     if name == "mllm_base_url":
@@ -203,5 +203,5 @@ def load_settings(**overrides: Any) -> Settings:
         field = str(error).split('"')[1:2]
         raise SettingsError(f"Bad settings: COW_{''.join(field).upper()} is not JSON.") from error
     except ValidationError as error:
-        told = "; ".join(_told(item) for item in error.errors() if item["type"] != "default_factory_not_called")
-        raise SettingsError(f"Bad settings: {told}.") from error
+        messages = "; ".join(_message(item) for item in error.errors() if item["type"] != "default_factory_not_called")
+        raise SettingsError(f"Bad settings: {messages}.") from error

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import atexit
 import tempfile
+import time
 from functools import cache
 from pathlib import Path
 
 from fastapi import FastAPI
 
 from cow_service.api.app import create_app
-from cow_service.jobs.engine import Engine
+from cow_service.jobs import state
+from cow_service.jobs.engine import JobEngine
 from cow_service.service import Service
 from cow_service.settings import Settings
 
@@ -18,10 +20,10 @@ FRESH = {"Cache-Control": "no-cache"}  # for requests that must not find what an
 
 
 @cache
-def running_engine() -> Engine:
+def running_engine() -> JobEngine:
     """The engine, with a database of its own."""
     folder = tempfile.TemporaryDirectory(prefix="cow-tests-")
-    engine = Engine(Service(Settings(data_dir=Path(folder.name), shutdown_grace=0)))
+    engine = JobEngine(Service(Settings(data_dir=Path(folder.name), shutdown_grace=0)))
     engine.start()
 
     def end() -> None:
@@ -35,5 +37,19 @@ def running_engine() -> Engine:
 def app_for(service: Service) -> FastAPI:
     """An application whose jobs are this service's from now on. Only one service is at work at a time."""
     engine = running_engine()
+    end_jobs(engine)
     engine.use(service)
     return create_app(engine, closing=False)
+
+
+def end_jobs(engine: JobEngine, seconds: float = 30.0) -> None:
+    """Cancels the jobs that an earlier test left behind, and waits until nobody works on them.
+
+    Else they would go on with the next test's service, and ask its multimodal LLM about another image.
+    """
+    until = time.monotonic() + seconds
+    while (left := set(state.open_jobs())) or engine.active.ids():
+        for job_id in left:
+            engine.cancel(job_id, None)
+        assert time.monotonic() < until, "the work on an earlier test's job does not end"
+        time.sleep(0.01)

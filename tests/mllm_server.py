@@ -43,14 +43,24 @@ class MllmServer:
 
     def text(self, call: int) -> str:
         """All words of a call, in order."""
-        return "\n".join(part for message in self.asked[call]["messages"] for part in _texts(message["content"]))
+        return text_of(self.asked[call])
 
     def images(self, call: int) -> list[NDArray[np.uint8]]:
         """The pictures of a call, RGB, in order."""
-        parts = [p for m in self.asked[call]["messages"] if isinstance(m["content"], list) for p in m["content"]]
-        urls = [part["image_url"]["url"] for part in parts if part["type"] == "image_url"]
-        data = [np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8) for url in urls]
-        return [np.asarray(cv2.imdecode(each, cv2.IMREAD_COLOR)[..., ::-1]) for each in data]
+        return images_of(self.asked[call])
+
+
+def text_of(call: dict[str, Any]) -> str:
+    """All words of a call, in order."""
+    return "\n".join(part for message in call["messages"] for part in _texts(message["content"]))
+
+
+def images_of(call: dict[str, Any]) -> list[NDArray[np.uint8]]:
+    """The pictures of a call, RGB, in order."""
+    parts = [p for m in call["messages"] if isinstance(m["content"], list) for p in m["content"]]
+    urls = [part["image_url"]["url"] for part in parts if part["type"] == "image_url"]
+    data = [np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8) for url in urls]
+    return [np.asarray(cv2.imdecode(each, cv2.IMREAD_COLOR)[..., ::-1]) for each in data]
 
 
 def _texts(content: Any) -> list[str]:
@@ -73,6 +83,7 @@ def completion(text: str | None, finish_reason: str = "stop") -> dict[str, Any]:
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_state: MllmServer
+    body: dict[str, Any]  # of the call that is being answered
 
     def log_message(self, format: str, *args: object) -> None:
         pass
@@ -81,7 +92,8 @@ class _Handler(BaseHTTPRequestHandler):
         state = self.server_state
         body = json.loads(self.rfile.read(int(self.headers["content-length"])))
         with state.lock:
-            state.asked.append(body | {"authorization": self.headers.get("authorization")})
+            self.body = body | {"authorization": self.headers.get("authorization")}
+            state.asked.append(self.body)
             state.at_once += 1  # only what waits counts itself out again
             state.most_at_once = max(state.most_at_once, state.at_once)
             reply = state.next()

@@ -21,7 +21,7 @@ from cow_service.client import (
     AsyncSimulation,
     Client,
     async_connection,
-    sync_connection,
+    connection,
 )
 
 Kind = Literal["sync", "async"]
@@ -147,7 +147,7 @@ class Hurried:
 def hurried(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> Connect:
     """The same, and no client sleeps: `slept` has what each pause would have been."""
     connect.slept.clear()
-    monkeypatch.setattr(sync_connection, "time", Hurried(sync_connection.time, connect.slept))
+    monkeypatch.setattr(connection, "time", Hurried(connection.time, connect.slept))
     monkeypatch.setattr(async_connection, "asyncio", Hurried(asyncio, connect.slept))
     return connect
 

@@ -26,8 +26,8 @@ from hypothesis import strategies as st
 from servers import BODY, IMAGE, QUESTION, Served, eventually
 
 from cow_service.client import AsyncClient, Client, errors
-from cow_service.client.batch_progress import Tally, duration, pace
-from cow_service.client.batches import Patience
+from cow_service.client.batch_progress import BatchProgress, duration, pace
+from cow_service.client.batches import OutageTimer
 from cow_service.client.journal import Journal
 from cow_service.client.questions import Question, questions
 
@@ -325,7 +325,7 @@ def test_what_all_questions_would_meet_ends_the_batch(server: Server, tmp_path: 
     "kind", [errors.QueueFull, errors.ShuttingDown, errors.StorageUnavailable, errors.RateLimited, errors.BodyTooSlow]
 )
 def test_what_passes_is_no_failure_of_a_question(kind: type[errors.CowError]) -> None:
-    assert Patience(60).pause_after(kind("not now")) is not None
+    assert OutageTimer(60).pause_after(kind("not now")) is not None
 
 
 def scripted(*, cancel: int = 200) -> Callable[[httpx.Request], httpx.Response]:
@@ -362,7 +362,7 @@ def test_a_question_that_takes_too_long_fails_alone(tmp_path: Path, cancel: int)
 
 def test_looks_at_jobs_are_words_of_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[int] = []
-    monkeypatch.setattr(Patience, "hear", lambda _: heard.append(1))
+    monkeypatch.setattr(OutageTimer, "reset", lambda _: heard.append(1))
     http = httpx.Client(transport=httpx.MockTransport(scripted()))
     with http, Client("http://x", http_client=http) as client:
         list(client.map(asked(1), kind="simulate", timeout=0.5))
@@ -427,28 +427,28 @@ def test_the_callers_iterator_is_used_where_it_lives(server: Server) -> None:
 
 
 def test_patience_with_a_server_that_takes_nothing() -> None:
-    assert Patience(60).pause_after(errors.CannotGround("no")) is None
+    assert OutageTimer(60).pause_after(errors.CannotGround("no")) is None
     with pytest.raises(errors.QueueFull):
-        Patience(-1).pause_after(errors.QueueFull("full"))
+        OutageTimer(-1).pause_after(errors.QueueFull("full"))
     told: list[str | None] = []
-    patience = Patience(60, lambda error: told.append(error and error.code))
+    timer = OutageTimer(60, lambda error: told.append(error and error.code))
     with pytest.raises(errors.ServerUnreachable):
-        patience.pause_after(errors.ServerUnreachable("there never was one"))
-    patience.hear()
-    assert patience.pause_after(errors.ServerUnreachable("it is away for a moment")) is not None
+        timer.pause_after(errors.ServerUnreachable("there never was one"))
+    timer.reset()
+    assert timer.pause_after(errors.ServerUnreachable("it is away for a moment")) is not None
     assert told == [None, "server-unreachable"]
     with pytest.raises(errors.Unauthorized):
-        Patience(60).pause_after(errors.Unauthorized("no key"))
+        OutageTimer(60).pause_after(errors.Unauthorized("no key"))
 
 
 def test_progress_in_words() -> None:
-    tally = Tally(100, began=time.monotonic() - 10)
+    progress = BatchProgress(100, began=time.monotonic() - 10)
     for _ in range(50):
-        tally.count(True, before=True)
+        progress.count(True, earlier=True)
     for _ in range(20):
-        tally.count(True)
-    tally.count(False)
-    assert str(tally) == "71/100 done, 1 failed, 2.1/s, 14 s left"
+        progress.count(True)
+    progress.count(False)
+    assert str(progress) == "71/100 done, 1 failed, 2.1/s, 14 s left"
     assert [duration(s) for s in (59.4, 61, 3600, 7300)] == ["59 s", "1:01 min", "1:00 h", "2:01 h"]
     assert [pace(r) for r in (2.04, 0.5)] == ["2.0/s", "30.0/min"]
 

@@ -38,10 +38,10 @@ from servers import IMAGE, QUESTION, Served, data_url, eventually, slow
 import cow_service.client
 from cow_service import records
 from cow_service.client import AsyncClient, Client, CowError, Event, Simulation, errors
+from cow_service.client.display import simulation_html
 from cow_service.client.inputs import Upload, image_input
 from cow_service.client.options import AnswerOptions, SimulateOptions
-from cow_service.client.progress import told
-from cow_service.client.shown import simulation_html
+from cow_service.client.progress import reporting
 from cow_service.records import Job
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, SimulateRequest
 
@@ -418,7 +418,7 @@ def test_a_notebook_shows_what_is_left_when_the_server_has_gone(
         seen: list[str] = []
         monkeypatch.setattr(
             simulation._files,
-            "_download",
+            "fetch",
             lambda sha256: seen.append(sha256) or (_ for _ in ()).throw(CowError("gone")),
         )
         page = simulation._repr_html_()
@@ -497,7 +497,7 @@ def test_jobs_are_found_by_what_they_are(client: Any, served: Served) -> None:
 
 
 def test_jobs_come_page_by_page(connect: Connect, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cow_service.client.calls.PAGE", 2)
+    monkeypatch.setattr("cow_service.client.operations.JOBS_PER_PAGE", 2)
     http, seen = connect.seen()
     client = connect(address, http_client=http)
     ids = [client.simulate(IMAGE, QUESTION, fresh=False, **SMALL).id for _ in range(5)]
@@ -544,10 +544,10 @@ def test_progress_is_shown(address: str, capsys: pytest.CaptureFixture[str], bar
 
 @pytest.mark.parametrize("bar", ["rich", "tqdm"])
 def test_bars_bear_every_share(bar: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    with told(bar) as tell:
-        assert tell is not None
+    with reporting(bar) as report:
+        assert report is not None
         for share in [0, *(n / 7 for n in range(8)), 0.1, 0.7, 1.0]:
-            tell(Job.model_validate({**JOB, "progress": share}))
+            report(Job.model_validate({**JOB, "progress": share}))
 
 
 def test_progress_in_many_threads(address: str) -> None:
@@ -641,7 +641,8 @@ def test_examples_in_the_docs_are_true(address: str, tmp_path: Path, monkeypatch
         own = {"client": client, "base_url": address, "asyncio": asyncio}
         found = {name: doctest.testmod(importlib.import_module(name), extraglobs=own) for name in names}
     assert not {name: each for name, each in found.items() if each.failed}
-    assert {name.rpartition(".")[2] for name, each in found.items() if each.attempted} >= {"sync", "aio", "results"}
+    modules = {"client", "async_client", "base", "results"}
+    assert {name.rpartition(".")[2] for name, each in found.items() if each.attempted} >= modules
 
 
 USE = """

@@ -37,7 +37,7 @@ from sdk import (
 from servers import IMAGE, QUESTION, Served, data_url, eventually, slow
 
 from cow_service.client import AsyncClient, CowError, errors
-from cow_service.client.retries import LONGEST_PAUSE
+from cow_service.client.retries import MAX_RETRY_AFTER_SECONDS
 from cow_service.errors import kinds
 
 __all__ = ["connect", "hurried"]  # fixtures
@@ -94,10 +94,10 @@ def test_refusals_at_the_door_are_tried_again(hurried: Connect, code: str) -> No
     [
         ("0", 0, 0.3),
         ("3", 3, 3.5),
-        ("3600", LONGEST_PAUSE, LONGEST_PAUSE + 0.3),
-        ("9" * 400, LONGEST_PAUSE, LONGEST_PAUSE + 0.3),
+        ("3600", MAX_RETRY_AFTER_SECONDS, MAX_RETRY_AFTER_SECONDS + 0.3),
+        ("9" * 400, MAX_RETRY_AFTER_SECONDS, MAX_RETRY_AFTER_SECONDS + 0.3),
         (30, 20, 31),
-        (4000, LONGEST_PAUSE, LONGEST_PAUSE + 0.3),
+        (4000, MAX_RETRY_AFTER_SECONDS, MAX_RETRY_AFTER_SECONDS + 0.3),
         (-50, 0, 0.3),
         ("soon", 0.3, 0.7),
         ("-5", 0.3, 0.7),
@@ -272,7 +272,7 @@ def test_a_problem_is_raised_as_the_class_of_its_code(hurried: Connect) -> None:
             assert error.detail == str(error) == f"Wrong: {code}."
             assert [(field.pointer, field.detail) for field in error.errors] == [("/fps", "too fast"), ("/seed", "odd")]
             assert any("r-9" in note for note in error.__notes__)
-            assert kind.__name__ in errors.__all__
+            assert getattr(errors, kind.__name__) is kind
 
 
 def test_what_a_job_failed_with_is_raised_as_the_same_class(hurried: Connect) -> None:
@@ -298,8 +298,7 @@ def test_every_error_class_can_be_imported_from_the_sdk() -> None:
         for name, value in vars(module).items()
         if isinstance(value, type) and value.__module__ == module.__name__
     }
-    assert set(errors.__all__) == classes
-    assert all(hasattr(errors, name) for name in errors.__all__)
+    assert classes <= set(vars(errors))
 
 
 def test_a_code_of_a_later_version_is_a_plain_error_with_that_code(hurried: Connect) -> None:

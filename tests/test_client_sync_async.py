@@ -20,7 +20,7 @@ from servers import IMAGE, QUESTION, data_url
 from cow_service import client as sdk
 from cow_service.client import CowError
 from cow_service.client.async_connection import AsyncConnection
-from cow_service.client.sync_connection import Connection
+from cow_service.client.connection import Connection
 
 PAIRS = [
     (sdk.Client, sdk.AsyncClient),

@@ -15,8 +15,8 @@ from engines import app_for
 from fastapi import FastAPI
 
 from cow_service import errors
-from cow_service.api.problems import problem_of
 from cow_service.errors import CowError, FieldError
+from cow_service.records import Problem
 from cow_service.registry import Registry
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -83,7 +83,7 @@ def test_every_code_of_simulate_is_in_the_contract(document: dict) -> None:
 
 
 def test_one_error_shape() -> None:
-    problem = problem_of(errors.InvalidRequest("x is 7; give 8.", errors=(FieldError("/x", "7"),)))
+    problem = Problem(**errors.InvalidRequest("x is 7; give 8.", errors=(FieldError("/x", "7"),)).as_problem())
     assert problem.model_dump() == {
         "type": "urn:cow:problem:invalid-request",
         "title": "The request is not valid.",

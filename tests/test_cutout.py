@@ -16,8 +16,7 @@ from cow_service.generators.cutout import MAX_SIDE, CutoutGenerator, CutoutOptio
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import compute_trajectory
-from cow_service.vision.obstacles import obstacles_of
-from cow_service.vision.quilt import quilt
+from cow_service.vision.inpainting import exemplar_inpaint
 
 RED, BLUE = (210, 20, 20), (50, 80, 200)
 CENTRE, RADIUS = (160.0, 200.0), 40.0
@@ -33,7 +32,7 @@ def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion)
     grounding = ground(run).value
     moving = read_motion(run, grounding).value
     trajectory = compute_trajectory(run, grounding, moving).value
-    obstacles = obstacles_of(run.scene, grounding.bbox)
+    obstacles = run.scene.obstacles(grounding.bbox)
     options = CutoutOptions(clean_cues=clean)
     return GeneratorInput(run.scene, grounding, moving, trajectory, obstacles, 0, options)
 
@@ -176,6 +175,6 @@ def test_quilting_copies_what_is_around() -> None:
     hole[36:60, 36:60] = True
     damaged = np.where(hole[..., None], 0, source).astype(np.float32)
     shading = np.full_like(source, 130)
-    filled = quilt(damaged, hole, np.zeros_like(hole), shading)
+    filled = exemplar_inpaint(damaged, hole, np.zeros_like(hole), shading)
     assert np.abs(filled - source)[hole].mean() < 30
-    assert np.allclose(quilt(damaged, np.ones_like(hole), hole, shading), shading)
+    assert np.allclose(exemplar_inpaint(damaged, np.ones_like(hole), hole, shading), shading)

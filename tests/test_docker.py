@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service import __version__
 from cow_service.cli.main import app
-from cow_service.jobs.engine import LEFT_OVER
+from cow_service.jobs.engine import HANDOVER_SECONDS
 from cow_service.server import BEYOND
 from cow_service.settings import Settings, load_settings
 from cow_service.weights.manifests import load_manifests
@@ -277,7 +277,7 @@ def test_the_commands_of_the_comments_are_right(file: Path, monkeypatch: pytest.
             options = words[:at]
             given = [words[at + 1] for at, word in enumerate(options) if word == "-e"]
             settings = check_settings(monkeypatch, dict(one.split("=", 1) for one in given))
-            assert settings.generator in [name for name, found in load_manifests().items() if found.door == "generator"]
+            assert settings.generator in [name for name, found in load_manifests().items() if found.role == "generator"]
             published = [words[at + 1] for at, word in enumerate(options) if word == "-p"]
             assert all(port.startswith("127.0.0.1:") for port in published)
             mounted = {words[at + 1].split(":")[1] for at, word in enumerate(options) if word == "-v"}
@@ -295,7 +295,7 @@ def test_the_commands_of_the_comments_are_right(file: Path, monkeypatch: pytest.
 
 def longest_stop(settings: Settings) -> float:
     """Seconds: open connections, then jobs, each with the grace and what is added to it."""
-    return 2 * settings.shutdown_grace + BEYOND + LEFT_OVER
+    return 2 * settings.shutdown_grace + BEYOND + HANDOVER_SECONDS
 
 
 # --- the health checks, run for real

@@ -61,7 +61,12 @@ def test_stages_and_pipeline_know_no_implementation() -> None:
     for name, path in modules().items():
         if name.startswith("stages.") or name == "pipeline":
             backends = {i for i in imports(path) if i.startswith(("readers.", "generators."))}
-            assert backends <= {"readers.base", "readers.question.wording", "readers.question.choices", "generators.base"}, name
+            assert backends <= {
+                "readers.base",
+                "readers.question.wording",
+                "readers.question.choices",
+                "generators.base",
+            }, name
 
 
 @pytest.mark.parametrize("name", sorted(modules()))
@@ -75,8 +80,8 @@ def test_files_stay_small(name: str) -> None:
         "import cow_service",
         "import cow_service.cli.main",
         "from cow_service.api.app import create_app; from cow_service.service import Service; "
-        "from cow_service.jobs.engine import Engine; from cow_service.settings import Settings; "
-        "s = Service(Settings(data_dir='x')); create_app(Engine(s)); s.models()",
+        "from cow_service.jobs.engine import JobEngine; from cow_service.settings import Settings; "
+        "s = Service(Settings(data_dir='x')); create_app(JobEngine(s)); s.models()",
     ],
 )
 def test_nothing_heavy_is_imported(statement: str) -> None:

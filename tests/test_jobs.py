@@ -495,7 +495,7 @@ def test_whoever_follows_hears_of_the_end(served: Served, method: str, path: str
 @pytest.mark.slow
 def test_silence_is_filled_with_comments(tmp_path_factory: pytest.TempPathFactory) -> None:
     code = (
-        "from cow_service.api.routes import events; events.PING = 1; "
+        "from cow_service.api.routes import jobs; jobs.PING_SECONDS = 1; "
         "from cow_service.cli.main import app; app(['serve'])"
     )
     with Served(tmp_path_factory.mktemp("pings"), code=code, COW_GENERATOR_CONCURRENCY='{"slow": 1}') as one:

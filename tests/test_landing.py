@@ -15,8 +15,7 @@ from drawn import Image, ball, block, jpeg
 from drawn import floor as drawn_floor
 
 from cow_service.physics.landing import landings_below, rolls_into
-from cow_service.vision.masks import BBox
-from cow_service.vision.obstacles import obstacles_of
+from cow_service.records import BBox
 from cow_service.vision.scene import Scene
 from cow_service.vision.shadows import find_shadow
 
@@ -238,7 +237,7 @@ def test_an_obstacle_on_the_way_leaves_it_open() -> None:
     between = throw.cube_bbox(4.5, 0.0)
     image = block(throw.drawn(), tuple(int(v) for v in between), (40, 170, 60))
     scene = Scene(image)
-    obstacles = obstacles_of(scene, throw.ball_bbox)
+    obstacles = scene.obstacles(throw.ball_bbox)
     assert rolls_into(scene, throw.ball_bbox, RIGHT, throw.target, obstacles) is None
     assert rolls_into(scene, throw.ball_bbox, RIGHT, between, obstacles) is True, "what comes after it does not matter"
 
@@ -273,4 +272,4 @@ def verdict(folder: Path) -> tuple[bool | None, bool]:
     meta, scene = given.meta, Scene(given.pixels("image.jpg"))
     mover, target = tuple(meta["bbox"]), tuple(meta["boxes"][meta["target"]][0])
     heading = meta["direction"][0], meta["direction"][1]
-    return rolls_into(scene, mover, heading, target, obstacles_of(scene, mover)), meta["target"] in meta["hits"]
+    return rolls_into(scene, mover, heading, target, scene.obstacles(mover)), meta["target"] in meta["hits"]

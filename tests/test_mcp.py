@@ -39,12 +39,13 @@ from cow_service.api.middleware.keys import hash_of, new_key
 from cow_service.client import AsyncClient, CowError
 from cow_service.client.errors import CannotGround
 from cow_service.errors import FieldError, InvalidRequest, Unauthorized
-from cow_service.mcp import transport as mcp_serving
-from cow_service.mcp.errors import REMEDIES, in_words
+from cow_service.mcp.backends import backend_for, for_its_owner
+from cow_service.mcp.errors import REMEDIES, error_text
 from cow_service.mcp.images import image_of
 from cow_service.mcp.inputs import AnswerInput, SimulateInput, parsed
-from cow_service.mcp.pictures import BUDGET, fitted
+from cow_service.mcp.pictures import MAX_BYTES, fitted
 from cow_service.mcp.server import Caller
+from cow_service.mcp.transport import protection, with_own_keys
 from cow_service.requests import ImageArtifact
 from cow_service.settings import Settings, SettingsError
 
@@ -595,7 +596,7 @@ def test_images_by_whatever_names_them(tmp_path: Path) -> None:
 
 def test_arguments_become_a_request() -> None:
     plain = parsed(SimulateInput, {"image": "x", "question": "?"})
-    assert plain.rest() == {"frames": {"policy": "events"}, "video": False}
+    assert plain.request_fields() == {"frames": {"policy": "events"}, "video": False}
     full = {
         "image": "x",
         "question": "?",
@@ -604,7 +605,7 @@ def test_arguments_become_a_request() -> None:
         "motion_kind": "fall",
         "options": '["a","b"]',
     }
-    assert parsed(AnswerInput, full).rest() == {
+    assert parsed(AnswerInput, full).request_fields() == {
         "grounding": {"object": "cup", "point": [1, 2]},
         "motion": {"kind": "fall"},
         "options": ["a", "b"],
@@ -625,16 +626,16 @@ def test_remedies_are_for_errors_that_there_are() -> None:
     known = {kind.code for kind in CowError.__subclasses__()} | {CannotGround.code, "object-not-found"}
     assert set(REMEDIES) <= known
     error = InvalidRequest("-", errors=(FieldError("/motion/kind", "wrong"), FieldError("", "none")))
-    assert in_words(error).splitlines()[1:] == ["- motion_kind: wrong", "- arguments: none"]
+    assert error_text(error).splitlines()[1:] == ["- motion_kind: wrong", "- arguments: none"]
 
 
 def test_names_by_which_it_may_be_asked() -> None:
-    security = mcp_serving.protection("::", ["Cow.Example", "10.0.0.7:8443"])
+    security = protection("::", ["Cow.Example", "10.0.0.7:8443"])
     assert security.enable_dns_rebinding_protection
     assert {"localhost:*", "[::1]", "cow.example", "cow.example:*", "10.0.0.7:8443"} <= set(security.allowed_hosts)
     assert "::" not in security.allowed_hosts
     assert "https://cow.example" in security.allowed_origins
-    assert "[fd00::1]:*" in mcp_serving.protection("fd00::1", []).allowed_hosts
+    assert "[fd00::1]:*" in protection("fd00::1", []).allowed_hosts
 
 
 def test_our_own_key_is_not_lent_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -644,24 +645,24 @@ def test_our_own_key_is_not_lent_to_others(monkeypatch: pytest.MonkeyPatch) -> N
     async def way(_: Caller) -> AsyncGenerator[AsyncClient]:
         yield AsyncClient("http://cow")
 
-    async def asked(caller: Caller, all_of_them: bool) -> None:
-        async with mcp_serving.with_own_keys(way, all_of_them=all_of_them)(caller) as client:
+    async def asked(caller: Caller, everybody: bool) -> None:
+        async with with_own_keys(way, everybody=everybody)(caller) as client:
             await client.close()
 
     anyio.run(asked, Caller("theirs"), True)
     anyio.run(asked, Caller(), False)
     anyio.run(asked, Caller("theirs", forwarded=True), False)
-    for caller, all_of_them in ((Caller(), True), (Caller(forwarded=True), False)):
+    for caller, everybody in ((Caller(), True), (Caller(forwarded=True), False)):
         with pytest.raises(Unauthorized):
-            anyio.run(asked, caller, all_of_them)
+            anyio.run(asked, caller, everybody)
 
 
 def test_a_server_of_ones_own_has_no_keys(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, api_keys=json.loads(KEYS), cors_origins=("*",), host="0.0.0.0")
-    own = mcp_serving.for_its_owner(settings)
+    own = for_its_owner(settings)
     assert (own.api_keys, own.cors_origins, own.host, own.data_dir) == ({}, (), "127.0.0.1", tmp_path)
     with pytest.raises(SettingsError, match="http"):
-        mcp_serving.house_of(settings, "cow.example")
+        backend_for(settings, "cow.example")
 
 
 @pytest.mark.parametrize("count", [1, 3, 30])
@@ -671,7 +672,7 @@ def test_pictures_of_photographs_fit_into_a_message(count: int) -> None:
     Image.fromarray(noise).save(buffer, "PNG")
     media_type, shown = fitted([buffer.getvalue()] * count)
     assert len(shown) == count
-    assert sum(map(len, shown)) <= BUDGET
+    assert sum(map(len, shown)) <= MAX_BYTES
     sizes = {Image.open(io.BytesIO(data)).size for data in shown}
     assert len(sizes) == 1
     assert max(sizes.pop()) <= 1024

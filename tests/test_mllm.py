@@ -22,7 +22,7 @@ import mllm_server as say
 import pytest
 from conftest import ROOT, example
 from drawn import DrawnArrow, angle_between, ball, block, floor
-from engines import FRESH, app_for
+from engines import FRESH, app_for, running_engine
 from hypothesis import given
 from hypothesis import strategies as st
 from mllm_server import MllmServer
@@ -325,26 +325,54 @@ def test_the_wait_that_a_server_asks_for_is_kept(mllm: MllmServer, make) -> None
 def test_a_caller_who_leaves_is_not_waited_for(mllm: MllmServer, make) -> None:
     mllm.say(say.slow(8))
     service = make(mllm_timeout=30)
-    service.check()  # its own thread is there from now on
-
     app = app_for(service)
+    body = json.dumps(QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}).encode()
+    jobs = running_engine().active.ids
 
     async def leave() -> None:
-        transport = httpx.ASGITransport(app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60, headers=FRESH) as client:
-            body = QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}
-            task = asyncio.create_task(client.post("/answer", json=body))
-            await asyncio.sleep(0.5)
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+        """Closes the connection as soon as the model is asked, as a server tells its application."""
+        sent = iter([{"type": "http.request", "body": body}])
 
-    before = set(threading.enumerate())
+        async def receive() -> dict[str, Any]:
+            while (message := next(sent, None)) is None:
+                if mllm.asked:
+                    return {"type": "http.disconnect"}
+                await asyncio.sleep(0.02)
+            return message
+
+        headers = [(b"host", b"cow"), (b"content-type", b"application/json"), (b"cache-control", b"no-cache")]
+        scope = {"type": "http", "method": "POST", "path": "/answer", "headers": headers, "query_string": b""}
+        await app(scope, receive, ignore)
+
+    async def ignore(_: Any) -> None:
+        pass
+
     asyncio.run(leave())
     started = time.monotonic()
-    new = {thread for thread in threading.enumerate() if thread not in before and thread.name.startswith("AnyIO")}
-    while any(thread.is_alive() for thread in new):
-        assert time.monotonic() - started < 6, "the thread waits for the reply"
+    while jobs():
+        assert time.monotonic() - started < 6, "the job waits for the reply"
         time.sleep(0.05)
+    assert len(mllm.asked) == 1
+
+
+def test_a_job_that_a_test_leaves_behind_asks_nobody_in_the_next_one(mllm: MllmServer, make) -> None:
+    mllm.say(say.slow(1, "no reply that can be used"))  # which has the model asked again
+    app = app_for(make())
+
+    async def forget() -> None:
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", headers=FRESH) as client:
+            body = QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}
+            response = await client.post("/answer", json=body, headers={"Prefer": "respond-async"})
+            assert response.status_code == 202
+            while not mllm.asked:
+                await asyncio.sleep(0.02)
+
+    asyncio.run(forget())
+    app_for(make())
+    mllm.say('{"answer": "B"}')
+    time.sleep(2)
+    assert not mllm.asked
 
 
 def test_closing_while_a_call_waits_is_a_typed_error(mllm: MllmServer, tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from cow_service.weights.manifests import Manifest, load_families, load_manifests
-from cow_service.weights.resources import family_names, manifest_names
+from cow_service.weights.resources import FAMILIES, MANIFESTS
 
-ALL = {name: manifest for name, manifest in load_manifests().items() if manifest.door == "mllm"}
+ALL = {name: manifest for name, manifest in load_manifests().items() if manifest.role == "mllm"}
 # One without a name under which it is served is a toy, made from nothing.
 MLLMS = {name: manifest for name, manifest in ALL.items() if manifest.model}
 OPEN = {name: manifest for name, manifest in MLLMS.items() if manifest.provider is None}
@@ -113,8 +113,8 @@ def counts(model: torch.nn.Module) -> dict[str, int]:
 
 class TestNames:
     def test_are_those_of_the_files_and_lower_case(self) -> None:
-        assert all(load_manifests()[name].name == name == name.lower() for name in manifest_names())
-        assert all(load_families()[name].name == name == name.lower() for name in family_names())
+        assert all(load_manifests()[name].name == name == name.lower() for name in MANIFESTS.names())
+        assert all(load_families()[name].name == name == name.lower() for name in FAMILIES.names())
 
     def test_every_model_is_claimed_by_its_own_manifest_alone(self) -> None:
         for name, manifest in MLLMS.items():

@@ -11,7 +11,7 @@ from cow_service.physics.anchors import points_inside, spread_anchors
 from cow_service.physics.camera import Camera, depth_motion
 from cow_service.physics.dynamics import GRAVITY, roll_out
 from cow_service.physics.encounters import Sweep, box_at, find_encounters, stands_nearer, swept_mask
-from cow_service.vision.cuttings import cutting_of
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.obstacles import Obstacle
 
 number = st.floats(-50, 50)
@@ -120,7 +120,7 @@ def sweep(start, end, radius=30, frames=41, airborne=False, scale=None, visible=
 
 
 def obstacle(centre, radius=30, name="vase") -> Obstacle:
-    return Obstacle(name, box(centre, radius), cutting_of(disc(centre, radius)))
+    return Obstacle(name, box(centre, radius), CroppedMask.of(disc(centre, radius)))
 
 
 def kinds(moving: Sweep, *others: Obstacle):

@@ -16,12 +16,12 @@ from cow_service.readers.question.choices import read_choices
 from cow_service.readers.question.wording import direction_words, motion_sentence
 from cow_service.records import MotionKind, Vector
 from cow_service.weights.manifests import Coordinates
-from cow_service.weights.resources import prompt_names
+from cow_service.weights.resources import PROMPTS
 
 HEAD = "---\nstage: motion\nversion: 1\ninputs: [name]\noutput: text\n---\n"
 
 
-@pytest.mark.parametrize("name", prompt_names())
+@pytest.mark.parametrize("name", PROMPTS.names())
 def test_every_shipped_prompt_loads(name: str) -> None:
     prompt = load_prompt(name)
     assert prompt.name == name
@@ -58,7 +58,7 @@ SAMPLES: dict[str, object] = {
 }
 
 
-@pytest.mark.parametrize("name", prompt_names())
+@pytest.mark.parametrize("name", PROMPTS.names())
 def test_every_shipped_prompt_renders_its_inputs_and_no_others(name: str) -> None:
     prompt = load_prompt(name)
     inputs = {each: SAMPLES[each] for each in prompt.inputs}
@@ -85,7 +85,7 @@ SCHEMAS = {
 }
 
 
-@pytest.mark.parametrize("name", [name for name in prompt_names() if load_prompt(name).output != "text"])
+@pytest.mark.parametrize("name", [name for name in PROMPTS.names() if load_prompt(name).output != "text"])
 def test_a_prompt_shows_the_fields_of_its_schema(name: str) -> None:
     prompt = load_prompt(name)
     text = prompt.render(**{each: SAMPLES[each] for each in prompt.inputs})

@@ -49,7 +49,7 @@ def test_what_cannot_be_loaded_is_told(service: Service, monkeypatch: pytest.Mon
 
 
 def test_not_on_a_full_disk(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(readiness, "LEAST_FREE", 10**18)
+    monkeypatch.setattr(readiness, "MIN_FREE_BYTES", 10**18)
     service.check()
     with pytest.raises(StorageUnavailable, match="MB left"):
         Readiness(service).check()

@@ -10,11 +10,11 @@ from drawn import ball, block, floor, jpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.vision.colours import name_of, names_of
-from cow_service.vision.masks import bbox_of, mask_from_bbox, mask_from_point
-from cow_service.vision.obstacles import obstacles_of
+from cow_service.vision.colours import colour_name, colour_names
+from cow_service.vision.masks import bbox_of
 from cow_service.vision.regions import find_regions
 from cow_service.vision.scene import Scene, iou
+from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 
 RGB = {
     "red": (200, 30, 30),
@@ -73,13 +73,13 @@ def test_objects_of_rendered_scenes(folder) -> None:
 
 @given(st.floats(0, 100), st.floats(-120, 120), st.floats(-120, 120))
 def test_every_colour_has_a_name(lightness: float, a: float, b: float) -> None:
-    assert name_of(lightness, a, b) in names_of(lightness, a, b)
+    assert colour_name(lightness, a, b) in colour_names(lightness, a, b)
 
 
 def test_colours_at_a_border_have_both_names_and_others_one() -> None:
-    assert names_of(55, 30, 52) == {"orange"}
-    assert names_of(45, 44, 47) >= {"red", "orange"}
-    assert "green" not in names_of(60, -3, 46)
+    assert colour_names(55, 30, 52) == {"orange"}
+    assert colour_names(45, 44, 47) >= {"red", "orange"}
+    assert "green" not in colour_names(60, -3, 46)
 
 
 @pytest.mark.parametrize("name", ["ball-and-mug", "bottle-passes-cylinder", "thrown-ball", "car-forward"])
@@ -116,5 +116,5 @@ def test_obstacles_are_named_by_the_question_first() -> None:
     scene = Scene(jpeg(image))
     mover = next(region.bbox for region in scene.regions if region.colour == "red")
     cube = next(region.bbox for region in scene.regions if region.colour == "blue")
-    obstacles = obstacles_of(scene, mover, (LocatedObject(object="big blue cube", bbox=cube),))
+    obstacles = scene.obstacles(mover, (LocatedObject(object="big blue cube", bbox=cube),))
     assert sorted(obstacle.name for obstacle in obstacles) == ["big blue cube", "green object"]

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from cow_service.weights import resources
+from cow_service.weights.resources import MANIFESTS, PROMPTS
 
 ROOT = Path(__file__).parents[1]
 
@@ -23,43 +24,43 @@ def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_names_in_a_checkout() -> None:
-    assert resources.prompt_names() == tuple(sorted(file.stem for file in (ROOT / "prompts").glob("*.md")))
-    assert resources.manifest_names() == tuple(sorted(file.stem for file in (ROOT / "models").glob("*.yaml")))
+    assert PROMPTS.names() == tuple(sorted(file.stem for file in (ROOT / "prompts").glob("*.md")))
+    assert MANIFESTS.names() == tuple(sorted(file.stem for file in (ROOT / "models").glob("*.yaml")))
 
 
 def test_text_in_a_checkout() -> None:
-    for name in resources.prompt_names():
-        assert resources.read_prompt_text(name) == (ROOT / "prompts" / f"{name}.md").read_text(encoding="utf-8")
-    for name in resources.manifest_names():
-        assert resources.read_manifest_text(name) == (ROOT / "models" / f"{name}.yaml").read_text(encoding="utf-8")
+    for name in PROMPTS.names():
+        assert PROMPTS.read(name) == (ROOT / "prompts" / f"{name}.md").read_text(encoding="utf-8")
+    for name in MANIFESTS.names():
+        assert MANIFESTS.read(name) == (ROOT / "models" / f"{name}.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.usefixtures("wheel")
 def test_wheel() -> None:
-    assert resources.prompt_names() == ("hello",)
-    assert resources.manifest_names() == ("toy",)
-    assert resources.read_prompt_text("hello") == "hello.md: ä"
-    assert resources.read_manifest_text("toy") == "toy.yaml: ä"
+    assert PROMPTS.names() == ("hello",)
+    assert MANIFESTS.names() == ("toy",)
+    assert PROMPTS.read("hello") == "hello.md: ä"
+    assert MANIFESTS.read("toy") == "toy.yaml: ä"
 
 
 @pytest.mark.usefixtures("wheel")
 @pytest.mark.parametrize("name", ["absent", "", "../models/toy", "hello.md", "notes"])
 def test_missing_names_what_exists(name: str) -> None:
     with pytest.raises(LookupError, match="there are: hello"):
-        resources.read_prompt_text(name)
+        PROMPTS.read(name)
     with pytest.raises(LookupError, match="there are: toy"):
-        resources.read_manifest_text(name)
+        MANIFESTS.read(name)
 
 
 def test_no_folder_means_no_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "_shipped").mkdir()
     monkeypatch.setattr(resources, "files", lambda package: tmp_path)
-    assert resources.prompt_names() == ()
+    assert PROMPTS.names() == ()
     with pytest.raises(LookupError, match="there are: none"):
-        resources.read_prompt_text("hello")
+        PROMPTS.read("hello")
 
 
 def test_shipped_folders_are_in_the_wheel_recipe() -> None:
     recipe = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    for folder, _ in (resources.PROMPTS, resources.MANIFESTS):
-        assert f'"{folder}" = "cow_service/_shipped/{folder}"' in recipe
+    for kind in (PROMPTS, MANIFESTS):
+        assert f'"{kind.folder}" = "cow_service/_shipped/{kind.folder}"' in recipe

@@ -17,7 +17,7 @@ from cow_service.api.app import create_app
 from cow_service.api.middleware.keys import KeyRing, hash_of, new_key
 from cow_service.api.middleware.rate_limit import Buckets, address_of
 from cow_service.cli.main import app as cow
-from cow_service.jobs.engine import Engine
+from cow_service.jobs.engine import JobEngine
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError, load_settings
 
@@ -45,7 +45,7 @@ UNKNOWN = [
 
 def app_of(tmp_path: Path, **settings: object) -> FastAPI:
     """An app whose engine does not run: what is asked here needs no job."""
-    return create_app(Engine(Service(Settings(data_dir=tmp_path / "data", **settings))))
+    return create_app(JobEngine(Service(Settings(data_dir=tmp_path / "data", **settings))))
 
 
 def ask(

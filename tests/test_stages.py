@@ -19,7 +19,7 @@ from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import trajectory_of
-from cow_service.vision.cuttings import cutting_of
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
 
@@ -129,7 +129,7 @@ def test_anchors_keep_off_where_they_would_else_stand(scene: Scene) -> None:
     x, y = next(anchor for anchor in free if math.dist(anchor, (200, 200)) > 120)
     here = np.zeros((400, 640), bool)
     here[int(y) - 15 : int(y) + 15, int(x) - 15 : int(x) + 15] = True
-    obstacle = Obstacle("vase", (x - 15, y - 15, x + 15, y + 15), cutting_of(here))
+    obstacle = Obstacle("vase", (x - 15, y - 15, x + 15, y + 15), CroppedMask.of(here))
     grounding = grounded(scene, point=(200, 200))
     kept = trajectory_of(scene, grounding, moved(scene, kind="static"), (obstacle,), None, 5, 16).anchors
     assert (x, y) not in kept

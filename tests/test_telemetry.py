@@ -26,10 +26,9 @@ from starlette.types import Message
 from cow_service.api.app import create_app
 from cow_service.api.middleware.keys import hash_of
 from cow_service.api.middleware.origins import Origins
-from cow_service.jobs.engine import Engine
+from cow_service.jobs.engine import JobEngine
 from cow_service.observability import context, tracing
 from cow_service.observability import logging as logs
-from cow_service.observability.context import TraceContext, parse_traceparent
 from cow_service.observability.metrics import Metrics
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
@@ -50,7 +49,7 @@ def ask(app: FastAPI, *requests: tuple[str, str] | tuple[str, str, dict[str, str
 
 @pytest.fixture
 def app(service: Service) -> FastAPI:
-    return create_app(Engine(service))
+    return create_app(JobEngine(service))
 
 
 # --- ids ---
@@ -77,14 +76,13 @@ def test_a_trace_goes_on_or_begins(app: FastAPI) -> None:
         ("GET", "/livez", {"traceparent": f"00-{'0' * 32}-{SPAN}-01"}),
         ("GET", "/livez"),
     )
-    here = parse_traceparent(known.headers["traceparent"])
-    assert here is not None
-    assert (here.trace_id, here.sampled) == (TRACE, True)
-    assert here.span_id != SPAN
+    _, trace_id, span_id, flags = known.headers["traceparent"].split("-")
+    assert (trace_id, flags) == (TRACE, "01")
+    assert span_id not in (SPAN, "0" * 16)
     for response in (other, none):
-        begun = parse_traceparent(response.headers["traceparent"])
-        assert begun is not None
-        assert begun.trace_id not in (TRACE, "0" * 32)
+        begun = re.fullmatch("00-([0-9a-f]{32})-[0-9a-f]{16}-00", response.headers["traceparent"])
+        assert begun
+        assert begun[1] not in (TRACE, "0" * 32)
 
 
 @pytest.mark.parametrize(
@@ -104,11 +102,9 @@ def test_a_trace_goes_on_or_begins(app: FastAPI) -> None:
     ],
 )
 def test_which_traceparents_are_valid(header: str, valid: bool) -> None:
-    found = parse_traceparent(header)
-    assert (found is not None) == valid
-    if found is not None:
-        assert (found.trace_id, found.span_id) == (TRACE, SPAN)
-        assert parse_traceparent(found.traceparent) == found
+    with tracing.span("job", parent=header):
+        assert context.ids() == ({"trace_id": TRACE, "span_id": SPAN} if valid else {})
+        assert context.traceparent() == (f"00-{TRACE}-{SPAN}-{header.split('-')[3]}" if valid else None)
 
 
 def test_faults_carry_the_ids_too(
@@ -117,7 +113,7 @@ def test_faults_carry_the_ids_too(
     def fail(*_: object) -> None:
         raise RuntimeError("secret")
 
-    app = create_app(Engine(service))
+    app = create_app(JobEngine(service))
     monkeypatch.setattr(service, "models", fail)
     in_route = ask(app, ("GET", "/models", {"X-Request-Id": "one"}))[0]
     monkeypatch.setattr(Origins, "_refusal", fail)
@@ -127,13 +123,13 @@ def test_faults_carry_the_ids_too(
         assert response.json()["type"] == "urn:cow:problem:internal-error"
         assert response.headers["x-request-id"] == given
         assert response.headers["x-content-type-options"] == "nosniff"
-        assert parse_traceparent(response.headers["traceparent"])
+        assert re.fullmatch("00-[0-9a-f]{32}-[0-9a-f]{16}-0[01]", response.headers["traceparent"])
         assert "secret" not in response.text
     assert len([record for record in caplog.records if record.exc_info]) == 2
 
 
 def test_an_answer_that_breaks_off_is_not_taken_for_whole(service: Service) -> None:
-    app = create_app(Engine(service))
+    app = create_app(JobEngine(service))
 
     @app.get("/broken")
     async def broken() -> StreamingResponse:
@@ -158,8 +154,7 @@ def test_an_answer_that_breaks_off_is_not_taken_for_whole(service: Service) -> N
 
 
 def test_ids_are_there_for_as_long_as_the_block_runs() -> None:
-    trace = TraceContext(TRACE, SPAN)
-    with context.bound(request="r", trace_context=trace), context.bound(job="j"):
+    with tracing.span("job", parent=PARENT), context.bound(request="r"), context.bound(job="j"):
         assert context.ids() == {"request_id": "r", "job_id": "j", "trace_id": TRACE, "span_id": SPAN}
     assert context.ids() == {}
 
@@ -179,7 +174,7 @@ def samples(metrics: Metrics | str) -> dict[tuple[str, tuple[str, ...]], float]:
 
 def test_requests_are_counted_by_the_template_of_their_route(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, api_keys={"alice": hash_of("cow_alice")}, rate_limit=4)
-    app = create_app(Engine(Service(settings)))
+    app = create_app(JobEngine(Service(settings)))
     key = {"Authorization": "Bearer cow_alice"}
     ask(
         app,
@@ -212,7 +207,7 @@ def test_requests_are_counted_by_the_template_of_their_route(tmp_path: Path) -> 
 
 def test_apps_count_for_themselves(tmp_path: Path) -> None:
     first, second = (Service(Settings(data_dir=tmp_path)) for _ in range(2))
-    app, _ = create_app(Engine(first)), create_app(Engine(second))
+    app, _ = create_app(JobEngine(first)), create_app(JobEngine(second))
     ask(app, ("GET", "/livez"))
     assert ("cow_http_requests_total", ("GET", "/livez", "200")) in samples(first.metrics)
     assert ("cow_http_requests_total", ("GET", "/livez", "200")) not in samples(second.metrics)
@@ -300,7 +295,7 @@ def test_text_is_one_line_a_record(written: SimpleNamespace) -> None:
 
 def test_json_is_one_object_a_line(written: SimpleNamespace) -> None:
     written.set_up(log_format="json", log_level="debug")
-    with context.bound(request="r1", job="j1", trace_context=TraceContext(TRACE, SPAN)):
+    with tracing.span("job", parent=PARENT), context.bound(request="r1", job="j1"):
         logging.getLogger("cow_service.jobs").debug("ü\n", extra={"path": Path("/x"), "n": 1, "message_": None})
     try:
         raise ValueError("why")
@@ -394,9 +389,9 @@ def test_a_collector_takes_a_span_for_each_request(run: SimpleNamespace) -> None
     assert run.collector.resources[0]["service.name"] == "cow"
     assert run.collector.resources[0]["deployment.environment"] == "test"
     spans = {span.span_id.hex(): span for span in run.collector.spans}
-    here = [parse_traceparent(answer.headers["traceparent"]) for answer in run.answers]
-    assert set(spans) == {each.span_id for each in here if each.sampled}  # not the one that its caller left out
-    first, second, refused = (spans[each.span_id] for each in (here[0], here[1], here[3]))
+    here = [answer.headers["traceparent"].split("-") for answer in run.answers]
+    assert set(spans) == {span for _, _, span, flags in here if flags == "01"}  # not the one that its caller left out
+    first, second, refused = (spans[here[place][2]] for place in (0, 1, 3))
     assert (first.trace_id.hex(), first.parent_span_id.hex(), first.name) == (TRACE, SPAN, "GET /models")
     assert first.kind == first.SPAN_KIND_SERVER
     assert not second.parent_span_id
@@ -420,13 +415,14 @@ def test_spans_nest_and_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(*next(iter(environment.items())))
         assert tracing.start(environment)
         try:
-            with tracing.request_span("GET", parse_traceparent(PARENT)) as request:
+            with tracing.request_span("GET", PARENT):
+                request = context.traceparent()
                 with tracing.span("stage", **{"cow.stage": "grounding", "cow.none": None}):
-                    inner = context.trace.get()
-                assert context.trace.get() == request
+                    inner = context.ids()
+                assert context.traceparent() == request
                 tracing.describe("GET /x", failed=True, status=500)
-            with tracing.span("job", parent=request.traceparent):
-                job = context.trace.get()
+            with tracing.span("job", parent=request):
+                job = context.ids()
             with pytest.raises(KeyError), tracing.span("fails"):
                 raise KeyError("k")
         finally:
@@ -437,17 +433,17 @@ def test_spans_nest_and_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(spans) == {"GET /x", "stage", "job", "fails"}
     assert spans["stage"].parent_span_id == spans["GET /x"].span_id == spans["job"].parent_span_id
     assert {span.trace_id.hex() for name, span in spans.items() if name != "fails"} == {TRACE}
-    assert (inner.span_id, job.span_id) == (spans["stage"].span_id.hex(), spans["job"].span_id.hex())
+    assert (inner["span_id"], job["span_id"]) == (spans["stage"].span_id.hex(), spans["job"].span_id.hex())
     assert {each.key: value(each.value) for each in spans["stage"].attributes} == {"cow.stage": "grounding"}
     assert spans["GET /x"].status.code == spans["fails"].status.code == 2
 
 
-def test_without_a_collector_nothing_is_imported() -> None:
+def test_without_a_collector_the_sdk_is_not_imported() -> None:
     code = (
-        "import sys; from cow_service import tracing, context; assert not tracing.start({})\n"
+        "import sys; from cow_service.observability import context, tracing; assert not tracing.start({})\n"
         "with tracing.request_span('GET', None), tracing.span('x', a=1): tracing.describe('y', failed=False)\n"
-        "assert context.trace.get() is None\n"
-        "print([m for m in sys.modules if m.startswith('opentelemetry')])"
+        "assert context.traceparent() is None\n"
+        "print([m for m in sys.modules if m.startswith(('opentelemetry.sdk', 'opentelemetry.exporter'))])"
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert shown.stdout.strip() == "[]"

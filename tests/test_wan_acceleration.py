@@ -24,30 +24,30 @@ from torch import Tensor
 
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
 from cow_service.generators.wan import acceleration as subject
-from cow_service.generators.wan.acceleration import (
-    Acceleration,
-    Machine,
-    accelerate,
-    add_lora,
-    look,
+from cow_service.generators.wan.acceleration import accelerate, reset_cache
+from cow_service.generators.wan.capabilities import (
+    ATTENTION_BACKENDS,
+    MINIMUM_VERSIONS,
+    Capabilities,
+    detect_capabilities,
     refusals,
-    reset_cache,
 )
-from cow_service.generators.wan.machine import BACKENDS, PACKAGES
+from cow_service.generators.wan.lora import add_lora
+from cow_service.generators.wan.profiles import Acceleration
 
 CPU = torch.device("cpu")
 WIDTH = 24  # of the toy's hidden states
 LAYERS = 3
-H200 = Machine(
+H200 = Capabilities(
     device="cuda",
     name="NVIDIA H200",
-    capability=(9, 0),
+    compute_capability=(9, 0),
     memory=150_000_000_000,
     gpus=8,
-    packages=tuple(PACKAGES),
+    packages=tuple(MINIMUM_VERSIONS),
     compiler=True,
 )
-BARE = Machine(device="cpu", name="x86_64", memory=1, gpus=0, compiler=False)
+BARE = Capabilities(device="cpu", name="x86_64", memory=1, gpus=0, compiler=False)
 
 with_torchao = pytest.mark.skipif(find_spec("torchao") is None, reason="torchao is not installed")
 with_accelerate = pytest.mark.skipif(find_spec("accelerate") is None, reason="accelerate is not installed")
@@ -241,7 +241,7 @@ def test_all_blocks_share_one_compiled_graph(options: dict[str, Any], monkeypatc
     graphs, compiler = CompileCounter(), torch.compile
     torch._dynamo.reset()
     monkeypatch.setattr(torch, "compile", lambda function: compiler(function, backend=graphs, fullgraph=True))
-    monkeypatch.setattr(subject, "look", lambda device: BARE.model_copy(update={"compiler": True}))
+    monkeypatch.setattr(subject, "detect_capabilities", lambda device: BARE.model_copy(update={"compiler": True}))
     transformer = accelerated(compile="regional", **options)
     assert same(clip(transformer), clip(accelerated(**options)))
     reset_cache(transformer)
@@ -287,7 +287,7 @@ def test_a_cache_skips_float8_blocks_too(options: dict[str, Any]):
 
 @with_torchao
 def test_what_a_library_raises_is_told_with_the_option(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(subject, "look", lambda device: H200)
+    monkeypatch.setattr(subject, "detect_capabilities", lambda device: H200)
     with pytest.raises(GeneratorUnavailable, match=r"`fp8: dynamic` does not work here: AssertionError: .*COW_PROFILE"):
         accelerate(toy(), Acceleration(fp8="dynamic"), CPU)
 
@@ -322,7 +322,7 @@ def test_no_folder_is_told(monkeypatch: pytest.MonkeyPatch):
 )
 def test_offloaded_parts_compute_the_same(offload: str, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch):
     kept = accelerated(**options)
-    monkeypatch.setattr(subject, "look", lambda device: H200)
+    monkeypatch.setattr(subject, "detect_capabilities", lambda device: H200)
     offloaded = accelerated(offload=offload, **options)
     for _ in range(2):
         assert same(clip(offloaded), clip(kept))
@@ -485,18 +485,22 @@ def test_a_lora_comes_before_float8(tmp_path: Path):
 # Refusals
 
 
-def without(*names: str) -> Machine:
-    return H200.model_copy(update={"packages": tuple(name for name in PACKAGES if name not in names)})
+def without(*names: str) -> Capabilities:
+    return H200.model_copy(update={"packages": tuple(name for name in MINIMUM_VERSIONS if name not in names)})
 
 
-def with_capability(major: int, minor: int) -> Machine:
-    return H200.model_copy(update={"name": "GPU", "capability": (major, minor)})
+def with_capability(major: int, minor: int) -> Capabilities:
+    return H200.model_copy(update={"name": "GPU", "compute_capability": (major, minor)})
 
 
 @pytest.mark.parametrize(
     ("options", "machine", "sentence"),
     [
-        ({"attention": "quick"}, H200, f"attention: there is no 'quick'; choose one of {', '.join(BACKENDS)}."),
+        (
+            {"attention": "quick"},
+            H200,
+            f"attention: there is no 'quick'; choose one of {', '.join(ATTENTION_BACKENDS)}.",
+        ),
         (
             {"attention": "flash"},
             BARE.model_copy(update={"packages": ("flash-attn",)}),
@@ -538,7 +542,7 @@ def with_capability(major: int, minor: int) -> Machine:
         ),
         (
             {"cache": "first-block", "context_parallel": 2},
-            H200.model_copy(update={"ranks": 2}),
+            H200.model_copy(update={"world_size": 2}),
             "cache: GPUs that share a video would not skip the same steps with first-block; choose mag or none.",
         ),
         (
@@ -575,7 +579,7 @@ def with_capability(major: int, minor: int) -> Machine:
         ),
         (
             {"context_parallel": 16},
-            H200.model_copy(update={"ranks": 16}),
+            H200.model_copy(update={"world_size": 16}),
             "context_parallel: 16 needs as many GPUs, and there are 8; choose 1.",
         ),
         (
@@ -586,14 +590,14 @@ def with_capability(major: int, minor: int) -> Machine:
         ),
         (
             {"context_parallel": 2, "attention": "_flash_3"},
-            H200.model_copy(update={"ranks": 2}),
+            H200.model_copy(update={"world_size": 2}),
             "context_parallel: attention '_flash_3' cannot be split among GPUs; choose one of native, _native_flash, "
             "_native_cudnn, flash, flash_hub, _flash_3_hub, sage, sage_hub.",
         ),
     ],
 )
 def test_what_a_machine_cannot_do_is_said_with_reason_and_remedy(
-    options: dict[str, Any], machine: Machine, sentence: str
+    options: dict[str, Any], machine: Capabilities, sentence: str
 ):
     assert refusals(Acceleration(**options), machine) == (sentence,)
 
@@ -628,33 +632,34 @@ def test_a_device_that_is_not_there():
 
 
 def test_the_machine_is_seen_as_it_is(monkeypatch: pytest.MonkeyPatch):
-    machine = look(CPU)
+    machine = detect_capabilities(CPU)
     assert machine.device == "cpu"
-    assert machine.capability is None
+    assert machine.compute_capability is None
     assert machine.memory > 1e8
-    assert machine.ranks == 1
+    assert machine.world_size == 1
     assert ("torchao" in machine.packages) == (find_spec("torchao") is not None)
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setenv("PATH", "")
     monkeypatch.setenv("WORLD_SIZE", "4")
-    assert not look(CPU).compiler
-    assert look(CPU).ranks == 4
+    assert not detect_capabilities(CPU).compiler
+    assert detect_capabilities(CPU).world_size == 4
 
 
 def test_an_old_package_counts_as_none(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("importlib.metadata.version", lambda name: "0.14.9.post2" if name == "torchao" else "99")
-    assert set(look(CPU).packages) == set(PACKAGES) - {"torchao"}
+    assert set(detect_capabilities(CPU).packages) == set(MINIMUM_VERSIONS) - {"torchao"}
 
 
 def test_our_tables_are_those_of_diffusers():
     known = {backend.value for backend in attention_dispatch.AttentionBackendName}
     splits = attention_dispatch._AttentionBackendRegistry._supports_context_parallel
-    assert set(BACKENDS) <= known
-    assert {name for name, backend in BACKENDS.items() if backend.splits} == splits & set(BACKENDS)
-    assert PACKAGES["flash-attn"] == attention_dispatch._REQUIRED_FLASH_VERSION
-    assert PACKAGES["sageattention"] == attention_dispatch._REQUIRED_SAGE_VERSION
-    assert PACKAGES["xformers"] == attention_dispatch._REQUIRED_XFORMERS_VERSION
-    assert {backend.package for backend in BACKENDS.values()} <= {None, *PACKAGES}
+    assert set(ATTENTION_BACKENDS) <= known
+    sharing = {name for name, backend in ATTENTION_BACKENDS.items() if backend.context_parallel}
+    assert sharing == splits & set(ATTENTION_BACKENDS)
+    assert MINIMUM_VERSIONS["flash-attn"] == attention_dispatch._REQUIRED_FLASH_VERSION
+    assert MINIMUM_VERSIONS["sageattention"] == attention_dispatch._REQUIRED_SAGE_VERSION
+    assert MINIMUM_VERSIONS["xformers"] == attention_dispatch._REQUIRED_XFORMERS_VERSION
+    assert {backend.package for backend in ATTENTION_BACKENDS.values()} <= {None, *MINIMUM_VERSIONS}
 
 
 # Several processes
@@ -667,7 +672,7 @@ from cow_service.generators.wan import acceleration
 
 # diffusers takes the rank modulo the number of accelerators; the machine is described as one with two GPUs.
 torch.accelerator.device_count = lambda: 1
-acceleration.look = lambda device: toy.H200.model_copy(update={"ranks": 2})
+acceleration.detect_capabilities = lambda device: toy.H200.model_copy(update={"world_size": 2})
 results = {}
 for name, options in (("none", {}), ("mag", toy.MAG)):
     transformer = toy.accelerated(context_parallel=2, **options)

@@ -158,11 +158,11 @@ def test_a_cancel_takes_effect_within_one_step(toys: Service, monkeypatch: pytes
 
 def test_text_and_image_are_encoded_once(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     simulate(toys, video=False)
-    calls = count(monkeypatch, pipeline_of(toys), "embed_text", "embed_picture")
+    calls = count(monkeypatch, pipeline_of(toys), "embed_text", "embed_image")
     simulate(toys, video=False, seed=7, motion={"direction": [0.3, 1]}, generator_options={"prompt": "new words"})
-    assert calls == {"embed_text": 1, "embed_picture": 0}
+    assert calls == {"embed_text": 1, "embed_image": 0}
     simulate(toys, video=False, num_frames=13, frames={})
-    assert calls["embed_picture"] == 1
+    assert calls["embed_image"] == 1
 
 
 def test_running_out_of_memory(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,7 +174,7 @@ def test_running_out_of_memory(toys: Service, monkeypatch: pytest.MonkeyPatch) -
         torch.empty(2**50, dtype=torch.float64)
 
     hook = pipeline.transformer.register_forward_hook(too_much)
-    calls = count(monkeypatch, pipeline, "embed_picture")
+    calls = count(monkeypatch, pipeline, "embed_image")
     try:
         with pytest.raises(GeneratorOutOfMemory, match="A clip of 17 frames at 112 x 64 does not fit") as caught:
             simulate(toys, video=False)
@@ -183,7 +183,7 @@ def test_running_out_of_memory(toys: Service, monkeypatch: pytest.MonkeyPatch) -
     assert caught.value.code == "generator-out-of-memory"
     assert caught.value.__cause__ is None  # no traceback that holds the tensors
     assert pictures(simulate(toys, video=False)) == before
-    assert calls["embed_picture"] == 1  # what was kept had been let go
+    assert calls["embed_image"] == 1  # what was kept had been let go
 
 
 def test_other_failures_pass_through(toys: Service) -> None:
@@ -352,7 +352,7 @@ def test_the_whole_image_is_looked_at(toys: Service) -> None:
     pipeline, found = pipeline_of(toys), []
     for left in (0, 255):
         image[:, :100] = left
-        found.append(pipeline.embed_picture(image, 112, 64, 5).embeds)
+        found.append(pipeline.embed_image(image, 112, 64, 5).embeds)
     assert not torch.allclose(found[0], found[1])
 
 

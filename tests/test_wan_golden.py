@@ -11,7 +11,7 @@ from golden import figures, image_embeds, original_folder, tensors
 
 from cow_service.generators.wan.checkpoints import load_transformer
 from cow_service.generators.wan.conditioning import ati_condition, wan_move_condition, wan_move_latent
-from cow_service.generators.wan.pipeline import Guide, WanTrackPipeline
+from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.generators.wan.tracks import to_ati_tensor
@@ -60,10 +60,10 @@ def pipeline(tmp_path_factory: pytest.TempPathFactory) -> WanTrackPipeline:
     return made
 
 
-def guide() -> Guide:
+def guide() -> Conditioning:
     golden = tensors("tiny_denoise")
     condition = golden["condition_after"]
-    return Guide(
+    return Conditioning(
         golden["prompt_embeds"][None], golden["negative_prompt_embeds"][None], image_embeds(), condition, condition
     )
 
@@ -132,7 +132,7 @@ def test_wan_move_guides_with_two_conditions(pipeline: WanTrackPipeline) -> None
         lambda module, args, kwargs: seen.append(kwargs["hidden_states"][0, 16:]), with_kwargs=True
     )
     same = guide()
-    split = Guide(same.prompt, same.negative, same.image, same.condition, golden["condition_before"])
+    split = Conditioning(same.prompt, same.negative_prompt, same.image, same.condition, golden["condition_before"])
     try:
         pipeline.denoise(golden["noise"][None], split, sampling, lambda done, steps: None)
     finally:

@@ -95,8 +95,8 @@ def receiver() -> Iterator[Receiver]:
 def app(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FastAPI]:
     """An app with a secret, that may call this machine, and does not wait long."""
     monkeypatch.syspath_prepend(str(SLOW_GENERATOR))
-    monkeypatch.setattr(webhooks, "WAITS", (0, 0))
-    monkeypatch.setattr(webhooks, "POLL", 0.05)
+    monkeypatch.setattr(webhooks, "RETRY_SECONDS", (0, 0))
+    monkeypatch.setattr(webhooks, "POLL_SECONDS", 0.05)
     secret = "whsec_" + base64.b64encode(SECRET).decode()
     service = Service(Settings(data_dir=tmp_path / "data", webhook_secret=secret))
     app = app_for(service)
@@ -120,7 +120,7 @@ def submitted(http: TestClient, body: dict[str, Any], **headers: str) -> str:
 
 def attempts(job: str) -> list[str]:
     """How the attempts to tell of a job's end have ended, as far as they were made."""
-    found = [DBOS.get_workflow_status(name) for name in webhooks.attempts_of(job)]
+    found = [DBOS.get_workflow_status(name) for name in webhooks.attempt_ids(job)]
     return [one.status for one in found if one is not None]
 
 

@@ -21,8 +21,8 @@ from typer.testing import CliRunner
 
 from cow_service.cli.main import app
 from cow_service.errors import WeightsUnavailable
-from cow_service.weights import hub_errors
-from cow_service.weights.hub import Step, fetch, plan, pull
+from cow_service.weights import hub as weights_hub
+from cow_service.weights.hub import DownloadProgress, ProgressCallback, download, resolve
 from cow_service.weights.lock import Lock, LockedFile, check, examine, folder_of, read_lock, ready, verify
 from cow_service.weights.manifests import Manifest, Source, load_manifests
 
@@ -57,7 +57,19 @@ def source(*files: str, repository: str = TOY) -> Source:
 
 def manifest(*sources: Source) -> Manifest:
     parts = {f"part{index}": each for index, each in enumerate(sources)}
-    return Manifest(name="toy", door="generator", summary="", licence="mit", sources=parts)
+    return Manifest(name="toy", role="generator", summary="", licence="mit", sources=parts)
+
+
+def pull(
+    wanted: Source,
+    folder: Path,
+    revision: str | None = None,
+    progress: ProgressCallback = lambda progress: None,
+    *,
+    endpoint: str,
+) -> Path:
+    download([resolve(wanted, folder, revision, endpoint=endpoint)], folder, progress, endpoint=endpoint)
+    return folder_of(folder, wanted.repository)
 
 
 def refusal(hub: Hub, folder: Path, wanted: Source = SOURCE, revision: str | None = None) -> str:
@@ -83,7 +95,7 @@ def problems(wanted: Source, folder: Path, *, digests: bool = True) -> dict[str,
 
 
 def test_a_pull_brings_the_files_that_match_and_records_them(hub: Hub, folder: Path) -> None:
-    steps: list[Step] = []
+    steps: list[DownloadProgress] = []
     assert pull(SOURCE, folder, progress=steps.append, endpoint=hub.address) == folder / "acme--toy"
     for path in ("config.json", "model.safetensors", "vae/model.safetensors"):
         assert (folder / "acme--toy" / path).read_bytes() == FILES[path].data
@@ -118,7 +130,7 @@ def test_a_connection_that_breaks_is_taken_up_where_it_broke(hub: Hub, folder: P
     large = Blob(hashlib.shake_256(b"weights").digest(2**16) * 256)
     hub.commit(TOY, {"large.safetensors": large})
     hub.cut["large.safetensors"] = chunk + 12345
-    steps: list[Step] = []
+    steps: list[DownloadProgress] = []
     pull(source("*.safetensors"), folder, progress=steps.append, endpoint=hub.address)
     assert [asked.range for asked in hub.asked] == [None, f"bytes={chunk}-"]
     assert (folder / "acme--toy" / "large.safetensors").read_bytes() == large.data
@@ -148,9 +160,10 @@ def test_a_pull_that_was_killed_goes_on_with_its_revision(hub: Hub, folder: Path
     hub.stall["vae/model.safetensors"] = 1000
     arguments = SOURCE.model_dump_json(), str(folder), hub.address
     code = (
-        "import sys; from pathlib import Path; from cow_service.weights.hub import pull; "
+        "import sys; from pathlib import Path; from cow_service.weights.hub import download, resolve; "
         "from cow_service.weights.manifests import Source; "
-        "pull(Source.model_validate_json(sys.argv[1]), Path(sys.argv[2]), endpoint=sys.argv[3])"
+        "source, folder, hub = Source.model_validate_json(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]; "
+        "download([resolve(source, folder, endpoint=hub)], folder, endpoint=hub)"
     )
     environment = os.environ | {"HF_HOME": str(tmp_path)}
     with subprocess.Popen([sys.executable, "-c", code, *arguments], env=environment) as process:
@@ -185,9 +198,9 @@ def test_sources_of_one_repository_share_its_folder_and_record(hub: Hub, folder:
 
 def test_pulls_planned_at_the_same_time_record_both(hub: Hub, folder: Path) -> None:
     model, vae = source("model.safetensors"), source("vae/*")
-    plans = [plan(each, folder, endpoint=hub.address) for each in (model, vae)]
-    for each in plans:
-        fetch([each], folder, endpoint=hub.address)
+    downloads = [resolve(each, folder, endpoint=hub.address) for each in (model, vae)]
+    for each in downloads:
+        download([each], folder, endpoint=hub.address)
     assert check(model, folder) == check(vae, folder) == ()
 
 
@@ -316,18 +329,18 @@ def test_the_exceptions_that_have_reasons_exist() -> None:
     import huggingface_hub.errors
 
     transport = sys.modules[huggingface_hub.errors.HTTPError.__module__.split(".", maxsplit=1)[0]]
-    for name, _, _ in hub_errors.REASONS:
+    for name, _, _ in weights_hub.REASONS:
         assert any(hasattr(home, name) for home in (huggingface_hub.errors, transport, builtins)), name
 
 
 def test_progress_is_told_where_files_come_in_chunks_by_the_other_protocol() -> None:
     from huggingface_hub.utils._xet_progress_reporting import XetDownloadProgressReporter
 
-    from cow_service.weights.hub import _bar
+    from cow_service.weights.hub import _progress_bar
 
     told: list[int] = []
     with XetDownloadProgressReporter(
-        reconstruction_desc="", total=100, log_level=30, name="x", tqdm_class=_bar(told.append)
+        reconstruction_desc="", total=100, log_level=30, name="x", tqdm_class=_progress_bar(told.append)
     ) as reporter:
         for done in (30, 100):
             reporter.update_progress(

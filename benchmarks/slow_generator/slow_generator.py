@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from cow_service.generators.base import Shot
+from cow_service.generators.base import GeneratorInput
 from cow_service.records import GeneratorInfo
 
 
@@ -31,10 +31,11 @@ class SlowGenerator:
 
     options_model = SlowOptions
     concurrency = 2
+    fingerprint = "slow"
 
-    def describe(self, shot: Shot) -> GeneratorInfo:
+    def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """Every seed is another clip."""
-        return GeneratorInfo(name="slow", seed=shot.seed, options=shot.options.model_dump())
+        return GeneratorInfo(name="slow", seed=given.seed, options=given.options.model_dump())
 
     def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
         """Any length."""
@@ -45,17 +46,17 @@ class SlowGenerator:
         return 64, 48
 
     def render(
-        self, shot: Shot, wanted: Sequence[int], progress: Callable[[float], None]
+        self, given: GeneratorInput, indices: Sequence[int], progress: Callable[[float], None]
     ) -> Iterator[NDArray[np.uint8]]:
-        """The wanted frames, RGB [48, 64, 3]."""
+        """The frames of these indices, RGB [48, 64, 3]."""
         if journal := os.environ.get("SLOW_JOURNAL"):
             with open(journal, "ab", buffering=0) as file:  # one write: it is whole, or not there
-                file.write(f"{shot.seed}\n".encode())
-        seconds: float = getattr(shot.options, "seconds", 0.0)
-        for done, index in enumerate(wanted):
-            progress(done / len(wanted))
-            time.sleep(seconds / len(wanted))
-            colour = (shot.seed % 251, shot.seed // 251 % 251, index % 251)
+                file.write(f"{given.seed}\n".encode())
+        seconds: float = getattr(given.options, "seconds", 0.0)
+        for done, index in enumerate(indices):
+            progress(done / len(indices))
+            time.sleep(seconds / len(indices))
+            colour = (given.seed % 251, given.seed // 251 % 251, index % 251)
             yield np.full((48, 64, 3), colour, np.uint8)
 
 

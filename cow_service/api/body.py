@@ -1,11 +1,17 @@
-"""Reads the body of a request, JSON or multipart, within the limits, into one checked record."""
+"""Reads the body of a request, JSON or multipart, within the limits, into one validated record.
+
+JSON is read as RFC 8259 has it, more strictly than parsers do by default: what two parsers could read differently is
+refused.
+"""
 
 from __future__ import annotations
 
+import json
+import re
 from collections import Counter
 from contextlib import aclosing
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from fastapi import Request
 from pydantic import ValidationError
@@ -13,7 +19,6 @@ from python_multipart.multipart import parse_options_header
 from starlette.datastructures import FormData, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
-from cow_service.api.json_body import read_object
 from cow_service.api.problems import invalid
 from cow_service.errors import (
     BodyTypeUnsupported,
@@ -29,6 +34,10 @@ from cow_service.service import Service
 
 FORM_FIELDS = ("image", "question", "request")
 SHOWN_CHARACTERS = 80  # of what the caller sent
+MAX_VALUES = 2_000_000  # of a JSON text: the longest tracks that a request may hold, twice; each takes up to 100 bytes
+MAX_KEYS = 1000  # of one JSON object
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+_NAMES = {list: "an array", str: "a string", int: "a number", float: "a number", bool: "a boolean", type(None): "null"}
 
 Body = TypeVar("Body", bound=SimulateRequest)
 
@@ -55,8 +64,8 @@ def body_of(model: type[SimulateRequest]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Posted:
-    """A body as it came: JSON, or the parts of a form. Nothing of it has been checked or decoded."""
+class RawBody:
+    """A body as received: JSON, or the parts of a form. Nothing of it is validated or decoded."""
 
     json: bytes | None = None
     request: str = "{}"  # the form field that holds the rest as JSON
@@ -64,8 +73,8 @@ class Posted:
     image: bytes | None = None
 
 
-async def receive(request: Request) -> Posted:
-    """Takes the body in.
+async def receive(request: Request) -> RawBody:
+    """Receives the body.
 
     Raises `BodyTypeUnsupported`, `BodyTooLarge`, `BodyTooSlow`, and for a form also `MalformedBody`.
     """
@@ -79,30 +88,25 @@ async def receive(request: Request) -> Posted:
             )
         return await _receive_form(request)
     if media_type == "application/json" or media_type.endswith("+json"):
-        return Posted(json=await request.body())
+        return RawBody(json=await request.body())
     raise BodyTypeUnsupported(
         f"The body has the media type '{media_type or 'none'}'. Send application/json or multipart/form-data."
     )
 
 
-def check(posted: Posted, model: type[Body], service: Service) -> tuple[Body, DecodedImage | None]:
-    """The checked request, and the image of a form, kept and decoded. This computes: not for the event loop."""
+def parse(raw: RawBody, model: type[Body], service: Service) -> tuple[Body, DecodedImage | None]:
+    """The validated request, and the image of a form, stored and decoded. CPU work: not for the event loop."""
     try:
-        if posted.json is not None:
-            return model.model_validate(read_object(posted.json, "The body")), None
-        given = read_object(posted.request, "The form field `request`")
-        twice = [name for name in ("image", "question") if name in given and getattr(posted, name) is not None]
-        if twice:
-            detail = "stands in the form and in its field `request`; give it once"
-            raise InvalidRequest(
-                f"{' and '.join(f'`{name}`' for name in twice)} {detail}.",
-                errors=tuple(FieldError(f"/{name}", detail) for name in twice),
-            )
-        if posted.question is not None:
-            given["question"] = posted.question
+        if raw.json is not None:
+            return model.model_validate(read_object(raw.json, "The body")), None
+        given = read_object(raw.request, "The form field `request`")
+        twice = [name for name in ("image", "question") if name in given and getattr(raw, name) is not None]
+        _check_unique(twice, "stands in the form and in its field `request`; give it once")
+        if raw.question is not None:
+            given["question"] = raw.question
         image = None
-        if posted.image is not None:
-            artifact, image = service.keep_image(posted.image)
+        if raw.image is not None:
+            artifact, image = service.keep_image(raw.image)
             given["image"] = {"artifact": artifact.sha256}
         return model.model_validate(given), image
     except ValidationError as error:
@@ -110,7 +114,7 @@ def check(posted: Posted, model: type[Body], service: Service) -> tuple[Body, De
 
 
 class _FormParser(MultiPartParser):
-    """Knows whether the form's last boundary came: what is cut off before it must not count as left out."""
+    """Records whether the last boundary arrived: fields cut off before it must not count as omitted."""
 
     ended = False
 
@@ -118,14 +122,14 @@ class _FormParser(MultiPartParser):
         self.ended = True
 
 
-async def _receive_form(request: Request) -> Posted:
+async def _receive_form(request: Request) -> RawBody:
     try:
         async with aclosing(request.stream()) as stream:
             parser = _FormParser(request.headers, stream, max_files=3, max_fields=8)
             form = await parser.parse()
     except (MultiPartException, ValueError) as error:
-        told = error.message if isinstance(error, MultiPartException) else error
-        raise MalformedBody(f"The multipart body could not be read: {told} Send an `image` file part.") from error
+        reason = error.message if isinstance(error, MultiPartException) else error
+        raise MalformedBody(f"The multipart body could not be read: {reason} Send an `image` file part.") from error
     try:
         if not parser.ended:
             raise MalformedBody("The multipart body ends before its last boundary: send it whole.")
@@ -137,17 +141,12 @@ async def _receive_form(request: Request) -> Posted:
                 errors=tuple(FieldError(f"/{pointer_part(name)}", "not a form field") for name in unknown),
             )
         twice = [name for name, times in Counter(name for name, _ in form.multi_items()).items() if times > 1]
-        if twice:
-            detail = "stands in the form more than once; give it once"
-            raise InvalidRequest(
-                f"{' and '.join(f'`{name}`' for name in twice)} {detail}.",
-                errors=tuple(FieldError(f"/{name}", detail) for name in twice),
-            )
+        _check_unique(twice, "stands in the form more than once; give it once")
         image = form.get("image")
         if image is not None and not isinstance(image, UploadFile):
             detail = "`image` must be a file part with a file name."
             raise InvalidRequest(detail, errors=(FieldError("/image", detail),))
-        return Posted(
+        return RawBody(
             request=_text(form, "request") or "{}",
             question=_text(form, "question"),
             image=None if image is None else await image.read(),
@@ -156,9 +155,79 @@ async def _receive_form(request: Request) -> Posted:
         await form.close()
 
 
+def _check_unique(twice: list[str], detail: str) -> None:
+    """Raises `InvalidRequest` where there are fields that were given twice."""
+    if twice:
+        names = " and ".join(f"`{name}`" for name in twice)
+        raise InvalidRequest(f"{names} {detail}.", errors=tuple(FieldError(f"/{name}", detail) for name in twice))
+
+
 def _text(form: FormData, name: str) -> str | None:
     value = form.get(name)
     if isinstance(value, UploadFile):
         detail = f"`{name}` must be a plain field, not a file."
         raise InvalidRequest(detail, errors=(FieldError(f"/{name}", detail),))
     return value
+
+
+def read_object(text: bytes | str, what: str) -> dict[str, Any]:
+    """The JSON object of a body or of a form's field, which `what` names in messages. A byte order mark is skipped.
+
+    Raises `MalformedBody` for anything else: other encodings, other values, keys given twice, NaN and infinities,
+    halves of surrogate pairs (no UTF-8 could say them again), and more values, keys, digits or levels than any request
+    needs.
+    """
+    try:
+        unicode = text.decode("utf-8-sig") if isinstance(text, bytes) else text
+    except UnicodeDecodeError as error:
+        raise MalformedBody(
+            f"{what} is not UTF-8 (byte {error.start} is {text[error.start]:#04x}): encode the JSON as UTF-8."
+        ) from error
+    if "\0" in unicode:
+        raise MalformedBody(f"{what} holds NUL bytes, as UTF-16 does: encode the JSON as UTF-8.")
+    if (commas := unicode.count(",")) > MAX_VALUES:
+        raise MalformedBody(f"{what} holds {commas} commas: no request needs more than {MAX_VALUES} values.")
+    try:
+        value = json.loads(unicode, object_pairs_hook=_unique, parse_constant=_reject_constant)
+    except json.JSONDecodeError as error:
+        reason = f"{error.msg[0].lower()}{error.msg[1:]}, line {error.lineno} column {error.colno}"
+        raise MalformedBody(f"{what} is not JSON ({reason}): send one JSON object.") from error
+    except RecursionError as error:
+        raise MalformedBody(f"{what} is JSON that is nested too deep: no field needs more than ten levels.") from error
+    except ValueError as error:
+        raise MalformedBody(f"{what} holds a whole number of thousands of digits: no field takes one.") from error
+    if not isinstance(value, dict):
+        raise MalformedBody(f"{what} must be a JSON object, got {_NAMES[type(value)]}: send {{...}}.")
+    if _SURROGATE.search(unicode):
+        _check_pairs(value, what)
+    return value
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, if no key stands in it twice: readers differ on which of the two counts."""
+    if len(pairs) > MAX_KEYS:
+        raise MalformedBody(f"A JSON object has {len(pairs)} keys: none of a request has more than {MAX_KEYS}.")
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        raise MalformedBody(f"The key {_shown(twice)} stands twice in one JSON object: give it once.")
+    return found
+
+
+def _reject_constant(literal: str) -> NoReturn:
+    raise MalformedBody(f"{literal} is no JSON number: give a finite one, or leave the field out.")
+
+
+def _check_pairs(value: dict[str, Any], what: str) -> None:
+    try:
+        json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        half = error.object[error.start]
+        raise MalformedBody(
+            f"{what} holds {_shown(half)}, half of a surrogate pair: send the whole character, or none."
+        ) from error
+
+
+def _shown(text: str) -> str:
+    return json.dumps(text[:SHOWN_CHARACTERS])

@@ -1,4 +1,4 @@
-"""What a caller says beside the body: `Prefer` (RFC 7240), `Idempotency-Key`, `Cache-Control`."""
+"""Request headers that say how to answer: `Prefer` (RFC 7240), `Idempotency-Key`, `Cache-Control`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from starlette.datastructures import Headers
 
 from cow_service.errors import FieldError, InvalidRequest
 
-LONGEST_WAIT = 600  # seconds
+MAX_WAIT_SECONDS = 600
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
 
 
@@ -25,8 +25,8 @@ class Preferences:
     @property
     def applied(self) -> str:
         """`Preference-Applied` of the response."""
-        told = ("respond-async",) if self.respond_async else ()
-        return ", ".join(told if self.wait is None else (*told, f"wait={self.wait}"))
+        applied = ("respond-async",) if self.respond_async else ()
+        return ", ".join(applied if self.wait is None else (*applied, f"wait={self.wait}"))
 
 
 def preferences_of(headers: Headers) -> Preferences:
@@ -46,7 +46,7 @@ def preferences_of(headers: Headers) -> Preferences:
     cached = {item.strip().lower() for item in headers.get("cache-control", "").split(",")}
     return Preferences(
         respond_async="respond-async" in stated,
-        wait=min(int(wait), LONGEST_WAIT) if wait.isascii() and wait.isdigit() else None,
+        wait=min(int(wait), MAX_WAIT_SECONDS) if wait.isascii() and wait.isdigit() else None,
         key=key,
         fresh=bool(cached & {"no-cache", "no-store"}),
     )

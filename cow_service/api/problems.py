@@ -26,7 +26,6 @@ from cow_service.errors import (
     pointer_part,
     shortened,
 )
-from cow_service.problems import problem_of
 
 MEDIA_TYPE = "application/problem+json"
 SHOWN_CHARACTERS = 80  # of what the caller sent
@@ -43,20 +42,19 @@ def invalid(
         return MalformedBody(f"The body is no JSON object: {error.errors()[0]['msg']}.")
     for item in error.errors():
         pointer = placed("".join("/" + pointer_part(part) for part in _location(item["loc"])))
-        fields.setdefault(pointer, FieldError(pointer, _told(str(item["msg"]), item["input"])))
-    told = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in list(fields.values())[:5])
-    return InvalidRequest(f"{told}. See /openapi.json for what the request may hold.", errors=tuple(fields.values()))
+        fields.setdefault(pointer, FieldError(pointer, _with_value(str(item["msg"]), item["input"])))
+    summary = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in list(fields.values())[:5])
+    return InvalidRequest(f"{summary}. See /openapi.json for what the request may hold.", errors=tuple(fields.values()))
 
 
 def respond(error: CowError) -> JSONResponse:
     """The HTTP response for an error."""
     headers = {"Retry-After": "5"} if error.status == HTTPStatus.SERVICE_UNAVAILABLE else {}
-    body = problem_of(error).model_dump(mode="json")
-    return JSONResponse(body, error.status, headers=headers | error.headers, media_type=MEDIA_TYPE)
+    return JSONResponse(error.as_problem(), error.status, headers=headers | error.headers, media_type=MEDIA_TYPE)
 
 
 def install_problem_handlers(app: FastAPI) -> None:
-    """Makes every error of the app a problem, also those of the framework and those that nobody foresaw."""
+    """Makes every error of the app a problem, those of the framework and unforeseen ones included."""
 
     async def cow_error(_: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, CowError)
@@ -113,15 +111,15 @@ def _path(request: Request) -> str:
     return shortened(request.url.path, SHOWN_CHARACTERS)
 
 
-def _told(message: str, value: Any) -> str:
-    """A validator's message with the value; the house's own messages name it where it helps."""
+def _with_value(message: str, value: Any) -> str:
+    """A validator's message with the value; our own messages name it where it helps."""
     ours = message.removeprefix("Value error, ")
     if ours != message or not isinstance(value, str | int | float):
         return ours
-    told = message.partition(", got ")[0]  # a kind of number, in place of the number
+    reason = message.partition(", got ")[0]  # a kind of number, in place of the number
     if isinstance(value, str) and len(value) > SHOWN_CHARACTERS:
-        return f"{told}, got {len(value)} characters"
-    return f"{told}, got {shortened(json.dumps(value), SHOWN_CHARACTERS)}"
+        return f"{reason}, got {len(value)} characters"
+    return f"{reason}, got {shortened(json.dumps(value), SHOWN_CHARACTERS)}"
 
 
 def _location(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:

@@ -1,4 +1,4 @@
-"""From a request to its job, and from the job to the response: at once, after a while, or when it has ended."""
+"""From a request to its job, and from the job to the response: at once, after some seconds, or when it has ended."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from typing import TypeVar
 from anyio import CapacityLimiter, to_thread
 from fastapi import Request, Response
 
-from cow_service.api.body import Body, check, receive
+from cow_service.api.body import Body, parse, receive
 from cow_service.api.preferences import Preferences, preferences_of
 from cow_service.errors import Canceled, CowError, JobNotFound
-from cow_service.jobs.engine import Engine, new_job_id
-from cow_service.jobs.live import Waiting
-from cow_service.jobs.orders import Order
-from cow_service.jobs.reports import Found
+from cow_service.jobs.active import Waiter
+from cow_service.jobs.engine import JobEngine, new_job_id
+from cow_service.jobs.spec import JobSpec
+from cow_service.jobs.state import JobState
 from cow_service.media.images import DecodedImage
 from cow_service.observability import context
 from cow_service.records import TERMINAL, JobKind
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.stages.run import now
 
-LOOK = 3.0  # seconds between looks at the database: another process may have run the job
-AT_ONCE = 4  # bodies that are decoded at the same time
+POLL_SECONDS = 3.0  # another process may have run the job
+MAX_CONCURRENT_BODIES = 4  # decoded at the same time
 RETRY_AFTER = {"Retry-After": "1"}
 
 Made = TypeVar("Made")
@@ -42,8 +42,8 @@ Checked = tuple[SimulateRequest, DecodedImage | None]  # a request, and its imag
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Who asks for which job, and how they want to be answered."""
+class Submission:
+    """Who submits which job, and how they want to be answered."""
 
     kind: JobKind
     owner: str | None
@@ -51,109 +51,120 @@ class Asked:
     job_id: str
 
     @property
-    def comes_back(self) -> bool:
-        """Whether a header says that somebody may ask for the job."""
+    def may_return(self) -> bool:
+        """Whether a header says that the caller may ask for the job later."""
         return self.prefer != Preferences(fresh=self.prefer.fresh)
 
 
 @dataclass
-class Submitting:
-    """Takes requests to the engine, and what they come to back. Bodies are decoded in threads."""
+class Submitter:
+    """Makes jobs of requests, and responses of their outcomes. Bodies are decoded in threads."""
 
-    engine: Engine
+    engine: JobEngine
 
     def __post_init__(self) -> None:
-        self._limiter = CapacityLimiter(AT_ONCE)
+        self._limiter = CapacityLimiter(MAX_CONCURRENT_BODIES)
 
     async def run(self, request: Request, kind: JobKind, model: type[Body]) -> Response:
         """The job's result, or the job itself where the caller does not want to wait so long.
 
         Raises what is wrong with the request, and what the job fails with.
         """
-        asked = self.asked(request, kind)
-        posted = await receive(request)
-        result = await self.result(request, asked, lambda: check(posted, model, self.engine.service))
-        return await self.accepted(asked) if result is None else json_response(result)
+        submission = self.submission(request, kind)
+        raw = await receive(request)
+        result = await self.result(request, submission, lambda: parse(raw, model, self.engine.service))
+        return await self.accepted(submission) if result is None else json_response(result)
 
-    def asked(self, request: Request, kind: JobKind) -> Asked:
+    def submission(self, request: Request, kind: JobKind) -> Submission:
         """What the request's headers say. Raises `QueueFull` and `ShuttingDown` where no job can be taken."""
         prefer, owner = preferences_of(request.headers), owner_of(request)
         if prefer.key is None:
-            self.engine.check_room()  # before the body: whoever is refused is told at once
-        return Asked(kind, owner, prefer, new_job_id(owner, prefer.key))
+            self.engine.check_room()  # before the body is read: a refusal comes at once
+        return Submission(kind, owner, prefer, new_job_id(owner, prefer.key))
 
-    async def apart(self, work: Callable[[], Made]) -> Made:
-        """Does work on a body in a thread, a few at the same time."""
+    async def in_thread(self, work: Callable[[], Made]) -> Made:
+        """Decodes a body in a thread, a few at the same time."""
         return await to_thread.run_sync(work, limiter=self._limiter)
 
-    async def take(self, asked: Asked, read: Callable[[], Checked]) -> bool:
-        """Makes a job of the request that `read` gives, in a thread; says whether the job is new."""
-        return await self.apart(lambda: self._submit(asked, *read()))
+    async def submit(self, submission: Submission, read: Callable[[], Checked]) -> str | None:
+        """Makes a job of the request that `read` gives; returns its creation time, or None for one that exists."""
+        return await self.in_thread(lambda: self._submit(submission, *read()))
 
-    async def result(self, request: Request, asked: Asked, read: Callable[[], Checked]) -> str | None:
+    async def result(self, request: Request, submission: Submission, read: Callable[[], Checked]) -> str | None:
         """What the request comes to, as JSON; None where the caller wants the job instead."""
-        with self.engine.live.waiting(asked.job_id) as waiting:
-            is_new = await self.take(asked, read)
-            if asked.prefer.respond_async and not asked.prefer.wait:
+        with self.engine.active.waiting(submission.job_id) as waiter:
+            created_at = await self.submit(submission, read)
+            if submission.prefer.respond_async and not submission.prefer.wait:
                 return None
-            async with _left(request) as left:
-                return await self.outcome(asked, waiting, is_new, left, asked.prefer.wait)
+            async with _disconnected(request) as gone:
+                return await self.outcome(submission, waiter, created_at, gone, submission.prefer.wait)
 
-    async def accepted(self, asked: Asked) -> Response:
+    async def accepted(self, submission: Submission) -> Response:
         """The job, for a caller who does not wait for its end."""
 
-        def settled() -> Found:
-            self.engine.database.settle()  # nobody is told of a job that a loss of power could take back
-            return self.engine.find(asked.job_id, asked.owner)
+        def durable() -> JobState:
+            self.engine.database.flush()  # no job is acknowledged that a loss of power could take back
+            return self.engine.find(submission.job_id, submission.owner)
 
-        found = await to_thread.run_sync(settled)
-        headers = {"Location": f"/jobs/{asked.job_id}", "Preference-Applied": asked.prefer.applied, **RETRY_AFTER}
+        found = await to_thread.run_sync(durable)
+        headers = {
+            "Location": f"/jobs/{submission.job_id}",
+            "Preference-Applied": submission.prefer.applied,
+            **RETRY_AFTER,
+        }
         return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers)
 
     async def outcome(
-        self, asked: Asked, waiting: Waiting, is_new: bool, left: asyncio.Event, wait: float | None = None
+        self,
+        submission: Submission,
+        waiter: Waiter,
+        created_at: str | None,
+        gone: asyncio.Event,
+        wait: float | None = None,
+        *,
+        may_have_ended: bool = False,
     ) -> str | None:
-        """What the job comes to once it has ended; None once `wait` seconds are over. Raises what it fails with.
+        """The result of the job, once it has ended; None after `wait` seconds. Raises what it fails with.
 
-        A job that is not new, or was not waited for from its beginning, may have ended: then `is_new` is false.
+        `created_at` is that of a job that this request submitted: another of the same id is not taken for it.
+        `may_have_ended`: the waiter was made after the job, and may have missed its end.
         """
         loop = asyncio.get_running_loop()
         until = None if wait is None else loop.time() + wait
-        gone = asyncio.ensure_future(left.wait())
-        look = not is_new
+        disconnected = asyncio.ensure_future(gone.wait())
+        look = may_have_ended or created_at is None
         try:
-            while not waiting.settled.done():
-                if look:
-                    found = await to_thread.run_sync(self.engine.find, asked.job_id, asked.owner)
-                    if found.job.status in TERMINAL:
-                        break
-                look = True
-                rest = LOOK if until is None else min(LOOK, until - loop.time())
+            while True:
+                if look and (result := await to_thread.run_sync(self._result, submission, created_at)) is not None:
+                    return result
+                rest = POLL_SECONDS if until is None else min(POLL_SECONDS, until - loop.time())
                 if rest <= 0:
                     return None
-                await asyncio.wait({waiting.settled, gone}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
-                if gone.done() and not waiting.settled.done():
-                    await self.leave(asked, is_new)
+                ended = asyncio.ensure_future(waiter.ended.wait())
+                await asyncio.wait({ended, disconnected}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
+                ended.cancel()
+                look = True
+                if waiter.ended.is_set():
+                    outcome, outcome_of = waiter.take()
+                    if outcome is not None and outcome_of in (None, created_at):
+                        if isinstance(outcome, CowError):
+                            raise outcome
+                        return outcome
+                elif disconnected.done():
+                    await self.leave(submission, created_at)
                     raise Canceled("The caller went away before the work was done.")
         finally:
-            gone.cancel()
-        if waiting.settled.done():
-            outcome = waiting.settled.result()
-            if isinstance(outcome, CowError):
-                raise outcome
-            if outcome is not None:
-                return outcome
-        return await to_thread.run_sync(self._ended, asked)
+            disconnected.cancel()
 
-    async def leave(self, asked: Asked, is_new: bool) -> None:
-        """The caller has gone: ends a job that nobody else can know of."""
-        if is_new and not asked.comes_back:
-            await to_thread.run_sync(self.engine.cancel, asked.job_id, asked.owner)
+    async def leave(self, submission: Submission, created_at: str | None) -> None:
+        """The caller has disconnected: cancels a new job that nobody can ask for."""
+        if created_at is not None and not submission.may_return:
+            await to_thread.run_sync(self.engine.cancel, submission.job_id, submission.owner)
 
-    def _submit(self, asked: Asked, body: SimulateRequest, image: DecodedImage | None) -> bool:
+    def _submit(self, submission: Submission, body: SimulateRequest, image: DecodedImage | None) -> str | None:
         service = self.engine.service
         if isinstance(body.image, ImageArtifact):
-            self.engine.may_read(body.image.artifact, asked.owner if image is None else None)
+            self.engine.may_read(body.image.artifact, submission.owner if image is None else None)
         reader, generator = service.precheck(body)
         if body.webhook is not None:
             self.engine.webhooks.check(body.webhook)
@@ -162,26 +173,30 @@ class Submitting:
             sha256, image = service.image_of(body.image)
         kept = ImageArtifact(artifact=sha256 or image.info.sha256)
         asks = body.model_copy(update={"image": kept, "webhook": None})
-        trace = context.trace.get()
-        order = Order(
-            kind=asked.kind,
+        spec = JobSpec(
+            kind=submission.kind,
             request=asks.model_dump(mode="json", exclude_defaults=True),
             reader=reader,
             generator=generator,
             created_at=now(),
-            fresh=asked.prefer.fresh,
+            fresh=submission.prefer.fresh,
             webhook=body.webhook,
             request_id=context.request_id.get(),
-            traceparent=None if trace is None else trace.traceparent,
+            traceparent=context.traceparent(),
         )
-        return self.engine.submit(order, generator, asked.owner, asked.prefer.key, image, asked.job_id)
+        is_new = self.engine.submit(submission.job_id, spec, submission.owner, submission.prefer.key, image)
+        return spec.created_at if is_new else None
 
-    def _ended(self, asked: Asked) -> str:
-        """The result of a job whose end only the database tells."""
+    def _result(self, submission: Submission, created_at: str | None) -> str | None:
+        """The result of the job from the database; None if it has not ended. Raises what it failed with."""
         try:
-            found = self.engine.find(asked.job_id, asked.owner)
+            found = self.engine.find(submission.job_id, submission.owner)
         except JobNotFound as error:
             raise Canceled("The job was deleted before it was done.") from error
+        if created_at not in (None, found.job.created_at):
+            raise Canceled("The job was deleted before it was done.")
+        if found.job.status not in TERMINAL:
+            return None
         if found.error is not None:
             raise found.error
         if found.result is None:
@@ -190,22 +205,22 @@ class Submitting:
 
 
 def json_response(body: str, status: int = HTTPStatus.OK, headers: dict[str, str] | None = None) -> Response:
-    """A record as it is kept: the framework would check its thousands of numbers once more."""
+    """A record that is JSON already: the framework would validate its thousands of numbers once more."""
     return Response(body, status, headers, media_type="application/json")
 
 
 @asynccontextmanager
-async def _left(request: Request) -> AsyncGenerator[asyncio.Event]:
-    """Tells when the caller has closed the connection."""
-    left = asyncio.Event()
+async def _disconnected(request: Request) -> AsyncGenerator[asyncio.Event]:
+    """An event that is set when the caller has closed the connection."""
+    gone = asyncio.Event()
 
     async def watch() -> None:
         while (await request.receive())["type"] != "http.disconnect":
             pass  # an empty rest of the body
-        left.set()
+        gone.set()
 
     task = asyncio.create_task(watch())
     try:
-        yield left
+        yield gone
     finally:
         task.cancel()

@@ -7,30 +7,23 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from cow_service.cli.terminal import printable
+from cow_service.cli.errors import printable
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
     from cow_service.client.questions import Question
+    from cow_service.records import JobKind
 
-SOME_FAILED = 3
-INTERRUPTED = 130
-SHOWN_FAILURES = 5
-SHOWN_FAULTS = 10
-AGAIN = "The same command goes on with the batch."
-
-
-class BatchKind(StrEnum):
-    """What each question asks for."""
-
-    answer = "answer"
-    simulate = "simulate"
+EXIT_SOME_FAILED = 3
+EXIT_INTERRUPTED = 130
+MAX_FAILURES_SHOWN = 5
+MAX_FAULTS_SHOWN = 10
+RESUME_HINT = "The same command goes on with the batch."
 
 
 def batch(
@@ -45,7 +38,9 @@ def batch(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.jsonl; a batch in it is gone on with.")],
-    kind: Annotated[BatchKind, typer.Option(help="Whether to answer, or only to simulate.")] = BatchKind.answer,
+    kind: Annotated[
+        Literal["answer", "simulate"], typer.Option(help="Whether to answer, or only to simulate.")
+    ] = "answer",
     request: Annotated[
         str | None,
         typer.Option(metavar="JSON", help='Fields for questions that lack them: {"votes": 5}.', show_default="none"),
@@ -64,37 +59,37 @@ def batch(
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
     """
-    from cow_service.client.batches import PASSING  # noqa: PLC0415
+    from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
 
     asked = _read(questions, _defaults(request), kind)
     try:
-        _ask(asked, out, kind, url, concurrency, timeout, save, retry_failed)
+        _ask(
+            asked,
+            url,
+            out=out,
+            kind=kind,
+            concurrency=concurrency,
+            timeout=timeout,
+            save=save,
+            retry_failed=retry_failed,
+        )
     except KeyboardInterrupt:
         typer.echo(f"Interrupted. The same command goes on with it; {out / 'results.jsonl'} is whole.", err=True)
         sys.stderr.flush()
-        os._exit(INTERRUPTED)  # threads that wait for jobs are not waited for
+        os._exit(EXIT_INTERRUPTED)  # threads that wait for jobs are not waited for
     except OSError as error:
         told = error.strerror or str(error)
-        raise StorageUnavailable(f"'{out}' cannot be written: {told}. {AGAIN}") from error
+        raise StorageUnavailable(f"'{out}' cannot be written: {told}. {RESUME_HINT}") from error
     except Unauthorized as error:
         error.detail += " Here: set COW_API_KEY."
         raise
-    except PASSING as error:
-        error.detail += f" {AGAIN}"
+    except TRANSIENT as error:
+        error.detail += f" {RESUME_HINT}"
         raise
-    raise typer.Exit(_tell(out))
+    raise typer.Exit(_print_summary(out))
 
 
-def _ask(
-    asked: list[Question],
-    out: Path,
-    kind: BatchKind,
-    url: str | None,
-    concurrency: int,
-    timeout: float | None,
-    save: bool,
-    retry_failed: bool,
-) -> None:
+def _ask(asked: list[Question], url: str | None, **options: Any) -> None:
     from cow_service.client import Client  # noqa: PLC0415
 
     try:
@@ -102,23 +97,12 @@ def _ask(
     except ValueError as error:
         raise InvalidRequest(f"{error}.") from error
     with client:
-        outcomes = client.map(
-            asked,
-            kind=kind.value,  # pyright: ignore[reportArgumentType] - one of the two
-            concurrency=concurrency,
-            out=out,
-            retry_failed=retry_failed,
-            only_new=True,
-            save=save,
-            timeout=timeout,
-            progress=True,
-        )
-        for outcome in outcomes:
+        for outcome in client.map(asked, only_new=True, progress=True, **options):
             if outcome.unsaved is not None:
                 typer.echo(printable(f"{outcome.id}: not saved: {outcome.unsaved.detail}"), err=True)
 
 
-def _read(path: Path, defaults: dict[str, Any], kind: BatchKind) -> list[Question]:
+def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]:
     """The questions of a file; images are looked for beside it.
 
     Raises `InvalidRequest` for whatever the server would refuse, before it is asked anything.
@@ -135,15 +119,15 @@ def _read(path: Path, defaults: dict[str, Any], kind: BatchKind) -> list[Questio
                 _check(question, kind)
                 items.append(item)
             except InvalidRequest as error:
-                told = error.detail.removeprefix("Question 1: ")
-                faults.append(f"{path.name}, line {number}: {told}")
+                told = [f"`{field.pointer.rpartition('/')[2]}` {field.detail}." for field in error.errors]
+                faults.append(f"{path.name}, line {number}: {' '.join(told) or error.detail}")
     if faults:
-        more = f"\n... and {len(faults) - SHOWN_FAULTS} more" if len(faults) > SHOWN_FAULTS else ""
-        raise InvalidRequest("\n".join(faults[:SHOWN_FAULTS]) + more)
+        more = f"\n... and {len(faults) - MAX_FAULTS_SHOWN} more" if len(faults) > MAX_FAULTS_SHOWN else ""
+        raise InvalidRequest("\n".join(faults[:MAX_FAULTS_SHOWN]) + more)
     if not items:
         raise InvalidRequest(f"{path.name} holds no questions: give one JSON object a line.")
     asked = list(questions(items, defaults, path.parent))
-    _look_for_images(asked, path)
+    _check_images(asked, path)
     return asked
 
 
@@ -157,8 +141,8 @@ def _parsed(line: bytes) -> dict[str, Any]:
     return item
 
 
-def _look_for_images(asked: list[Question], path: Path) -> None:
-    """Says which files are missing: their questions will fail. Raises `InvalidRequest` where all are."""
+def _check_images(asked: list[Question], path: Path) -> None:
+    """Prints which files are missing: their questions will fail. Raises `InvalidRequest` where all are."""
     files = [question.image for question in asked if isinstance(question.image, Path)]
     missing = [file for file in files if not file.is_file()]
     if files and len(missing) == len(files):
@@ -168,9 +152,9 @@ def _look_for_images(asked: list[Question], path: Path) -> None:
         )
     if missing:
         verb = "is" if len(missing) == 1 else "are"
-        names = ", ".join(file.name for file in missing[:SHOWN_FAILURES])
+        names = ", ".join(file.name for file in missing[:MAX_FAILURES_SHOWN])
         told = f"{len(missing)} of {len(files)} images {verb} not there: {names}"
-        typer.echo(printable(told + (", ..." if len(missing) > SHOWN_FAILURES else "")), err=True)
+        typer.echo(printable(told + (", ..." if len(missing) > MAX_FAILURES_SHOWN else "")), err=True)
 
 
 def _defaults(text: str | None) -> dict[str, Any]:
@@ -183,12 +167,12 @@ def _defaults(text: str | None) -> dict[str, Any]:
     return given
 
 
-def _check(question: Question, kind: BatchKind) -> None:
+def _check(question: Question, kind: JobKind) -> None:
     from pydantic import ValidationError  # noqa: PLC0415
 
     from cow_service.requests import AnswerRequest, SimulateRequest  # noqa: PLC0415
 
-    model = AnswerRequest if kind is BatchKind.answer else SimulateRequest
+    model = AnswerRequest if kind == "answer" else SimulateRequest
     image = dict(question.image) if isinstance(question.image, Mapping) else "data:"
     try:
         model.model_validate({**question.options, "image": image, "question": question.question})
@@ -197,27 +181,27 @@ def _check(question: Question, kind: BatchKind) -> None:
         raise InvalidRequest(f"/{'/'.join(str(part) for part in wrong['loc'])}: {wrong['msg']}.") from error
 
 
-def _tell(out: Path) -> int:
-    """Says what the folder holds of the batch; returns the exit code."""
+def _print_summary(out: Path) -> int:
+    """Prints what the folder holds of the batch; returns the exit code."""
     results = out / "results.jsonl"
     codes: Counter[str] = Counter()
     failures: list[str] = []
-    count = unimagined = 0
+    count = without_simulation = 0
     with results.open("rb") as lines:
         for line in map(json.loads, lines):
             count += 1
-            unimagined += "result" in line and line["result"].get("simulation", ...) is None
+            without_simulation += "result" in line and line["result"].get("simulation", ...) is None
             if line["status"] == "failed":
                 code = line["problem"]["code"]
                 codes[code] += 1
                 failures.append(f"  {line['id']}: {code}: {line['problem']['detail']}")
-    without = f" ({unimagined} without a simulation)" if unimagined else ""
+    without = f" ({without_simulation} without a simulation)" if without_simulation else ""
     typer.echo(f"{count - len(failures)} succeeded{without}, {len(failures)} failed: {results}")
     if not failures:
         return 0
     typer.echo(", ".join(f"{code} {times}" for code, times in codes.most_common()), err=True)
-    for told in failures[:SHOWN_FAILURES]:
+    for told in failures[:MAX_FAILURES_SHOWN]:
         typer.echo(printable(told), err=True)
-    if len(failures) > SHOWN_FAILURES:
-        typer.echo(f"  ... and {len(failures) - SHOWN_FAILURES} more", err=True)
-    return SOME_FAILED
+    if len(failures) > MAX_FAILURES_SHOWN:
+        typer.echo(f"  ... and {len(failures) - MAX_FAILURES_SHOWN} more", err=True)
+    return EXIT_SOME_FAILED

@@ -1,12 +1,11 @@
-"""What the command line does and shows: requests from options, results into a folder, tables."""
+"""What `simulate`, `answer` and `models` do and show: stages as they run, results into a folder, tables."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 from rich.console import Console
@@ -14,53 +13,15 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
+from cow_service.cli.errors import HINTS
+from cow_service.cli.options import read_file
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.images import DecodedImage
-from cow_service.records import BackendInfo, Models, Simulation
-from cow_service.requests import SimulateRequest, Stage
+from cow_service.records import Answer, BackendInfo, Models, Simulation, Verdict
+from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.service import Service
 
 Body = TypeVar("Body", bound=SimulateRequest)
-
-
-def build_request(
-    *,
-    point: str | None,
-    box: str | None,
-    name: str | None,
-    direction: str | None,
-    kind: str,
-    speed: float | None,
-    trajectory: Path | None,
-    option: list[str],
-    **rest: Any,
-) -> dict[str, Any]:
-    """The request's body without its image. Raises `InvalidRequest` naming the option that cannot be read."""
-    body = {**rest, "generator_options": dict(map(_option, option))}
-    if point is not None or box is not None:
-        body["grounding"] = {
-            "object": name,
-            "point": None if point is None else _numbers("--point", point, 2),
-            "bbox": None if box is None else _numbers("--box", box, 4),
-        }
-    elif name is not None and trajectory is None:
-        raise InvalidRequest("--object goes with --point, --box or --trajectory; else the question names the object.")
-    if direction is not None or kind in ("fall", "static"):
-        body["motion"] = {
-            "direction": None if direction is None else _numbers("--direction", direction, 2),
-            "kind": kind,
-            "speed": speed,
-        }
-    elif kind != "linear" or speed is not None:
-        raise InvalidRequest("--kind and --speed go with --direction; without it the motion is read from the question.")
-    if trajectory is not None:
-        body["trajectory"] = path = _json(trajectory)
-        if name is not None and "grounding" not in body and isinstance(path, dict):
-            body["grounding"] = {
-                "object": name,
-                "point": next(iter(cast("dict[str, Any]", path).get("points", [])), None),
-            }
-    return body
 
 
 def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Path, *, as_json: bool) -> None:
@@ -74,9 +35,35 @@ def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Pat
     if as_json:
         print(simulation.model_dump_json(indent=2))
         return
-    tell(console, simulation)
-    tell_warnings(console, simulation.warnings)
+    print_stages(console, simulation)
+    print_warnings(console, simulation.warnings)
     console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
+
+
+def run_answer(service: Service, image: Path, body: dict[str, Any], out: Path | None, *, as_json: bool) -> None:
+    """Answers, showing each stage as it runs, and says what came out; results go into a folder where one is given."""
+    console = console_for(as_json)
+    if out is not None:
+        make_folder(out)
+    request, decoded = read_request(service, image, body, AnswerRequest)
+    with stages_shown(console) as show:
+        answer = service.answer(request, show, decoded)
+    written = [] if out is None else _save_answer(service, answer, out)
+    if as_json:
+        print(answer.model_dump_json(indent=2))
+        return
+    if answer.simulation is not None:
+        print_stages(console, answer.simulation)
+    console.print(_answer_table(answer))
+    if answer.reasoning:
+        console.print(f"[dim]reasoning[/]: {escape(answer.reasoning)}")
+    simulated = () if answer.simulation is None else answer.simulation.warnings
+    print_warnings(console, (*simulated, *answer.warnings))
+    for code, hint in HINTS.items():
+        if any(f" {code}: " in warning for warning in answer.warnings):
+            console.print(hint)
+    if out is not None:
+        console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
 
 
 def console_for(as_json: bool) -> Console:
@@ -86,7 +73,7 @@ def console_for(as_json: bool) -> Console:
 
 def read_request(service: Service, image: Path, body: dict[str, Any], model: type[Body]) -> tuple[Body, DecodedImage]:
     """The checked request and its image, which the service keeps. Raises `InvalidRequest` naming the fields."""
-    artifact, decoded = service.keep_image(_read(image))
+    artifact, decoded = service.keep_image(read_file(image))
     try:
         return model.model_validate({"image": {"artifact": artifact.sha256}, **body}), decoded
     except ValidationError as error:
@@ -113,13 +100,13 @@ def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], 
         yield show
 
 
-def tell(console: Console, simulation: Simulation) -> None:
+def print_stages(console: Console, simulation: Simulation) -> None:
     """A line for each stage of what came out of it."""
-    for stage, said in _told(simulation).items():
-        console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {escape(said)}")
+    for stage, line in _stage_lines(simulation).items():
+        console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {escape(line)}")
 
 
-def tell_warnings(console: Console, warnings: Iterable[str]) -> None:
+def print_warnings(console: Console, warnings: Iterable[str]) -> None:
     """A line for each."""
     for warning in warnings:
         console.print(f"[yellow]warning[/]: {escape(warning)}")
@@ -159,12 +146,12 @@ def print_models(models: Models, *, as_json: bool) -> None:
         print(models.model_dump_json(indent=2))
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("door", "name", "ready", "what it is"):
+    for heading in ("role", "name", "ready", "what it is"):
         table.add_column(heading)
-    for door, backends in (("reader", models.readers), ("generator", models.generators)):
+    for role, backends in (("reader", models.readers), ("generator", models.generators)):
         for backend in backends:
             table.add_row(
-                door, backend.name + (" (default)" if backend.default else ""), _readiness(backend), backend.summary
+                role, backend.name + (" (default)" if backend.default else ""), _readiness(backend), backend.summary
             )
     console = Console()
     console.print(table)
@@ -179,7 +166,7 @@ def _readiness(backend: BackendInfo) -> str:
     return f"[yellow]needs {', '.join(backend.missing) or 'its weights'}[/]"
 
 
-def _told(simulation: Simulation) -> dict[Stage, str]:
+def _stage_lines(simulation: Simulation) -> dict[Stage, str]:
     """One line per stage of what came out of it."""
     grounding, motion, trajectory = simulation.grounding, simulation.motion, simulation.trajectory
     x, y = grounding.point
@@ -196,38 +183,37 @@ def _told(simulation: Simulation) -> dict[Stage, str]:
     }
 
 
-def _numbers(option: str, text: str, count: int) -> list[float]:
-    try:
-        values = [float(part) for part in text.replace(" ", "").split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        raise InvalidRequest(
-            f"{option} takes {count} numbers with commas between, such as {','.join(['10'] * count)}; got '{text}'."
-        )
-    return values
+def _save_answer(service: Service, answer: Answer, out: Path) -> list[str]:
+    written = [] if answer.simulation is None else save(service, answer.simulation, out)
+    with writable(out):
+        (out / "answer.json").write_text(answer.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    return [*written, "answer.json"]
 
 
-def _option(given: str) -> tuple[str, object]:
-    """Name and value; what is no JSON is text."""
-    name, equals, text = given.partition("=")
-    if not name or not equals:
-        raise InvalidRequest(f"--option takes NAME=VALUE, such as steps=20; got '{given}'.")
-    try:
-        return name, json.loads(text)
-    except ValueError:
-        return name, text
+def _answer_table(answer: Answer) -> Table:
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(style="bold")
+    table.add_column()
+    table.add_row("answer", _verdict(answer))
+    if sum(answer.votes.values()) > 1:
+        table.add_row("votes", _votes(answer))
+    if answer.baseline is not None:
+        table.add_row("without frames", f"{_verdict(answer.baseline)}, votes {_votes(answer.baseline)}")
+    usage = answer.usage
+    asked = f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out" if usage.calls else "none"
+    table.add_row("tokens", asked)
+    table.add_row("time", f"{sum(answer.timings.values()):.2f} s")
+    model = answer.reader.model
+    table.add_row("reader", escape(answer.reader.name if model is None else f"{answer.reader.name} ({model})"))
+    return table
 
 
-def _json(path: Path) -> object:
-    try:
-        return json.loads(_read(path))
-    except ValueError as error:
-        raise InvalidRequest(f"{path.name} is not JSON: {error}.") from error
+def _verdict(verdict: Verdict) -> str:
+    if verdict.answer is None:
+        return "[yellow]not sure[/]"
+    text = verdict.answer if verdict.option is None else f"({verdict.answer}) {verdict.option}"
+    return f"[yellow]{escape(text)}[/]" if verdict.not_sure else f"[green]{escape(text)}[/]"
 
 
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise CowError(f"'{path}' cannot be read: {error.strerror}.") from error
+def _votes(verdict: Verdict) -> str:
+    return ", ".join(f"{escape(name)}: {count}" for name, count in verdict.votes.items())

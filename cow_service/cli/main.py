@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Generator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from cow_service import __version__
 from cow_service.cli import batch as batch_cli
@@ -19,8 +16,8 @@ from cow_service.cli import mcp as mcp_cli
 from cow_service.cli import models as models_cli
 from cow_service.cli import options
 from cow_service.cli import tracks as tracks_cli
-from cow_service.cli.terminal import printable
-from cow_service.errors import CowError
+from cow_service.cli.errors import Commands
+from cow_service.cli.options import with_request_options
 
 # Notes that these libraries print when they are imported, such as on optional packages, are not for our users.
 QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
@@ -29,6 +26,7 @@ if TYPE_CHECKING:
     from cow_service.service import Service
 
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -52,58 +50,28 @@ def main(
 
 
 @app.command()
+@with_request_options
 def simulate(
     image: options.Image,
     question: options.Question,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the results.", show_default="./<image>-cow")
     ] = None,
-    point: options.Place = None,
-    box: options.Box = None,
-    name: options.Name = None,
-    direction: options.Direction = None,
-    kind: options.KindOfMotion = options.Kind.linear,
-    speed: options.Speed = None,
-    trajectory: options.Path_ = None,
-    reader: options.Reader = None,
-    generator: options.Generator = None,
-    option: options.GeneratorOption = None,
-    num_frames: options.NumFrames = 81,
-    fps: options.Fps = 16,
-    seed: options.Seed = 0,
     video: Annotated[bool, typer.Option(help="Make the mp4.")] = True,
-    frames: options.Frames = options.Policy.initial,
-    count: options.Count = 3,
-    max_side: options.MaxSide = 512,
     as_json: Annotated[bool, typer.Option("--json", help="Print the simulation as JSON, and nothing else.")] = False,
+    *,
+    request: dict[str, Any],
 ) -> None:
     """Imagine one image's future: frames, video, overlay and simulation.json in a folder."""
-    with _errors_told():
-        from cow_service.cli.console import build_request, run_simulation  # noqa: PLC0415
+    from cow_service.cli.console import run_simulation  # noqa: PLC0415
 
-        request = build_request(
-            question=question,
-            point=point,
-            box=box,
-            name=name,
-            direction=direction,
-            kind=kind.value,
-            speed=speed,
-            trajectory=trajectory,
-            reader=reader,
-            generator=generator,
-            option=option or [],
-            num_frames=num_frames,
-            fps=fps,
-            seed=seed,
-            video=video,
-            frames={"policy": frames.value, "count": count, "max_side": max_side or None},
-        )
-        with _service() as service:
-            run_simulation(service, image, request, out or Path(f"{image.stem}-cow"), as_json=as_json)
+    body = {**request, "question": question, "video": video}
+    with _service() as service:
+        run_simulation(service, image, body, out or Path(f"{image.stem}-cow"), as_json=as_json)
 
 
 @app.command()
+@with_request_options
 def answer(
     image: options.Image,
     question: options.Question,
@@ -121,53 +89,24 @@ def answer(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the simulation and answer.json.", show_default="none")
     ] = None,
-    point: options.Place = None,
-    box: options.Box = None,
-    name: options.Name = None,
-    direction: options.Direction = None,
-    kind: options.KindOfMotion = options.Kind.linear,
-    speed: options.Speed = None,
-    trajectory: options.Path_ = None,
-    reader: options.Reader = None,
-    generator: options.Generator = None,
-    option: options.GeneratorOption = None,
-    num_frames: options.NumFrames = 81,
-    fps: options.Fps = 16,
-    seed: options.Seed = 0,
-    frames: options.Frames = options.Policy.initial,
-    count: options.Count = 3,
-    max_side: options.MaxSide = 512,
     as_json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON, and nothing else.")] = False,
+    *,
+    request: dict[str, Any],
 ) -> None:
     """Look, then answer: the answer, the votes, the baseline, tokens and time."""
-    with _errors_told():
-        from cow_service.cli.answer_console import run_answer  # noqa: PLC0415
-        from cow_service.cli.console import build_request  # noqa: PLC0415
+    from cow_service.cli.console import run_answer  # noqa: PLC0415
 
-        request = build_request(
-            question=question,
-            options=choice,
-            imagine="always" if imagine else "never",
-            votes=votes,
-            baseline=baseline,
-            point=point,
-            box=box,
-            name=name,
-            direction=direction,
-            kind=kind.value,
-            speed=speed,
-            trajectory=trajectory,
-            reader=reader,
-            generator=generator,
-            option=option or [],
-            num_frames=num_frames,
-            fps=fps,
-            seed=seed,
-            video=out is not None,
-            frames={"policy": frames.value, "count": count, "max_side": max_side or None},
-        )
-        with _service() as service:
-            run_answer(service, image, request, out, as_json=as_json)
+    body = {
+        **request,
+        "question": question,
+        "options": choice,
+        "imagine": "always" if imagine else "never",
+        "votes": votes,
+        "baseline": baseline,
+        "video": out is not None,
+    }
+    with _service() as service:
+        run_answer(service, image, body, out, as_json=as_json)
 
 
 @app.command()
@@ -178,44 +117,41 @@ def serve(
     ] = None,
 ) -> None:
     """Start the server."""
-    with _errors_told():
-        service = _service(host=host, port=port)
-        from cow_service.observability import logging as logs  # noqa: PLC0415
-        from cow_service.observability import tracing  # noqa: PLC0415
+    service = _service(host=host, port=port)
+    from cow_service.observability import logging as logs  # noqa: PLC0415
+    from cow_service.observability import tracing  # noqa: PLC0415
 
-        logs.set_up(service.settings)
-        tracing.start()
-        from cow_service.api.middleware.order import tell_if_open  # noqa: PLC0415
-        from cow_service.server import run_server  # noqa: PLC0415
+    logs.set_up(service.settings)
+    tracing.start()
+    from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
+    from cow_service.server import run_server  # noqa: PLC0415
 
-        tell_if_open(service.settings)
-        run_server(service)
+    warn_if_open(service.settings)
+    run_server(service)
 
 
 @app.command()
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
     """Say what is installed, what is missing for which backend, and the line that installs it."""
-    with _errors_told():
-        from cow_service.cli.doctor import examine, print_report  # noqa: PLC0415
+    from cow_service.cli.doctor import examine, print_report  # noqa: PLC0415
 
-        with _service() as service:
-            report = examine(service)
-        print_report(report, as_json=as_json)
-        if not report.healthy:
-            raise typer.Exit(1)
+    with _service() as service:
+        report = examine(service)
+    print_report(report, as_json=as_json)
+    if not report.healthy:
+        raise typer.Exit(1)
 
 
 @app.command(hidden=True)
 def openapi() -> None:
     """Print the HTTP contract as YAML; `make openapi` keeps openapi.yaml with it."""
-    with _errors_told():
-        import yaml  # noqa: PLC0415
+    import yaml  # noqa: PLC0415
 
-        from cow_service.api.app import create_app  # noqa: PLC0415
-        from cow_service.jobs.engine import Engine  # noqa: PLC0415
+    from cow_service.api.app import create_app  # noqa: PLC0415
+    from cow_service.jobs.engine import JobEngine  # noqa: PLC0415
 
-        document = create_app(Engine(_service())).openapi()
-        typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
+    document = create_app(JobEngine(_service())).openapi()
+    typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
 
 
 def _service(host: str | None = None, port: int | None = None) -> Service:
@@ -227,39 +163,11 @@ def _service(host: str | None = None, port: int | None = None) -> Service:
     return Service(load_settings(host=host, port=port))
 
 
-@contextmanager
-def _errors_told() -> Generator[None]:
-    """Errors as a few plain lines on standard error, and exit code 1; 2 for bad settings."""
-    from cow_service.settings import SettingsError  # noqa: PLC0415
-
-    try:
-        yield
-    except CowError as error:
-        typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
-        typer.echo(printable(error.detail), err=True)
-        if error.code in options.HINTS:
-            typer.echo(options.HINTS[error.code], err=True)
-        for field in error.errors:
-            typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
-        raise typer.Exit(1) from error
-    except SettingsError as error:
-        typer.secho(str(error), fg="red", err=True)
-        raise typer.Exit(2) from error
-
-
-class _Told(TyperGroup):
-    """A group of commands whose errors are told as those of the other commands are."""
-
-    def invoke(self, ctx: Any) -> Any:
-        with _errors_told():
-            return super().invoke(ctx)
-
-
-app.command("batch")(_errors_told()(batch_cli.batch))
-app.command("mcp")(_errors_told()(mcp_cli.mcp))
-app.add_typer(keys_cli.app, name="keys", cls=_Told)
-app.add_typer(models_cli.app, name="models", cls=_Told)
-app.add_typer(tracks_cli.app, name="tracks", cls=_Told)
+app.command("batch")(batch_cli.batch)
+app.command("mcp")(mcp_cli.mcp)
+app.add_typer(keys_cli.app, name="keys")
+app.add_typer(models_cli.app, name="models")
+app.add_typer(tracks_cli.app, name="tracks")
 
 if __name__ == "__main__":
     sys.exit(app())

@@ -14,7 +14,7 @@ from cow_service.errors import InvalidRequest
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from cow_service.weights.hub import Listener, Plan, Step
+    from cow_service.weights.hub import Download, DownloadProgress, ProgressCallback
     from cow_service.weights.manifests import Manifest, Source
 
 app = typer.Typer(help="List readers and generators; pull and check weights.")
@@ -58,19 +58,19 @@ def pull(
     from rich.console import Console  # noqa: PLC0415
     from rich.filesize import decimal  # noqa: PLC0415
 
-    from cow_service.weights.hub import fetch  # noqa: PLC0415
+    from cow_service.weights.hub import download  # noqa: PLC0415
     from cow_service.weights.lock import folder_of  # noqa: PLC0415
 
     weights_dir = _weights_dir()
     console = Console(highlight=False, soft_wrap=True, markup=False)
     console.print("Looking at what is there, and at what is here ...")
-    plans = _plans(manifest, weights_dir, revisions)
-    count, size = sum(len(each.files) for each in plans), sum(each.size for each in plans)
-    pending, needed = sum(len(each.pending) for each in plans), sum(each.pending_size for each in plans)
+    downloads = _downloads(manifest, weights_dir, revisions)
+    count, size = sum(len(each.files) for each in downloads), sum(each.size for each in downloads)
+    pending, needed = sum(len(each.pending) for each in downloads), sum(each.pending_size for each in downloads)
     console.print(f"{name}: {count} files, {decimal(size)}; to download: {pending} files, {decimal(needed)}.")
     with _shown(console, needed) as show:
-        fetch(plans, weights_dir, show)
-    for each in plans:
+        download(downloads, weights_dir, show)
+    for each in downloads:
         folder = folder_of(weights_dir, each.lock.repository)
         console.print(f"{each.lock.repository} at {each.lock.revision[:12]} is in {folder}")
 
@@ -95,7 +95,7 @@ def check(name: Name, as_json: AsJson = False) -> None:
             source = manifest.sources[part]
             typer.echo(f"{part} ({source.repository}, {source.licence}): {'not complete' if found else 'complete'}")
             for finding in found:
-                typer.echo(f"  {finding.told()}")
+                typer.echo(f"  {finding.message}")
     if not complete:
         typer.echo(f"Run `cow models pull {name}`.", err=True)
         raise typer.Exit(1)
@@ -129,9 +129,9 @@ def _revisions(manifest: Manifest, wanted: list[str]) -> dict[str, str]:
     return revisions
 
 
-def _plans(manifest: Manifest, weights_dir: Path, revisions: dict[str, str]) -> list[Plan]:
-    """One plan for each repository: parts that come from the same one share its folder and its revision."""
-    from cow_service.weights.hub import plan  # noqa: PLC0415
+def _downloads(manifest: Manifest, weights_dir: Path, revisions: dict[str, str]) -> list[Download]:
+    """One download for each repository: parts that come from the same one share its folder and its revision."""
+    from cow_service.weights.hub import resolve  # noqa: PLC0415
 
     sources: dict[str, Source] = {}
     chosen: dict[str, str] = {}
@@ -141,11 +141,11 @@ def _plans(manifest: Manifest, weights_dir: Path, revisions: dict[str, str]) -> 
         sources[source.repository] = known.model_copy(update={"files": files})
         if part in revisions and chosen.setdefault(source.repository, revisions[part]) != revisions[part]:
             raise InvalidRequest(f"Parts of '{source.repository}' share its folder: give them one --revision.")
-    return [plan(source, weights_dir, chosen.get(name)) for name, source in sources.items()]
+    return [resolve(source, weights_dir, chosen.get(name)) for name, source in sources.items()]
 
 
 @contextmanager
-def _shown(console: Console, size: int) -> Generator[Listener]:
+def _shown(console: Console, size: int) -> Generator[ProgressCallback]:
     """Bars for the files and for all bytes; where there is no terminal, a line for each file."""
     from rich.filesize import decimal  # noqa: PLC0415
     from rich.progress import (  # noqa: PLC0415
@@ -158,7 +158,7 @@ def _shown(console: Console, size: int) -> Generator[Listener]:
         TransferSpeedColumn,
     )
 
-    def tell(step: Step) -> None:
+    def tell(step: DownloadProgress) -> None:
         if step.state == "downloading" and step.done == 0:
             console.print(f"{step.repository}: {step.file}, {decimal(step.size)}")
 
@@ -172,7 +172,7 @@ def _shown(console: Console, size: int) -> Generator[Listener]:
         tasks: dict[tuple[str, str], TaskID] = {}
         done: dict[tuple[str, str], int] = {}
 
-        def show(step: Step) -> None:
+        def show(step: DownloadProgress) -> None:
             key = step.repository, step.file
             if key not in tasks:
                 tasks[key] = bars.add_task(step.file, total=step.size)

@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cow_service.client import errors
-    from cow_service.client.aio import AsyncClient, AsyncJobHandle
+    from cow_service.client.async_client import AsyncClient
     from cow_service.client.batches import Outcome
+    from cow_service.client.client import Client
     from cow_service.client.errors import CowError
     from cow_service.client.events import Event
+    from cow_service.client.handles import AsyncJobHandle, JobHandle
     from cow_service.client.inputs import ImageLike
     from cow_service.client.questions import Question, QuestionLike
     from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
-    from cow_service.client.sync import Client, JobHandle
 
 __all__ = [
     "Answer",
@@ -41,18 +42,18 @@ __all__ = [
     "errors",
 ]
 
-# Each is loaded when it is first asked for: whoever calls one client need not wait for the other.
-_HOMES = {
+# Each is imported when it is first asked for: whoever uses one client need not wait for the rest.
+_MODULES = {
     "Answer": "results",
     "AsyncAnswer": "results",
-    "AsyncClient": "aio",
-    "AsyncJobHandle": "aio",
+    "AsyncClient": "async_client",
+    "AsyncJobHandle": "handles",
     "AsyncSimulation": "results",
-    "Client": "sync",
+    "Client": "client",
     "CowError": "errors",
     "Event": "events",
     "ImageLike": "inputs",
-    "JobHandle": "sync",
+    "JobHandle": "handles",
     "Outcome": "batches",
     "Question": "questions",
     "QuestionLike": "questions",
@@ -63,9 +64,9 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name == "errors":
         return import_module("cow_service.client.errors")
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     globals()[name] = value
     return value
 

@@ -1,142 +1,139 @@
-"""How `AsyncClient` does what calls say: requests sent, pauses slept, events followed."""
+"""How `AsyncClient` performs steps: it awaits."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-from collections.abc import AsyncGenerator
-from typing import TypeVar
+from collections.abc import AsyncGenerator, Mapping
+from contextlib import aclosing
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import httpx
 from httpx_sse import EventSource
 
-from cow_service.client import calls
-from cow_service.client.calls import Order, Pause, Placed, Send, Steps, Tell
-from cow_service.client.errors import closed, unreachable
-from cow_service.client.events import Event, Following, streams
-from cow_service.client.progress import ProgressLike, told
-from cow_service.client.results import AsyncAnswer, AsyncSimulation, async_result_from
-from cow_service.client.settings import Contact, Target
-from cow_service.errors import CowError
-from cow_service.records import Job
+from cow_service.client.events import Event, EventCursor, is_event_stream
+from cow_service.client.handles import AsyncJobHandle
+from cow_service.client.operations import Operations, closed
+from cow_service.client.results import AsyncAnswer, AsyncSimulation
+from cow_service.client.steps import Blocking, Send, Shielded, Sleep, Step, Steps
+from cow_service.records import JobKind
+
+if TYPE_CHECKING:
+    from cow_service.client.batches import Batch, Outcome
 
 T = TypeVar("T")
 
 
-class AsyncConnection:
-    """A server, and the way to it. `own` says whether the way is closed with it."""
+class AsyncConnection(Operations):
+    """A server and the way to it, for calls that are awaited."""
 
-    def __init__(self, target: Target, retries: int, http: httpx.AsyncClient, *, own: bool) -> None:
-        self.target = target
-        self.retries = retries
-        self._http = http
-        self._own = own
-        self._contact = Contact()
-        self._leaving: set[asyncio.Task[None]] = set()
+    result_types: ClassVar[Mapping[JobKind, type[Any]]] = {"simulate": AsyncSimulation, "answer": AsyncAnswer}
+    handle_type = AsyncJobHandle
+    _http_type = httpx.AsyncClient
+    _http: httpx.AsyncClient
+
+    @cached_property
+    def _shielded(self) -> set[asyncio.Task[None]]:
+        """Tasks that outlive their callers."""
+        return set()
 
     async def close(self) -> None:
-        """Closes the connections that were made here, once the server has heard who has left."""
-        await asyncio.gather(*self._leaving, return_exceptions=True)
-        if self._own:
+        """Closes the HTTP client, where it was made here, once the server knows which callers have left."""
+        await asyncio.gather(*self._shielded, return_exceptions=True)
+        if self._own_http:
             await self._http.aclose()
 
-    async def artifact(self, sha256: str) -> bytes:
-        """The bytes of an artifact."""
-        return await self.run(calls.artifact(sha256, self.retries))
-
-    async def job(self, job_id: str) -> Job:
-        """A job as it is."""
-        return calls.job_in(await self.run(calls.looked_at(job_id, self.retries)))
-
-    async def done(
-        self,
-        order: Order,
-        timeout: float | None,
-        progress: ProgressLike,
-        *,
-        keep: bool = False,
-        hear: Tell | None = None,
-    ) -> AsyncSimulation | AsyncAnswer:
-        """The result of an order, waited for. The caller's cancellation ends its job, unless `keep`.
-
-        `hear` is told of each look.
-        """
-        patience = self.target.patience(timeout) if progress is False else 0
-        placed = Placed(order)
-        with told(progress) as tell:
-            try:
-                body = await self.run(calls.done(placed, patience, timeout, hear or tell, self.retries))
-            except CowError:
-                raise
-            except (asyncio.CancelledError, Exception):
-                if not keep:
-                    # A task of its own: whoever is canceled may be canceled again before the server has heard of it.
-                    leaving = asyncio.create_task(self._withdraw(placed))
-                    self._leaving.add(leaving)
-                    leaving.add_done_callback(self._leaving.discard)
-                    await asyncio.shield(leaving)
-                raise
-        return async_result_from(order.kind, body, self.artifact)
-
-    async def awaited(self, job: Job, timeout: float | None, tell: Tell | None) -> AsyncSimulation | AsyncAnswer:
-        """The result of a job, once it has ended."""
-        body = await self.run(calls.awaited(job.id, timeout, calls.deadline(timeout), tell, self.retries))
-        return async_result_from(job.kind, body, self.artifact)
-
     async def run(self, steps: Steps[T]) -> T:
-        """Does what a call says, to its end."""
-        came: httpx.Response | httpx.HTTPError | None = None
+        """The result of steps."""
+        resume = partial(next, steps)
         while True:
             try:
-                step = steps.send(came)
+                step = resume()
             except StopIteration as end:
                 return end.value
-            if isinstance(step, Pause):
-                await asyncio.sleep(step.seconds)
-                came = None
-            else:
-                came = await self._sent(step)
-                if self._contact.missing(came) and isinstance(came, httpx.HTTPError):
-                    raise unreachable(came) from came
-
-    async def events(self, job_id: str, after: int) -> AsyncGenerator[Event]:
-        """The events of a job after a number, through broken connections."""
-        following = Following(after, self.retries)
-        send = calls.events_of(job_id)
-        url, limit = self.target.url(send.path), self.target.following
-        while not following.ended:
-            headers = self.target.headers(send) | following.headers
             try:
-                async with self._http.stream("GET", url, headers=headers, timeout=limit) as response:
+                result = await self._perform(step)
+            except (asyncio.CancelledError, Exception) as error:  # noqa: BLE001 - the steps raise it again, see `Client`
+                resume = partial(steps.throw, error)
+            else:
+                resume = partial(steps.send, result)
+
+    async def _perform(self, step: Step) -> Any:
+        if isinstance(step, Shielded):
+            # A task of its own: whoever is canceled may be canceled again before the server knows of it.
+            task = asyncio.create_task(self.run(step.steps))
+            self._shielded.add(task)
+            task.add_done_callback(self._shielded.discard)
+            return await asyncio.shield(task)
+        if isinstance(step, Sleep):
+            return await asyncio.sleep(step.seconds)
+        return await (asyncio.to_thread(step.function) if isinstance(step, Blocking) else self._send(step))
+
+    async def _send(self, send: Send) -> httpx.Response | httpx.HTTPError:
+        if self._http.is_closed:
+            raise closed()
+        try:
+            outcome: httpx.Response | httpx.HTTPError = await self._http.request(**self._arguments(send))
+        except httpx.HTTPError as error:
+            outcome = error
+        return self._received(outcome)
+
+    async def events(self, handle: AsyncJobHandle[Any], after: int) -> AsyncGenerator[Event]:
+        """The events of a job after a number, through broken connections."""
+        cursor = EventCursor(after, self.retries)
+        while not cursor.ended:
+            try:
+                async with self._http.stream(**self._stream_arguments(handle.id, cursor)) as response:
                     outcome: httpx.Response | httpx.HTTPError = response
-                    if streams(response):
+                    if is_event_stream(response):
                         async for sent in EventSource(response).aiter_sse():
-                            if (event := following.take(sent)) is not None:
+                            if (event := cursor.take(sent)) is not None:
+                                handle.job = event.job or handle.job
                                 yield event
-                            if following.ended:
+                            if cursor.ended:
                                 break
                     else:
                         await response.aread()
             except httpx.HTTPError as error:
                 outcome = error
-            if not following.ended:
-                await asyncio.sleep(following.pause_after(outcome))
+            if not cursor.ended:
+                await asyncio.sleep(cursor.pause_after(outcome))
 
-    async def _withdraw(self, placed: Placed) -> None:
-        with contextlib.suppress(Exception):
-            await self.run(calls.withdrawn(placed))
+    async def jobs(self, filters: Mapping[str, Any]) -> AsyncGenerator[AsyncJobHandle[Any]]:
+        """The jobs of this key, page by page."""
+        cursor: str | None = None
+        while True:
+            page = await self.run(self.page_of_jobs(filters, cursor))
+            for job in page.jobs:
+                yield AsyncJobHandle(self, job)
+            cursor = page.next
+            if cursor is None:
+                return
 
-    async def _sent(self, send: Send) -> httpx.Response | httpx.HTTPError:
-        if self._http.is_closed:
-            raise closed()
+    async def map(self, batch: Batch) -> AsyncGenerator[Outcome[Any]]:
+        """The outcomes of a batch as they come, then those of before."""
+        with batch:
+            async with aclosing(self._outcomes(batch)) as outcomes:
+                async for outcome in outcomes:
+                    batch.count(outcome)
+                    yield outcome
+            for outcome in batch.earlier_outcomes():
+                yield outcome
+
+    async def _outcomes(self, batch: Batch) -> AsyncGenerator[Outcome[Any]]:
+        """The outcomes, as they come; each is written down before it is yielded."""
+        pending = batch.pending()
+        tasks: set[asyncio.Task[Outcome[Any]]] = set()
         try:
-            return await self._http.request(
-                send.method,
-                self.target.url(send.path),
-                headers=self.target.headers(send),
-                params=send.params,
-                content=send.content,
-                timeout=self.target.limited(send.limit),
-            )
-        except httpx.HTTPError as error:
-            return error
+            while True:
+                while len(tasks) < batch.concurrency and (question := next(pending, None)) is not None:
+                    tasks.add(asyncio.create_task(self.run(batch.ask(question))))
+                if not tasks:
+                    return
+                done, tasks = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    yield task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)

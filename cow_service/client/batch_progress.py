@@ -8,18 +8,18 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-LINE_EVERY = 30.0  # seconds, where there is no terminal
+LINE_SECONDS = 30.0  # between two lines, where there is no terminal
 
 
 @dataclass
-class Tally:
+class BatchProgress:
     """How many questions are done, of how many, where that is known."""
 
     total: int | None
     succeeded: int = 0
     failed: int = 0
-    before: int = 0  # of those, found in the folder
-    note: str = ""  # what keeps it from going on, where something does
+    earlier: int = 0  # of those, found in the folder
+    note: str = ""  # what the batch waits for, where it waits
     began: float = field(default_factory=time.monotonic)
 
     @property
@@ -27,20 +27,20 @@ class Tally:
         """All that have an outcome."""
         return self.succeeded + self.failed
 
-    def count(self, succeeded: bool, *, before: bool = False) -> None:
+    def count(self, succeeded: bool, *, earlier: bool = False) -> None:
         """One more is done."""
         self.succeeded += succeeded
         self.failed += not succeeded
-        self.before += before
+        self.earlier += earlier
 
     @property
     def rate(self) -> float:
         """Questions done per second since the start."""
-        return (self.done - self.before) / max(time.monotonic() - self.began, 1e-6)
+        return (self.done - self.earlier) / max(time.monotonic() - self.began, 1e-6)
 
     @property
     def left(self) -> float | None:
-        """Seconds left at this rate; None where nothing tells."""
+        """Seconds left at this rate; None where that is not known."""
         if self.total is None or not self.rate:
             return None
         return (self.total - self.done) / self.rate
@@ -67,35 +67,36 @@ def duration(seconds: float) -> str:
 
 
 @contextmanager
-def shown(tally: Tally, progress: bool) -> Generator[Callable[[], None]]:
-    """Whom to tell that the tally has changed."""
+def progress_shown(state: BatchProgress, progress: bool) -> Generator[Callable[[], None]]:
+    """A bar or lines on standard error; yields the function to call when the state has changed."""
     if not progress:
         yield lambda: None
     elif sys.stderr.isatty():
-        with _bar(tally) as tell:
-            yield tell
+        with _bar(state) as update:
+            yield update
     else:
-        last, noted = [time.monotonic()], [tally.note]
+        printed, note = time.monotonic(), state.note
 
-        def tell_now_and_then() -> None:
-            if time.monotonic() - last[0] >= LINE_EVERY or tally.note != noted[0]:
-                last[0], noted[0] = time.monotonic(), tally.note
-                print(tally, file=sys.stderr, flush=True)
+        def print_now_and_then() -> None:
+            nonlocal printed, note
+            if time.monotonic() - printed >= LINE_SECONDS or state.note != note:
+                printed, note = time.monotonic(), state.note
+                print(state, file=sys.stderr, flush=True)
 
-        yield tell_now_and_then
+        yield print_now_and_then
 
 
 @contextmanager
-def _bar(tally: Tally) -> Generator[Callable[[], None]]:
+def _bar(state: BatchProgress) -> Generator[Callable[[], None]]:
     from rich.console import Console  # noqa: PLC0415
     from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 
     columns = (BarColumn(bar_width=30), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(str(tally), total=tally.total)
+        task = bar.add_task(str(state), total=state.total)
 
-        def tell() -> None:
-            bar.update(task, completed=tally.done, description=str(tally))
+        def update() -> None:
+            bar.update(task, completed=state.done, description=str(state))
 
-        tell()
-        yield tell
+        update()
+        yield update

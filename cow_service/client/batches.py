@@ -1,22 +1,24 @@
-"""Many questions: what comes of each, and which errors are about the question and which about the server."""
+"""Batches: what comes of each question, and which errors are about the question and which about the server."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
 
-from cow_service.client.batch_progress import Tally, shown
-from cow_service.client.calls import Order, order_of
+from cow_service.client.batch_progress import BatchProgress, progress_shown
 from cow_service.client.errors import BadResponse, ServerUnreachable, WaitTimeout, error_from
+from cow_service.client.job_request import JobRequest, job_request
 from cow_service.client.journal import Journal
 from cow_service.client.questions import Question, QuestionLike, questions
 from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
+from cow_service.client.steps import Blocking, Sleep, Steps
 from cow_service.errors import (
     BodyTooSlow,
     CowError,
@@ -31,14 +33,15 @@ from cow_service.errors import (
     StorageUnavailable,
     Unauthorized,
 )
-from cow_service.problems import problem_of
 from cow_service.records import JobKind
 
-PATIENCE = 300.0  # seconds without any answer after which a batch gives up; it can be resumed
-PAUSE = 2.0  # seconds before a question is sent again that the server could not take
-CONCURRENCY = 8
-_FINAL = (Unauthorized, OriginNotAllowed, MethodNotAllowed, NotFound)  # every other question would meet it, too
-PASSING = (ServerUnreachable, ShuttingDown, QueueFull, RateLimited, NotReady, StorageUnavailable, BodyTooSlow)
+if TYPE_CHECKING:
+    from cow_service.client.operations import Operations
+
+MAX_OUTAGE_SECONDS = 300.0  # without any response, after which a batch ends; it can be resumed
+RETRY_SECONDS = 2.0  # before a question is sent again that the server could not accept
+_FATAL = (Unauthorized, OriginNotAllowed, MethodNotAllowed, NotFound)  # every other question would meet it, too
+TRANSIENT = (ServerUnreachable, ShuttingDown, QueueFull, RateLimited, NotReady, StorageUnavailable, BodyTooSlow)
 
 R_co = TypeVar("R_co", bound=Simulation | Answer | AsyncSimulation | AsyncAnswer, covariant=True)
 
@@ -72,20 +75,13 @@ class Outcome(Generic[R_co]):
         """What is kept of it."""
         head = {"status": self.status, "seconds": round(self.seconds, 3)}
         if self.error is not None:
-            problem = {"code": self.error.code, **problem_of(self.error).model_dump(mode="json")}
+            problem = {"code": self.error.code, **self.error.as_problem()}
             job = {"job_id": self.error.job_id} if isinstance(self.error, WaitTimeout) else {}
             return {**head, "problem": {**problem, "request_id": self.error.request_id, **job}}
         assert self.result is not None
         if self.unsaved is not None:
             head["unsaved"] = self.unsaved.detail
         return {**head, "result": self.result.model_dump(mode="json")}
-
-
-def outcome_of(question: Question, result: R_co | None, failed: CowError | None, seconds: float) -> Outcome[R_co]:
-    """The outcome of a question. Where its pictures failed to be saved, its result stands."""
-    if result is None:
-        return Outcome(question, None, failed, seconds)
-    return Outcome(question, result, None, seconds, unsaved=failed)
 
 
 def outcome_from(question: Question, line: Mapping[str, Any], read: Callable[[dict[str, Any]], R_co]) -> Outcome[R_co]:
@@ -99,23 +95,25 @@ def outcome_from(question: Question, line: Mapping[str, Any], read: Callable[[di
     return Outcome(question, None, error, line["seconds"])
 
 
-class Patience:
-    """How long a batch bears a server that takes nothing. One for all questions, safe to use from every thread."""
+class OutageTimer:
+    """How long a batch waits for a server that accepts nothing. One for all questions; thread-safe."""
 
-    def __init__(self, seconds: float = PATIENCE, waiting: Callable[[CowError | None], None] | None = None) -> None:
-        """`waiting` is told what the batch waits for, and None when that is over."""
+    def __init__(
+        self, seconds: float = MAX_OUTAGE_SECONDS, on_change: Callable[[CowError | None], None] | None = None
+    ) -> None:
+        """`on_change` is told what the batch waits for, and None when that is over."""
         self._seconds = seconds
-        self._waiting = waiting
-        self._guard = threading.Lock()
-        self._heard = time.monotonic()
-        self._answered = False
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        self._last_response = time.monotonic()
+        self._ever_answered = False
 
-    def hear(self) -> None:
-        """The server has answered."""
-        with self._guard:
-            self._heard, self._answered = time.monotonic(), True
-            if self._waiting is not None:
-                self._waiting(None)
+    def reset(self) -> None:
+        """The server has responded."""
+        with self._lock:
+            self._last_response, self._ever_answered = time.monotonic(), True
+            if self._on_change is not None:
+                self._on_change(None)
 
     def pause_after(self, error: CowError) -> float | None:
         """Seconds before the question is sent again; None where the error is about the question.
@@ -123,145 +121,153 @@ class Patience:
         Raises an error that all questions would meet, or that has lasted for too long.
         """
         proxy = isinstance(error, BadResponse)
-        if isinstance(error, _FINAL) or (proxy and 300 <= error.status < 500):
+        if isinstance(error, _FATAL) or (proxy and 300 <= error.status < 500):
             raise error
-        if not (isinstance(error, PASSING) or (proxy and error.status >= 500)):
-            self.hear()
+        if not (isinstance(error, TRANSIENT) or (proxy and error.status >= 500)):
+            self.reset()
             return None
-        with self._guard:
-            missing = isinstance(error, ServerUnreachable) and not self._answered
-            if missing or time.monotonic() - self._heard > self._seconds:
+        with self._lock:
+            missing = isinstance(error, ServerUnreachable) and not self._ever_answered
+            if missing or time.monotonic() - self._last_response > self._seconds:
                 raise error
-            if self._waiting is not None:
-                self._waiting(error)
-        return PAUSE
+            if self._on_change is not None:
+                self._on_change(error)
+        return RETRY_SECONDS
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How the questions of one batch are asked."""
+class BatchOptions:
+    """How the questions of one batch are asked (`Client.map`). Raises `ValueError` for what does not fit together."""
 
     kind: JobKind
     concurrency: int
     timeout: float | None
     fresh: bool
-    journal: Journal | None
+    out: str | PathLike[str] | None
+    retry_failed: bool
+    only_new: bool
     save: bool
+    progress: bool
 
-    def order(self, question: Question) -> Order:
-        """The question as it is sent, with a key that a batch which goes on after a kill uses again.
-
-        Raises `ImageUnreadable` where its file cannot be read, and `InvalidRequest` where its image is none.
-        """
-        try:
-            order = order_of(self.kind, question.image, question.question, question.options, None, self.fresh)
-        except OSError as error:
-            raise ImageUnreadable(f"'{question.image}' cannot be read: {error.strerror or error}.") from error
-        return (
-            order
-            if self.journal is None
-            else replace(order, key=self.journal.key(question, order.content, fresh=self.fresh))
-        )
-
-    def folder(self, question: Question) -> Path | None:
-        """Where a question's pictures are saved; None where they are not."""
-        return self.journal.folder / "items" / question.folder if self.journal is not None and self.save else None
-
-    @property
-    def keeps(self) -> bool:
-        """Whether jobs go on that the batch no longer waits for: the next start asks for them."""
-        return self.journal is not None
-
-    def keep(self, outcome: Outcome[Any]) -> None:
-        """Writes an outcome down."""
-        if self.journal is not None:
-            folder = {"folder": f"items/{outcome.question.folder}"} if self.save and outcome.succeeded else {}
-            self.journal.append(outcome.question, {**outcome.line(), **folder})
+    def __post_init__(self) -> None:
+        if self.concurrency < 1:
+            raise ValueError(f"concurrency must be at least 1, got {self.concurrency}")
+        if self.out is None and (self.retry_failed or self.save):
+            raise ValueError("retry_failed and save need `out`, the folder of the batch")
 
 
 class Batch:
-    """One batch from its questions to its outcomes, but for the asking. A context that holds the folder."""
+    """One batch: its questions, how each is asked, and its outcomes. A context that holds the folder."""
 
     def __init__(
         self,
-        plan: Plan,
+        connection: Operations,
         items: Iterable[QuestionLike],
         defaults: Mapping[str, Any],
-        *,
-        progress: bool,
-        tells_earlier: bool,
+        options: BatchOptions,
     ) -> None:
-        self.plan = plan
-        self._tells_earlier = tells_earlier
-        self.tally = Tally(len(items) if isinstance(items, Sized) else None)
-        self._items, self._defaults, self._progress = items, defaults, progress
-        self._known: dict[str, Question] = {}
+        self.concurrency = options.concurrency
+        self._connection, self._items, self._defaults, self._options = connection, items, defaults, options
+        self._journal: Journal | None = None
+        self._known: dict[str, Question] = {}  # questions with an earlier outcome that is to be yielded, by id
+        self._progress = BatchProgress(len(items) if isinstance(items, Sized) else None)
+        self._show: Callable[[], None] = lambda: None
+        self._outage = OutageTimer(on_change=self._waiting_for)
         self._stack = ExitStack()
-        self._tell: Callable[[], None] = lambda: None
 
     def __enter__(self) -> Self:
-        if self.plan.journal is not None:
-            self._stack.callback(self.plan.journal.close)
-        self._tell = self._stack.enter_context(shown(self.tally, self._progress))
+        """Raises what `Journal` raises."""
+        options = self._options
+        if options.out is not None:
+            self._journal = Journal(Path(options.out), options.kind, retry_failed=options.retry_failed)
+            self._stack.callback(self._journal.close)
+        self._show = self._stack.enter_context(progress_shown(self._progress, options.progress))
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def todo(self) -> Iterator[Question]:
+    def pending(self) -> Iterator[Question]:
         """The questions without an outcome yet."""
-        journal = self.plan.journal
+        journal = self._journal
         for question in questions(self._items, self._defaults):
             if journal is None or not journal.has(question):
                 yield question
             else:
-                if self._tells_earlier:
+                if not self._options.only_new:
                     self._known[question.id] = question
-                self.tally.count(journal.done[question.id][1] == "succeeded", before=True)
+                self._progress.count(journal.done[question.id][1] == "succeeded", earlier=True)
 
-    def patience(self) -> Patience:
-        """A fresh one with the server; the bar tells when it is needed."""
+    def ask(self, question: Question) -> Steps[Outcome[Any]]:
+        """The steps to the outcome of a question, which is written down.
 
-        def wait(error: CowError | None) -> None:
-            note = "" if error is None else f"waiting for the server ({error.code})"
-            if note != self.tally.note:
-                self.tally.note = note
-                self._tell()
-
-        return Patience(waiting=wait)
+        Raises what no question could get past (`OutageTimer`).
+        """
+        began, timeout = time.monotonic(), self._options.timeout
+        while True:
+            result: Any = None
+            failed: CowError | None = None
+            try:
+                request = yield Blocking(partial(self._request, question))  # files are read, pictures encoded
+                result = yield from self._connection.complete_request(
+                    request,
+                    self._connection.endpoint.server_wait(timeout),
+                    timeout,
+                    lambda _: self._outage.reset(),
+                    cancel_abandoned=self._journal is None,  # with a journal, the next start asks for the job again
+                )
+                if self._journal is not None and self._options.save:
+                    yield from result.save_steps(self._journal.folder / "items" / question.folder)
+            except CowError as error:
+                failed = error
+                if isinstance(error, WaitTimeout):
+                    with suppress(CowError):
+                        yield from self._connection.cancel_job(error.job_id)
+            pause = None if failed is None else self._outage.pause_after(failed)
+            if pause is None:
+                self._outage.reset()
+                # Where its pictures failed to be saved, the result stands.
+                unanswered, unsaved = (failed, None) if result is None else (None, failed)
+                outcome = Outcome(question, result, unanswered, time.monotonic() - began, unsaved)
+                self._keep(outcome)
+                return outcome
+            yield Sleep(pause)
 
     def count(self, outcome: Outcome[Any]) -> None:
-        """One more has come."""
-        self.tally.count(outcome.succeeded)
-        self._tell()
+        """Shows that one more has come."""
+        self._progress.count(outcome.succeeded)
+        self._show()
 
-    def earlier(self) -> Iterator[tuple[Question, dict[str, Any]]]:
-        """The questions that had an outcome before, with its line."""
-        if self.plan.journal is not None and self._known:
-            for line in self.plan.journal.lines():
+    def earlier_outcomes(self) -> Iterator[Outcome[Any]]:
+        """The outcomes that were there before."""
+        if self._journal is not None and self._known:
+            for line in self._journal.lines():
                 if line["id"] in self._known:
-                    yield self._known[line["id"]], line
+                    read = partial(self._connection.result, self._options.kind)
+                    yield outcome_from(self._known[line["id"]], line, read)
 
+    def _request(self, question: Question) -> JobRequest:
+        """The request of a question, with a key that a batch which resumes after a kill uses again.
 
-def batch_of(
-    items: Iterable[QuestionLike],
-    defaults: Mapping[str, Any],
-    *,
-    kind: JobKind,
-    concurrency: int,
-    timeout: float | None,
-    fresh: bool,
-    out: str | PathLike[str] | None,
-    retry_failed: bool,
-    save: bool,
-    progress: bool,
-    only_new: bool,
-) -> Batch:
-    """A batch that is about to begin. Raises `ValueError` for what does not fit together, and what `Journal` raises."""
-    if concurrency < 1:
-        raise ValueError(f"concurrency must be at least 1, got {concurrency}")
-    if out is None and (retry_failed or save):
-        raise ValueError("retry_failed and save need `out`, the folder of the batch")
-    journal = None if out is None else Journal(Path(out), kind, retry_failed=retry_failed)
-    plan = Plan(kind, concurrency, timeout, fresh, journal, save)
-    return Batch(plan, items, defaults, progress=progress, tells_earlier=not only_new)
+        Raises `ImageUnreadable` where its file cannot be read, and `InvalidRequest` where its image is none.
+        """
+        fresh = self._options.fresh
+        try:
+            request = job_request(self._options.kind, question.image, question.question, question.options, None, fresh)
+        except OSError as error:
+            raise ImageUnreadable(f"'{question.image}' cannot be read: {error.strerror or error}.") from error
+        if self._journal is None:
+            return request
+        return replace(request, key=self._journal.key(question, request.content, fresh=fresh))
+
+    def _keep(self, outcome: Outcome[Any]) -> None:
+        if self._journal is not None:
+            saved = self._options.save and outcome.succeeded
+            folder = {"folder": f"items/{outcome.question.folder}"} if saved else {}
+            self._journal.append(outcome.question, {**outcome.line(), **folder})
+
+    def _waiting_for(self, error: CowError | None) -> None:
+        note = "" if error is None else f"waiting for the server ({error.code})"
+        if note != self._progress.note:
+            self._progress.note = note
+            self._show()

@@ -1,12 +1,12 @@
-"""What calls raise: the server's own errors, one class for each code, and those of the way to it.
+"""What calls raise: the server's own errors, one class for each code, and those of the connection.
 
     CowError                        everything here
     ├── (cow_service.errors)        one class for each problem code: CannotGround, QueueFull, Unauthorized...
     ├── ServerUnreachable           no connection, or it broke, more often than `retries`
     ├── WaitTimeout                 a job had not ended in time; it goes on, and `job_id` names it
-    └── BadResponse                 what answered speaks no COW: a proxy's page, a damaged artifact
+    └── BadResponse                 not a response of COW: a proxy's page, a damaged artifact
 
-Each has `code`, `status` (0 where no server told it), `detail` (what was wrong, with the value, and what to do),
+Each has `code`, `status` (0 where it is not the server's), `detail` (what was wrong, with the value, and what to do),
 `errors` (a JSON Pointer for each invalid field) and `request_id` (by which the server's log knows the request).
 """
 
@@ -17,95 +17,10 @@ from typing import Any
 
 import httpx
 
-from cow_service.errors import (
-    ArtifactNotFound,
-    BodyTooLarge,
-    BodyTooSlow,
-    BodyTypeUnsupported,
-    Canceled,
-    CannotGround,
-    CannotReadDirection,
-    CheckpointInvalid,
-    CowError,
-    FieldError,
-    GeneratorOutOfMemory,
-    GeneratorUnavailable,
-    IdempotencyKeyReused,
-    ImageTooLarge,
-    ImageTypeUnsupported,
-    ImageUnreadable,
-    ImageUrlNotAllowed,
-    ImageUrlUnreachable,
-    InternalError,
-    InvalidRequest,
-    JobNotFound,
-    MalformedBody,
-    MethodNotAllowed,
-    MllmBadReply,
-    MllmUnavailable,
-    ModelNotFound,
-    NotFound,
-    NotReady,
-    ObjectNotFound,
-    OriginNotAllowed,
-    QueueFull,
-    RangeNotSatisfiable,
-    RateLimited,
-    ReaderUnavailable,
-    ShuttingDown,
-    StorageUnavailable,
-    Unauthorized,
-    WebhookNotAllowed,
-    WeightsUnavailable,
-    kinds,
-)
+from cow_service.errors import *  # noqa: F403 - each class can be imported from here, too
+from cow_service.errors import CowError, FieldError, kinds
 
-__all__ = [
-    "ArtifactNotFound",
-    "BadResponse",
-    "BodyTooLarge",
-    "BodyTooSlow",
-    "BodyTypeUnsupported",
-    "Canceled",
-    "CannotGround",
-    "CannotReadDirection",
-    "CheckpointInvalid",
-    "CowError",
-    "FieldError",
-    "GeneratorOutOfMemory",
-    "GeneratorUnavailable",
-    "IdempotencyKeyReused",
-    "ImageTooLarge",
-    "ImageTypeUnsupported",
-    "ImageUnreadable",
-    "ImageUrlNotAllowed",
-    "ImageUrlUnreachable",
-    "InternalError",
-    "InvalidRequest",
-    "JobNotFound",
-    "MalformedBody",
-    "MethodNotAllowed",
-    "MllmBadReply",
-    "MllmUnavailable",
-    "ModelNotFound",
-    "NotFound",
-    "NotReady",
-    "ObjectNotFound",
-    "OriginNotAllowed",
-    "QueueFull",
-    "RangeNotSatisfiable",
-    "RateLimited",
-    "ReaderUnavailable",
-    "ServerUnreachable",
-    "ShuttingDown",
-    "StorageUnavailable",
-    "Unauthorized",
-    "WaitTimeout",
-    "WebhookNotAllowed",
-    "WeightsUnavailable",
-]
-
-SHOWN = 200  # characters of a response that is none of COW's
+MAX_BODY_SHOWN = 200  # characters of a response that is not COW's
 
 
 class ServerUnreachable(CowError):
@@ -135,44 +50,39 @@ class BadResponse(CowError):
     code, status = "bad-response", 0
 
 
-OWN: dict[str, type[CowError]] = {kind.code: kind for kind in (ServerUnreachable, WaitTimeout, BadResponse)}
-
-
-def closed() -> ServerUnreachable:
-    """The error of a call of a client that is closed, such as for a picture that was not downloaded before."""
-    return ServerUnreachable("The client is closed. Call `load()` or `save()` on results before that.")
+_OWN: dict[str, type[CowError]] = {kind.code: kind for kind in (ServerUnreachable, WaitTimeout, BadResponse)}
 
 
 def unreachable(error: httpx.HTTPError) -> ServerUnreachable | BadResponse:
-    """The error of a request that no response came to, or none that can be read."""
+    """The error of a request without a response, or with one that cannot be decoded."""
     url = error.request.url
-    told = (
+    request = (
         f"{error.request.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}."
     )
     if isinstance(error, httpx.DecodingError):
-        return BadResponse(f"{told} Does a proxy stand between?")
-    return ServerUnreachable(f"{told} Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?")
+        return BadResponse(f"{request} Does a proxy stand between?")
+    return ServerUnreachable(f"{request} Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?")
 
 
 def error_of(response: httpx.Response) -> CowError:
-    """The error that a response tells; the body has been read."""
+    """The error that a response holds; its body has been read."""
     problem = _problem(response)
     if problem is None:
         body = " ".join(response.text.split())
         moved = response.headers.get("location")
         error: CowError = BadResponse(
             f"{response.request.method} {response.url.path} was answered with {response.status_code} "
-            f"{response.reason_phrase}, and with nothing of COW's: {body[:SHOWN] or 'no body'}. "
+            f"{response.reason_phrase}, and with nothing of COW's: {body[:MAX_BODY_SHOWN] or 'no body'}. "
             + (f"It points to {moved}: is that its address (COW_BASE_URL)?" if moved else "Does a proxy stand between?")
         )
         error.status = response.status_code
     else:
         error = error_from(problem, response.headers)
-    return known_by(error, response)
+    return with_request_id(error, response)
 
 
-def known_by(error: CowError, response: httpx.Response) -> CowError:
-    """The same error, with the id by which the server's log knows its request; tracebacks show it."""
+def with_request_id(error: CowError, response: httpx.Response) -> CowError:
+    """The same error, with the id of its request in the server's log; tracebacks show it."""
     error.request_id = response.headers.get("x-request-id")
     if error.request_id is not None:
         error.add_note(f"request id: {error.request_id}")
@@ -182,9 +92,9 @@ def known_by(error: CowError, response: httpx.Response) -> CowError:
 def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) -> CowError:
     """The error that a problem (RFC 9457) is. A code of a later version than this comes as a plain `CowError`."""
     code = _code(problem)
-    kind = (kinds() | OWN).get(code, CowError)
-    told = problem.get("errors")
-    fields = [field for field in told if isinstance(field, dict)] if isinstance(told, list) else []
+    kind = (kinds() | _OWN).get(code, CowError)
+    given = problem.get("errors")
+    fields = [field for field in given if isinstance(field, dict)] if isinstance(given, list) else []
     error = kind(
         str(problem.get("detail") or problem.get("title") or ""),
         errors=tuple(FieldError(str(field.get("pointer", "")), str(field.get("detail", ""))) for field in fields),
@@ -197,7 +107,7 @@ def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) ->
 
 
 def code_of(response: httpx.Response) -> str | None:
-    """The problem code that a response tells; None where it tells none."""
+    """The problem code of a response; None where it has none."""
     problem = _problem(response)
     return None if problem is None else _code(problem)
 

@@ -1,4 +1,4 @@
-"""Images as callers have them: a file, bytes, a PIL image, an array, a URL, or what the server keeps already."""
+"""Images as callers give them: a file, bytes, a PIL image, an array, a URL, or an artifact of the server."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ else:
     ImageLike = Any
 
 URLS = ("http://", "https://", "data:")
-_OTHER_ALPHA = {"PA": "RGBA", "RGBa": "RGBA", "La": "LA"}  # modes that PNG has not, with an alpha to keep
+_ALPHA_MODES = {"PA": "RGBA", "RGBa": "RGBA", "La": "LA"}  # modes with alpha that PNG lacks, and those that keep it
 
 
 def is_url(text: str) -> bool:
@@ -49,14 +49,14 @@ def is_url(text: str) -> bool:
 
 @dataclass(frozen=True)
 class Upload:
-    """An image to be sent as a file. It holds the bytes themselves, so that every try sends the same."""
+    """An image to be sent as a file. It holds the bytes themselves, so that every attempt sends the same."""
 
     data: bytes
 
 
 @dataclass(frozen=True)
 class Reference:
-    """An image that the server finds by what stands in the request."""
+    """An image that the request names: a URL, a data URL or an artifact."""
 
     json: str | dict[str, str]
 
@@ -108,7 +108,7 @@ def encoded_array(array: NDArray[np.uint8]) -> bytes:
 
 
 def encoded_picture(picture: Image.Image) -> bytes:
-    """PNG of a PIL image, upright: what its EXIF says of its orientation is applied, and no EXIF sent."""
+    """PNG of a PIL image, upright: its EXIF orientation is applied, and no EXIF sent."""
     from PIL import ImageOps  # noqa: PLC0415
 
     if 0 in picture.size or picture.mode in ("I", "F"):
@@ -119,8 +119,8 @@ def encoded_picture(picture: Image.Image) -> bytes:
     upright = ImageOps.exif_transpose(picture)
     if upright.mode.startswith("I;16"):
         upright = upright.convert("I").convert("I;16")
-    elif upright.mode in _OTHER_ALPHA:
-        upright = upright.convert(_OTHER_ALPHA[upright.mode])
+    elif upright.mode in _ALPHA_MODES:
+        upright = upright.convert(_ALPHA_MODES[upright.mode])
     elif upright.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
         upright = upright.convert("RGB")
     return _png(upright)
@@ -128,7 +128,7 @@ def encoded_picture(picture: Image.Image) -> bytes:
 
 def _png(picture: Image.Image) -> bytes:
     buffer = io.BytesIO()
-    # It crosses a network once: small matters less than soon. A profile would be that of the mode before.
+    # Speed matters more than size: it is sent once. An ICC profile would be that of the mode before conversion.
     picture.save(buffer, "PNG", compress_level=1, icc_profile=None)
     return buffer.getvalue()
 

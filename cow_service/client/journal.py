@@ -1,11 +1,11 @@
-"""The folder of a batch: what has come of each question, kept so that a batch that was killed goes on where it was.
+"""The folder of a batch: the outcome of each question, so that a batch that was killed can be resumed.
 
-    batch.json      what is asked of each question, and the secret of which its idempotency keys are made
+    batch.json      what is asked of each question, and the secret that its idempotency keys are derived from
     results.jsonl   one line for each question that is done, appended when it is
     retried.jsonl   failures that were asked again
 
-A line is written at once and whole. What a kill left half is cut off at the next start; its question is then sent again
-under the same key, and the server, which has kept the job, only tells its result.
+A line is written at once and whole. A line that a kill cut short is removed at the next start; its question is then
+sent again under the same key, and the server, which has kept the job, returns its result.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
-from cow_service.client.calls import to_json
 from cow_service.client.questions import Question
+from cow_service.client.serialization import to_json
 from cow_service.errors import InvalidRequest
 from cow_service.records import JobKind
 
@@ -43,7 +43,7 @@ class Journal:
         self.results = folder / "results.jsonl"
         self._retried = folder / "retried.jsonl"
         self._lock = FileLock(folder / ".lock", thread_local=False)
-        self._guard = threading.Lock()
+        self._write_lock = threading.Lock()
         try:
             self._lock.acquire(timeout=0)
         except Timeout as error:
@@ -56,7 +56,7 @@ class Journal:
             _cut(self._retried)
             self._attempts = {line["id"]: line["attempt"] for line in _lines(self._retried)}
             if retry_failed:
-                self._put_failures_by()
+                self._set_failures_aside()
             self.done: dict[str, tuple[str, str]] = {
                 line["id"]: (line["fingerprint"], line["status"]) for line in _lines(self.results)
             }
@@ -72,8 +72,8 @@ class Journal:
         self.close()
 
     def close(self) -> None:
-        """Lets go of the folder."""
-        with self._guard:
+        """Releases the folder."""
+        with self._write_lock:
             if self._file >= 0:
                 os.close(self._file)
                 self._file = -1
@@ -105,9 +105,9 @@ class Journal:
             "fingerprint": question.fingerprint,
         }
         data = to_json(whole) + b"\n"
-        with self._guard:
+        with self._write_lock:
             if self._file < 0:
-                return  # the batch was given up; the server keeps what came of this one
+                return  # the batch has ended; the server keeps this result
             end = os.fstat(self._file).st_size
             try:
                 while data:
@@ -139,7 +139,7 @@ class Journal:
         _replace(path, json.dumps({"version": VERSION, "kind": kind, "secret": secret}, indent=2).encode() + b"\n")
         return secret
 
-    def _put_failures_by(self) -> None:
+    def _set_failures_aside(self) -> None:
         """Moves failures to `retried.jsonl`. Killed in between, they stand in both, and are moved at the next start."""
         beside = self.results.with_name(self.results.name + ".new")
         failed = 0
@@ -165,18 +165,7 @@ class Journal:
 def _cut(path: Path) -> None:
     """Cuts off a last line that was not written to its end."""
     with contextlib.suppress(FileNotFoundError), path.open("r+b") as file:
-        end = file.seek(0, os.SEEK_END)
-        at = end
-        while at > 0:
-            begin = max(0, at - 65536)
-            file.seek(begin)
-            found = file.read(at - begin).rfind(b"\n")
-            if found >= 0:
-                at = begin + found + 1
-                break
-            at = begin
-        if at < end:
-            file.truncate(at)
+        file.truncate(sum(len(line) for line in file if line.endswith(b"\n")))
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:

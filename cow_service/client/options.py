@@ -1,4 +1,4 @@
-"""What calls take beside image and question: the fields of `SimulateRequest` and `AnswerRequest`, by their names."""
+"""What calls take beside image and question: the fields of `SimulateRequest` and `AnswerRequest`; and defaults."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
     from cow_service.requests import FramesRequest, GroundingRequest, MotionRequest, TrajectoryRequest
+
+DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
+RETRIES = 5
+CONCURRENCY = 8  # questions of a batch at the same time
 
 Given = Mapping[str, Any]  # a record as a plain mapping, checked by the server
 

@@ -14,10 +14,10 @@ ProgressLike: TypeAlias = bool | Literal["rich", "tqdm"] | Callable[[Job], None]
 
 
 @contextmanager
-def told(progress: ProgressLike) -> Generator[Callable[[Job], None] | None]:
-    """Whom to tell of a job as it goes on; None for nobody.
+def reporting(progress: ProgressLike) -> Generator[Callable[[Job], None] | None]:
+    """Shows the progress of a job; yields the function to call with its state, None for none.
 
-    Raises `ImportError` where the bar is not installed, and `ValueError` for one that nobody knows.
+    Raises `ImportError` where the bar is not installed, and `ValueError` for an unknown one.
     """
     if progress is False:
         yield None
@@ -26,18 +26,18 @@ def told(progress: ProgressLike) -> Generator[Callable[[Job], None] | None]:
     elif progress is not True and progress not in ("rich", "tqdm"):
         raise ValueError(f"progress must be True, False, 'rich', 'tqdm' or a function, got {progress!r}")
     else:
-        with _bar(progress) as tell:
-            yield tell
+        with _bar(progress) as report:
+            yield report
 
 
 @contextmanager
 def _bar(kind: Literal[True, "rich", "tqdm"]) -> Generator[Callable[[Job], None]]:
     if kind is not True:
-        with _rich() if kind == "rich" else _tqdm() as tell:
-            yield tell
+        with _rich() if kind == "rich" else _tqdm() as report:
+            yield report
         return
-    with _bar("rich" if find_spec("rich") else "tqdm") as tell:
-        yield tell
+    with _bar("rich" if find_spec("rich") else "tqdm") as report:
+        yield report
 
 
 @contextmanager
@@ -56,14 +56,14 @@ def _tqdm() -> Generator[Callable[[Job], None]]:
 
     with tqdm(total=1.0, bar_format="{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}") as bar:
 
-        def tell(job: Job) -> None:
+        def report(job: Job) -> None:
             bar.set_description_str(describe(job), refresh=False)
-            bar.n = job.progress  # what is added up is not the same to the last digit, and tqdm warns of too much
+            bar.n = job.progress  # added up by tqdm, rounding could exceed 1, of which it warns
             bar.refresh()
 
-        yield tell
+        yield report
 
 
 def describe(job: Job) -> str:
-    """What a job is at, in a word."""
+    """The stage of a running job, else its status."""
     return job.stage if job.status == "running" and job.stage else job.status

@@ -1,4 +1,4 @@
-"""The questions of a batch: what each asks, by which id its outcome is known, and how the server knows it again."""
+"""The questions of a batch: what each asks, and its id and fingerprint."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cow_service.client.calls import to_json
 from cow_service.client.inputs import ImageLike, Reference, image_input, is_url
+from cow_service.client.serialization import to_json
 from cow_service.errors import FieldError, InvalidRequest
 
 # A mapping has `image` and `question`, maybe `id` and `meta`, and else fields of the request; a pair has the first two.
 QuestionLike: TypeAlias = "Question | Mapping[str, Any] | tuple[ImageLike, str]"
-MAX_ID = 200  # characters
-OWN = {"id", "image", "meta", "question"}  # fields of a question that are none of the request's, or its very own
+MAX_ID_CHARACTERS = 200
+_OWN_FIELDS = {
+    "id",
+    "image",
+    "meta",
+    "question",
+}  # fields of a question that are none of the request's, or its very own
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -57,18 +62,18 @@ def questions(
     `InvalidRequest` for an item without image or question, for what no JSON can hold, and for an id that comes twice.
     """
     defaults = defaults or {}
-    wrong = sorted(OWN & defaults.keys())
+    wrong = sorted(_OWN_FIELDS & defaults.keys())
     if wrong:
         raise InvalidRequest(
             f"Each question has its own {' and '.join(f'`{name}`' for name in wrong)}: give none for all."
         )
     seen: set[str] = set()
-    alike: dict[str, int] = {}
+    same: dict[str, int] = {}
     for place, item in enumerate(items, 1):
         question = _read(item, place, defaults, folder)
         if question.id == "":
             made = _checked(question, place).fingerprint[:16]
-            times = alike[made] = alike.get(made, 0) + 1
+            times = same[made] = same.get(made, 0) + 1
             question = replace(question, id=made if times == 1 else f"{made}-{times}")
         if question.id in seen:
             raise _wrong(place, "id", f"'{question.id}' stands before; give each its own")
@@ -89,8 +94,8 @@ def _read(item: Any, place: int, defaults: Mapping[str, Any], folder: Path | Non
     if not isinstance(given["question"], str):
         raise _wrong(place, "question", f"must be a text, got {type(given['question']).__name__}")
     own = given.pop("id", None)
-    if own is not None and not 0 < len(str(own)) <= MAX_ID:
-        raise _wrong(place, "id", f"has {len(str(own))} characters; give 1 to {MAX_ID}")
+    if own is not None and not 0 < len(str(own)) <= MAX_ID_CHARACTERS:
+        raise _wrong(place, "id", f"has {len(str(own))} characters; give 1 to {MAX_ID_CHARACTERS}")
     image, question, meta = given.pop("image"), given.pop("question"), given.pop("meta", None)
     named = None
     if folder is not None and isinstance(image, str) and not is_url(image):
@@ -99,7 +104,7 @@ def _read(item: Any, place: int, defaults: Mapping[str, Any], folder: Path | Non
 
 
 def _checked(question: Question, place: int) -> Question:
-    """The question, of which all can be written down. Found out before it is asked, not after it was paid for."""
+    """The question, all of which JSON can hold: checked before it is asked, not after it was paid for."""
     for name, value in (("id", question.id), ("question", question.question), ("meta", question.meta)):
         try:
             to_json(value)
@@ -119,5 +124,5 @@ def _named(image: ImageLike) -> Any:
 
 
 def _wrong(place: int, name: str, detail: str) -> InvalidRequest:
-    told = f"Question {place}: `{name}` {detail}."
-    return InvalidRequest(told, errors=(FieldError(f"/{place - 1}/{name}", detail),))
+    message = f"Question {place}: `{name}` {detail}."
+    return InvalidRequest(message, errors=(FieldError(f"/{place - 1}/{name}", detail),))

@@ -1,29 +1,31 @@
 """What calls return: the server's own records, with the pictures that they name, downloaded when first asked for.
 
 `Simulation` and `Answer` are those of `Client`; `AsyncSimulation` and `AsyncAnswer` those of `AsyncClient`, the same
-but for `await`.
+but for `await`. What either does is written once, as steps.
 """
+
+# The classes of this file share their private members.
+# pyright: reportPrivateUsage=false
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from pydantic import PrivateAttr
 
 from cow_service import records
-from cow_service.client.calls import read
-from cow_service.client.shown import (
+from cow_service.client.display import (
     answer_html,
-    answered,
-    brief,
+    describe_answer,
+    describe_encounters,
     filmstrip_png,
-    met,
+    one_line,
     picture_of,
     simulation_html,
     stacked,
 )
+from cow_service.client.steps import Steps, finished
 from cow_service.errors import CowError
 
 if TYPE_CHECKING:
@@ -31,19 +33,34 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from PIL import Image
 
+    from cow_service.client.operations import Operations
 
-class _Held:
-    """Bytes by their digests. They are no part of what a result says: results that say the same are equal."""
+T = TypeVar("T")
 
-    def __init__(self) -> None:
-        self._held: dict[str, bytes] = {}
 
-    def shown(self, sha256: str) -> bytes | None:
-        """The bytes, for a notebook; None where they are not here."""
-        return self._held.get(sha256)
+class Files:
+    """The artifacts of one result, by their digests: downloaded once, then held.
+
+    They are no part of what a result says: results that say the same are equal.
+    """
+
+    def __init__(self, connection: Operations | None = None) -> None:
+        self.connection = connection
+        self.held: dict[str, bytes] = {}
+        self.download_failed = False
+
+    def fetch(self, sha256: str) -> Steps[bytes]:
+        """The bytes, which are downloaded the first time."""
+        if sha256 not in self.held:
+            if self.connection is None:
+                raise ValueError(
+                    f"This result comes from a file or another process: get {sha256} by `Client.artifact`."
+                )
+            self.held[sha256] = yield from self.connection.artifact(sha256)
+        return self.held[sha256]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Held)
+        return isinstance(other, Files)
 
     __hash__ = object.__hash__
 
@@ -51,104 +68,107 @@ class _Held:
         return self  # bytes by their digests are the same for every copy
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A connection does not go into another process; what it has brought does.
-        return type(self), (), {"_held": self._held}
-
-
-def _nowhere(sha256: str) -> bytes:
-    raise ValueError(f"This result comes from a file or another process: get {sha256} by `Client.artifact`.")
-
-
-async def _async_nowhere(sha256: str) -> bytes:
-    return _nowhere(sha256)
-
-
-class Files(_Held):
-    """Artifacts of one result: downloaded once, then held."""
-
-    def __init__(self, download: Callable[[str], bytes] = _nowhere) -> None:
-        super().__init__()
-        self._given_up = False
-        self._download = download
-
-    def get(self, sha256: str) -> bytes:
-        """The bytes; downloads them the first time."""
-        if sha256 not in self._held:
-            self._held[sha256] = self._download(sha256)
-        return self._held[sha256]
-
-    def shown(self, sha256: str) -> bytes | None:
-        """The bytes, for a notebook, which shows what it can: nothing is downloaded after that has failed once."""
-        if not self._given_up and sha256 not in self._held:
-            try:
-                self.get(sha256)
-            except (CowError, ValueError):
-                self._given_up = True
-        return self._held.get(sha256)
-
-
-class AsyncFiles(_Held):
-    """The same, where downloads are awaited."""
-
-    def __init__(self, download: Callable[[str], Awaitable[bytes]] = _async_nowhere) -> None:
-        super().__init__()
-        self._download = download
-
-    async def get(self, sha256: str) -> bytes:
-        """The bytes; downloads them the first time."""
-        if sha256 not in self._held:
-            self._held[sha256] = await self._download(sha256)
-        return self._held[sha256]
+        # A connection does not go into another process; what it has downloaded does.
+        return type(self), (), {"held": self.held}
 
 
 class _Simulation(records.Simulation):
     """What both kinds of simulation have in common."""
 
+    _files: Files = PrivateAttr(default_factory=Files)
+
     def __repr__(self) -> str:
-        told = brief(f"{self.grounding.object} {met(self)}")
-        return f"<{type(self).__name__} {self.id}: {told}; {len(self.frames)} frames>"
+        said = one_line(f"{self.grounding.object} {describe_encounters(self)}")
+        return f"<{type(self).__name__} {self.id}: {said}; {len(self.frames)} frames>"
 
     __str__ = __repr__
 
-    def shown(self, sha256: str) -> bytes | None:
-        """The bytes of one of its pictures, for a notebook; None where they are not to be had."""
-        raise NotImplementedError
+    def bind(self, connection: Operations) -> None:
+        """Sets where its pictures are downloaded from."""
+        self._files = Files(connection)
 
     def _repr_html_(self) -> str:
-        return simulation_html(self, self.shown)
+        return simulation_html(self, self._picture)
 
     def _repr_png_(self) -> bytes | None:
-        return filmstrip_png(self, self.shown)
+        return filmstrip_png(self, self._picture)
 
-    def _pictures(self) -> Iterator[tuple[str, str]]:
-        """Names of files in a folder and their digests, but for the video."""
-        yield from ((f"frame_{frame.index:03d}.png", frame.sha256) for frame in self.frames)
-        yield "overlay.png", self.overlay.sha256
+    def _picture(self, sha256: str) -> bytes | None:
+        """The bytes of a picture for a notebook; None where they are not available."""
+        return self._files.held.get(sha256)
 
-    def _video(self) -> str:
+    def _names(self) -> dict[str, str]:
+        """The digests of its pictures by their names in a folder."""
+        return {f"frame_{frame.index:03d}.png": frame.sha256 for frame in self.frames} | {
+            "overlay.png": self.overlay.sha256
+        }
+
+    def _pil(self, sha256: str) -> Steps[Image.Image]:
+        return picture_of((yield from self._files.fetch(sha256)))
+
+    def _pil_frames(self) -> Steps[list[Image.Image]]:
+        pictures: list[Image.Image] = []
+        for frame in self.frames:
+            pictures.append((yield from self._pil(frame.sha256)))
+        return pictures
+
+    def _numpy_frames(self) -> Steps[NDArray[np.uint8]]:
+        return stacked((yield from self._pil_frames()))
+
+    def _video_bytes(self) -> Steps[bytes]:
         if self.video is None:
             raise ValueError("This simulation has no video: ask for one with video=True.")
-        return self.video.sha256
+        return (yield from self._files.fetch(self.video.sha256))
 
-    def _write(self, folder: Path) -> Path:
-        return _written(folder / "simulation.json", self)
+    def _load(self) -> Steps[Self]:
+        for sha256 in self._names().values():
+            yield from self._files.fetch(sha256)
+        return self
+
+    def save_steps(self, folder: str | Path) -> Steps[Path]:
+        """The steps of `save`."""
+        folder = _made(folder)
+        for name, sha256 in self._names().items():
+            (folder / name).write_bytes((yield from self._files.fetch(sha256)))
+        if self.video is not None:
+            (folder / "video.mp4").write_bytes((yield from self._video_bytes()))
+        _write(folder / "simulation.json", self)
+        return folder
 
 
 class _Answer(records.Answer):
     """What both kinds of answer have in common."""
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.id}: {brief(answered(self))}>"
+        return f"<{type(self).__name__} {self.id}: {one_line(describe_answer(self))}>"
 
     __str__ = __repr__
 
+    def bind(self, connection: Operations) -> None:
+        """Sets where its pictures are downloaded from."""
+        if (simulation := _simulation_of(self)) is not None:
+            simulation.bind(connection)
+
     def _repr_html_(self) -> str:
-        simulation = self.simulation
-        return answer_html(self, simulation.shown if isinstance(simulation, _Simulation) else lambda _: None)
+        simulation = _simulation_of(self)
+        return answer_html(self, (lambda _: None) if simulation is None else simulation._picture)
 
     def _repr_png_(self) -> bytes | None:
-        simulation = self.simulation
-        return filmstrip_png(simulation, simulation.shown) if isinstance(simulation, _Simulation) else None
+        simulation = _simulation_of(self)
+        return None if simulation is None else simulation._repr_png_()
+
+    def _load(self) -> Steps[Self]:
+        if (simulation := _simulation_of(self)) is not None:
+            yield from simulation._load()
+        return self
+
+    def save_steps(self, folder: str | Path) -> Steps[Path]:
+        """The steps of `save`."""
+        folder = _made(folder)
+        if (simulation := _simulation_of(self)) is not None:
+            yield from simulation.save_steps(folder)
+        _write(folder / "answer.json", self)
+        return folder
 
 
 class Simulation(_Simulation):
@@ -161,93 +181,66 @@ class Simulation(_Simulation):
     (3, 295, 512, 3)
     """
 
-    _files: Files = PrivateAttr(default_factory=Files)
-
-    def bind(self, files: Files) -> None:
-        """Tells where its pictures come from."""
-        self._files = files
-
-    def shown(self, sha256: str) -> bytes | None:
-        """The bytes of one of its pictures, for a notebook; None where they are not to be had."""
-        return self._files.shown(sha256)
-
     def pil_frames(self) -> list[Image.Image]:
         """The frames chosen for reasoning as PIL images, RGB, in order of time."""
-        return [picture_of(self._files.get(frame.sha256)) for frame in self.frames]
+        return _run(self, self._pil_frames())
 
     def numpy_frames(self) -> NDArray[np.uint8]:
         """The same frames as one array (frames, height, width, 3), RGB, uint8."""
-        return stacked(self.pil_frames())
+        return _run(self, self._numpy_frames())
 
     def pil_overlay(self) -> Image.Image:
         """The input with box, point, arrow and path drawn on it, RGB."""
-        return picture_of(self._files.get(self.overlay.sha256))
+        return _run(self, self._pil(self.overlay.sha256))
 
     def video_bytes(self) -> bytes:
         """The clip as mp4 (H.264). Raises `ValueError` where the request said `video=False`."""
-        return self._files.get(self._video())
+        return _run(self, self._video_bytes())
 
     def load(self) -> Self:
         """Downloads overlay and frames now."""
-        for _, sha256 in self._pictures():
-            self._files.get(sha256)
-        return self
+        return _run(self, self._load())
 
     def save(self, folder: str | Path) -> Path:
         """Writes frame_*.png, overlay.png, video.mp4 and simulation.json into a folder, which is made if missing."""
-        folder = _made(folder)
-        for name, sha256 in self._pictures():
-            (folder / name).write_bytes(self._files.get(sha256))
-        if self.video is not None:
-            (folder / "video.mp4").write_bytes(self.video_bytes())
-        self._write(folder)
-        return folder
+        return _run(self, self.save_steps(folder))
+
+    def _picture(self, sha256: str) -> bytes | None:
+        """Downloads what is missing; nothing after a download has failed, so that a notebook does not hang."""
+        if not self._files.download_failed:
+            try:
+                return _run(self, self._files.fetch(sha256))
+            except (CowError, ValueError):
+                self._files.download_failed = True
+        return super()._picture(sha256)
 
 
 class AsyncSimulation(_Simulation):
-    """A simulation, as `AsyncClient` returns it. A notebook shows what `await simulation.load()` has brought."""
-
-    _files: AsyncFiles = PrivateAttr(default_factory=AsyncFiles)
-
-    def bind(self, files: AsyncFiles) -> None:
-        """Tells where its pictures come from."""
-        self._files = files
-
-    def shown(self, sha256: str) -> bytes | None:
-        """The bytes of one of its pictures, for a notebook; None where they are not to be had."""
-        return self._files.shown(sha256)
+    """A simulation, as `AsyncClient` returns it. A notebook shows what `await simulation.load()` has downloaded."""
 
     async def pil_frames(self) -> list[Image.Image]:
         """The frames chosen for reasoning as PIL images, RGB, in order of time."""
-        return [picture_of(await self._files.get(frame.sha256)) for frame in self.frames]
+        return await _async_run(self, self._pil_frames())
 
     async def numpy_frames(self) -> NDArray[np.uint8]:
         """The same frames as one array (frames, height, width, 3), RGB, uint8."""
-        return stacked(await self.pil_frames())
+        return await _async_run(self, self._numpy_frames())
 
     async def pil_overlay(self) -> Image.Image:
         """The input with box, point, arrow and path drawn on it, RGB."""
-        return picture_of(await self._files.get(self.overlay.sha256))
+        return await _async_run(self, self._pil(self.overlay.sha256))
 
     async def video_bytes(self) -> bytes:
         """The clip as mp4 (H.264). Raises `ValueError` where the request said `video=False`."""
-        return await self._files.get(self._video())
+        return await _async_run(self, self._video_bytes())
 
     async def load(self) -> Self:
         """Downloads overlay and frames now."""
-        for _, sha256 in self._pictures():
-            await self._files.get(sha256)
-        return self
+        return await _async_run(self, self._load())
 
     async def save(self, folder: str | Path) -> Path:
         """Writes frame_*.png, overlay.png, video.mp4 and simulation.json into a folder, which is made if missing."""
-        folder = _made(folder)
-        for name, sha256 in self._pictures():
-            (folder / name).write_bytes(await self._files.get(sha256))
-        if self.video is not None:
-            (folder / "video.mp4").write_bytes(await self.video_bytes())
-        self._write(folder)
-        return folder
+        return await _async_run(self, self.save_steps(folder))
 
 
 class Answer(_Answer):
@@ -265,17 +258,11 @@ class Answer(_Answer):
 
     def load(self) -> Self:
         """Downloads overlay and frames now."""
-        if self.simulation is not None:
-            self.simulation.load()
-        return self
+        return _run(self.simulation, self._load())
 
     def save(self, folder: str | Path) -> Path:
         """Writes answer.json, and what `Simulation.save` writes, into a folder, which is made if missing."""
-        folder = _made(folder)
-        if self.simulation is not None:
-            self.simulation.save(folder)
-        _written(folder / "answer.json", self)
-        return folder
+        return _run(self.simulation, self.save_steps(folder))
 
 
 class AsyncAnswer(_Answer):
@@ -285,37 +272,25 @@ class AsyncAnswer(_Answer):
 
     async def load(self) -> Self:
         """Downloads overlay and frames now."""
-        if self.simulation is not None:
-            await self.simulation.load()
-        return self
+        return await _async_run(self.simulation, self._load())
 
     async def save(self, folder: str | Path) -> Path:
         """Writes answer.json, and what `AsyncSimulation.save` writes, into a folder, which is made if missing."""
-        folder = _made(folder)
-        if self.simulation is not None:
-            await self.simulation.save(folder)
-        _written(folder / "answer.json", self)
-        return folder
+        return await _async_run(self.simulation, self.save_steps(folder))
 
 
-def result_from(kind: records.JobKind, body: Any, download: Callable[[str], bytes]) -> Simulation | Answer:
-    """The result of a job from its JSON."""
-    result = read(Simulation if kind == "simulate" else Answer, body)
-    simulation = result.simulation if isinstance(result, Answer) else result
-    if simulation is not None:
-        simulation.bind(Files(download))
-    return result
+def _simulation_of(answer: _Answer) -> _Simulation | None:
+    return answer.simulation if isinstance(answer.simulation, _Simulation) else None
 
 
-def async_result_from(
-    kind: records.JobKind, body: Any, download: Callable[[str], Awaitable[bytes]]
-) -> AsyncSimulation | AsyncAnswer:
-    """The same for `AsyncClient`."""
-    result = read(AsyncSimulation if kind == "simulate" else AsyncAnswer, body)
-    simulation = result.simulation if isinstance(result, AsyncAnswer) else result
-    if simulation is not None:
-        simulation.bind(AsyncFiles(download))
-    return result
+def _run(simulation: Simulation | None, steps: Steps[T]) -> T:
+    connection = None if simulation is None else simulation._files.connection
+    return finished(steps) if connection is None else connection.run(steps)
+
+
+async def _async_run(simulation: AsyncSimulation | None, steps: Steps[T]) -> T:
+    connection = None if simulation is None else simulation._files.connection
+    return finished(steps) if connection is None else await connection.run(steps)
 
 
 def _made(folder: str | Path) -> Path:
@@ -324,6 +299,5 @@ def _made(folder: str | Path) -> Path:
     return folder
 
 
-def _written(path: Path, record: records.Record) -> Path:
+def _write(path: Path, record: records.Record) -> None:
     path.write_text(record.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    return path

@@ -9,61 +9,41 @@ from dataclasses import dataclass
 import httpx
 
 from cow_service import __version__
-from cow_service.client.calls import PATIENCE, Send
+from cow_service.client.steps import Send
 
 DEFAULT_URL = "http://127.0.0.1:8000"
-DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
-SILENCE = 60.0  # seconds in a stream of events; the server says something every 15
-RETRIES = 5
-FIRST_TRIES = 3  # connections to a server that has never answered
+STREAM_TIMEOUT_SECONDS = 60.0  # of silence in a stream of events; the server sends something every 15
+MAX_SERVER_WAIT_SECONDS = 10  # that the server holds one request for a result; then the job is polled
 _KEY = re.compile(r"[\x21-\x7e]+")
 
 
-class Contact:
-    """Whether a server has ever answered: one that has not is soon said to be missing, and not waited for."""
-
-    def __init__(self) -> None:
-        self._answered = False
-        self._refused = 0
-
-    def missing(self, came: httpx.Response | httpx.HTTPError) -> bool:
-        """Whether this was one refused connection too many, with no answer before."""
-        self._answered = self._answered or isinstance(came, httpx.Response)
-        self._refused += isinstance(came, httpx.ConnectError)
-        return not self._answered and self._refused >= FIRST_TRIES
-
-
 @dataclass(frozen=True)
-class Target:
-    """A server, by address and key."""
+class Endpoint:
+    """A server: address, key and timeouts."""
 
     base_url: str
     api_key: str | None
     timeout: httpx.Timeout
 
-    def patience(self, timeout: float | None) -> int:
-        """Seconds that one request waits for a job: well within the time after which silence counts as broken."""
-        longest = PATIENCE if self.timeout.read is None else min(PATIENCE, int(self.timeout.read / 2))
+    def server_wait(self, timeout: float | None) -> int:
+        """Seconds that the server may hold a request for a result (`Prefer: wait`): well within the read timeout."""
+        read = self.timeout.read
+        longest = MAX_SERVER_WAIT_SECONDS if read is None else min(MAX_SERVER_WAIT_SECONDS, int(read / 2))
         return longest if timeout is None else min(longest, int(timeout))
 
     @property
-    def following(self) -> httpx.Timeout:
-        """Limits of a stream of events, in which the server may be silent for longer."""
+    def stream_timeout(self) -> httpx.Timeout:
+        """Timeouts of a stream of events, in which the server may be silent for longer."""
         return httpx.Timeout(
-            connect=self.timeout.connect, read=SILENCE, write=self.timeout.write, pool=self.timeout.pool
+            connect=self.timeout.connect, read=STREAM_TIMEOUT_SECONDS, write=self.timeout.write, pool=self.timeout.pool
         )
 
     def limited(self, seconds: float | None) -> httpx.Timeout:
-        """Limits of a request, none of them longer than so many seconds."""
-        own = self.timeout
+        """Timeouts of a request, none of them longer than so many seconds."""
         if seconds is None:
-            return own
-        connect, read, write, pool = (seconds if one is None else min(one, seconds) for one in _parts(own))
-        return httpx.Timeout(connect=connect, read=read, write=write, pool=pool)
-
-    def url(self, path: str) -> str:
-        """The address of a path of the API."""
-        return self.base_url + path
+            return self.timeout
+        limits = self.timeout.as_dict().items()
+        return httpx.Timeout(**{name: seconds if limit is None else min(limit, seconds) for name, limit in limits})
 
     def headers(self, send: Send) -> dict[str, str]:
         """The headers of a request."""
@@ -75,11 +55,7 @@ class Target:
         return headers
 
 
-def _parts(timeout: httpx.Timeout) -> tuple[float | None, float | None, float | None, float | None]:
-    return timeout.connect, timeout.read, timeout.write, timeout.pool
-
-
-def target_of(base_url: str | None, api_key: str | None, timeout: float | httpx.Timeout | None) -> Target:
+def endpoint_of(base_url: str | None, api_key: str | None, timeout: float | httpx.Timeout | None) -> Endpoint:
     """The server of these arguments, else of COW_BASE_URL and COW_API_KEY, else the one on this machine.
 
     Raises `ValueError` for what is no address, and for what is no key.
@@ -97,4 +73,4 @@ def target_of(base_url: str | None, api_key: str | None, timeout: float | httpx.
     if key is not None and not _KEY.fullmatch(key):
         raise ValueError("api_key must be printable ASCII without spaces; has a line break been read with it?")
     limit = timeout if isinstance(timeout, httpx.Timeout) else httpx.Timeout(timeout, connect=min(10, timeout or 10))
-    return Target(address, key, limit)
+    return Endpoint(address, key, limit)

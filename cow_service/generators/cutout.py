@@ -1,4 +1,4 @@
-"""The CPU compositor: the mover is cut out and drawn along its trajectory over the filled-in background."""
+"""The CPU compositor: the mover is cut out and drawn along its trajectory over the inpainted background."""
 
 from __future__ import annotations
 
@@ -11,22 +11,20 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service import __version__
-from cow_service.generators.base import Shot
+from cow_service.generators.base import GeneratorInput
 from cow_service.media.images import fit_within
 from cow_service.physics.camera import has_passed
-from cow_service.physics.encounters import box_at, stands_nearer
+from cow_service.physics.encounters import box_at, boxes_overlap, stands_nearer
 from cow_service.records import BBox, GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.fill import crop_of, draw_in, fill_hole
+from cow_service.vision.inpainting import fill_hole, push_pull
+from cow_service.vision.masks import Image, Mask, resized_mask, scaled_size, window_of
 from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.sizes import resized_mask
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
-EDGE_SIGMA = 0.8  # px of softness at the cut
-HOLE_GROWTH = 0.03  # of the object's size: its rim is mixed with the background and must go too
+EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge
+HOLE_GROWTH = 0.03  # of the object's size: the rim, mixed with the background, is inpainted too
 
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 
@@ -50,14 +48,15 @@ class _Layers:
 
 
 class CutoutGenerator:
-    """Milliseconds per frame, no weights. It moves a picture: it does not turn, light or break things."""
+    """Milliseconds per frame, no weights. It moves a sprite: nothing turns, breaks or changes its lighting."""
 
     options_model = CutoutOptions
     concurrency = None
+    fingerprint = f"cutout {__version__}"
 
-    def describe(self, shot: Shot) -> GeneratorInfo:
+    def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """The same image, trajectory and version give the same frames; the seed changes nothing."""
-        return GeneratorInfo(name="cutout", revision=__version__, seed=shot.seed, options=shot.options.model_dump())
+        return GeneratorInfo(name="cutout", revision=__version__, seed=given.seed, options=given.options.model_dump())
 
     def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
         """Any length."""
@@ -65,23 +64,24 @@ class CutoutGenerator:
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """The image's own size, up to 1280 px on the longer side."""
-        factor = min(1.0, MAX_SIDE / max(width, height))
-        return max(1, round(width * factor)), max(1, round(height * factor))
+        return scaled_size(width, height, min(1.0, MAX_SIDE / max(width, height)))
 
-    def render(self, shot: Shot, wanted: Sequence[int], progress: Callable[[float], None]) -> Iterator[Image]:
-        """The wanted frames, RGB [h, w, 3]; only where the mover is are they composed anew."""
-        layers = _layers(shot)
-        start = np.array(shot.grounding.point)
-        airborne = shot.motion.kind in ("projectile", "fall")
-        depths = np.array([state[2] for state in shot.trajectory.states])
+    def render(
+        self, given: GeneratorInput, indices: Sequence[int], progress: Callable[[float], None]
+    ) -> Iterator[Image]:
+        """The frames of these indices, RGB [h, w, 3]; only the window of the mover is composed."""
+        layers = _layers(given)
+        start = np.array(given.grounding.point)
+        airborne = given.motion.kind in ("projectile", "fall")
+        depths = np.array([state[2] for state in given.trajectory.states])
         gone = has_passed(depths, depths[0])
-        for done, index in enumerate(wanted):
-            progress(done / len(wanted))
+        for done, index in enumerate(indices):
+            progress(done / len(indices))
             if gone[index]:  # behind the camera
                 yield layers.background.copy()
                 continue
-            point, scale = np.array(shot.trajectory.points[index]), shot.trajectory.scale[index]
-            box = box_at(shot.grounding.bbox, start, point, scale)
+            point, scale = np.array(given.trajectory.points[index]), given.trajectory.scale[index]
+            box = box_at(given.grounding.bbox, start, point, scale)
             in_front = [alpha for other, alpha in layers.occluders if not stands_nearer(box, other, airborne=airborne)]
             yield _compose(layers, start, point, scale, in_front)
 
@@ -91,51 +91,44 @@ def create(settings: Settings) -> CutoutGenerator:
     return CutoutGenerator()
 
 
-def _layers(shot: Shot) -> _Layers:
-    scene, options = shot.scene, shot.options
+def _layers(given: GeneratorInput) -> _Layers:
+    scene, options = given.scene, given.options
     clean = not isinstance(options, CutoutOptions) or options.clean_cues
     image = fit_within(scene.clean if clean else scene.image, MAX_SIDE)
     size = image.shape[1], image.shape[0]
     factor = image.shape[1] / scene.width
-    mover = resized_mask(scene.silhouette(shot.grounding.bbox), size)
+    mover = resized_mask(scene.silhouette(given.grounding.bbox), size)
     others = np.zeros(mover.shape, bool)
-    for obstacle in shot.obstacles:
-        others |= obstacle.cutting.at(size)
+    for obstacle in given.obstacles:
+        others |= obstacle.mask.at(size)
     growth = 2 * max(2, round(HOLE_GROWTH * float(np.sqrt(mover.sum())))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (growth, growth))
     hole = cv2.dilate(mover.astype(np.uint8), kernel) > 0
-    if clean:  # what continued a cue next to the mover has the mover's colour in it
+    if clean:  # where a cue next to the mover was inpainted, the mover's colour has spread
         hole |= resized_mask(scene.cues, size) & (cv2.dilate(hole.astype(np.uint8), kernel, iterations=3) > 0)
     hole &= ~(others & ~mover)
     sprite, origin = _sprite(image, mover)
-    occluders = tuple((obstacle.bbox, _soft(obstacle.cutting.at(size) & ~mover)) for obstacle in _near(shot))
+    occluders = tuple((obstacle.bbox, _soft(obstacle.mask.at(size) & ~mover)) for obstacle in _near(given))
     return _Layers(fill_hole(image, hole, others & ~mover), sprite, origin, occluders, factor)
 
 
-def _near(shot: Shot) -> list[Obstacle]:
+def _near(given: GeneratorInput) -> list[Obstacle]:
     """The objects whose box the mover's box crosses at some frame: no other can hide it."""
-    start, bbox = np.array(shot.grounding.point), shot.grounding.bbox
+    start, bbox = np.array(given.grounding.point), given.grounding.bbox
     boxes = [
         box_at(bbox, start, np.array(point), scale)
-        for point, scale in zip(shot.trajectory.points, shot.trajectory.scale, strict=True)
+        for point, scale in zip(given.trajectory.points, given.trajectory.scale, strict=True)
     ]
-    return [
-        other
-        for other in shot.obstacles
-        if any(
-            b[0] < other.bbox[2] and other.bbox[0] < b[2] and b[1] < other.bbox[3] and other.bbox[1] < b[3]
-            for b in boxes
-        )
-    ]
+    return [other for other in given.obstacles if any(boxes_overlap(box, other.bbox) for box in boxes)]
 
 
 def _sprite(image: Image, mover: Mask) -> tuple[Floats, tuple[float, float]]:
     """The mover with a soft edge, and where its corner lies. Colours at the edge are the mover's own, not mixed."""
-    inside = crop_of(mover, 4) or (slice(0, 1), slice(0, 1))
+    inside = window_of(mover, 4) or (slice(0, 1), slice(0, 1))
     mask, colours = mover[inside], image[inside].astype(np.float32)
     alpha = _soft(mask)
     core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
-    own = draw_in(colours, core) if core.any() else colours
+    own = push_pull(colours, core) if core.any() else colours
     blended = np.where((core | ~mask)[..., None], np.where(core[..., None], colours, own), 0.5 * colours + 0.5 * own)
     sprite = np.dstack([blended * alpha[..., None], alpha]).astype(np.float32)
     return sprite, (float(inside[1].start), float(inside[0].start))

@@ -1,1 +1,1 @@
-"""Runs requests as durable jobs: what was accepted outlives the process, and what a stage came to is kept."""
+"""Runs requests as durable jobs: what was accepted survives the process, and the results of stages are cached."""

@@ -1,7 +1,7 @@
 """The job database: SQLite in the data folder, or PostgreSQL by COW_DATABASE_URL. DBOS keeps its tables beside ours.
 
-`cow_stage_results` holds what stages came to, by the digest of what decided it. `cow_holds` says which job needs which
-artifact: an artifact that no job holds may go.
+`cow_stage_results` keeps the results of stages under their cache keys. `cow_holds` has the artifact references: which
+job needs which artifact. An artifact without a reference may be removed.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from cow_service.errors import StorageUnavailable
 from cow_service.settings import Settings, SettingsError
 
-BUSY_MS = 30_000  # how long SQLite waits for another writer
-AT_ONCE = 500  # ids in one statement
+BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
+MAX_IDS = 500  # in one statement
 
 _metadata = sa.MetaData()
 _results = sa.Table(
@@ -35,7 +35,7 @@ _results = sa.Table(
     sa.Column("result", sa.Text, nullable=False),
     sa.Column("created_at", sa.Float, nullable=False),
 )
-_holds = sa.Table(
+_references = sa.Table(
     "cow_holds",
     _metadata,
     sa.Column("sha256", sa.String(64), primary_key=True),
@@ -50,14 +50,14 @@ _stages = sa.Table(
 )
 # These run several times in every job: as plain text they take a fifth of the time that expressions do.
 _FIND = "SELECT job_id, result FROM cow_stage_results WHERE key = ?"
-# A result that lost its artifacts is made anew, and replaces the one that was there.
-_KEEP = (
+# A result that lost its artifacts is computed again, and replaces the one that was there.
+_SAVE = (
     "INSERT INTO cow_stage_results (key, job_id, stage, result, created_at) VALUES (?, ?, ?, ?, ?) "
     "ON CONFLICT (key) DO UPDATE SET job_id = excluded.job_id, result = excluded.result, "
     "created_at = excluded.created_at"
 )
 _DONE = "INSERT INTO cow_job_stages (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
-_HOLD = "INSERT INTO cow_holds (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
+_REFER = "INSERT INTO cow_holds (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
 
 
 class Database:
@@ -76,21 +76,21 @@ class Database:
             _metadata.create_all(self.engine)
 
     def check(self) -> None:
-        """Asks the database for something."""
+        """Runs a query that always succeeds where the database can be used."""
         with database_errors(), self._reading.connect() as connection:
             connection.execute(sa.text("SELECT 1"))
 
-    def check_far(self) -> None:
-        """As `check`, where the database is a server: DBOS would wait for one that is away, and so would the caller."""
+    def check_server(self) -> None:
+        """As `check`, but only of a database server: DBOS would wait for one that is down, and so would the caller."""
         if self.file is None:
             self.check()
 
     def close(self) -> None:
-        """Lets go of its connections."""
+        """Closes its connections."""
         self.engine.dispose()
 
-    def settle(self) -> None:
-        """What was committed is on the disk when this returns, and outlives a loss of power, too."""
+    def flush(self) -> None:
+        """Returns once everything that was committed is on the disk, and so outlives a loss of power."""
         if self.file is None:
             with database_errors(), self.engine.begin() as connection:
                 connection.execute(sa.text("SET LOCAL synchronous_commit = on"))
@@ -114,59 +114,57 @@ class Database:
         return None if row is None else (row[0], row[1])
 
     def store_result(self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str]) -> None:
-        """Holds a stage's artifacts for the job, then stores its result: in this order, each may stand alone."""
+        """Refers to a stage's artifacts, then saves its result: in this order, each is valid without the other."""
         with self._cursor() as cursor:
-            self._hold(cursor, job, artifacts)
-            cursor.execute(self._plain(_KEEP), (key, job, stage, result, time.time()))
+            self._add_references(cursor, job, artifacts)
+            cursor.execute(self._plain(_SAVE), (key, job, stage, result, time.time()))
             cursor.execute(self._plain(_DONE), (job, stage))
 
     def reuse_result(self, job: str, stage: str, artifacts: Iterable[str]) -> None:
-        """Holds the artifacts of a result that another job had computed."""
+        """Refers to the artifacts of a result that another job had computed."""
         with self._cursor() as cursor:
-            self._hold(cursor, job, artifacts)
+            self._add_references(cursor, job, artifacts)
             cursor.execute(self._plain(_DONE), (job, stage))
 
     def finished_stages(self, job: str) -> set[str]:
         """The stages of a job that are done."""
-        with database_errors(), self._reading.connect() as connection:
-            return set(connection.execute(sa.select(_stages.c.stage).where(_stages.c.job_id == job)).scalars())
+        return self._column(sa.select(_stages.c.stage).where(_stages.c.job_id == job))
 
-    def hold(self, job: str, artifacts: Iterable[str]) -> None:
-        """Holds artifacts for a job."""
+    def add_references(self, job: str, artifacts: Iterable[str]) -> None:
+        """Notes that a job needs some artifacts."""
         with self._cursor() as cursor:
-            self._hold(cursor, job, artifacts)
+            self._add_references(cursor, job, artifacts)
 
-    def forget(self, jobs: list[str]) -> list[str]:
-        """Removes what was kept for some jobs; returns the artifacts that no job holds any more."""
-        loose: set[str] = set()
+    def remove_jobs(self, jobs: list[str]) -> list[str]:
+        """Removes the results and references of some jobs; returns the artifacts that no job needs any more."""
+        artifacts: set[str] = set()
         with database_errors(), self.engine.begin() as connection:
-            for some in _parts(jobs):
-                mine = sa.select(_holds.c.sha256).where(_holds.c.job_id.in_(some)).distinct()
-                loose |= set(connection.execute(mine).scalars())
-                connection.execute(sa.delete(_holds).where(_holds.c.job_id.in_(some)))
-                connection.execute(sa.delete(_results).where(_results.c.job_id.in_(some)))
-                connection.execute(sa.delete(_stages).where(_stages.c.job_id.in_(some)))
-        held = self.held(loose)
-        return [sha256 for sha256 in loose if sha256 not in held]
+            for chunk in _chunks(jobs):
+                theirs = sa.select(_references.c.sha256).where(_references.c.job_id.in_(chunk)).distinct()
+                artifacts |= set(connection.execute(theirs).scalars())
+                connection.execute(sa.delete(_references).where(_references.c.job_id.in_(chunk)))
+                connection.execute(sa.delete(_results).where(_results.c.job_id.in_(chunk)))
+                connection.execute(sa.delete(_stages).where(_stages.c.job_id.in_(chunk)))
+        return list(artifacts - self.referenced(artifacts))
 
-    def held(self, artifacts: Iterable[str]) -> set[str]:
-        """Those of some artifacts that a job holds."""
+    def referenced(self, artifacts: Iterable[str]) -> set[str]:
+        """Those of some artifacts that a job needs."""
         found: set[str] = set()
-        with database_errors(), self._reading.connect() as connection:
-            for some in _parts(list(artifacts)):
-                found |= set(connection.execute(sa.select(_holds.c.sha256).where(_holds.c.sha256.in_(some))).scalars())
+        for chunk in _chunks(list(artifacts)):
+            found |= self._column(sa.select(_references.c.sha256).where(_references.c.sha256.in_(chunk)))
         return found
 
-    def holds(self, job: str, sha256: str) -> bool:
-        """Whether a job holds an artifact."""
-        with database_errors(), self._reading.connect() as connection:
-            query = sa.select(_holds.c.job_id).where(_holds.c.sha256 == sha256, _holds.c.job_id == job)
-            return connection.execute(query).first() is not None
+    def jobs_with(self, sha256: str) -> list[str]:
+        """The jobs that need an artifact."""
+        return list(self._column(sa.select(_references.c.job_id).where(_references.c.sha256 == sha256)))
 
-    def holders(self, sha256: str) -> list[str]:
-        """The jobs that hold an artifact."""
+    def job_ids(self) -> list[str]:
+        """The jobs that have results or references."""
+        return list(self._column(sa.union(sa.select(_references.c.job_id), sa.select(_results.c.job_id))))
+
+    def _column(self, query: Any) -> set[str]:
         with database_errors(), self._reading.connect() as connection:
-            return list(connection.execute(sa.select(_holds.c.job_id).where(_holds.c.sha256 == sha256)).scalars())
+            return set(connection.execute(query).scalars())
 
     @contextmanager
     def _cursor(self) -> Generator[Any]:
@@ -189,21 +187,15 @@ class Database:
     def _plain(self, statement: str) -> str:
         return statement if self.file is not None else statement.replace("?", "%s")
 
-    def _hold(self, cursor: Any, job: str, artifacts: Iterable[str]) -> None:
+    def _add_references(self, cursor: Any, job: str, artifacts: Iterable[str]) -> None:
         rows = [value for sha256 in dict.fromkeys(artifacts) for value in (sha256, job)]
         if rows:
-            cursor.execute(self._plain(_HOLD.format(", ".join(["(?, ?)"] * (len(rows) // 2)))), rows)
-
-    def jobs(self) -> list[str]:
-        """The jobs for which something is kept."""
-        with database_errors(), self._reading.connect() as connection:
-            both = sa.union(sa.select(_holds.c.job_id), sa.select(_results.c.job_id))
-            return list(connection.execute(both).scalars())
+            cursor.execute(self._plain(_REFER.format(", ".join(["(?, ?)"] * (len(rows) // 2)))), rows)
 
 
 @contextmanager
 def database_errors() -> Generator[None]:
-    """What the database raises, as `StorageUnavailable`. Its own words may hold addresses, and are left out."""
+    """Translates the database's errors to `StorageUnavailable`. Their own text may hold addresses, and is left out."""
     try:
         yield
     except (SQLAlchemyError, sqlite3.Error, psycopg.Error) as error:
@@ -212,22 +204,22 @@ def database_errors() -> Generator[None]:
         ) from error
 
 
-def _parts(values: list[str]) -> Iterable[list[str]]:
-    return (values[i : i + AT_ONCE] for i in range(0, len(values), AT_ONCE))
+def _chunks(values: list[str]) -> Iterable[list[str]]:
+    return (values[i : i + MAX_IDS] for i in range(0, len(values), MAX_IDS))
 
 
 def _address(settings: Settings) -> tuple[str, Path | None]:
     """The URL, and the file where it is SQLite. Raises `SettingsError` without repeating it: it may hold a password."""
-    told = None if settings.database_url is None else settings.database_url.get_secret_value()
-    if told is None:
+    given = None if settings.database_url is None else settings.database_url.get_secret_value()
+    if given is None:
         file = settings.data_dir / "jobs.sqlite3"
         return f"sqlite:///{file}", file
     try:
-        url = sa.make_url(told)
+        url = sa.make_url(given)
     except SQLAlchemyError as error:
         raise SettingsError("Bad settings: COW_DATABASE_URL is no database URL.") from error
     if url.get_backend_name() == "sqlite" and url.database:
-        return told, Path(url.database)
+        return given, Path(url.database)
     if url.get_backend_name() in ("postgresql", "postgres"):
         return url.set(drivername="postgresql+psycopg").render_as_string(hide_password=False), None
     raise SettingsError("Bad settings: COW_DATABASE_URL must be sqlite:///FILE or postgresql://USER@HOST/DATABASE.")
@@ -235,7 +227,7 @@ def _address(settings: Settings) -> tuple[str, Path | None]:
 
 def _engine(url: str, is_file: bool) -> sa.Engine:
     if not is_file:
-        # A commit is safe from the end of this process at once; `settle` waits for the disk where that matters.
+        # A commit survives the end of this process at once; `flush` waits for the disk where that matters.
         options = {"options": "-c synchronous_commit=off"}
         return sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True, connect_args=options)
     engine = sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True)
@@ -243,7 +235,7 @@ def _engine(url: str, is_file: bool) -> sa.Engine:
     @event.listens_for(engine, "connect")
     def prepare(connection: object, _: object) -> None:  # pyright: ignore[reportUnusedFunction]
         connection.isolation_level = "IMMEDIATE"  # type: ignore[attr-defined] # writers wait instead of failing
-        for pragma in ("journal_mode=WAL", "synchronous=NORMAL", f"busy_timeout={BUSY_MS}", "foreign_keys=ON"):
+        for pragma in ("journal_mode=WAL", "synchronous=NORMAL", f"busy_timeout={BUSY_TIMEOUT_MS}", "foreign_keys=ON"):
             connection.execute(f"PRAGMA {pragma}")  # type: ignore[attr-defined]
 
     return engine

@@ -1,4 +1,4 @@
-"""What an engine does now and then: tells ends, sees cancellations by others, takes over from the dead, tidies up."""
+"""Background work of a job engine: announces ends, polls for cancellations, recovers jobs, collects garbage."""
 
 from __future__ import annotations
 
@@ -13,151 +13,150 @@ from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import CowError
-from cow_service.jobs import reports
-from cow_service.jobs.executors import Executors
-from cow_service.jobs.ledger import Ledger
+from cow_service.jobs import state
+from cow_service.jobs.leases import ExecutorLease
+from cow_service.jobs.registry import JobRegistry
 
-SETTLE = 0.005  # seconds between looks at whether the database has the end of a job
-SETTLING = 30.0  # seconds after which nobody looks any more
-LOOK = 1.0  # seconds between looks at jobs that run here
-RECOUNT = 10.0  # seconds
-TIDY = 600.0  # seconds
-GRACE = 3600.0  # seconds that an artifact is kept without a job: somebody may be about to send it with one
-TAKING = 5.0  # seconds in which the database has taken a job that holds its image
-AT_ONCE = 200  # jobs removed in one go
-LONGEST_STOP = 5.0  # seconds
+OUTCOME_POLL_SECONDS = 0.005  # while the database has not got the outcome of finished work
+OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own polling
+CANCEL_POLL_SECONDS = 1.0  # for jobs that run here and were canceled by another process
+RECOVERY_SECONDS = 10.0  # between checks for dead processes and stalled jobs
+GARBAGE_SECONDS = 600.0  # between garbage collections
+ARTIFACT_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
+SUBMIT_SECONDS = 5.0  # within which a job is in the database after the reference to its image
+MAX_REMOVED_JOBS = 200  # at a time
+JOIN_TIMEOUT_SECONDS = 5.0
 
 log = logging.getLogger("cow_service")
 
 
-class Upkeep:
+class Maintenance:
     """Two threads beside an engine's own."""
 
-    def __init__(self, ledger: Ledger) -> None:
-        self._ledger = ledger
-        self._settling: dict[str, float] = {}
-        self._new = threading.Event()
+    def __init__(self, registry: JobRegistry, lease: ExecutorLease) -> None:
+        self._registry = registry
+        self._lease = lease
+        self._finished: dict[str, float] = {}  # jobs whose outcome is awaited, and until when
+        self._has_finished = threading.Event()
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._idle: set[str] = set()  # jobs of this process on which nobody worked at the last look
+        self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
 
-    def start(self, executors: Executors) -> None:
+    def start(self) -> None:
         """Starts the threads."""
         self._stop.clear()
-        for work, name in ((self._settle_all, "cow-settle"), (lambda: self._keep_up(executors), "cow-upkeep")):
-            thread = threading.Thread(target=work, name=name, daemon=True)
+        for target, name in ((self._announce_ends, "cow-outcomes"), (self._maintain, "cow-maintenance")):
+            thread = threading.Thread(target=target, name=name, daemon=True)
             thread.start()
             self._threads.append(thread)
 
     def stop(self) -> None:
-        """Ends the threads."""
+        """Ends the threads; one that waits for a database that is down does not keep the process."""
         self._stop.set()
-        self._new.set()
+        self._has_finished.set()
         for thread in self._threads:
-            thread.join(LONGEST_STOP)  # one that waits for a database that is away does not keep the process
+            thread.join(JOIN_TIMEOUT_SECONDS)
         self._threads.clear()
 
-    def settle(self, job_id: str) -> None:
-        """Has the end of a job told as soon as the database has it."""
-        self._settling[job_id] = time.monotonic() + SETTLING
-        self._new.set()
+    def announce(self, job_id: str) -> None:
+        """Has the end of a job announced as soon as the database has its outcome."""
+        self._finished[job_id] = time.monotonic() + OUTCOME_TIMEOUT_SECONDS
+        self._has_finished.set()
 
-    def tidy(self) -> None:
-        """Removes jobs that ended long ago, and artifacts that no job holds."""
-        ledger = self._ledger
-        before = datetime.now(UTC) - timedelta(hours=ledger.service.settings.job_retention_hours)
-        while not self._stop.is_set() and (jobs := reports.ended_before(before, AT_ONCE)):
-            ledger.remove(jobs, before.timestamp())
-        kept = ledger.database.jobs()
-        for start in range(0, len(kept), AT_ONCE):  # of jobs that were deleted while they ran
+    def collect_garbage(self) -> None:
+        """Removes jobs past their retention, and artifacts without references."""
+        registry = self._registry
+        before = datetime.now(UTC) - timedelta(hours=registry.service.settings.job_retention_hours)
+        while not self._stop.is_set() and (jobs := state.ended_before(before, MAX_REMOVED_JOBS)):
+            registry.remove(jobs, before.timestamp())
+        known = registry.database.job_ids()
+        for start in range(0, len(known), MAX_REMOVED_JOBS):  # what jobs left that were deleted while they ran
             if self._stop.is_set():
                 return
-            some = kept[start : start + AT_ONCE]
-            missing = set(some) - reports.existing(some)
-            # One that is just being taken holds its image a moment before the database has it.
-            if missing and not self._stop.wait(TAKING):
-                ledger.database.forget(sorted(missing - reports.existing(sorted(missing))))
-        moment = time.time() - GRACE
-        loose = list(ledger.service.artifacts.untouched_since(moment))
-        held = ledger.database.held(loose)
-        removed = sum(ledger.service.artifacts.delete(one, moment) for one in loose if one not in held)
+            chunk = known[start : start + MAX_REMOVED_JOBS]
+            missing = set(chunk) - state.existing(chunk)
+            # A job that is being submitted refers to its image a moment before it is in the database.
+            if missing and not self._stop.wait(SUBMIT_SECONDS):
+                registry.database.remove_jobs(sorted(missing - state.existing(sorted(missing))))
+        moment = time.time() - ARTIFACT_GRACE_SECONDS
+        untouched = list(registry.service.artifacts.untouched_since(moment))
+        needed = registry.database.referenced(untouched)
+        removed = sum(registry.service.artifacts.delete(one, moment) for one in untouched if one not in needed)
         if removed:
-            log.info("removed %d artifacts that no job holds", removed)
+            log.info("removed %d artifacts that no job refers to", removed)
 
-    def _settle_all(self) -> None:
-        while self._new.wait() and not self._stop.is_set():
-            self._new.clear()
-            while self._settling and not self._stop.wait(SETTLE):
-                if not self._guarded(self._settle_some):
-                    self._stop.wait(LOOK)
+    def _announce_ends(self) -> None:
+        while self._has_finished.wait() and not self._stop.is_set():
+            self._has_finished.clear()
+            while self._finished and not self._stop.wait(OUTCOME_POLL_SECONDS):
+                if not self._logged(self._check_finished):
+                    self._stop.wait(CANCEL_POLL_SECONDS)
 
-    def _settle_some(self) -> None:
+    def _check_finished(self) -> None:
         now = time.monotonic()
-        for job_id, until in list(self._settling.items()):
+        for job_id, until in list(self._finished.items()):
             if now > until:
-                del self._settling[job_id]  # whoever waits looks for themselves now and then
-                self._ledger.live.forget(job_id)
+                del self._finished[job_id]
+                self._registry.active.forget(job_id)
                 continue
-            found = reports.find(job_id, self._ledger.live, full=False)
+            found = state.find(job_id, self._registry.active, full=False)
             if found is None or found.ended is not None:
-                self._ledger.ended(job_id, None)
-                del self._settling[job_id]
+                self._registry.ended(job_id, None)
+                del self._finished[job_id]
 
-    def _keep_up(self, executors: Executors) -> None:
-        counted = tidied = time.monotonic()  # jobs that were cut off take hold of their artifacts before anybody tidies
-        self._guarded(lambda: self._take_over(executors))
-        while not self._stop.wait(LOOK):
+    def _maintain(self) -> None:
+        recovered = collected = time.monotonic()  # recovered jobs refer to their artifacts before anything is removed
+        self._logged(self._recover)
+        while not self._stop.wait(CANCEL_POLL_SECONDS):
             now = time.monotonic()
-            self._guarded(self._see_cancellations)
-            if now - counted > RECOUNT:
-                counted = now
-                self._guarded(lambda: self._take_over(executors))
-                self._guarded(self._revive)
-                self._guarded(self._ledger.recount)
-            if now - tidied > TIDY:
-                tidied = now
-                self._guarded(self.tidy)
+            self._logged(self._poll_cancellations)
+            if now - recovered > RECOVERY_SECONDS:
+                recovered = now
+                self._logged(self._recover)
+                self._logged(self._resume_stalled)
+                self._logged(self._registry.recount)
+            if now - collected > GARBAGE_SECONDS:
+                collected = now
+                self._logged(self.collect_garbage)
 
-    def _see_cancellations(self) -> None:
+    def _poll_cancellations(self) -> None:
         """Another process may have canceled or deleted a job that runs here."""
-        for job_id in self._ledger.live.jobs():
-            found = reports.find(job_id, self._ledger.live, full=False)
+        for job_id in self._registry.active.ids():
+            found = state.find(job_id, self._registry.active, full=False)
             if found is None or found.job.status == "canceled":
-                self._ledger.live.end(job_id)
+                self._registry.active.request_cancel(job_id)
 
-    def _take_over(self, executors: Executors) -> None:
-        """Has the jobs that were under way in processes that have ended begin again, in any that runs."""
-        for name, lock in executors.dead():
-            try:
-                # What DBOS does at its own start: a job that was canceled meanwhile stays so, and each start counts.
-                for handle in DBOS._recover_pending_workflows([name]):  # pyright: ignore[reportPrivateUsage]
-                    log.info("taking over %s", handle.get_workflow_id())
-            finally:
-                lock.release()
+    def _recover(self) -> None:
+        """Returns the jobs of processes that have ended to the queue, from which any live process takes them."""
+        with self._lease.expired() as executors:
+            # What DBOS itself does at its start. The public `resume_workflow` would also revive a job that was
+            # canceled meanwhile, and would reset the count of starts that ends a job which kills its process.
+            for handle in DBOS._recover_pending_workflows(executors) if executors else ():  # pyright: ignore[reportPrivateUsage]
+                log.info("recovering %s", handle.get_workflow_id())
 
-    def _revive(self) -> None:
-        """Has jobs of this process begin again on which nobody works: their end could not be written, say."""
+    def _resume_stalled(self) -> None:
+        """Resumes jobs of this process that no thread works on: their outcome could not be written, for example."""
         pending = DBOS.list_workflows(
-            name=list(reports.KINDS),
+            name=list(state.KINDS),
             status="PENDING",
             executor_id=DBOS.executor_id,
             load_input=False,
             load_output=False,
         )
-        idle = {one.workflow_id for one in pending} - set(self._ledger.live.jobs())
-        for job_id in idle & self._idle:  # also a while ago: it is not just being started
-            log.warning("job %s was left alone, and begins again", job_id)
+        idle = {one.workflow_id for one in pending} - set(self._registry.active.ids())
+        for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
+            log.warning("job %s was stalled, and is resumed", job_id)
             DBOS.resume_workflow(job_id)
         self._idle = idle
 
-    def _guarded(self, work: Callable[[], None]) -> bool:
-        """Whether work went well. Upkeep goes on whatever happens: nobody would do it instead."""
+    def _logged(self, work: Callable[[], None]) -> bool:
+        """Whether work succeeded. Errors are logged only: maintenance continues whatever happens."""
         try:
             work()
         except (CowError, dbos_error.DBOSException, SQLAlchemyError) as error:
-            log.warning("upkeep: %s", getattr(error, "detail", type(error).__name__))
+            log.warning("maintenance: %s", getattr(error, "detail", type(error).__name__))
             return False
         except Exception:
-            log.exception("upkeep failed")
+            log.exception("maintenance failed")
             return False
         return True

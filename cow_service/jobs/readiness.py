@@ -1,4 +1,4 @@
-"""Whether the server can do what it is asked by default: its backends are loaded beside it, and may take minutes."""
+"""Whether the server can serve the default request: its backends load in the background, for minutes perhaps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from cow_service.errors import CowError, NotReady, StorageUnavailable
 from cow_service.service import Service
 
-LEAST_FREE = 200_000_000  # bytes on the disk of the data folder
+MIN_FREE_BYTES = 200_000_000  # on the disk of the data folder
 
 
 class Readiness:
@@ -22,12 +22,12 @@ class Readiness:
         self.error: CowError | None = None
 
     def start(self, failed: Callable[[], None] = lambda: None) -> None:
-        """Begins to load; `failed` is called where that cannot be done."""
+        """Starts loading; `failed` is called where that raises."""
         self._started = True
         threading.Thread(target=self._load, args=(failed,), name="cow-loading", daemon=True).start()
 
     def wait(self, seconds: float) -> None:
-        """Waits for a while until all is loaded. Raises the `CowError` for which it cannot be."""
+        """Waits at most so long until all is loaded. Raises the `CowError` for which it cannot be."""
         self._done.wait(seconds)
         if self.error is not None:
             raise self.error
@@ -38,9 +38,10 @@ class Readiness:
             raise NotReady("The default reader and generator are being loaded. Ask again in a while.")
         self._service.check()
         free = shutil.disk_usage(self._service.settings.data_dir).free
-        if free < LEAST_FREE:
+        if free < MIN_FREE_BYTES:
+            needed = MIN_FREE_BYTES / 1e6
             raise StorageUnavailable(
-                f"The disk of the data folder has {free / 1e6:.0f} MB left, and {LEAST_FREE / 1e6:.0f} MB are needed."
+                f"The disk of the data folder has {free / 1e6:.0f} MB left, and {needed:.0f} MB are needed."
             )
 
     def _load(self, failed: Callable[[], None]) -> None:

@@ -1,4 +1,4 @@
-"""How the job database keeps values: as JSON, never as pickles, so that reading it runs no code."""
+"""Values in the job database are JSON, never pickles: reading it runs no code."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _ERROR = "cow_error"
 
 
 class JsonSerializer(Serializer):
-    """JSON values as they are; a `CowError` as its code, detail and fields."""
+    """JSON values unchanged; a `CowError` as its code, detail and fields."""
 
     def name(self) -> str:
         """The name that the database keeps beside each value."""
         return "cow_json"
 
     def serialize(self, data: Any) -> str:
-        """One value as JSON text. What is no `CowError` is kept as an internal error, without its words."""
+        """One value as JSON text. Any other exception becomes an internal error without its text."""
         if isinstance(data, BaseException):
             error = data if isinstance(data, CowError) else InternalError("The job met an error that nobody foresaw.")
             fields = [{"pointer": field.pointer, "detail": field.detail} for field in error.errors]

@@ -1,6 +1,6 @@
-"""Tells callers' servers that a job has ended, as Standard Webhooks says: signed, and tried again until it is heard.
+"""Notifies callers' servers that a job has ended (Standard Webhooks): signed, with retries.
 
-Each attempt is a workflow of its own, so that attempts outlive this process; one that waits for its time holds nothing.
+Each attempt is a workflow of its own, so that retries survive this process; one that waits occupies no thread.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
     from cow_service.net.egress import Egress
 
 QUEUE = "cow-webhooks"
-AT_ONCE = 8
-POLL = 1.0  # seconds
-WAITS = (5, 30, 120, 600, 3600, 6 * 3600)  # seconds before each further attempt, give or take JITTER
-JITTER = 0.2
-GOOD = range(200, 300)
-_GONE = 410  # the receiver wants no more
+MAX_CONCURRENT_DELIVERIES = 8
+POLL_SECONDS = 1.0
+RETRY_SECONDS = (5, 30, 120, 600, 3600, 6 * 3600)  # before each further attempt, plus or minus JITTER
+JITTER = 0.2  # share
+SUCCESS = range(200, 300)
+GONE = 410  # the receiver wants no more
 
 log = logging.getLogger("cow_service")
 
 
 class Webhooks:
-    """Signs and sends. `egress` stands in for the way out in tests."""
+    """Signs and sends. Tests give an `egress` of their own."""
 
     def __init__(self, settings: Settings, egress: Egress | None = None) -> None:
         self._secret = settings.webhook_secret
@@ -52,7 +52,7 @@ class Webhooks:
         return Egress(None) if self._given is None else self._given
 
     def use(self, settings: Settings) -> None:
-        """Takes the secret of other settings."""
+        """Takes the secret from other settings."""
         self._secret = settings.webhook_secret
 
     def check(self, url: str) -> None:
@@ -67,43 +67,45 @@ class Webhooks:
             raise WebhookNotAllowed(f"`webhook`: {error}") from error
 
     def job_ended(self, job_id: str, url: str | None) -> None:
-        """Sees to it that the URL is told, once the database says that the job has ended."""
+        """Enqueues the first attempt, which waits until the database has the end of the job."""
         if url is not None and self._secret is not None:
-            self.attempt(job_id, url, 1, delay=None)
+            self.enqueue(job_id, url, 1, delay=None)
 
     def send(self, job: Job, url: str, attempt: int) -> float | None:
-        """One attempt; where nobody took it, seconds until another one is to follow."""
+        """Makes one attempt; returns the seconds until the next one, or None where none follows."""
         from cow_service.net.egress import NotAllowed, Unreachable  # noqa: PLC0415
 
-        told = {"type": f"job.{job.status}", "timestamp": job.finished_at, "data": job.model_dump(mode="json")}
-        body = json.dumps(told, separators=(",", ":")).encode()
+        event = {"type": f"job.{job.status}", "timestamp": job.finished_at, "data": job.model_dump(mode="json")}
+        body = json.dumps(event, separators=(",", ":")).encode()
         message = f"msg_{job.id}"
         try:
             status = self._egress.post(url, body, self._headers(message, body))
         except NotAllowed as error:
             log.warning("webhook of job %s: %s", job.id, error)
-            return None  # nor will it be later
+            return None  # a retry would not be allowed either
         except Unreachable as error:
             log.info("webhook of job %s, attempt %d: %s", job.id, attempt, error)
             status = None
-        if status in GOOD or status == _GONE:
+        if status in SUCCESS or status == GONE:
             return None
         return self.wait_after(job.id, attempt, f"the last answer was {status}")
 
     def wait_after(self, job_id: str, attempt: int, reason: str) -> float | None:
-        """Seconds until the attempt after this one, None after the last."""
-        if attempt > len(WAITS):
+        """Seconds until the attempt after this one; None after the last."""
+        if attempt > len(RETRY_SECONDS):
             log.warning("webhook of job %s: given up after %d attempts, %s", job_id, attempt, reason)
             return None
-        return WAITS[attempt - 1] * random.uniform(1 - JITTER, 1 + JITTER)  # so that many do not come back at once
+        return RETRY_SECONDS[attempt - 1] * random.uniform(1 - JITTER, 1 + JITTER)  # so that retries spread
 
-    def attempt(self, job_id: str, url: str, attempt: int, delay: float | None) -> None:
-        """Has an attempt made, after some seconds where they are given."""
+    def enqueue(self, job_id: str, url: str, attempt: int, delay: float | None) -> None:
+        """Enqueues an attempt, to be made after `delay` seconds."""
         with database_errors():
             if not self._registered:
-                DBOS.register_queue(QUEUE, worker_concurrency=AT_ONCE, polling_interval_sec=POLL)
+                DBOS.register_queue(
+                    QUEUE, worker_concurrency=MAX_CONCURRENT_DELIVERIES, polling_interval_sec=POLL_SECONDS
+                )
                 self._registered = True
-            with SetWorkflowID(attempts_of(job_id)[attempt - 1]), SetEnqueueOptions(delay_seconds=delay):
+            with SetWorkflowID(attempt_ids(job_id)[attempt - 1]), SetEnqueueOptions(delay_seconds=delay):
                 DBOS.enqueue_workflow(QUEUE, workflows.webhook, job_id, url, attempt)
 
     def _headers(self, message: str, body: bytes) -> dict[str, str]:
@@ -117,9 +119,9 @@ class Webhooks:
         }
 
 
-def attempts_of(job_id: str) -> list[str]:
-    """The ids of all workflows that may tell of a job's end."""
-    return [f"{job_id}.webhook.{attempt}" for attempt in range(1, len(WAITS) + 2)]
+def attempt_ids(job_id: str) -> list[str]:
+    """The ids of the workflows of all attempts for a job."""
+    return [f"{job_id}.webhook.{attempt}" for attempt in range(1, len(RETRY_SECONDS) + 2)]
 
 
 def sign(secret: str, message: str, moment: str, body: bytes) -> str:

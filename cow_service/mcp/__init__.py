@@ -1,11 +1,13 @@
-"""Tools of the Model Context Protocol: `simulate` and `answer`, by the SDK, for whoever speaks the protocol.
+"""Tools of the Model Context Protocol: `simulate` and `answer`, built on the SDK.
 
-inputs      what a tool takes, and what becomes of it for the SDK
+inputs      arguments of the tools, and the request that they become
 images      an image as a caller names it
-progress    a job that is waited for, told of, and ended with its call
-results     what a tool returns as data
-words       the same as text
+progress    the job of a call: awaited, its progress reported, canceled with the call
+results     what a tool returns as structured content
+text        the same as text
 pictures    the same as pictures
-failures    errors as text from which a model can do better
-server      the protocol's side of all that
+errors      errors as text from which a model can correct its call
+server      the tools and resources of the protocol
+backends    the server or service that does the work
+transport   stdio and HTTP
 """

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from cow_service.client import CowError
 
-_PLACE = (
+_GIVE_PLACE = (
     "Look at the image and call again with `bbox` [x0, y0, x1, y1] or `point` [x, y] of the thing that moves, in "
     "pixels of the image, and `object`, its name."
 )
-_LATER = "Call again in a while, with the same arguments."
+_RETRY_LATER = "Call again in a while, with the same arguments."
 REMEDIES = {
-    "cannot-ground": _PLACE,
-    "object-not-found": _PLACE,
+    "cannot-ground": _GIVE_PLACE,
+    "object-not-found": _GIVE_PLACE,
     "cannot-read-direction": "Call again with `direction` [dx, dy] (x right, y down; [-1, 0] is to the left), or with "
     '`motion_kind` "fall" where it is dropped.',
     "artifact-not-found": "Send the image itself: the server keeps none of that digest for you.",
@@ -20,10 +20,10 @@ REMEDIES = {
     "image-url-unreachable": "Check the address, or give the image itself.",
     "unauthorized": "The person who set up this tool has to give it a valid key: COW_API_KEY in the environment of "
     "`cow mcp`, or the header `Authorization: Bearer <key>` where it is reached over HTTP.",
-    "queue-full": _LATER,
-    "rate-limited": _LATER,
-    "shutting-down": _LATER,
-    "not-ready": _LATER,
+    "queue-full": _RETRY_LATER,
+    "rate-limited": _RETRY_LATER,
+    "shutting-down": _RETRY_LATER,
+    "not-ready": _RETRY_LATER,
     "mllm-unavailable": "Call again in a while, or with another `reader` ('embedded' needs no model).",
     "canceled": "Somebody canceled the job. Call again if it is still wanted.",
 }
@@ -37,7 +37,7 @@ _ARGUMENTS = {
 }
 
 
-def in_words(error: CowError) -> str:
+def error_text(error: CowError) -> str:
     """An error, for a model to read."""
     lines = [f"{error.code}: {error.title}"]
     # The detail says the same as the fields do, in words of the service's requests.

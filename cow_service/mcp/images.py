@@ -9,21 +9,22 @@ from urllib.request import url2pathname
 
 from cow_service.client import ImageLike
 from cow_service.errors import FieldError, InvalidRequest
+from cow_service.media.artifacts import media_type_of
 from cow_service.requests import ImageArtifact
 
 ARTIFACTS = "cow://artifacts/"
-KEPT = "the 64-digit `image_sha256` of an earlier result, which asks about the same image again without sending it"
-WITH_PATHS = f"The image: the absolute path of a PNG, JPEG or WebP file, a data URL, an http(s) URL, or {KEPT}."
-WITHOUT_PATHS = (
-    f"The image (PNG, JPEG or WebP): a data URL (data:image/png;base64,...), an http(s) URL, or {KEPT}. No path: this "
+_KEPT = "the 64-digit `image_sha256` of an earlier result, which asks about the same image again without sending it"
+HELP_WITH_PATHS = f"The image: the absolute path of a PNG, JPEG or WebP file, a data URL, an http(s) URL, or {_KEPT}."
+HELP_WITHOUT_PATHS = (
+    f"The image (PNG, JPEG or WebP): a data URL (data:image/png;base64,...), an http(s) URL, or {_KEPT}. No path: this "
     "server does not read files."
 )
 _DIGEST = re.compile(rf"(?:{ARTIFACTS})?([0-9a-f]{{64}})", re.IGNORECASE | re.ASCII)
 _SCHEME = re.compile(r"(data:|[a-z][a-z0-9+.-]*://)", re.IGNORECASE | re.ASCII)
-_SENT = ("data:", "http://", "https://")
-LARGEST = 100_000_000  # bytes of a file; servers take less
-_HEAD = 12  # bytes that tell what a file is
-_SHOWN = 200  # characters
+_SENT_AS_IS = ("data:", "http://", "https://")
+MAX_FILE_BYTES = 100_000_000  # servers take less
+_SIGNATURE_BYTES = 12  # that tell what a file is
+_MAX_SHOWN = 200  # characters of the caller's text in an error
 
 
 def image_of(text: str, *, paths: bool) -> ImageLike:
@@ -35,7 +36,7 @@ def image_of(text: str, *, paths: bool) -> ImageLike:
     if digest := digest_of(text):
         return ImageArtifact(artifact=digest)
     scheme = found[0].lower() if (found := _SCHEME.match(text)) else None
-    if scheme in _SENT:
+    if scheme in _SENT_AS_IS:
         return scheme + text[len(scheme) :]
     if not paths:
         raise _wrong(
@@ -58,31 +59,20 @@ def _read(path: Path) -> bytes:
         if not path.is_file():  # devices and pipes may never end
             raise _wrong(f"there is no file {_shown(str(path))}; give an absolute path")
         with path.open("rb") as file:
-            head = file.read(_HEAD)
-            if media_type(head) not in ("image/png", "image/jpeg", "image/webp"):
+            head = file.read(_SIGNATURE_BYTES)
+            if media_type_of(head) not in ("image/png", "image/jpeg", "image/webp"):
                 raise _wrong(f"{_shown(str(path))} is no PNG, JPEG or WebP")
-            rest = file.read(LARGEST)
-            if len(head) + len(rest) > LARGEST:
-                raise _wrong(f"{_shown(str(path))} is larger than {LARGEST // 1_000_000} MB")
+            rest = file.read(MAX_FILE_BYTES)
+            if len(head) + len(rest) > MAX_FILE_BYTES:
+                raise _wrong(f"{_shown(str(path))} is larger than {MAX_FILE_BYTES // 1_000_000} MB")
             return head + rest
     except (OSError, RuntimeError, ValueError) as error:  # no home folder; NUL in the name
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise _wrong(f"{_shown(str(path))} cannot be read: {why or type(error).__name__}") from error
 
 
-def media_type(data: bytes) -> str:
-    """What the service's artifacts are, by their first bytes."""
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "image/png"
-    if data.startswith(b"\xff\xd8\xff"):
-        return "image/jpeg"
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        return "image/webp"
-    return "video/mp4" if data[4:8] == b"ftyp" else "application/octet-stream"
-
-
 def _shown(text: str) -> str:
-    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+    return repr(text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}...")
 
 
 def _wrong(detail: str) -> InvalidRequest:

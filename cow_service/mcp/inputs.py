@@ -11,7 +11,7 @@ from cow_service.errors import FieldError, InvalidRequest, pointer_part
 from cow_service.records import FramePolicy, MotionKind
 
 
-def _listed(value: Any) -> Any:
+def _list_from_json(value: Any) -> Any:
     """Some clients write a list as a string of JSON."""
     if isinstance(value, str) and value.lstrip().startswith("["):
         try:
@@ -21,13 +21,13 @@ def _listed(value: Any) -> Any:
     return value
 
 
-FromText = BeforeValidator(_listed)
+FromJson = BeforeValidator(_list_from_json)
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Box = Annotated[list[Number], Field(min_length=4, max_length=4)]
 
 
-class Asked(BaseModel):
+class ToolInput(BaseModel):
     """Arguments of either tool."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -40,15 +40,15 @@ class Asked(BaseModel):
     object: str | None = Field(
         default=None, description="What moves, in words ('red ball'). Only together with `bbox` or `point`."
     )
-    bbox: Annotated[Box | None, FromText] = Field(
+    bbox: Annotated[Box | None, FromJson] = Field(
         default=None,
         description="Box of the thing that moves, [x0, y0, x1, y1] in pixels of the image (upright, x right, y down). "
         "Give it, or `point`, where the thing is hard to find by its name.",
     )
-    point: Annotated[Pair | None, FromText] = Field(
+    point: Annotated[Pair | None, FromJson] = Field(
         default=None, description="Instead of `bbox`: a point on the thing, [x, y], pixels."
     )
-    direction: Annotated[Pair | None, FromText] = Field(
+    direction: Annotated[Pair | None, FromJson] = Field(
         default=None,
         description="Where it moves, [dx, dy] in the image, x right, y down, any length: [-1, 0] is to the left. "
         "By default it is read from the question and from arrows drawn in the image.",
@@ -74,8 +74,8 @@ class Asked(BaseModel):
         default=None, description="Who looks at the image, by name; by default the server's choice."
     )
 
-    def rest(self) -> dict[str, Any]:
-        """What the SDK takes beside image and question."""
+    def request_fields(self) -> dict[str, Any]:
+        """The fields of the service's request beside image and question."""
         grounding = _given(object=self.object, bbox=self.bbox, point=self.point)
         motion = _given(direction=self.direction, kind=self.motion_kind, speed=self.speed)
         frames = _given(policy=self.frames_policy, count=self.frames_count)
@@ -90,7 +90,7 @@ class Asked(BaseModel):
         )
 
 
-class SimulateInput(Asked):
+class SimulateInput(ToolInput):
     """Arguments of `simulate`: the pictures are for the caller to look at, and the video may be wanted."""
 
     frames_policy: FramePolicy | None = Field(
@@ -100,15 +100,15 @@ class SimulateInput(Asked):
     )
     video: bool | None = Field(default=False, description="Make an mp4 of the whole clip, too.")
 
-    def rest(self) -> dict[str, Any]:
+    def request_fields(self) -> dict[str, Any]:
         """See above."""
-        return super().rest() | {"video": bool(self.video)}
+        return super().request_fields() | {"video": bool(self.video)}
 
 
-class AnswerInput(Asked):
+class AnswerInput(ToolInput):
     """Arguments of `answer`."""
 
-    options: Annotated[list[str] | None, FromText] = Field(
+    options: Annotated[list[str] | None, FromJson] = Field(
         default=None,
         description="Answers to choose from, lettered A, B, C... By default those that the question lists, as in "
         "'(A) Yes (B) No (C) Not sure'; without any the answer is in words.",
@@ -123,12 +123,12 @@ class AnswerInput(Asked):
         "it meets something; uniform: evenly over the clip.",
     )
 
-    def rest(self) -> dict[str, Any]:
+    def request_fields(self) -> dict[str, Any]:
         """See above."""
-        return super().rest() | _given(options=self.options, votes=self.votes, baseline=self.baseline)
+        return super().request_fields() | _given(options=self.options, votes=self.votes, baseline=self.baseline)
 
 
-Input = TypeVar("Input", bound=Asked)
+Input = TypeVar("Input", bound=ToolInput)
 
 
 def parsed(model: type[Input], arguments: dict[str, Any]) -> Input:
@@ -137,13 +137,13 @@ def parsed(model: type[Input], arguments: dict[str, Any]) -> Input:
         return model.model_validate(arguments)
     except ValidationError as error:
         wrong = tuple(
-            FieldError("".join(f"/{pointer_part(part)}" for part in item["loc"]), _told(item, model))
+            FieldError("".join(f"/{pointer_part(part)}" for part in item["loc"]), _detail(item, model))
             for item in error.errors(include_url=False)
         )
         raise InvalidRequest("The arguments of the tool are not valid.", errors=wrong) from error
 
 
-def input_schema(model: type[Asked], image: str) -> dict[str, Any]:
+def input_schema(model: type[ToolInput], image: str) -> dict[str, Any]:
     """The JSON schema of a tool's arguments; `image` says how an image may be given."""
     schema = model.model_json_schema()
     del schema["description"]  # the tool has one
@@ -174,7 +174,7 @@ def _given(**values: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _told(item: Any, model: type[Asked]) -> str:
+def _detail(item: Any, model: type[ToolInput]) -> str:
     if item["type"] == "extra_forbidden":
         return f"there is no such argument; there are: {', '.join(model.model_fields)}"
     if item["type"] == "missing":
@@ -183,4 +183,4 @@ def _told(item: Any, model: type[Asked]) -> str:
 
 
 ToolName = Literal["simulate", "answer"]
-INPUTS: dict[ToolName, type[Asked]] = {"simulate": SimulateInput, "answer": AnswerInput}
+INPUTS: dict[ToolName, type[ToolInput]] = {"simulate": SimulateInput, "answer": AnswerInput}

@@ -13,9 +13,9 @@ from PIL import Image
 from cow_service.client import AsyncClient
 from cow_service.records import Simulation
 
-MOST = 1024  # px of the longest side: of more, models see no more
-BUDGET = 500_000  # bytes of all pictures of a result: in base64 a third more, and clients refuse messages of 1 MB
-# What is tried when PNGs are too large, as those of photographs are: quality of JPEG, share of the sides.
+MAX_SIDE_PX = 1024  # models do not see more
+MAX_BYTES = 500_000  # of all pictures of a result together: in base64 a third more, and clients refuse messages of 1 MB
+# Tried in turn when PNGs are too large, as those of photographs are: quality of JPEG, scale of the sides.
 _SMALLER = ((90, 1.0), (80, 1.0), (75, 0.75), (75, 0.5), (70, 0.35), (60, 0.25), (50, 0.15))
 
 
@@ -28,32 +28,32 @@ async def pictures_of(simulation: Simulation, client: AsyncClient) -> list[Image
 
 
 def fitted(pngs: Sequence[bytes]) -> tuple[str, list[bytes]]:
-    """Pictures of at most `MOST` pixels on the longest side and `BUDGET` bytes together, and their media type."""
+    """The media type, and pictures of at most `MAX_SIDE_PX` on the longest side and `MAX_BYTES` together."""
     shown = [_fit(png) for png in pngs]
     media_type = "image/png"
-    for quality, share in _SMALLER:
-        if sum(map(len, shown)) <= BUDGET:
+    for quality, scale in _SMALLER:
+        if sum(map(len, shown)) <= MAX_BYTES:
             break
-        media_type, shown = "image/jpeg", [_jpeg(png, quality, share) for png in pngs]
+        media_type, shown = "image/jpeg", [_jpeg(png, quality, scale) for png in pngs]
     return media_type, shown
 
 
 def _fit(png: bytes) -> bytes:
     with Image.open(io.BytesIO(png)) as picture:
-        if max(picture.size) <= MOST:
+        if max(picture.size) <= MAX_SIDE_PX:
             return png
     return _saved(_thumbnail(png, 1.0), "PNG")
 
 
-def _jpeg(png: bytes, quality: int, share: float) -> bytes:
-    return _saved(_thumbnail(png, share), "JPEG", quality=quality)
+def _jpeg(png: bytes, quality: int, scale: float) -> bytes:
+    return _saved(_thumbnail(png, scale), "JPEG", quality=quality)
 
 
-def _thumbnail(png: bytes, share: float) -> Image.Image:
+def _thumbnail(png: bytes, scale: float) -> Image.Image:
     with Image.open(io.BytesIO(png)) as picture:
         small = picture.convert("RGB")
-    most = share * min(MOST, max(small.size))
-    small.thumbnail((most, most), Image.Resampling.LANCZOS)
+    side = scale * min(MAX_SIDE_PX, max(small.size))
+    small.thumbnail((side, side), Image.Resampling.LANCZOS)
     return small
 
 

@@ -13,12 +13,12 @@ from cow_service.records import EncounterKind, MotionKind
 
 
 class Result(BaseModel):
-    """Something that a tool returns."""
+    """Something that a tool returns; fields of the service's records that it does not have are left out."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class Met(Result):
+class Encounter(Result):
     """The mover's silhouette meets another thing: a hypothesis, computed from the image alone."""
 
     object: str
@@ -29,7 +29,7 @@ class Met(Result):
     frame: int = Field(description="When it begins, frame of the clip.")
 
 
-class FrameShown(Result):
+class Frame(Result):
     """One of the returned pictures, after the overlay and in this order."""
 
     index: int = Field(description="Frame of the clip.")
@@ -39,7 +39,7 @@ class FrameShown(Result):
     height: int
 
 
-class VideoMade(Result):
+class Video(Result):
     """The clip as mp4."""
 
     sha256: str
@@ -64,10 +64,10 @@ class SimulateResult(Result):
     )
     speed: float = Field(description="Pixels per second at first.")
     leaves_at_s: float | None = Field(description="When its centre leaves the image; null where it stays inside.")
-    encounters: list[Met] = Field(description="What it meets on its way, in order of time.")
+    encounters: list[Encounter] = Field(description="What it meets on its way, in order of time.")
     encounters_known: bool = Field(description="Whether an empty list of encounters means that it meets nothing.")
-    frames: list[FrameShown]
-    video: VideoMade | None
+    frames: list[Frame]
+    video: Video | None
     overlay_sha256: str = Field(description="The image with box, direction and path drawn: the first picture.")
     image_sha256: str = Field(description="Give this as `image` to ask about the same image again.")
     image_width: int = Field(description="Pixels.")
@@ -116,7 +116,7 @@ class AnswerResult(Result):
 def simulate_result(simulation: records.Simulation, base_url: str | None) -> SimulateResult:
     """A simulation as a tool returns it; `base_url` is the address of its server, where that has one."""
     motion, trajectory, video = simulation.motion, simulation.trajectory, simulation.video
-    gone = [not visible for visible in trajectory.visible]
+    hidden = [not visible for visible in trajectory.visible]
     return SimulateResult(
         id=simulation.id,
         object=simulation.grounding.object,
@@ -125,16 +125,15 @@ def simulate_result(simulation: records.Simulation, base_url: str | None) -> Sim
         kind=motion.kind,
         direction=None if motion.direction is None else _rounded(motion.direction, 3),
         speed=round(motion.speed, 1),
-        leaves_at_s=round(gone.index(True) / trajectory.fps, 2) if any(gone) else None,
+        leaves_at_s=round(hidden.index(True) / trajectory.fps, 2) if any(hidden) else None,
         encounters=[
-            Met(object=e.object, kind=e.kind, time_s=round(e.first_frame / trajectory.fps, 2), frame=e.first_frame)
+            Encounter(
+                object=e.object, kind=e.kind, time_s=round(e.first_frame / trajectory.fps, 2), frame=e.first_frame
+            )
             for e in sorted(trajectory.encounters, key=lambda e: e.first_frame)
         ],
         encounters_known=simulation.encounters_known,
-        frames=[
-            FrameShown(index=f.index, time_s=round(f.time, 2), sha256=f.sha256, width=f.width, height=f.height)
-            for f in simulation.frames
-        ],
+        frames=[Frame(time_s=round(frame.time, 2), **frame.model_dump()) for frame in simulation.frames],
         video=None if video is None else _video(video, base_url),
         overlay_sha256=simulation.overlay.sha256,
         image_sha256=simulation.image.sha256,
@@ -148,23 +147,12 @@ def simulate_result(simulation: records.Simulation, base_url: str | None) -> Sim
 
 def answer_result(answer: records.Answer, base_url: str | None) -> AnswerResult:
     """An answer as a tool returns it."""
-    baseline = answer.baseline
-    return AnswerResult(
-        id=answer.id,
-        answer=answer.answer,
-        option=answer.option,
-        not_sure=answer.not_sure,
-        reasoning=answer.reasoning,
-        votes=answer.votes,
-        baseline=None
-        if baseline is None
-        else Verdict(answer=baseline.answer, option=baseline.option, not_sure=baseline.not_sure, votes=baseline.votes),
-        warnings=list(answer.warnings),
-        simulation=None if answer.simulation is None else simulate_result(answer.simulation, base_url),
-        image_sha256=answer.image.sha256,
-        reader=answer.reader.name,
-        usage=Usage.model_validate(answer.usage.model_dump()),
-    )
+    own = {
+        "simulation": None if answer.simulation is None else simulate_result(answer.simulation, base_url),
+        "image_sha256": answer.image.sha256,
+        "reader": answer.reader.name,
+    }
+    return AnswerResult.model_validate(answer.model_dump(exclude={"simulation"}) | own)
 
 
 def output_schema(model: type[Result]) -> dict[str, Any]:
@@ -172,16 +160,9 @@ def output_schema(model: type[Result]) -> dict[str, Any]:
     return lean(model.model_json_schema(mode="serialization"))
 
 
-def _video(video: records.Video, base_url: str | None) -> VideoMade:
-    return VideoMade(
-        sha256=video.sha256,
-        uri=ARTIFACTS + video.sha256,
-        url=None if base_url is None else base_url + video.url,
-        fps=video.fps,
-        num_frames=video.num_frames,
-        width=video.width,
-        height=video.height,
-    )
+def _video(video: records.Video, base_url: str | None) -> Video:
+    url = None if base_url is None else base_url + video.url
+    return Video(uri=ARTIFACTS + video.sha256, url=url, **video.model_dump(exclude={"url"}))
 
 
 def _rounded(values: tuple[float, ...], digits: int) -> list[float]:

@@ -40,13 +40,14 @@ from mcp_types import (
 from cow_service import __version__
 from cow_service.client import AsyncAnswer, AsyncClient, CowError
 from cow_service.errors import InternalError
-from cow_service.mcp import errors as failures
-from cow_service.mcp.images import ARTIFACTS, WITH_PATHS, WITHOUT_PATHS, digest_of, image_of, media_type
+from cow_service.mcp.errors import error_text
+from cow_service.mcp.images import ARTIFACTS, HELP_WITH_PATHS, HELP_WITHOUT_PATHS, digest_of, image_of
 from cow_service.mcp.inputs import INPUTS, ToolName, input_schema, parsed
 from cow_service.mcp.pictures import pictures_of
 from cow_service.mcp.progress import result_of
 from cow_service.mcp.results import AnswerResult, Result, SimulateResult, answer_result, output_schema, simulate_result
-from cow_service.mcp.text import answer_in_words, simulation_in_words
+from cow_service.mcp.text import answer_text, simulation_text
+from cow_service.media.artifacts import media_type_of
 
 INSTRUCTIONS = """\
 COW imagines what would happen in a picture. Use it for what-if questions about one still image in which something \
@@ -139,7 +140,7 @@ class _Tools:
                 name=name,
                 title=TITLES[name],
                 description=DESCRIPTIONS[name],
-                input_schema=input_schema(model, WITH_PATHS if paths else WITHOUT_PATHS),
+                input_schema=input_schema(model, HELP_WITH_PATHS if paths else HELP_WITHOUT_PATHS),
                 output_schema=output_schema(OUTPUTS[name]),
                 annotations=ToolAnnotations(title=TITLES[name], **HINTS),
             )
@@ -155,33 +156,33 @@ class _Tools:
             raise MCPError(code=INVALID_PARAMS, message=f"Unknown tool: {params.name[:80]!r}")
         tool = params.name
         try:
-            return await self._done(tool, context, params.arguments or {})
+            return await self._run(tool, context, params.arguments or {})
         except CowError as error:
             log.info("%s failed: %s", tool, error.code)
-            return _failed(error)
+            return _failure(error)
         except Exception:
             log.exception("%s failed", tool)
-            return _failed(InternalError("The tool met an error that it did not foresee; its log has the trace."))
+            return _failure(InternalError("The tool met an error that it did not foresee; its log has the trace."))
 
-    async def _done(
+    async def _run(
         self, tool: ToolName, context: ServerRequestContext[Any], arguments: dict[str, Any]
     ) -> CallToolResult:
         given = parsed(INPUTS[tool], arguments)
 
-        async def report(done: float, doing: str) -> None:
-            await context.session.report_progress(done, 1.0, doing)
+        async def report(done: float, stage: str) -> None:
+            await context.session.report_progress(done, 1.0, stage)
 
         image = await to_thread.run_sync(partial(image_of, given.image, paths=self._paths))
         async with self._connect(_caller(context)) as client:
-            result = await result_of(client, tool, image, given.question, given.rest(), report)
+            result = await result_of(client, tool, image, given.question, given.request_fields(), report)
             simulation = result.simulation if isinstance(result, AsyncAnswer) else result
             pictures = [] if simulation is None else await pictures_of(simulation, client)
             base_url = client.base_url if self._links else None
         if isinstance(result, AsyncAnswer):
             answer = answer_result(result, base_url)
-            return _returned(answer, answer_in_words(answer), pictures)
+            return _success(answer, answer_text(answer), pictures)
         simulated = simulate_result(result, base_url)
-        return _returned(simulated, simulation_in_words(simulated), pictures)
+        return _success(simulated, simulation_text(simulated), pictures)
 
     async def resources(self, _: ServerRequestContext[Any], __: PaginatedRequestParams | None) -> ListResourcesResult:
         return ListResourcesResult(resources=[])
@@ -207,9 +208,10 @@ class _Tools:
                 data = await client.artifact(sha256)
         except CowError as error:
             code = INVALID_PARAMS if error.code == "artifact-not-found" else INTERNAL_ERROR
-            raise MCPError(code=code, message=failures.in_words(error)) from error
+            raise MCPError(code=code, message=error_text(error)) from error
         blob = base64.b64encode(data).decode()
-        return ReadResourceResult(contents=[BlobResourceContents(uri=uri, mime_type=media_type(data), blob=blob)])
+        media_type = media_type_of(data) or "application/octet-stream"
+        return ReadResourceResult(contents=[BlobResourceContents(uri=uri, mime_type=media_type, blob=blob)])
 
 
 def _caller(context: ServerRequestContext[Any]) -> Caller:
@@ -223,11 +225,11 @@ def _caller(context: ServerRequestContext[Any]) -> Caller:
     return Caller((key.strip() or None) if scheme.lower() == "bearer" else None, address, forwarded)
 
 
-def _returned(result: Result, text: str, pictures: list[ImageContent]) -> CallToolResult:
+def _success(result: Result, text: str, pictures: list[ImageContent]) -> CallToolResult:
     return CallToolResult(
         content=[TextContent(text=text), *pictures], structured_content=result.model_dump(mode="json")
     )
 
 
-def _failed(error: CowError) -> CallToolResult:
-    return CallToolResult(content=[TextContent(text=failures.in_words(error))], is_error=True)
+def _failure(error: CowError) -> CallToolResult:
+    return CallToolResult(content=[TextContent(text=error_text(error))], is_error=True)

@@ -1,19 +1,19 @@
-"""What came of a call in words, for models and for clients that do not look at the data."""
+"""Results as text, for models and for clients that do not read structured content."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from cow_service.mcp.results import AnswerResult, Met, SimulateResult, Verdict
+from cow_service.mcp.results import AnswerResult, Encounter, SimulateResult, Verdict
 from cow_service.records import MEETINGS
 
 
-def simulation_in_words(simulation: SimulateResult) -> str:
+def simulation_text(simulation: SimulateResult) -> str:
     """What moves, how, what it meets when; which picture is which; what to mind."""
-    return "\n".join([*_imagined(simulation), *_notes(simulation.warnings), _again(simulation.image_sha256)])
+    return "\n".join([*_simulation(simulation), *_warnings(simulation.warnings), _image_hint(simulation.image_sha256)])
 
 
-def answer_in_words(answer: AnswerResult) -> str:
+def answer_text(answer: AnswerResult) -> str:
     """The answer first, then what was imagined for it."""
     lines = [f"Answer: {_verdict(answer.answer, answer.option)}."]
     if answer.reasoning:
@@ -24,19 +24,19 @@ def answer_in_words(answer: AnswerResult) -> str:
         lines.append(f"Without imagined frames: {_baseline(answer.baseline)}.")
     warnings = list(answer.warnings)
     if answer.simulation is not None:
-        lines += ["", "Imagined:", *_imagined(answer.simulation)]
+        lines += ["", "Imagined:", *_simulation(answer.simulation)]
         warnings += answer.simulation.warnings
     else:
         lines.append("Nothing was imagined: the answer is from the image alone.")
-    return "\n".join([*lines, *_notes(warnings), _again(answer.image_sha256)])
+    return "\n".join([*lines, *_warnings(warnings), _image_hint(answer.image_sha256)])
 
 
-def _imagined(simulation: SimulateResult) -> Iterable[str]:
+def _simulation(simulation: SimulateResult) -> Iterable[str]:
     box = ", ".join(f"{side:g}" for side in simulation.bbox)
     size = f"{simulation.image_width} x {simulation.image_height} px"
     yield simulation.motion
-    yield f"It is the {simulation.object} at [{box}] in the image of {size}; {_how(simulation)}."
-    yield _meets(simulation)
+    yield f"It is the {simulation.object} at [{box}] in the image of {size}; {_motion(simulation)}."
+    yield _encounters(simulation)
     if simulation.leaves_at_s is not None:
         yield f"Its centre leaves the image at {simulation.leaves_at_s:g} s."
     frames = [f"frame {frame.index} ({frame.time_s:g} s)" for frame in simulation.frames]
@@ -46,23 +46,23 @@ def _imagined(simulation: SimulateResult) -> Iterable[str]:
     yield f"Simulation {simulation.id}; generator {simulation.generator}, reader {simulation.reader}."
 
 
-def _how(simulation: SimulateResult) -> str:
+def _motion(simulation: SimulateResult) -> str:
     if simulation.direction is None:
         return simulation.kind
     along = ", ".join(f"{part:g}" for part in simulation.direction)
     return f"{simulation.kind}, direction [{along}] (x right, y down), {simulation.speed:g} px/s"
 
 
-def _meets(simulation: SimulateResult) -> str:
-    met = "; ".join(_met(encounter) for encounter in simulation.encounters)
-    if met:
-        return f"On its way (from silhouettes, hypotheses) it {met}."
+def _encounters(simulation: SimulateResult) -> str:
+    encounters = "; ".join(_encounter(encounter) for encounter in simulation.encounters)
+    if encounters:
+        return f"On its way (from silhouettes, hypotheses) it {encounters}."
     if simulation.encounters_known:
         return "It meets nothing on its way, as far as silhouettes tell."
     return "What it meets was not computed."
 
 
-def _met(encounter: Met) -> str:
+def _encounter(encounter: Encounter) -> str:
     return f"{MEETINGS[encounter.kind]} {encounter.object} from {encounter.time_s:g} s (frame {encounter.frame})"
 
 
@@ -81,9 +81,9 @@ def _votes(votes: dict[str, int]) -> str:
     return ", ".join(f"{answer}: {count}" for answer, count in votes.items())
 
 
-def _notes(warnings: Iterable[str]) -> Iterable[str]:
+def _warnings(warnings: Iterable[str]) -> Iterable[str]:
     return (f"Note: {warning}" for warning in dict.fromkeys(warnings))
 
 
-def _again(sha256: str) -> str:
+def _image_hint(sha256: str) -> str:
     return f'To ask about this image again, give image="{sha256}".'

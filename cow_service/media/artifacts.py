@@ -29,9 +29,20 @@ MEDIA_TYPES = {
     "application/json": "json",
 }
 
+_SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-_SHOWN_CHARACTERS = 80
+_MAX_SHOWN_CHARACTERS = 80
+
+
+def media_type_of(data: bytes) -> str | None:
+    """The media type of an image or MP4 file, told by its first 12 bytes; None for anything else."""
+    for signature, media_type in _SIGNATURES.items():
+        if data.startswith(signature):
+            return media_type
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return "image/webp"
+    return "video/mp4" if data[4:8] == b"ftyp" else None
 
 
 @dataclass(frozen=True)
@@ -50,10 +61,10 @@ class ArtifactStore:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._settling = threading.Lock()
+        self._commit_lock = threading.Lock()
 
     def put(self, data: bytes, media_type: str) -> Artifact:
-        """Keep the bytes. Bytes that are there already stay as they are, their first media type too.
+        """Stores bytes. Bytes that are stored already keep their first media type.
 
         Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
         """
@@ -62,17 +73,17 @@ class ArtifactStore:
         with _storage_errors():
             known = self._find(sha256)
             if known is not None:
-                os.utime(known.path)  # somebody needs it now: it is not one of those that nobody has asked for lately
+                os.utime(known.path)  # it is in use: maintenance deletes by this time
                 return known.artifact
             target = self._target(sha256, extension)
             with _temporary_beside(target) as temporary:
                 with temporary.open("xb") as file:
                     file.write(data)
                     _sync(file)
-                return self._settle(temporary, target, sha256)
+                return self._commit(temporary, target, sha256)
 
     def put_file(self, path: Path, media_type: str) -> Artifact:
-        """Move a finished file in, hashing it in chunks; afterwards `path` is gone.
+        """Moves a finished file in, hashing it in chunks; afterwards `path` no longer exists.
 
         Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
         """
@@ -84,14 +95,14 @@ class ArtifactStore:
             target = self._target(sha256, extension)
             with _temporary_beside(target) as temporary:
                 _move(path, temporary)
-                return self._settle(temporary, target, sha256)
+                return self._commit(temporary, target, sha256)
 
     def get(self, sha256: str) -> StoredArtifact:
         """Find an artifact. Raises `ArtifactNotFound` if there is none, or if it is not a digest at all."""
         if _DIGEST.fullmatch(sha256) is None:
-            # Decided without the disk: what is no digest must never become a part of a path.
+            # Before any path is built: only a digest may become part of one.
             raise ArtifactNotFound(
-                f"No artifact is named {sha256[:_SHOWN_CHARACTERS]!r}: give its SHA-256, 64 lower-case hex digits."
+                f"No artifact is named {sha256[:_MAX_SHOWN_CHARACTERS]!r}: give its SHA-256, 64 lower-case hex digits."
             )
         with _storage_errors():
             stored = self._find(sha256)
@@ -102,13 +113,13 @@ class ArtifactStore:
         return stored
 
     def touch(self, sha256: str) -> None:
-        """Says that an artifact is needed now. Raises as `get` does."""
+        """Marks an artifact as used now. Raises as `get` does."""
         path = self.get(sha256).path
         with _storage_errors():
             os.utime(path)
 
     def delete(self, sha256: str, untouched_since: float) -> bool:
-        """Removes an artifact unless somebody needed it after that time (seconds since 1970); says whether it did."""
+        """Deletes an artifact unless it was used after that time (seconds since 1970). Returns whether it did."""
         with _storage_errors():
             stored = self._find(sha256)
             if stored is None or stored.path.stat().st_mtime > untouched_since:
@@ -117,7 +128,7 @@ class ArtifactStore:
         return True
 
     def untouched_since(self, moment: float) -> Iterator[str]:
-        """Artifacts that nobody needed after that time (seconds since 1970)."""
+        """Digests of the artifacts not used after that time (seconds since 1970)."""
         with _storage_errors():
             for path in self._folder.glob("[0-9a-f][0-9a-f]/*.*"):
                 if _DIGEST.fullmatch(path.stem) and path.stat().st_mtime <= moment:
@@ -131,7 +142,7 @@ class ArtifactStore:
 
     @contextmanager
     def scratch(self) -> Generator[Path]:
-        """A path on the data folder's disk for a file in the making; removed afterwards unless `put_file` took it."""
+        """A path on the data folder's disk for a temporary file; deleted afterwards unless `put_file` moved it."""
         with ExitStack() as stack:
             with _storage_errors():
                 path = stack.enter_context(_temporary_beside(self._folder / "scratch"))
@@ -157,9 +168,9 @@ class ArtifactStore:
             return StoredArtifact(Artifact(sha256=sha256, url=url, media_type=media_type, size=size), path)
         return None
 
-    def _settle(self, temporary: Path, target: Path, sha256: str) -> Artifact:
-        # Two threads may bring the same bytes under two media types: the first one in decides.
-        with self._settling:
+    def _commit(self, temporary: Path, target: Path, sha256: str) -> Artifact:
+        # Two threads may store the same bytes under two media types: the first one decides.
+        with self._commit_lock:
             stored = self._find(sha256)
             if stored is None:
                 temporary.replace(target)

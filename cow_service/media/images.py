@@ -1,6 +1,8 @@
-"""Bytes to upright RGB pixels, and pixels to PNG.
+"""Decodes image files to upright RGB pixels, encodes PNG. Exceptions of pillow become `CowError` here.
 
-This is the seam to pillow: whatever a file holds, `decode` returns a `DecodedImage` or raises a `CowError`.
+Before pillow sees a file, everything that is not the picture is stripped: text, profiles, thumbnails. Nothing here
+needs them, and decoders spend on them without bound: compressed text grows a thousandfold, an EXIF directory may name
+the same bytes thousands of times, blocks are joined in quadratic time. Of EXIF only the orientation is read, here.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import codecs
 import hashlib
 import io
+import re
 import struct
 import zlib
 from collections.abc import Callable
@@ -23,7 +26,7 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from cow_service.errors import ImageTooLarge, ImageTypeUnsupported, ImageUnreadable, InternalError
-from cow_service.media.image_files import LeanFile, OverfullError, lean_jpeg, lean_png, orientation_of
+from cow_service.media.artifacts import media_type_of
 from cow_service.records import ImageInfo
 
 MAX_IMAGE_MEGAPIXELS_DEFAULT = 25.0  # millions of pixels
@@ -38,8 +41,21 @@ _OPENERS: dict[str, Callable[[io.BytesIO], ImageFile]] = {
     "WebP": WebPImageFile,
 }
 
-# A WebP file's blocks are handed out as they are, never decoded or joined.
-_LEAN: dict[str, Callable[[bytes], LeanFile]] = {"PNG": lean_png, "JPEG": lean_jpeg}
+UPRIGHT = 1  # EXIF orientation, EXIF 2.3, section 4.6.4
+MAX_PNG_CHUNKS = 100_000  # a file of 50 MB in pieces of 512 bytes
+MAX_JPEG_SEGMENTS = 4096  # cameras write up to a few hundred
+MAX_JPEG_SCANS = 100  # encoders write up to about 20; each goes over the whole picture again, however few its bytes
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_KEPT = frozenset((b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"acTL", b"fcTL", b"fdAT"))
+# Junk between segments is skipped, as decoders do: segments that they find behind it must be found here, too.
+_JPEG_MARKER = re.compile(rb"\xff+([^\xff])", re.DOTALL)
+_JPEG_ALONE = frozenset((0x00, 0x01, *range(0xD0, 0xD9)))  # without a length: stuffing, TEM, RST0 to RST7, SOI
+_JPEG_END, _JPEG_SCAN, _JPEG_APP1, _JPEG_ADOBE, _JPEG_COMMENT = 0xD9, 0xDA, 0xE1, 0xEE, 0xFE
+_JPEG_SCAN_START = b"\xff\xda"
+_EXIF = b"Exif\0\0"
+_ORIENTATION = 0x0112
+_TIFF_INTEGERS = {3: "H", 4: "I"}  # SHORT, LONG
 
 # What pillow raises on damaged files. Its warnings are raised only where the host made warnings errors.
 _PILLOW_ERRORS = (
@@ -59,7 +75,7 @@ _PILLOW_ERRORS = (
     zlib.error,
 )
 
-_UPRIGHT = {
+_TRANSPOSE_TO_UPRIGHT = {  # by EXIF orientation
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -91,6 +107,11 @@ _FOREIGN_SIGNATURES = (
 )
 _ISO_BRANDS = {b"avif": "an AVIF file", b"avis": "an AVIF file", b"heic": "a HEIC file", b"mif1": "a HEIF file"}
 _SNIFFED_BYTES = 1024
+_KINDS = {"image/png": "PNG", "image/jpeg": "JPEG", "image/webp": "WebP"}
+
+
+class OverfullError(ValueError):
+    """A file of more parts than any camera or program writes. The message says what it is."""
 
 
 @dataclass(frozen=True)
@@ -173,13 +194,10 @@ def fit_within(pixels: NDArray[np.uint8], max_side: int | None) -> NDArray[np.ui
 def _kind(data: bytes) -> str:
     if not data:
         raise ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "PNG"
-    if data.startswith(b"\xff\xd8\xff"):
-        return "JPEG"
-    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return "WebP"
-    raise ImageTypeUnsupported(f"The image is {_describe_foreign(data)}: send it as PNG, JPEG or WebP.")
+    kind = _KINDS.get(media_type_of(data) or "")
+    if kind is None:
+        raise ImageTypeUnsupported(f"The image is {_describe_foreign(data)}: send it as PNG, JPEG or WebP.")
+    return kind
 
 
 def _describe_foreign(data: bytes) -> str:
@@ -210,13 +228,16 @@ def _decode_as(kind: str, data: bytes, max_megapixels: float) -> NDArray[np.uint
     if kind == "WebP":
         # Opening a WebP file allocates its whole canvas, so that its size has to be known before.
         _check_size(*_webp_size(data), max_megapixels)
-    lean = _LEAN[kind](data) if kind in _LEAN else LeanFile(data)
-    with _OPENERS[kind](io.BytesIO(lean.data)) as image:
+    strip = {"PNG": _strip_png, "JPEG": _strip_jpeg}.get(kind)
+    # The blocks of a WebP file are never decoded or joined by the decoder: they can stay.
+    stripped, orientation = strip(data) if strip else (data, UPRIGHT)
+    with _OPENERS[kind](io.BytesIO(stripped)) as image:
         _check_size(image.width, image.height, max_megapixels)
         _check_still(kind, image)
         rgb = _to_rgb(image)
-        orientation = orientation_of(image.info.get("exif", b"")) if kind == "WebP" else lean.orientation
-    turn = _UPRIGHT.get(orientation)
+        if kind == "WebP":
+            orientation = _exif_orientation(image.info.get("exif", b""))
+    turn = _TRANSPOSE_TO_UPRIGHT.get(orientation)
     return np.array(rgb if turn is None else rgb.transpose(turn), dtype=np.uint8)
 
 
@@ -276,3 +297,74 @@ def _damaged(kind: str, data: bytes) -> ImageUnreadable:
     return ImageUnreadable(
         f"The {kind} file of {len(data)} bytes could not be decoded, it is damaged or incomplete: send it whole."
     )
+
+
+def _strip_png(data: bytes) -> tuple[bytes, int]:
+    """A PNG file without its ancillary chunks, except transparency and animation; and its EXIF orientation.
+
+    Raises `OverfullError`.
+    """
+    kept = [_PNG_SIGNATURE]
+    orientation = UPRIGHT
+    at = len(_PNG_SIGNATURE)
+    for _ in range(MAX_PNG_CHUNKS):
+        head = data[at : at + 8]
+        if len(head) < 8:  # truncated: the decoder reports it
+            return b"".join((*kept, head)), orientation
+        end = at + 12 + int.from_bytes(head[:4])
+        name = head[4:]
+        if name in _PNG_KEPT:
+            kept.append(data[at:end])
+        elif name == b"eXIf":
+            orientation = _exif_orientation(data[at + 8 : end - 4])
+        if name == b"IEND":
+            return b"".join(kept), orientation
+        at = end
+    raise OverfullError(f"a PNG file of more than {MAX_PNG_CHUNKS} chunks")
+
+
+def _strip_jpeg(data: bytes) -> tuple[bytes, int]:
+    """A JPEG file without application segments and comments, except Adobe's colour transform; and its EXIF orientation.
+
+    Raises `OverfullError`.
+    """
+    kept = [data[:2]]
+    orientation = UPRIGHT
+    at = 2
+    for _ in range(MAX_JPEG_SEGMENTS):
+        found = _JPEG_MARKER.search(data, at)
+        if found is None:  # truncated: the decoder reports it
+            return b"".join(kept), orientation
+        at, marker = found.end(), found[1][0]
+        if marker in _JPEG_ALONE:
+            continue
+        if marker in (_JPEG_SCAN, _JPEG_END):
+            rest = data[at - 2 :]
+            if (scans := rest.count(_JPEG_SCAN_START)) > MAX_JPEG_SCANS:
+                raise OverfullError(f"a JPEG file of {scans} scans, more than {MAX_JPEG_SCANS}")
+            return b"".join((*kept, rest)), orientation
+        end = at + int.from_bytes(data[at : at + 2])
+        if marker == _JPEG_ADOBE or not (0xE0 <= marker <= 0xEF or marker == _JPEG_COMMENT):
+            kept.append(data[at - 2 : end])
+        elif marker == _JPEG_APP1 and orientation == UPRIGHT and data.startswith(_EXIF, at + 2):
+            orientation = _exif_orientation(data[at + 2 : end])
+        at = end
+    raise OverfullError(f"a JPEG file of more than {MAX_JPEG_SEGMENTS} segments")
+
+
+def _exif_orientation(exif: bytes) -> int:
+    """The orientation (1 to 8) that an EXIF block names in its first directory; 1 where it names none."""
+    tiff = exif.removeprefix(_EXIF)
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if order is None or len(tiff) < 8:
+        return UPRIGHT
+    start = int(struct.unpack_from(f"{order}I", tiff, 4)[0])
+    if start + 2 > len(tiff):
+        return UPRIGHT
+    entries = int(struct.unpack_from(f"{order}H", tiff, start)[0])
+    for entry in range(start + 2, min(start + 2 + 12 * entries, len(tiff) - 11), 12):
+        tag, kind, count = struct.unpack_from(f"{order}HHI", tiff, entry)
+        if tag == _ORIENTATION and count == 1 and kind in _TIFF_INTEGERS:
+            value = int(struct.unpack_from(order + _TIFF_INTEGERS[kind], tiff, entry + 8)[0])
+            return value if 1 <= value <= 8 else UPRIGHT
+    return UPRIGHT

@@ -1,11 +1,11 @@
-"""Outgoing HTTP to addresses that strangers name: nothing inside can be reached with it, and nobody can hold it up.
+"""Outgoing HTTP to URLs of callers, safe against requests into the private network (SSRF) and against slow servers.
 
 Every hop is checked in full before anything is sent: scheme, host, and every address that the name has now. The
 connection goes to the addresses that were checked, never to the name, so that a name server that answers otherwise the
 second time changes nothing. Proxies of the environment are not asked, redirects of a POST are not followed, no body is
-decompressed, and one clock runs over name, connection, TLS, headers and body together.
+decompressed, and one deadline covers name, connection, TLS, headers and body together.
 
-httpcore, the lower half of httpx, takes its connections from a backend of ours: the clock has to stop a server that
+httpcore, the lower half of httpx, takes its connections from a backend of ours: the deadline has to stop a server that
 sends its headers byte by byte, and httpx's time limits begin anew with every read.
 """
 
@@ -19,13 +19,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Thread
+from time import monotonic
+from typing import Any
 
 import httpcore
 import httpx
 
 from cow_service import __version__
 from cow_service.net.hosts import HostList, host_name, is_address, is_public
-from cow_service.net.pinned import Clock, Pinned
 
 MAX_REDIRECTS = 3
 MAX_URL = 4096  # characters
@@ -34,15 +35,15 @@ _DEFAULT_PORTS = {"http": 80, "https": 443}
 
 
 class EgressError(Exception):
-    """Nothing came of it. The message is whole sentences and names no address that a host name led to."""
+    """The exchange failed. The message is whole sentences and names no address that a host name resolved to."""
 
 
 class NotAllowed(EgressError):
-    """The URL is none that may be asked."""
+    """The URL may not be requested."""
 
 
 class Unreachable(EgressError):
-    """Whoever was asked cannot be reached, or did not answer as it must."""
+    """The host cannot be reached, or did not answer as it must."""
 
 
 # What others raise, and what becomes of it. The first row that fits is taken.
@@ -68,8 +69,8 @@ TRANSLATED: tuple[tuple[type[Exception], type[EgressError], str], ...] = (
 
 
 @contextmanager
-def _told(host: str) -> Generator[None]:
-    """Exceptions of others become ours, by the table."""
+def _translated(host: str) -> Generator[None]:
+    """Translates exceptions of others to ours, by the table."""
     try:
         yield
     except tuple(foreign for foreign, _, _ in TRANSLATED) as error:
@@ -78,12 +79,12 @@ def _told(host: str) -> Generator[None]:
 
 
 def look_up(host: str, port: int) -> list[str]:
-    """Every address that a host name has, as the system's resolver tells. Raises `OSError`."""
+    """Every address that a host name has, from the system's resolver. Raises `OSError`."""
     return [str(found[4][0]) for found in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
 
 
 class Egress:
-    """Asks addresses that strangers name. Safe to use from several threads.
+    """Sends requests to URLs of callers. Safe to use from several threads.
 
     `allow` lists the hosts that may be asked, as `HostList` reads them; None allows every public host at every port.
     `seconds` is for a whole exchange with all redirects, `connect_seconds` for taking up one connection.
@@ -110,15 +111,15 @@ class Egress:
 
     def fetch(self, url: str, most_bytes: int) -> bytes:
         """The body at a URL, at most so long. Raises `NotAllowed` or `Unreachable`."""
-        clock = Clock(self._seconds)
+        deadline = _Deadline(self._seconds)
         target = self._target(url, "The URL")
         for _ in range(MAX_REDIRECTS + 1):
-            with _told(target.host), self._exchange("GET", target, clock) as response:
+            with _translated(target.host), self._exchange("GET", target, deadline) as response:
                 location = _headers(response, b"location")
                 if response.status not in REDIRECTS or not location:
                     return _body(response, target.host, most_bytes)
                 where = location[0].decode()
-            with _told("A redirect"):
+            with _translated("A redirect"):
                 where = str(target.url.join(where))
             target = self._target(where, "A redirect")
         raise Unreachable(f"There were more than {MAX_REDIRECTS} redirects. Give the URL that they end at.")
@@ -130,7 +131,10 @@ class Egress:
         `Unreachable`.
         """
         target = self._target(url, "The URL")
-        with _told(target.host), self._exchange("POST", target, Clock(self._seconds), body, headers) as response:
+        with (
+            _translated(target.host),
+            self._exchange("POST", target, _Deadline(self._seconds), body, headers) as response,
+        ):
             return response.status
 
     def check(self, url: str) -> None:
@@ -145,7 +149,7 @@ class Egress:
             raise NotAllowed(f"{what} does not begin with http:// or https://.")
         if len(text) > MAX_URL:
             raise NotAllowed(f"{what} is longer than {MAX_URL} characters.")
-        with _told(what):
+        with _translated(what):
             url = httpx.URL(text)
         if url.userinfo:
             raise NotAllowed(f"{what} holds a user name or a password. Leave them out.")
@@ -165,7 +169,7 @@ class Egress:
         self,
         method: str,
         target: _Target,
-        clock: Clock,
+        deadline: _Deadline,
         body: bytes | None = None,
         headers: Mapping[str, str] | None = None,
     ) -> Generator[httpcore.Response]:
@@ -182,16 +186,16 @@ class Egress:
             scheme=target.url.raw_scheme, host=target.host.encode(), port=target.port, target=target.url.raw_path
         )
         tls = self._tls if target.url.scheme == "https" else None
-        backend = Pinned(self._addresses(target, clock), clock, self._connect_seconds)
+        backend = _PinnedBackend(self._addresses(target, deadline), deadline, self._connect_seconds)
         with (
             httpcore.ConnectionPool(ssl_context=tls, network_backend=backend) as pool,
             pool.stream(method, url, headers=coded, content=body) as response,
         ):
             yield response
 
-    def _addresses(self, target: _Target, clock: Clock) -> list[str]:
+    def _addresses(self, target: _Target, deadline: _Deadline) -> list[str]:
         """Where a host is now. Raises `NotAllowed` where any of it may not be connected to."""
-        addresses = [target.host] if is_address(target.host) else self._looked_up(target, clock)
+        addresses = [target.host] if is_address(target.host) else self._looked_up(target, deadline)
         if not addresses:
             raise Unreachable(f"The host name '{target.host}' has no address.")
         self._check_addresses(target, addresses)
@@ -201,7 +205,7 @@ class Egress:
         if not all(self._permitted(address) for address in addresses):
             raise NotAllowed(f"{target.what} leads to the host '{target.host}', whose address is not a public one.")
 
-    def _looked_up(self, target: _Target, clock: Clock) -> list[str]:
+    def _looked_up(self, target: _Target, deadline: _Deadline) -> list[str]:
         # The system's resolver takes no time limit. Where it is too slow, its thread is left to end by itself.
         answer: Future[list[str]] = Future()
 
@@ -212,7 +216,7 @@ class Egress:
                 answer.set_exception(error)
 
         Thread(target=ask, name="cow-look-up", daemon=True).start()
-        return answer.result(clock.left())
+        return answer.result(deadline.left())
 
     @cached_property
     def _tls(self) -> ssl.SSLContext:
@@ -222,7 +226,7 @@ class Egress:
 
 @dataclass(frozen=True)
 class _Target:
-    """A URL that may be asked, as far as that can be told without looking up its host."""
+    """A URL that passed every check that needs no look-up of its host."""
 
     url: httpx.URL
     host: str  # normalised: lower case, IDNA, no trailing dot, no brackets
@@ -234,6 +238,74 @@ class _Target:
         """The Host header."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return host if self.port == _DEFAULT_PORTS[self.url.scheme] else f"{host}:{self.port}"
+
+
+class _Deadline:
+    """The time limit of a whole exchange."""
+
+    def __init__(self, seconds: float) -> None:
+        self._end = monotonic() + seconds
+
+    def left(self) -> float:
+        """Seconds, more than none. Raises `TimeoutError` after the end."""
+        left = self._end - monotonic()
+        if left <= 0:
+            raise TimeoutError("the time for this exchange is over")
+        return left
+
+
+class _PinnedBackend(httpcore.NetworkBackend):
+    """Connects to addresses that were checked, whatever the host name."""
+
+    def __init__(self, addresses: list[str], deadline: _Deadline, seconds: float) -> None:
+        self._addresses = addresses
+        self._deadline = deadline
+        self._seconds = seconds
+
+    def connect_tcp(self, host: str, port: int, *_: Any, **__: Any) -> httpcore.NetworkStream:
+        """A connection to the first address that takes one. Raises `OSError`."""
+        failed: OSError = OSError("no address")
+        for address in self._addresses:
+            try:
+                connection = socket.create_connection((address, port), min(self._seconds, self._deadline.left()))
+            except OSError as error:  # the last one is raised
+                failed = error
+            else:
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                return _Stream(connection, self._deadline)
+        raise failed
+
+
+class _Stream(httpcore.NetworkStream):
+    """A connection whose every operation ends with the deadline. Raises `OSError`."""
+
+    def __init__(self, connection: socket.socket, deadline: _Deadline) -> None:
+        self._socket = connection
+        self._deadline = deadline
+
+    def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
+        self._socket.settimeout(self._deadline.left())
+        return self._socket.recv(max_bytes)
+
+    def write(self, buffer: bytes, timeout: float | None = None) -> None:
+        rest = memoryview(buffer)
+        while rest:  # not sendall, which with TLS begins its time limit anew for every piece
+            self._socket.settimeout(self._deadline.left())
+            rest = rest[self._socket.send(rest) :]
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def start_tls(
+        self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
+    ) -> httpcore.NetworkStream:
+        """The same connection with TLS, for the name in the URL. Raises `OSError`."""
+        try:
+            self._socket.settimeout(self._deadline.left())
+            return _Stream(ssl_context.wrap_socket(self._socket, server_hostname=server_hostname), self._deadline)
+        except BaseException:
+            self._socket.close()
+            raise
 
 
 def _headers(response: httpcore.Response, name: bytes) -> list[bytes]:

@@ -43,7 +43,7 @@ def is_public(ip: str) -> bool:
 
 
 def is_address(host: str) -> bool:
-    """Whether it is an IP address in the usual notation, without brackets; one that holds on one link only is not."""
+    """Whether it is an IP address in the usual notation, without brackets; one with a zone (%eth0) is not."""
     try:
         ip_address(host)
     except ValueError:  # a name, or one of the notations that only resolvers read

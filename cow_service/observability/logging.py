@@ -1,6 +1,6 @@
 """Logs of the server: text for people or one JSON object a line for machines, each with the ids of its request.
 
-Requests are told on standard output, everything else on standard error.
+Requests go to standard output, everything else on standard error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cow_service.settings import Settings
 
 ACCESS = "cow_service.access"
 _NOT_EXTRA = frozenset((*vars(logging.makeLogRecord({})), "message", "asctime", "color_message", "taskName"))
-_SHOWN = ("request_id", "job_id", "owner")  # what a line of text says of them
+_SHOWN = ("request_id", "job_id", "owner")  # shown in a line of text
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _FAILED_JOB = "Exception encountered in background workflow"
 
@@ -47,9 +47,9 @@ class TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """One line. Control characters are escaped: no value can forge a second one."""
         shown = "".join(f" {name}={value}" for name in _SHOWN if (value := getattr(record, name, None)) is not None)
-        told = _CONTROL.sub(lambda found: repr(found[0])[1:-1], record.getMessage() + shown)
+        text = _CONTROL.sub(lambda found: repr(found[0])[1:-1], record.getMessage() + shown)
         name = record.name.removesuffix(".error")  # uvicorn's name for whatever is no request
-        line = f"{self.formatTime(record, '%Y-%m-%d %H:%M:%S')} {record.levelname} {name}: {told}"
+        line = f"{self.formatTime(record, '%Y-%m-%d %H:%M:%S')} {record.levelname} {name}: {text}"
         trace = _trace_of(self, record)
         return f"{line}\n{trace}" if trace else line
 
@@ -59,16 +59,16 @@ class JsonFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """One line, whatever the record holds."""
-        told: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
             "level": record.levelname.lower(),
             "logger": record.name,
             "message": record.getMessage(),
         }
         if trace := _trace_of(self, record):
-            told["exception"] = trace
+            fields["exception"] = trace
         extra = {name: value for name, value in vars(record).items() if name not in _NOT_EXTRA and value is not None}
-        return json.dumps(extra | told, default=str, ensure_ascii=False)
+        return json.dumps(extra | fields, default=str, ensure_ascii=False)
 
 
 def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None = None) -> None:

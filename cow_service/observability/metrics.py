@@ -20,9 +20,9 @@ log = logging.getLogger("cow_service")
 
 
 class Metrics:
-    """Counters and histograms, from several threads, and gauges that are read when somebody asks.
+    """Counters and histograms, from several threads, and gauges that are read on request.
 
-    `queue_depth` is to be set by whoever has a queue.
+    The job engine sets `queue_depth`.
     """
 
     def __init__(self) -> None:
@@ -71,13 +71,13 @@ class Metrics:
 
 
 class _Gauges(Collector):
-    """What is asked for only when somebody looks."""
+    """Gauges that are computed when the metrics are read."""
 
     def __init__(self, metrics: Metrics) -> None:
         self._metrics = metrics
 
     def describe(self) -> Iterable[GaugeMetricFamily]:
-        """The gauges without values, so that registering them asks nobody."""
+        """The gauges without values, so that registering them computes nothing."""
         return (_queue_gauge(), _gpu_gauge())
 
     def collect(self) -> Iterable[GaugeMetricFamily]:

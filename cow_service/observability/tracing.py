@@ -1,24 +1,34 @@
-"""OpenTelemetry traces, where the environment names a collector. Elsewhere nothing of OpenTelemetry is imported.
+"""OpenTelemetry traces, where the environment names a collector; else OpenTelemetry's SDK is not imported.
 
 The provider is our own and not the process's: libraries that would put questions and images into spans stay silent.
+Without a collector, requests have spans that are not recorded: their ids serve logs and callers.
 """
 
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from opentelemetry.context import Context, attach, detach
+from opentelemetry.trace import (
+    NonRecordingSpan,
+    SpanContext,
+    SpanKind,
+    StatusCode,
+    TraceFlags,
+    get_current_span,
+    use_span,
+)
+
 from cow_service import __version__
 from cow_service.observability import context
-from cow_service.observability.context import TraceContext
 from cow_service.settings import SettingsError
 
 if TYPE_CHECKING:
-    from opentelemetry.context import Context
     from opentelemetry.sdk.trace import TracerProvider
-    from opentelemetry.trace import Span
 
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
 PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
@@ -30,7 +40,7 @@ _provider: TracerProvider | None = None
 
 
 def start(environment: Mapping[str, str] = os.environ) -> bool:
-    """Begins to record and export, where the environment asks for it; says whether it does.
+    """Starts recording and exporting where the environment asks for it; returns whether it does.
 
     Raises `SettingsError` where it asks for what cannot be done.
     """
@@ -64,7 +74,7 @@ def start(environment: Mapping[str, str] = os.environ) -> bool:
 
 
 def stop() -> None:
-    """Sends what is left, for as long as OTEL_EXPORTER_OTLP_TIMEOUT says (10 s), and records no more."""
+    """Exports what is left, within OTEL_EXPORTER_OTLP_TIMEOUT (10 s), and records no more."""
     global _provider
     provider, _provider = _provider, None
     if provider is not None:
@@ -73,42 +83,42 @@ def stop() -> None:
 
 @contextmanager
 def span(name: str, *, parent: str | None = None, **attributes: Attribute) -> Generator[None]:
-    """A span around the block, where traces are on; its ids are in `context.trace` for that long.
+    """A span around the block, recorded where traces are on.
 
-    `parent` is a traceparent, for work that goes on in another thread or process; else it is the span around.
+    `parent` is a traceparent, for work that goes on in another thread or process; else it is the current span.
     """
-    if _provider is None:
-        yield
-        return
-    from opentelemetry.trace import SpanKind  # noqa: PLC0415
-
-    above = None if parent is None else context.parse_traceparent(parent)
-    with _recorded(_provider, name, SpanKind.INTERNAL, None if above is None else _remote(above), attributes):
+    above = None if parent is None else context.remote(parent)
+    if _provider is not None:
+        with _recorded(_provider, name, SpanKind.INTERNAL, above, attributes):
+            yield
+    elif above is not None:
+        token = attach(above)
+        try:
+            yield
+        finally:
+            detach(token)
+    else:
         yield
 
 
 @contextmanager
-def request_span(name: str, parent: TraceContext | None) -> Generator[TraceContext]:
-    """The span of a request, for as long as the block runs; without traces, ids that are as good for logs."""
-    if _provider is None:
-        here = context.child_of(parent)
-        with context.bound(trace_context=here):
-            yield here
+def request_span(name: str, parent: str | None) -> Generator[None]:
+    """The span of a request around the block; `parent` is the caller's traceparent."""
+    above = context.remote(parent)
+    if _provider is not None:
+        with _recorded(_provider, name, SpanKind.SERVER, above, {}):
+            yield
         return
-    from opentelemetry.context import Context  # noqa: PLC0415
-    from opentelemetry.trace import SpanKind  # noqa: PLC0415
-
-    above = Context() if parent is None else _remote(parent)
-    with _recorded(_provider, name, SpanKind.SERVER, above, {}) as real:
-        yield _told(real)
+    caller = get_current_span(above).get_span_context()
+    trace_id = caller.trace_id or secrets.randbits(128) or 1
+    sampled = TraceFlags(caller.trace_flags & TraceFlags.SAMPLED)
+    ids = SpanContext(trace_id, secrets.randbits(64) or 1, is_remote=False, trace_flags=sampled)
+    with use_span(NonRecordingSpan(ids)):
+        yield
 
 
 def describe(name: str, *, failed: bool, **attributes: Attribute) -> None:
-    """Names the span around, now that more is known of it, and adds to what it says."""
-    if _provider is None:
-        return
-    from opentelemetry.trace import StatusCode, get_current_span  # noqa: PLC0415
-
+    """Renames the current span, now that more is known of it, and adds attributes."""
     here = get_current_span()
     here.update_name(name)
     here.set_attributes({key: value for key, value in attributes.items() if value is not None})
@@ -118,28 +128,9 @@ def describe(name: str, *, failed: bool, **attributes: Attribute) -> None:
 
 @contextmanager
 def _recorded(
-    provider: TracerProvider, name: str, kind: object, above: Context | None, attributes: Mapping[str, Attribute]
-) -> Generator[Span]:
-    from opentelemetry.trace import SpanKind  # noqa: PLC0415
-
-    assert isinstance(kind, SpanKind)
+    provider: TracerProvider, name: str, kind: SpanKind, above: Context | None, attributes: Mapping[str, Attribute]
+) -> Generator[None]:
     known = {key: value for key, value in attributes.items() if value is not None}
     tracer = provider.get_tracer("cow_service", __version__)
-    with (
-        tracer.start_as_current_span(name, context=above, kind=kind, attributes=known) as real,
-        context.bound(trace_context=_told(real)),
-    ):
-        yield real
-
-
-def _told(real: Span) -> TraceContext:
-    ids = real.get_span_context()
-    return TraceContext(f"{ids.trace_id:032x}", f"{ids.span_id:016x}", ids.trace_flags.sampled)
-
-
-def _remote(parent: TraceContext) -> Context:
-    from opentelemetry.context import Context  # noqa: PLC0415
-    from opentelemetry.trace import NonRecordingSpan, SpanContext, TraceFlags, set_span_in_context  # noqa: PLC0415
-
-    ids = SpanContext(int(parent.trace_id, 16), int(parent.span_id, 16), True, TraceFlags(int(parent.sampled)))
-    return set_span_in_context(NonRecordingSpan(ids), Context())
+    with tracer.start_as_current_span(name, context=above, kind=kind, attributes=known):
+        yield

@@ -1,4 +1,4 @@
-"""Static points that hold the camera still, and points of the object that move with it."""
+"""Track points: static anchors that hold the camera still, and points of the object that move with it."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.vision.masks import Mask, window_of
+
 ANCHORS = 8
 TRACKS = 5
 GRID = 14  # candidates along the longer side
 CLEARANCE = 0.02  # of the shorter side, kept between an anchor and what may move
 
-Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 
 def spread_anchors(movable: Mask, count: int = ANCHORS) -> tuple[tuple[float, float], ...]:
     """At most `count` points (px), far from each other, off a mask [H, W] of everything that may move."""
     height, width = movable.shape
-    reach = 2 * max(2, int(CLEARANCE * min(height, width))) + 1
-    blocked = cv2.dilate(movable.astype(np.uint8), np.ones((reach, reach), np.uint8))
+    side = 2 * max(2, int(CLEARANCE * min(height, width))) + 1
+    blocked = cv2.dilate(movable.astype(np.uint8), np.ones((side, side), np.uint8))
     step = max(height, width) / GRID
     xs = np.arange(step / 2, width, step)
     ys = np.arange(step / 2, height, step)
@@ -30,13 +31,12 @@ def spread_anchors(movable: Mask, count: int = ANCHORS) -> tuple[tuple[float, fl
 
 def points_inside(mask: Mask, centre: tuple[float, float], count: int = TRACKS) -> tuple[tuple[float, float], ...]:
     """The centre and points inside a mask [H, W] away from its rim (px), spread out; at least one point."""
-    ys, xs = np.nonzero(mask)
-    if not len(xs):
+    window = window_of(mask)
+    if window is None:
         return (centre,)
-    window = slice(ys.min(), ys.max() + 1), slice(xs.min(), xs.max() + 1)
     deep = cv2.distanceTransform(np.pad(mask[window], 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     rows, columns = np.nonzero(deep >= 0.35 * deep.max())
-    candidates = np.stack([columns + xs.min() + 0.5, rows + ys.min() + 0.5], axis=1)
+    candidates = np.stack([columns + window[1].start + 0.5, rows + window[0].start + 0.5], axis=1)
     start = candidates[int(np.linalg.norm(candidates - np.array(centre), axis=1).argmin())]
     return tuple((float(x), float(y)) for x, y in [start, *_farthest(candidates, start, count - 1)])
 

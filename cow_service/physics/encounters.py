@@ -1,14 +1,15 @@
-"""What the mover meets: its silhouette swept along the path against the silhouettes of other objects.
+"""What the mover encounters: its silhouette swept along the path against the silhouettes of other objects.
 
-Two things tell touching from passing: the silhouettes overlap, and on the floor the two stand as near to each other as
-they are wide. What stands lower in the image stands nearer to the camera. An object in the air has no place on the
-floor; it touches what it overlaps until it has sunk below that thing's foot.
+The mover touches an object where the silhouettes overlap and the two stand, on the floor, within the sum of their half
+widths. What stands lower in the image is nearer to the camera. An object in the air has no place on the floor; it
+touches what it overlaps until it has sunk below that object's lower edge.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -16,20 +17,19 @@ from numpy.typing import NDArray
 
 from cow_service.physics.camera import PITCH
 from cow_service.records import BBox, Encounter, EncounterKind
+from cow_service.vision.masks import Mask, resized_mask, scaled_size
 from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.sizes import resized_mask
 
 WORKING_SIDE = 320  # px: masks are swept at this size
-LEAST_OVERLAP = 0.03  # of the smaller silhouette: less is a graze that nobody would call an encounter
+LEAST_OVERLAP = 0.03  # of the smaller silhouette: less is no encounter
 REACH = 0.95  # of the summed half widths: corners and handles do not reach all around
 
-Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """The mover on its way: mask [H, W] and box in the image, then where its centre is and how large it appears."""
+    """The mover on its path: mask [H, W] and box in the image, then its centre and apparent size per frame."""
 
     mask: Mask
     bbox: BBox
@@ -39,23 +39,41 @@ class Sweep:
     visible: Mask  # [F]
     airborne: bool
 
+    @cached_property
+    def _factor(self) -> float:
+        return min(1.0, WORKING_SIDE / max(self.mask.shape))
+
+    @cached_property
+    def small(self) -> Mask:
+        """The mask at the working size."""
+        height, width = self.mask.shape
+        return resized_mask(self.mask, scaled_size(width, height, self._factor))
+
+    def box(self, frame: int) -> BBox:
+        """The mover's box (px) at a frame."""
+        return box_at(self.bbox, self.start, self.points[frame], float(self.scale[frame]))
+
+    def moved(self, frame: int) -> NDArray[np.uint8]:
+        """The mover's mask (0 and 1) at a frame, at the working size."""
+        scale = float(self.scale[frame])
+        shift = self.points[frame] * self._factor - scale * (self.start * self._factor)
+        transform = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]], np.float64)
+        size = self.small.shape[1], self.small.shape[0]
+        small = self.small.astype(np.uint8)
+        return np.asarray(cv2.warpAffine(small, transform, size, flags=cv2.INTER_NEAREST), np.uint8)
+
 
 def find_encounters(sweep: Sweep, obstacles: Sequence[Obstacle]) -> tuple[Encounter, ...]:
     """Encounters in the order of their first frame; of one object each kind once, and nothing after touching it."""
-    height, width = sweep.mask.shape
-    factor = min(1.0, WORKING_SIDE / max(height, width))
-    size = max(1, round(width * factor)), max(1, round(height * factor))
-    mover = resized_mask(sweep.mask, size)
+    size = sweep.small.shape[1], sweep.small.shape[0]
     found: list[Encounter] = []
     for obstacle in obstacles:
-        other = obstacle.cutting.at(size)
+        other = obstacle.mask.at(size)
         seen: set[EncounterKind] = set()
-        for frame, (point, scale, visible) in enumerate(zip(sweep.points, sweep.scale, sweep.visible, strict=True)):
-            if not visible or not _boxes_meet(sweep, point, scale, obstacle.bbox):
+        for frame in np.nonzero(sweep.visible)[0].tolist():
+            if not boxes_overlap(sweep.box(frame), obstacle.bbox) or not _overlaps(sweep, frame, other):
                 continue
-            if not _overlaps(mover, sweep.start * factor, other, point * factor, scale):
-                continue
-            kind = _kind(sweep, point, scale, obstacle.bbox)
+            kind = _kind(sweep, frame, obstacle.bbox)
             if kind not in seen:
                 seen.add(kind)
                 found.append(Encounter(object=obstacle.name, bbox=obstacle.bbox, first_frame=frame, kind=kind))
@@ -65,17 +83,12 @@ def find_encounters(sweep: Sweep, obstacles: Sequence[Obstacle]) -> tuple[Encoun
 
 
 def swept_mask(sweep: Sweep) -> Mask:
-    """Mask [H, W] of every place that the mover covers on its way."""
+    """Mask [H, W] of every place that the mover covers on its path."""
     height, width = sweep.mask.shape
-    factor = min(1.0, WORKING_SIDE / max(height, width))
-    size = max(1, round(width * factor)), max(1, round(height * factor))
-    mover = resized_mask(sweep.mask, size)
-    swept = np.zeros(mover.shape, np.uint8)
-    whole = (0.0, 0.0, float(width), float(height))
-    for point, scale in zip(sweep.points, sweep.scale, strict=True):
-        if not _boxes_meet(sweep, point, scale, whole):
-            continue
-        swept |= _moved(mover, sweep.start * factor, point * factor, scale)
+    swept = np.zeros(sweep.small.shape, np.uint8)
+    for frame in range(len(sweep.points)):
+        if boxes_overlap(sweep.box(frame), (0, 0, width, height)):
+            swept |= sweep.moved(frame)
     return cv2.resize(swept, (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
 
@@ -111,8 +124,13 @@ def box_at(bbox: BBox, start: Floats, point: Floats, scale: float) -> BBox:
     )
 
 
-def _kind(sweep: Sweep, point: Floats, scale: float, other: BBox) -> EncounterKind:
-    box = box_at(sweep.bbox, sweep.start, point, scale)
+def boxes_overlap(a: BBox, b: BBox) -> bool:
+    """Whether two boxes [x0, y0, x1, y1] have area in common."""
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _kind(sweep: Sweep, frame: int, other: BBox) -> EncounterKind:
+    box = sweep.box(frame)
     if sweep.airborne:
         return "touches" if foot_line(box) <= foot_line(other) else "occludes"
     across, away, reach = floor_gap(box, other, float(np.sin(PITCH)))
@@ -121,20 +139,9 @@ def _kind(sweep: Sweep, point: Floats, scale: float, other: BBox) -> EncounterKi
     return "occludes" if stands_nearer(box, other, airborne=False) else "occluded-by"
 
 
-def _boxes_meet(sweep: Sweep, point: Floats, scale: float, other: BBox) -> bool:
-    box = box_at(sweep.bbox, sweep.start, point, scale)
-    return box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3]
-
-
-def _overlaps(mover: Mask, start: Floats, other: Mask, point: Floats, scale: float) -> bool:
-    """Whether the mover, moved and scaled, covers enough of the other mask or is covered enough by it."""
-    both = int((other & (_moved(mover, start, point, scale) > 0)).sum())
-    smaller = min(int(other.sum()), int(mover.sum() * scale * scale))
+def _overlaps(sweep: Sweep, frame: int, other: Mask) -> bool:
+    """Whether the mover covers enough of the other mask or is covered enough by it."""
+    both = int((other & (sweep.moved(frame) > 0)).sum())
+    scale = float(sweep.scale[frame])
+    smaller = min(int(other.sum()), int(sweep.small.sum() * scale * scale))
     return both > 0 and both >= LEAST_OVERLAP * smaller
-
-
-def _moved(mover: Mask, start: Floats, point: Floats, scale: float) -> NDArray[np.uint8]:
-    shift = point - scale * start
-    transform = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]], np.float64)
-    size = mover.shape[1], mover.shape[0]
-    return np.asarray(cv2.warpAffine(mover.astype(np.uint8), transform, size, flags=cv2.INTER_NEAREST), np.uint8)

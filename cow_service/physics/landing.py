@@ -1,9 +1,9 @@
-"""Where a ball in the air comes down and whether it then rolls into something, told by its shadow on the floor.
+"""Where a ball in the air comes down and whether it then rolls into something, estimated from its shadow on the floor.
 
-A thrown ball comes down, bounces and rolls on in its heading, at whatever speed. What decides is how deep in the scene
-it flies. Its shadow tells that, but only along with the light, which slants: on the floor, the shadow of a ball is a
-circle drawn out along the light. Its centre and its shape in the image are five numbers, and camera pitch, height,
-and slant of the light are four; the fit of these to those also says how sure they are.
+A thrown ball comes down, bounces and rolls on along its heading, at whatever speed; what decides is its depth in the
+scene. Its shadow depends on that depth and on the light: on the floor it is a circle stretched along the slant of the
+light. Its centre and shape in the image are five measurements; camera pitch, height above the floor and the slant of
+the light are four unknowns. A least-squares fit gives them with their covariance.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import SAME_OBJECT, Scene, iou
 from cow_service.vision.shadows import Shadow, find_shadow
 
-UPRIGHT = 0.5  # of the heading's length, sideways in the image: less is up, down or away, not along the floor's rows
-SURE = 0.88  # chance from which an answer is given
-RULE_ERROR = 0.12  # of the reach: what stands on the floor is no circle, and boxes are a little off
-CLEAR = 1.2  # of the reach: what lies so far back is not met
-GUESSES = (PITCH, 4.0, 0.0, 0.1)  # rad, radii, radii per radius: pitch, height, slant of the light sideways and away
-DOUBTS = (0.21, 4.0, 0.5, 0.35)  # of the guesses, in their units: a room's light falls steeper than 45 degrees
-# Of what is measured: the centre in radii of the ball, the log of width and height, the correlation.
-ERRORS = (0.05, 0.05, 0.06, 0.08, 0.05)
-WORST_FIT = 14.0  # squared deviations in all: a patch that fits worse is not the ball's shadow
-LOWEST = 1.4  # radii, from the floor to the ball's centre: lower, it stands
-STEPS = 12  # of the fit
+MIN_SIDEWAYS = 0.5  # of the heading's length, sideways in the image: less is up, down or away
+SURE = 0.88  # probability from which an answer is given
+REACH_SIGMA = 0.12  # of the reach: objects are no circles on the floor, and boxes are inexact
+CLEAR = 1.2  # of the reach: what lies that far behind the start is not met
+PRIOR_MEAN = (PITCH, 4.0, 0.0, 0.1)  # rad, radii, radii per radius: pitch, height, slant of the light sideways and away
+PRIOR_SIGMA = (0.21, 4.0, 0.5, 0.35)  # of the mean, in its units: a room's light falls steeper than 45 degrees
+# Of the measurements: centre in radii of the ball, log of width and height, correlation.
+MEASUREMENT_SIGMA = (0.05, 0.05, 0.06, 0.08, 0.05)
+MAX_COST = 14.0  # squared deviations in all: a patch that fits worse is not the ball's shadow
+MIN_HEIGHT = 1.4  # radii, from the floor to the ball's centre: lower, it stands
+MAX_ITERATIONS = 12  # of the fit
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Landing:
-    """The ball on the floor below where it is in the air, as one light would have it. Not where it comes to rest."""
+    """The ball on the floor below its place in the air, under one hypothesis. Not where it comes to rest."""
 
     footprint: BBox  # px: the circle on the floor that is as wide as the ball, around where it touches
     pitch: float  # rad: how far the camera looks down
@@ -59,7 +59,7 @@ def rolls_into(
     the heading is too steep, where it is too close to call, or where an obstacle might be met before the target.
     """
     region, length = scene.region_of(mover), float(np.hypot(*heading))
-    if region is None or not region.is_disc or length == 0 or abs(heading[0]) < UPRIGHT * length:
+    if region is None or not region.is_disc or length == 0 or abs(heading[0]) < MIN_SIDEWAYS * length:
         return None
     shadow = find_shadow(scene, mover)
     if shadow is None:
@@ -84,20 +84,20 @@ def _verdict(scene: Scene, landings: Sequence[Landing], sense: float, bbox: BBox
     """Whether the ball meets what stands in a box, where that is sure, be a round thing a ball or a block."""
     region = scene.region_of(bbox)
     shapes = (False, True) if region is not None and region.is_disc else (False,)
-    chances = [_chance(landings, sense, _Thing(bbox, is_ball)) for is_ball in shapes]
+    chances = [_chance(landings, sense, _Target(bbox, is_ball)) for is_ball in shapes]
     verdicts = {None if chance is None or 1 - SURE < chance < SURE else chance >= SURE for chance in chances}
     return verdicts.pop() if len(verdicts) == 1 else None
 
 
 @dataclass(frozen=True)
-class _Thing:
+class _Target:
     """What stands on the floor."""
 
     bbox: BBox  # px
     is_ball: bool
 
 
-def _standing(thing: _Thing, landing: Landing) -> BBox:
+def _standing(thing: _Target, landing: Landing) -> BBox:
     """The box of a thing, down to the foot of its footprint: a ball is seen further down than that."""
     left, top, right, bottom = thing.bbox
     if not thing.is_ball:
@@ -106,7 +106,7 @@ def _standing(thing: _Thing, landing: Landing) -> BBox:
     return left, top, right, bottom + overhang
 
 
-def _chance(landings: Sequence[Landing], sense: float, other: _Thing) -> float | None:
+def _chance(landings: Sequence[Landing], sense: float, other: _Target) -> float | None:
     """How likely the ball, rolling on along its row of the image, comes within reach of what stands in a box.
 
     None where it may come down upon that very thing, or beside it.
@@ -114,8 +114,8 @@ def _chance(landings: Sequence[Landing], sense: float, other: _Thing) -> float |
     gaps = [floor_gap(landing.footprint, _standing(other, landing), landing.squash) for landing in landings]
     ratios = [away / (REACH * reach) for _, away, reach in gaps]
     variance = sum(((more - less) / 2) ** 2 for less, more in zip(ratios[1::2], ratios[2::2], strict=True))
-    deviation = math.sqrt(variance + RULE_ERROR**2)
-    chance = _below((1 - ratios[0]) / deviation) - _below((-1 - ratios[0]) / deviation)
+    deviation = math.sqrt(variance + REACH_SIGMA**2)
+    chance = _normal_cdf((1 - ratios[0]) / deviation) - _normal_cdf((-1 - ratios[0]) / deviation)
     across, _, reach = gaps[0]
     if -sense * across > REACH * reach:
         return chance
@@ -124,7 +124,7 @@ def _chance(landings: Sequence[Landing], sense: float, other: _Thing) -> float |
     return chance if chance < 1 - SURE else None
 
 
-def _below(deviations: float) -> float:
+def _normal_cdf(deviations: float) -> float:
     """Share of a normal distribution below so many standard deviations."""
     return (1 + math.erf(deviations / math.sqrt(2))) / 2
 
@@ -200,35 +200,35 @@ def _bounded(parameters: Floats) -> Floats:
 
 
 def _fit(view: _View, shadow: Shadow) -> tuple[Floats, Floats] | None:
-    """Pitch, height and slant of the light [4] with their covariance [4, 4], by Gauss-Newton from the guesses.
+    """Pitch, height and slant of the light [4] with their covariance [4, 4], by Gauss-Newton from the prior_mean.
 
     None where no likely camera and light would make that shadow of the ball in the air.
     """
-    guesses, doubts = np.array(GUESSES), np.array(DOUBTS)
+    prior_mean, prior_sigma = np.array(PRIOR_MEAN), np.array(PRIOR_SIGMA)
     radius = view.focal / view.ball[2]
 
-    def misfit(parameters: Floats) -> Floats:
-        seen = _numbers(np.array([*shadow.centre, *shadow.spread]), radius)
-        made = _numbers(view.shadow(_bounded(parameters)), radius)
-        return np.concatenate([(made - seen) / np.array(ERRORS), (parameters - guesses) / doubts])
+    def residuals(parameters: Floats) -> Floats:
+        seen = _features(np.array([*shadow.centre, *shadow.spread]), radius)
+        made = _features(view.shadow(_bounded(parameters)), radius)
+        return np.concatenate([(made - seen) / np.array(MEASUREMENT_SIGMA), (parameters - prior_mean) / prior_sigma])
 
     drop = shadow.centre[1] - float(view.image(view.ball[None])[0, 1])
-    parameters = _bounded(np.array([guesses[0], drop / radius / math.cos(guesses[0]), *guesses[2:]]))
+    parameters = _bounded(np.array([prior_mean[0], drop / radius / math.cos(prior_mean[0]), *prior_mean[2:]]))
     slopes = np.zeros((9, 4))
-    for _ in range(STEPS):
-        now = misfit(parameters)
-        slopes = np.stack([(misfit(parameters + step) - now) / 1e-4 for step in 1e-4 * np.eye(4)], axis=1)
+    for _ in range(MAX_ITERATIONS):
+        now = residuals(parameters)
+        slopes = np.stack([(residuals(parameters + step) - now) / 1e-4 for step in 1e-4 * np.eye(4)], axis=1)
         move = np.clip(np.linalg.lstsq(slopes, -now, rcond=None)[0], [-0.2, -2, -0.4, -0.4], [0.2, 2, 0.4, 0.4])
         parameters = _bounded(parameters + move)
         if float(np.abs(move).max()) < 1e-3:
             break
-    cost = float((misfit(parameters) ** 2).sum())
-    if cost > WORST_FIT or parameters[1] < LOWEST:
+    cost = float((residuals(parameters) ** 2).sum())
+    if cost > MAX_COST or parameters[1] < MIN_HEIGHT:
         return None
     return parameters, np.asarray(np.linalg.pinv(slopes.T @ slopes), np.float64)
 
 
-def _numbers(shadow: Floats, radius: float) -> Floats:
+def _features(shadow: Floats, radius: float) -> Floats:
     """A shadow's centre in radii, log half width and half height, and correlation."""
     x, y, xx, yy, xy = shadow
     return np.array([x / radius, y / radius, np.log(xx) / 2, np.log(yy) / 2, xy / np.sqrt(xx * yy)])

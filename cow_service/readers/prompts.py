@@ -14,7 +14,7 @@ from jinja2 import StrictUndefined, Template
 from jinja2.meta import find_undeclared_variables
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from cow_service.weights.resources import read_prompt_text
+from cow_service.weights.resources import PROMPTS
 
 FIELDS = ("stage", "version", "inputs", "output")
 _FENCE = "---"
@@ -53,7 +53,7 @@ def _compiled(body: str) -> Template:
 @cache
 def load_prompt(name: str) -> Prompt:
     """A shipped prompt. Raises `LookupError` where there is none, `ValueError` where its file is not well formed."""
-    return parse_prompt(name, read_prompt_text(name))
+    return parse_prompt(name, PROMPTS.read(name))
 
 
 def parse_prompt(name: str, text: str) -> Prompt:

@@ -16,7 +16,6 @@ from cow_service.records import Clip, Frame, Grounding, Motion, Trajectory, Vide
 from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
-from cow_service.vision.obstacles import obstacles_of
 
 Image = NDArray[np.uint8]
 
@@ -60,7 +59,7 @@ def generate(run: Run, grounding: Grounding, motion: Motion, trajectory: Traject
     """
     request, scene, artifacts = run.request, run.scene, run.backends.artifacts
     with run.cpu():
-        obstacles = obstacles_of(scene, grounding.bbox, grounding.others)
+        obstacles = scene.obstacles(grounding.bbox, grounding.others)
     given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, request.seed, run.options)
     with run.device():
         frames, video = _render(given, run.generator, request, artifacts, run.report_share)

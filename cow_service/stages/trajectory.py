@@ -16,7 +16,7 @@ from cow_service.requests import TrajectoryRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.warnings import warnings_of
-from cow_service.vision.obstacles import Obstacle, obstacles_of
+from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,7 @@ def compute_trajectory(run: Run, grounding: Grounding, motion: Motion) -> StageR
     """The path over the whole clip, rolled out from the motion or taken from the request, and what it meets."""
     request = run.request
     with run.cpu():
-        obstacles = obstacles_of(run.scene, grounding.bbox, grounding.others)
+        obstacles = run.scene.obstacles(grounding.bbox, grounding.others)
         trajectory = trajectory_of(
             run.scene, grounding, motion, obstacles, request.trajectory, request.num_frames, request.fps
         )
@@ -61,7 +61,7 @@ def trajectory_of(
     sweep = Sweep(mask, grounding.bbox, np.array(grounding.point), points, scale, visible, airborne)
     movable = swept_mask(sweep)
     for obstacle in obstacles:
-        obstacle.cutting.add_to(movable)
+        obstacle.mask.add_to(movable)
     if given is not None and given.tracks is not None:
         tracks = [_sampled(np.array(track), given.fps, times) for track in given.tracks]
     else:

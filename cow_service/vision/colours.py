@@ -25,7 +25,7 @@ HUES = (
 HUE_MARGIN, CHROMA_MARGIN, LIGHTNESS_MARGIN = 7.0, 2.5, 5.0  # how far a border may be for both its names to do
 
 
-def name_of(lightness: float, a: float, b: float) -> str:
+def colour_name(lightness: float, a: float, b: float) -> str:
     """The name of a Lab colour (lightness 0..100; a, b in CIE units)."""
     chroma = math.hypot(a, b)
     if chroma < CHROMATIC:
@@ -39,7 +39,7 @@ def name_of(lightness: float, a: float, b: float) -> str:
     return name
 
 
-def names_of(lightness: float, a: float, b: float) -> frozenset[str]:
+def colour_names(lightness: float, a: float, b: float) -> frozenset[str]:
     """Every name that people may give a Lab colour: its own, and that across a border it lies next to."""
     chroma, hue = math.hypot(a, b), math.atan2(b, a)
     names: set[str] = set()
@@ -47,5 +47,5 @@ def names_of(lightness: float, a: float, b: float) -> frozenset[str]:
         for more in (-CHROMA_MARGIN, 0.0, CHROMA_MARGIN):
             for lift in (-LIGHTNESS_MARGIN, 0.0, LIGHTNESS_MARGIN):
                 angle, radius = hue + math.radians(turn), max(0.0, chroma + more)
-                names.add(name_of(lightness + lift, radius * math.cos(angle), radius * math.sin(angle)))
+                names.add(colour_name(lightness + lift, radius * math.cos(angle), radius * math.sin(angle)))
     return frozenset(names)

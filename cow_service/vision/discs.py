@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.vision.masks import Mask
+
 TRIES = 120  # circles through three points of the outline
 NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
 ON_CIRCLE = 0.55  # share of the outline
@@ -17,11 +19,9 @@ FILLED, SPILLED = 0.72, 0.14  # share of the disc that the region fills; share o
 SAMPLES = 72  # points tried on the circle
 LEAST_RADIUS = 5.0  # px
 
-Mask = NDArray[np.bool_]
 
-
-def as_disc(part: Mask, edges: NDArray[np.float32], fence: float) -> Mask | None:
-    """The disc [h, w] that a part is, or None. `edges` [h, w] are gradients; above `fence` they count as edges."""
+def as_disc(part: Mask, edges: NDArray[np.float32], edge_threshold: float) -> Mask | None:
+    """The disc [h, w] that a part is, or None. `edges` [h, w] are gradients, edges above `edge_threshold`."""
     contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = np.asarray(max(contours, key=len)[:, 0], np.float64)
     if len(outline) < 20:
@@ -34,7 +34,7 @@ def as_disc(part: Mask, edges: NDArray[np.float32], fence: float) -> Mask | None
     angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)
     columns, rows = np.round(x + radius * np.cos(angles)).astype(int), np.round(y + radius * np.sin(angles)).astype(int)
     seen = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    strong = cv2.dilate((edges > fence).astype(np.uint8), np.ones((3, 3), np.uint8))
+    strong = cv2.dilate((edges > edge_threshold).astype(np.uint8), np.ones((3, 3), np.uint8))
     if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < ON_EDGES:
         return None
     ys, xs = np.mgrid[:height, :width]

@@ -1,32 +1,34 @@
 """Finds the objects of an uncluttered image: coloured, white or black things on a floor, a table or a wall.
 
 What differs from its wide surroundings in colour, stands out brighter, or is nearly black, is part of an object; a
-patch fenced in by edges below a bright top is the shaded side of a white one. Shadows are darker and keep the hue:
+patch enclosed by edges below a bright top is the shaded side of a white one. Shadows are darker and keep the hue:
 left out. Where the surroundings themselves vary too much (most photographs), nothing is reported instead of something
 wrong.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.colours import name_of, names_of
-from cow_service.vision.cuttings import Cutting, enlarged
+from cow_service.records import BBox
+from cow_service.vision.colours import colour_name, colour_names
 from cow_service.vision.discs import as_disc
-from cow_service.vision.sizes import scaled
+from cow_service.vision.masks import CroppedMask, Mask, enlarged, iou, outline_of, scaled
 
 WORKING_SIDE = 512  # px: images are searched at this size
 CHROMA_STEP = 9.0  # Lab units from the surroundings
 BRIGHT_STEP, BRIGHT_REACH = 5.0, 1.6  # Lab lightness above the surroundings: a top, and another lit face
-FENCES = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median edge: the larger makes an edge
+EDGE_THRESHOLDS = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median gradient; the larger counts
 SHARP_SHARE = 0.65  # of an outline that must lie on edges
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
 MIN_AREA = 0.0004  # of the image
 MAX_AREA = 0.25
+SAME_OBJECT = 0.5  # intersection over union from which a region is the object of a box
 MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
 CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
 SPLIT_HUE = 36.0  # degrees: another colour, hence another object
@@ -34,7 +36,6 @@ MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged ma
 
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
 
-Mask = NDArray[np.bool_]
 Channel = NDArray[np.float32]
 
 
@@ -42,16 +43,16 @@ Channel = NDArray[np.float32]
 class Region:
     """One object of the image as seen, without a noun: where it is and what colour. Not what moves."""
 
-    cutting: Cutting  # its mask in the image
+    mask: CroppedMask
     colour: str
     colours: frozenset[str]  # other names that would do for it included
     roundness: float  # 0..1: how much of the smallest circle around it the region fills
     is_disc: bool  # its outline was measured as a circle: the mask is exact, no cut can better it
 
     @property
-    def bbox(self) -> tuple[float, float, float, float]:
+    def bbox(self) -> BBox:
         """Tight box [x0, y0, x1, y1], px of the image."""
-        return self.cutting.bbox
+        return self.mask.bbox
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -68,14 +69,14 @@ class _View:
     bright: Channel  # lightness above the surroundings
     around: Channel  # lightness of the surroundings
     edges: Channel  # Lab gradient per px
-    fence: float  # gradient from which the outline of an object may lie on it
+    edge_threshold: float  # gradient from which the outline of an object may lie on it
 
     def crop(self, window: tuple[slice, slice]) -> _View:
         """The same measurements for a part of the image."""
         gap, bright, around, edges = (
             layer[window] for layer in (self.chroma_gap, self.bright, self.around, self.edges)
         )
-        return _View(self.lab[window], gap, bright, around, edges, self.fence)
+        return _View(self.lab[window], gap, bright, around, edges, self.edge_threshold)
 
 
 def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
@@ -96,12 +97,18 @@ def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
         window = _window(stats[i], solid.shape)
         near = view.crop(window)
         for part in _parts(near, labels[window] == i):
-            disc = as_disc(part, near.edges, view.fence)
-            if disc is not None or _is_sharp(near, part, view.fence):
+            disc = as_disc(part, near.edges, view.edge_threshold)
+            if disc is not None or _is_sharp(near, part, view.edge_threshold):
                 whole = np.zeros(solid.shape, np.float32)
                 whole[window] = part if disc is None else disc
                 regions.append(_region(near.lab[part], whole, (height, width), disc is not None))
-    return tuple(sorted(regions, key=lambda region: -region.cutting.area)[:MAX_REGIONS])
+    return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
+
+
+def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
+    """The region that best overlaps a box [x0, y0, x1, y1], if it is the same object."""
+    best = max(regions, key=lambda region: iou(region.bbox, bbox), default=None)
+    return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT else None
 
 
 def _view(small: NDArray[np.uint8]) -> _View:
@@ -119,8 +126,8 @@ def _view(small: NDArray[np.uint8]) -> _View:
     blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
     dx, dy = cv2.Sobel(blurred, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(blurred, cv2.CV_32F, 0, 1) / 8
     edges = np.sqrt((dx * dx + dy * dy).sum(axis=2))
-    fence = max(FENCES[1][0], FENCES[1][1] * float(np.median(edges)))
-    return _View(lab, gap, lab[..., 0] - around_l, around_l, edges, fence)
+    edge_threshold = max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * float(np.median(edges)))
+    return _View(lab, gap, lab[..., 0] - around_l, around_l, edges, edge_threshold)
 
 
 def _window(stats: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[slice, slice]:
@@ -138,16 +145,16 @@ def _core(view: _View) -> Mask:
 
 
 def _white_sides(view: _View, core: Mask) -> Mask:
-    """Patches fenced in by edges at a bright neutral top: the other faces of something white, lit or in shade."""
+    """Patches enclosed by edges at a bright neutral top: the other faces of something white, lit or in shade."""
     neutral = (np.hypot(view.lab[..., 1], view.lab[..., 2]) < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
     white = (core & (view.bright > BRIGHT_STEP) & neutral).astype(np.uint8)
     _, top_labels, top_stats, _ = cv2.connectedComponentsWithStats(white, connectivity=8)
     sides = _lit_fronts(view, white > 0, np.asarray(top_labels, np.int32), np.asarray(top_stats, np.int32))
     height, width = core.shape
     kernel = np.ones((3, 3), np.uint8)
-    for floor, factor in FENCES:
-        fence = max(floor, factor * float(np.median(view.edges)))
-        edges = cv2.morphologyEx((view.edges > fence).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    for floor, factor in EDGE_THRESHOLDS:
+        edge_threshold = max(floor, factor * float(np.median(view.edges)))
+        edges = cv2.morphologyEx((view.edges > edge_threshold).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
         for i in range(1, count):
             x, y, w, h, area = (int(v) for v in stats[i])
@@ -180,11 +187,10 @@ def _lit_fronts(view: _View, white: Mask, labels: NDArray[np.int32], stats: NDAr
     return fronts
 
 
-def _is_sharp(view: _View, part: Mask, fence: float) -> bool:
+def _is_sharp(view: _View, part: Mask, edge_threshold: float) -> bool:
     """Whether the outline of a part lies on edges, as an object's does and a patch of light does not."""
-    outline = part & ~cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     nearby = cv2.dilate(view.edges, np.ones((5, 5), np.uint8))
-    return float(np.mean(nearby[outline] > fence)) > SHARP_SHARE
+    return float(np.mean(nearby[outline_of(part)] > edge_threshold)) > SHARP_SHARE
 
 
 def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
@@ -235,11 +241,11 @@ def _blobs(mask: Mask, least: float) -> list[Mask]:
 
 def _region(lab: NDArray[np.float32], part: Channel, size: tuple[int, int], is_disc: bool) -> Region:
     """A part [h, w] at the working size, with the Lab colours [N, 3] of its pixels, as a region of the image."""
-    cutting = enlarged(np.asarray(cv2.GaussianBlur(part, (0, 0), MASK_SIGMA), np.float32), size)
+    mask = enlarged(np.asarray(cv2.GaussianBlur(part, (0, 0), MASK_SIGMA), np.float32), size)
     chroma = np.hypot(lab[:, 1], lab[:, 2])
-    told = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
-    seen = [float(v) for v in np.median(told, axis=0)]
-    return Region(cutting, name_of(*seen), names_of(*seen), _roundness(cutting.patch), is_disc)
+    sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
+    seen = [float(v) for v in np.median(sample, axis=0)]
+    return Region(mask, colour_name(*seen), colour_names(*seen), _roundness(mask.patch), is_disc)
 
 
 def _roundness(mask: Mask) -> float:

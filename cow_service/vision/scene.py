@@ -1,26 +1,25 @@
-"""Everything that can be seen in one image without a model, each thing looked at once and only when asked for."""
+"""Everything measured in one image without a model, each lazily and once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import RLock
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cow_service.records import BBox, LocatedObject
 from cow_service.vision.arrows import Arrow, find_arrows
 from cow_service.vision.boxes import DrawnBox, find_boxes
-from cow_service.vision.fill import erase_drawing
-from cow_service.vision.masks import BBox, bbox_of, mask_from_bbox, mask_from_point
-from cow_service.vision.regions import Region, find_regions
+from cow_service.vision.inpainting import erase_drawing
+from cow_service.vision.masks import Image, Mask, bbox_of, iou
+from cow_service.vision.obstacles import Obstacle, find_obstacles
+from cow_service.vision.regions import SAME_OBJECT, Region, find_regions, region_of
+from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
 
-SAME_OBJECT = 0.5  # intersection over union from which a region is the object of a box
-
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
+__all__ = ["SAME_OBJECT", "Scene", "iou"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +28,10 @@ class Scene:
 
     image: Image
     _masks: dict[BBox, Mask] = field(default_factory=dict, repr=False)
-    _kept: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
+    _recalled: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
+    _obstacles: dict[tuple[BBox, tuple[LocatedObject, ...]], tuple[Obstacle, ...]] = field(
+        default_factory=dict, repr=False
+    )
     _lock: RLock = field(default_factory=RLock, repr=False)
 
     @property
@@ -77,47 +79,43 @@ class Scene:
 
     def region_of(self, bbox: BBox) -> Region | None:
         """The region that a box [x0, y0, x1, y1] is about, if there is one."""
-        best = max(self.regions, key=lambda region: iou(region.bbox, bbox), default=None)
-        return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT else None
+        return region_of(self.regions, bbox)
 
     def silhouette(self, bbox: BBox) -> Mask:
         """Mask [H, W] of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
         with self._lock:
-            if bbox not in self._masks and bbox in self._kept:
-                self._masks[bbox] = self._kept[bbox]()
             if bbox not in self._masks:
-                region = self.region_of(bbox)
-                known = region is not None and region.is_disc
-                guess = None if region is None else region.cutting.full()
-                self._masks[bbox] = guess if known and guess is not None else mask_from_bbox(self.clean, bbox, guess)
+                self._masks[bbox] = self._recalled[bbox]() if bbox in self._recalled else self._segmented(bbox)
             return self._masks[bbox]
 
+    def _segmented(self, bbox: BBox) -> Mask:
+        region = self.region_of(bbox)
+        if region is not None and region.is_disc:
+            return region.mask.full()
+        return mask_from_bbox(self.clean, bbox, None if region is None else region.mask.full())
+
     def recall(self, bbox: BBox, mask: Callable[[], Mask]) -> None:
-        """Says where to find a mask that was cut before: one cut again from its box may differ from one of a point."""
+        """Gives the mask that an earlier run segmented for a box; it may have been segmented from a point instead."""
         with self._lock:
-            self._kept[bbox] = mask
+            self._recalled[bbox] = mask
+
+    def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
+        """The objects beside the mover in a box, `named` ones by their name; found once for the same arguments."""
+        key = mover, tuple(named)
+        with self._lock:
+            if key not in self._obstacles:
+                self._obstacles[key] = find_obstacles(self.regions, self.silhouette, mover, named)
+            return self._obstacles[key]
 
     def bbox_at(self, point: tuple[float, float]) -> BBox:
-        """Tight box [x0, y0, x1, y1] of the object at a point [x, y]: the smallest region there, or a cut around it."""
+        """Tight box [x0, y0, x1, y1] of the object at a point [x, y]: the smallest region there, or else segmented."""
         x = min(self.width - 1, max(0, int(point[0])))
         y = min(self.height - 1, max(0, int(point[1])))
         with self._lock:
-            pixel = np.zeros((self.height, self.width), bool)
-            pixel[y, x] = True
-            under = [region for region in self.regions if region.cutting.shared_with(pixel)]
+            under = [region for region in self.regions if region.mask.contains(x, y)]
             if under:
-                return min(under, key=lambda region: region.cutting.area).bbox
+                return min(under, key=lambda region: region.mask.area).bbox
             mask = mask_from_point(self.clean, (float(x), float(y)))
             bbox = bbox_of(mask)
             self._masks[bbox] = mask
             return bbox
-
-
-def iou(a: BBox, b: BBox) -> float:
-    """Intersection over union of two boxes [x0, y0, x1, y1]."""
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    if width <= 0 or height <= 0:
-        return 0.0
-    both = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - width * height
-    return width * height / both

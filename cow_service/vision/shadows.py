@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.cuttings import BBox
+from cow_service.records import BBox
+from cow_service.vision.masks import Mask, resized_mask, scaled
 from cow_service.vision.scene import Scene
-from cow_service.vision.sizes import resized_mask, scaled
 
 WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
 LEAST_WIDTH = 14.0  # px in the image: the shadow of something smaller is lost in the floor's grain
@@ -35,7 +35,6 @@ QUARTERS = (0.0, np.pi / 2, np.pi, -np.pi / 2)  # radians
 LEAST_PIXELS, MOST_PIXELS = 60, 700  # of the floor about a patch, at the working size
 STEPS = 8  # of the fit
 
-Mask = NDArray[np.bool_]
 Channel = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Ellipse = tuple[float, float, float, float]  # centre and half axes, px
@@ -87,7 +86,7 @@ def _floor(scene: Scene, bbox: BBox, scale: float) -> _Floor:
     lab = np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
     taken = np.zeros((scene.height, scene.width), bool)
     for region in scene.regions:
-        region.cutting.add_to(taken)
+        region.mask.add_to(taken)
     taken[max(0, int(bbox[1])) : int(np.ceil(bbox[3])), max(0, int(bbox[0])) : int(np.ceil(bbox[2]))] = True
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     grown = cv2.dilate(resized_mask(taken, (width, height)).astype(np.uint8), kernel) > 0

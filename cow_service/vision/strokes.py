@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.sizes import scaled
+from cow_service.vision.masks import Image, Mask, scaled
 
 WORKING_SIDE = 896  # px: longer images are searched at this size
 THIN = 41  # px: side of the median window; narrower structures stand out from it
@@ -29,9 +29,6 @@ BIN = 16  # grey levels: colours this close are tried as one
 MAX_COLOURS = 36  # flat colours tried per thin structure
 
 _SQUARE = np.ones((3, 3), np.uint8)
-
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Weights on this disk: what was recorded when they were downloaded, and whether they are still that. No network.
+"""Weights on this disk: the lock file written when they were downloaded, and checks against it. No network.
 
-The layout is `<folder>/<owner>--<name>/`, shared by all manifests that use the repository: its files under the names
-that they have there, and `cow.lock.json`, which pins their revision, sizes and digests.
+The layout is `<folder>/<owner>--<name>/`, shared by all manifests that use the repository: its files under their own
+names, and `cow.lock.json`, which pins their revision, sizes and digests.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cow_service.weights.manifests import Manifest, Source
 LOCK_NAME = "cow.lock.json"
 
 _CHUNK_BYTES = 8 * 2**20
-_MAX_TOLD = 10
+_MAX_LISTED = 10
 _ALGORITHMS = {"sha256": hashlib.sha256, "git-sha1": hashlib.sha1}
 
 
@@ -73,7 +73,8 @@ class Finding(Record):
     wanted: str | None = None
     found: str | None = None
 
-    def told(self) -> str:
+    @property
+    def message(self) -> str:
         """The finding in words."""
         if self.problem == "not-pulled":
             return f"{self.file} was not pulled"
@@ -98,7 +99,7 @@ def check(source: Source, weights_dir: Path, digests: bool = True) -> tuple[Find
     unpulled = [Finding(file=name, problem="not-pulled") for name in source.files if name not in lock.patterns]
     return (
         *unpulled,
-        *_strangers(lock, source, weights_dir),
+        *_unrecorded(lock, source, weights_dir),
         *examine(lock, chosen(lock, source.files), weights_dir, digests),
     )
 
@@ -110,11 +111,11 @@ def verify(source: Source, weights_dir: Path, name: str) -> Path:
     """
     findings = check(source, weights_dir)
     if findings:
-        told = [finding.told() for finding in findings[:_MAX_TOLD]]
-        if len(findings) > _MAX_TOLD:
-            told.append(f"and {len(findings) - _MAX_TOLD} more")
+        messages = [finding.message for finding in findings[:_MAX_LISTED]]
+        if len(findings) > _MAX_LISTED:
+            messages.append(f"and {len(findings) - _MAX_LISTED} more")
         raise WeightsUnavailable(
-            f"'{name}' cannot use its weights of '{source.repository}': {'; '.join(told)}. "
+            f"'{name}' cannot use its weights of '{source.repository}': {'; '.join(messages)}. "
             f"Run `cow models pull {name}`."
         )
     return folder_of(weights_dir, source.repository)
@@ -133,22 +134,22 @@ def ready(manifest: Manifest, weights_dir: Path, without: Container[str] = ()) -
 
 
 def weights_identity(manifest: Manifest, settings: Settings) -> str:
-    """What tells these weights from others: revisions of what was pulled, names, sizes and times of one's own files."""
+    """Changes with the weights: revisions of what was pulled; names, sizes and times of the user's own files."""
     own = settings.checkpoints.get(manifest.name)
-    told: list[object] = []
+    parts: list[object] = []
     if own is not None:
         files = [own] if own.is_file() else sorted(path for path in own.rglob("*") if path.is_file())
-        told += [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+        parts += [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
     for part, source in sorted(manifest.sources.items()):
         lock = read_lock(settings.weights_dir, source.repository)
-        told.append((part, None if lock is None else lock.revision))
-    return hashlib.sha256(repr(told).encode()).hexdigest()
+        parts.append((part, None if lock is None else lock.revision))
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 def read_lock(weights_dir: Path, repository: str) -> Lock | None:
     """The record of a repository's files; None before the first pull. Raises `WeightsUnavailable` for a spoilt one."""
     path = folder_of(weights_dir, repository) / LOCK_NAME
-    with disk_told(repository):
+    with disk_errors(repository):
         try:
             return Lock.model_validate_json(path.read_bytes())
         except FileNotFoundError:
@@ -187,10 +188,10 @@ def merged(old: Lock | None, new: Lock) -> Lock:
     )
 
 
-def _strangers(lock: Lock, source: Source, weights_dir: Path) -> list[Finding]:
-    """Weights beside those of the record, such as another revision's shards: a loader would take them for its own."""
+def _unrecorded(lock: Lock, source: Source, weights_dir: Path) -> list[Finding]:
+    """Weights that are not in the lock file, such as shards of another revision: a loader would read them, too."""
     folder, known = folder_of(weights_dir, lock.repository), {file.path for file in lock.files}
-    with disk_told(lock.repository):
+    with disk_errors(lock.repository):
         here = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.safetensors*") if path.is_file())
     return [
         Finding(file=path, problem="not-recorded")
@@ -208,17 +209,17 @@ def chosen(lock: Lock, patterns: Iterable[str]) -> tuple[LockedFile, ...]:
 def examine(lock: Lock, files: tuple[LockedFile, ...], weights_dir: Path, digests: bool = True) -> tuple[Finding, ...]:
     """Compares files with their record, hashing several at a time. Raises `WeightsUnavailable` if one is unreadable."""
     folder = folder_of(weights_dir, lock.repository)
-    with disk_told(lock.repository):
+    with disk_errors(lock.repository):
         sizes = {file.path: _size(folder / file.path) for file in files}
         whole = [file for file in files if sizes[file.path] == file.size]
         found = _digests(folder, whole) if digests else {}
-    findings = (_judge(file, sizes[file.path], found.get(file.path)) for file in files)
+    findings = (_compare(file, sizes[file.path], found.get(file.path)) for file in files)
     return tuple(finding for finding in findings if finding is not None)
 
 
 @contextmanager
-def disk_told(repository: str) -> Generator[None]:
-    """An `OSError` becomes a `WeightsUnavailable` that says why, without the path that the text of an OSError holds."""
+def disk_errors(repository: str) -> Generator[None]:
+    """Turns an `OSError` into `WeightsUnavailable` with the reason, without the path that the OSError's text holds."""
     try:
         yield
     except OSError as error:
@@ -229,7 +230,7 @@ def disk_told(repository: str) -> Generator[None]:
         ) from error
 
 
-def _judge(file: LockedFile, size: int | None, digest: str | None) -> Finding | None:
+def _compare(file: LockedFile, size: int | None, digest: str | None) -> Finding | None:
     if size is None:
         return Finding(file=file.path, problem="missing")
     if size != file.size:
@@ -249,12 +250,12 @@ def _size(path: Path) -> int | None:
 
 def _digests(folder: Path, files: list[LockedFile]) -> dict[str, str]:
     stop = Event()
-    # Hashing leaves Python's lock alone, so threads are enough; the disk is what is slow beyond a few.
+    # Hashing releases the GIL, so threads are enough; beyond a few, the disk is the limit.
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         try:
             digests = list(pool.map(_digest, [folder] * len(files), files, [stop] * len(files)))
         except BaseException:
-            stop.set()  # else an interrupted check would first finish the files that it has begun
+            stop.set()  # else an interrupted check would first finish the files in progress
             raise
     return {file.path: digest for file, digest in zip(files, digests, strict=True)}
 

@@ -10,7 +10,7 @@ import yaml
 from pydantic import Field, JsonValue
 
 from cow_service.records import Record
-from cow_service.weights.resources import family_names, manifest_names, read_family_text, read_manifest_text
+from cow_service.weights.resources import FAMILIES, MANIFESTS
 
 
 class Source(Record):
@@ -25,8 +25,8 @@ class Manifest(Record):
     """One backend or model as described by `models/<name>.yaml`."""
 
     name: str
-    door: Literal["reader", "generator", "mllm"] = Field(
-        description="Which registry it stands in; an `mllm` is what the readers `mllm` and `local` ask."
+    role: Literal["reader", "generator", "mllm"] = Field(
+        description="Which registry it belongs to; an `mllm` is what the readers `mllm` and `local` ask."
     )
     summary: str
     licence: str
@@ -96,19 +96,19 @@ class Family(Record):
 @cache
 def load_families() -> dict[str, Family]:
     """All shipped families by name."""
-    return {name: Family.model_validate(_parse(read_family_text(name))) for name in family_names()}
+    return {name: Family.model_validate(_parse(FAMILIES.read(name))) for name in FAMILIES.names()}
 
 
 @cache
 def find_manifest(name: str) -> Manifest | None:
     """One shipped manifest; None where there is none of that name. Only its own file is read."""
-    return Manifest.model_validate(_parse(read_manifest_text(name))) if name in manifest_names() else None
+    return Manifest.model_validate(_parse(MANIFESTS.read(name))) if name in MANIFESTS.names() else None
 
 
 @cache
 def load_manifests() -> dict[str, Manifest]:
     """All shipped manifests by name."""
-    found = {name: find_manifest(name) for name in manifest_names()}
+    found = {name: find_manifest(name) for name in MANIFESTS.names()}
     return {name: manifest for name, manifest in found.items() if manifest is not None}
 
 

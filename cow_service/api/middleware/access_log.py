@@ -1,6 +1,6 @@
-"""What the operator sees of each request: one line in the log, two metrics, and what its span says.
+"""One log line, two metrics and the attributes of a span for each request.
 
-It also answers for faults of whatever stands further in, so that no caller is left without a problem to read.
+It also turns exceptions of the inner layers into problems, so that every caller gets one.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from cow_service.observability.metrics import Metrics
 
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 UNMATCHED = "unmatched"
-LEFT = 499  # nothing was sent: the caller left, or the server stopped
-MOST_PATH = 500  # characters of a path in a log
+CLIENT_CLOSED = 499  # nothing was sent: the caller disconnected, or the server stopped
+MAX_PATH = 500  # characters of a path in a log
 
 log = logging.getLogger("cow_service")
 access = logging.getLogger("cow_service.access")
 
 
-class Observer:
-    """ASGI middleware: observes each request from its first to its last byte.
+class AccessLog:
+    """ASGI middleware: records each request from its first to its last byte.
 
     `paths` gives the templates of all routes, for requests that were refused before the router saw them.
     """
@@ -61,13 +61,13 @@ class Observer:
         except Exception as error:
             if not status:
                 log.error("%s %s failed", scope["method"], _shown(scope), exc_info=error)
-                told = "The server met an error that it did not foresee; its log has the trace."
-                await respond(InternalError(told))(scope, receive, observed)
+                detail = "The server met an error that it did not foresee; its log has the trace."
+                await respond(InternalError(detail))(scope, receive, observed)
             elif not complete:
                 raise  # the server must break the connection off: the caller would take the part for the whole
             # Else the framework has answered and logged it, and raised it again only to tell the server.
         finally:
-            self._record(scope, status or LEFT, time.perf_counter() - started)
+            self._record(scope, status or CLIENT_CLOSED, time.perf_counter() - started)
 
     def _record(self, scope: Scope, status: int, seconds: float) -> None:
         method = scope["method"] if scope["method"] in METHODS else "other"
@@ -106,4 +106,4 @@ class Observer:
 
 def _shown(scope: Scope) -> str:
     """The path without its query, percent-encoded: nothing in it can end a line of a log."""
-    return quote(scope["path"][:MOST_PATH], safe="/:@!$&'()*+,;=~")
+    return quote(scope["path"][:MAX_PATH], safe="/:@!$&'()*+,;=~")

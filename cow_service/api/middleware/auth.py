@@ -1,4 +1,4 @@
-"""Who may call: where the server has keys, nothing but the probes is served without one."""
+"""API keys: where the server has any, only the probes are served without one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cow_service.api.middleware.rate_limit import Buckets, address_of, is_probe,
 from cow_service.api.problems import respond
 from cow_service.errors import CowError, Unauthorized
 
-MOST_FAILURES = 30  # a minute from one address, before the answer is to wait
+MAX_FAILURES = 30  # per minute from one address, before it is told to wait
 
 
 class ApiKeys:
@@ -23,7 +23,7 @@ class ApiKeys:
     def __init__(self, app: ASGIApp, keys: KeyRing, count_failures: bool) -> None:
         self.app = app
         self.keys = keys
-        self._failures = Buckets(MOST_FAILURES) if count_failures else None
+        self._failures = Buckets(MAX_FAILURES) if count_failures else None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Passes a request on with its owner, or refuses it."""

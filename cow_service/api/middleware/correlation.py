@@ -1,4 +1,4 @@
-"""The ids of a request: told to logs and traces while it runs, and to its caller whatever comes out."""
+"""The ids of a request: in its logs and traces, and in its response."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class Correlation:
         headers = Headers(scope=scope)
         given = headers.get("x-request-id", "")
         request_id = given if _REQUEST_ID.fullmatch(given) else secrets.token_hex(16)
-        parent = context.parse_traceparent(headers.get("traceparent", ""))
-        with tracing.request_span(scope["method"], parent) as here, context.bound(request=request_id):
+        with tracing.request_span(scope["method"], headers.get("traceparent")), context.bound(request=request_id):
+            traceparent = context.traceparent() or ""
 
             async def tagged(message: Message) -> None:
                 if message["type"] == "http.response.start":
-                    told = MutableHeaders(scope=message)
-                    told["X-Request-Id"] = request_id
-                    told["traceparent"] = here.traceparent
-                    told["X-Content-Type-Options"] = "nosniff"
+                    response = MutableHeaders(scope=message)
+                    response["X-Request-Id"] = request_id
+                    response["traceparent"] = traceparent
+                    response["X-Content-Type-Options"] = "nosniff"
                 await send(message)
 
             await self.app(scope, receive, tagged)

@@ -1,4 +1,4 @@
-"""API keys: made at random, kept by the server as hashes only, found again in constant time."""
+"""API keys: made at random, stored as hashes only, compared in constant time."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from hashlib import sha256
 
 PREFIX = "cow_"  # lets scanners for leaked secrets know one
-ENTROPY = 32  # bytes
+ENTROPY_BYTES = 32
 
 
 def new_key() -> str:
     """A fresh key, random enough that guessing is hopeless and a plain SHA-256 hides it."""
-    return PREFIX + secrets.token_urlsafe(ENTROPY)
+    return PREFIX + secrets.token_urlsafe(ENTROPY_BYTES)
 
 
 def hash_of(key: str) -> str:
@@ -23,7 +23,7 @@ def hash_of(key: str) -> str:
 
 
 class KeyRing:
-    """The keys that a server knows, by the name of their owner. It holds hashes, never a key."""
+    """The hashes of a server's keys, by the name of their owner."""
 
     def __init__(self, hashes: Mapping[str, str]) -> None:
         self._hashes = {name: value.lower().encode() for name, value in hashes.items()}
@@ -35,7 +35,7 @@ class KeyRing:
         """The owner's name, or None where nobody has that key."""
         asked = hash_of(key).encode()
         owner = None
-        for name, known in self._hashes.items():  # all of them: how long it takes tells nothing
+        for name, known in self._hashes.items():  # all of them, so that the time is always the same
             if hmac.compare_digest(asked, known):
                 owner = name
         return owner

@@ -1,7 +1,7 @@
-"""What stands around the routes, in order, and what it adds to the contract.
+"""The middleware around the routes, from the outside in.
 
 Correlation   ids of the request, on every response
-Observer      log line, metrics, span; answers for faults of what follows
+AccessLog     log line, metrics, span; answers for faults of what follows
 Origins       web pages that may not use the server
 CORS          headers for those that may
 (framework)   faults of what follows become problems
@@ -14,19 +14,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any
 
 from fastapi import FastAPI
 from starlette.types import ASGIApp
 
-from cow_service.api.middleware.access_log import Observer
+from cow_service.api.middleware.access_log import AccessLog
 from cow_service.api.middleware.auth import ApiKeys
 from cow_service.api.middleware.correlation import Correlation
 from cow_service.api.middleware.keys import KeyRing
 from cow_service.api.middleware.origins import Origins, cors, is_loopback
-from cow_service.api.middleware.rate_limit import PROBES, RateLimit
-from cow_service.api.problems import documented
-from cow_service.errors import OriginNotAllowed, RateLimited, Unauthorized
+from cow_service.api.middleware.rate_limit import RateLimit
 from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings
 
@@ -54,29 +51,12 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
     def surround(stack: ASGIApp) -> ASGIApp:
         stack = cors(stack, settings.cors_origins)
         stack = Origins(stack, settings.cors_origins, only_local=not keys and is_loopback(settings.host))
-        return Correlation(Observer(stack, metrics, paths=lambda: app.openapi()["paths"]))
+        return Correlation(AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"]))
 
     app.surround = surround
 
 
-def tell_if_open(settings: Settings) -> None:
-    """Says in the log where nothing keeps strangers from the server."""
+def warn_if_open(settings: Settings) -> None:
+    """Logs a warning where anybody who reaches the server can use it."""
     if not settings.api_keys and not is_loopback(settings.host):
         log.warning("COW_API_KEYS is not set: whoever reaches %s can use this server.", settings.host)
-
-
-def document_layers(document: dict[str, Any]) -> None:
-    """Adds keys, and what the layers may answer, to each operation of the contract."""
-    scheme = {"type": "http", "scheme": "bearer", "description": "Needed where the server has COW_API_KEYS."}
-    document["components"]["securitySchemes"] = {"key": scheme}
-    for path, operations in document["paths"].items():
-        for operation in operations.values():
-            probe = path in PROBES
-            operation["security"] = [] if probe else [{"key": []}, {}]
-            refusals = (OriginNotAllowed,) if probe else (Unauthorized, OriginNotAllowed, RateLimited)
-            responses = operation["responses"]
-            for status, response in documented(*refusals).items():
-                known = responses.setdefault(str(status), response)
-                if known is not response:
-                    known["description"] += ", " + response["description"]
-            operation["responses"] = dict(sorted(responses.items()))

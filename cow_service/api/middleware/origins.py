@@ -19,7 +19,7 @@ from cow_service.api.problems import respond
 from cow_service.errors import OriginNotAllowed
 
 METHODS = ("GET", "HEAD", "POST", "DELETE")
-SENT = (
+REQUEST_HEADERS = (
     "Authorization",
     "Content-Type",
     "Idempotency-Key",
@@ -29,9 +29,9 @@ SENT = (
     "X-Request-Id",
     "traceparent",
 )
-SHOWN = ("X-Request-Id", "Location", "Retry-After", "traceparent")
+RESPONSE_HEADERS = ("X-Request-Id", "Location", "Retry-After", "traceparent")
 _PORT = re.compile(r":\d*$", re.ASCII)
-_PORTS = {"http": ":80", "https": ":443"}  # browsers leave them out
+_DEFAULT_PORTS = {"http": ":80", "https": ":443"}  # browsers leave them out
 
 
 def cors(app: ASGIApp, allowed: Collection[str]) -> ASGIApp:
@@ -39,7 +39,11 @@ def cors(app: ASGIApp, allowed: Collection[str]) -> ASGIApp:
     if not allowed:
         return app
     return CORSMiddleware(
-        app, allow_origins=tuple(allowed), allow_methods=METHODS, allow_headers=SENT, expose_headers=SHOWN
+        app,
+        allow_origins=tuple(allowed),
+        allow_methods=METHODS,
+        allow_headers=REQUEST_HEADERS,
+        expose_headers=RESPONSE_HEADERS,
     )
 
 
@@ -101,5 +105,5 @@ class Origins:
 def _is_own(origin: str, host: str) -> bool:
     """Whether a page was served under the very name and port that it asks."""
     scheme, _, place = origin.partition("://")
-    port = _PORTS.get(scheme, "")
+    port = _DEFAULT_PORTS.get(scheme, "")
     return bool(place) and place == (host.removesuffix(port) if port else host)

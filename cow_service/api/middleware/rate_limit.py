@@ -1,4 +1,4 @@
-"""How often one caller may ask: token buckets in this process, and the middleware that holds callers to them."""
+"""Rate limit: a token bucket for each caller, in this process."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from cow_service.api.problems import respond
 from cow_service.errors import RateLimited
 
-MOST_CALLERS = 10_000  # remembered; past that the one who has been silent longest starts anew
+MAX_CALLERS = 10_000  # remembered; beyond that the one that has been idle longest gets a full bucket
 PROBES = frozenset({"/livez", "/readyz"})
 
 
 def is_probe(scope: Scope) -> bool:
-    """Whether a request is one that whoever watches over the process must always get through."""
+    """Whether a request is a health probe, which must always be served."""
     return scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and scope["path"] in PROBES
 
 
@@ -37,7 +37,7 @@ def address_of(scope: Scope) -> str:
 class Buckets:
     """A token bucket for each caller, full at first. For the event loop alone: it takes no lock."""
 
-    def __init__(self, per_minute: int, most: int = MOST_CALLERS, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, per_minute: int, most: int = MAX_CALLERS, clock: Callable[[], float] = time.monotonic) -> None:
         self.per_minute = per_minute
         self._rate = per_minute / 60  # tokens per second
         self._most = most

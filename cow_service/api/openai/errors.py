@@ -1,8 +1,7 @@
-"""Errors under `/v1`: the house's problems, and in each the member `error` that OpenAI's clients read."""
+"""Errors under `/v1`: problems as elsewhere, each with the member `error` that OpenAI's clients read."""
 
 from __future__ import annotations
 
-import json
 import re
 from http import HTTPStatus
 from typing import Any
@@ -12,7 +11,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cow_service.api.openai.records import ChatError, ChatProblem
 from cow_service.api.problems import MEDIA_TYPE
-from cow_service.problems import TYPE_PREFIX
+from cow_service.errors import TYPE_PREFIX
 from cow_service.records import Problem
 
 ROOT = "/v1/"
@@ -36,20 +35,20 @@ def chat_problem(problem: Problem) -> ChatProblem:
 
 
 class ChatProblems:
-    """ASGI middleware, around all others: whoever refuses a request under `/v1`, OpenAI's clients can read why."""
+    """ASGI middleware, the outermost: adds the member `error` to every problem under `/v1`."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes a request on; a problem that is answered waits here until it is whole."""
+        """Passes a request on; a response that is a problem is buffered and extended."""
         if scope["type"] != "http" or not scope["path"].startswith(ROOT):
             await self.app(scope, receive, send)
             return
         start: Message | None = None
         body = b""
 
-        async def told(message: Message) -> None:
+        async def extended(message: Message) -> None:
             nonlocal start, body
             if message["type"] == "http.response.start" and _is_problem(message):
                 start = message
@@ -63,15 +62,17 @@ class ChatProblems:
                     await send(start)
                     await send({**message, "body": text})
 
-        await self.app(scope, receive, told)
+        await self.app(scope, receive, extended)
 
 
 def document_problems(document: dict[str, Any]) -> None:
     """Puts their shape into the contract."""
-    schema = json.dumps({"$ref": "#/components/schemas/Problem"})
-    own = json.dumps({"$ref": f"#/components/schemas/{ChatProblem.__name__}"})
-    for path in [path for path in document["paths"] if path.startswith(ROOT)]:
-        document["paths"][path] = json.loads(json.dumps(document["paths"][path]).replace(schema, own))
+    reference = {"$ref": f"#/components/schemas/{ChatProblem.__name__}"}
+    for path, operations in document["paths"].items():
+        for operation in operations.values() if path.startswith(ROOT) else ():
+            for response in operation["responses"].values():
+                if problem := response.get("content", {}).get(MEDIA_TYPE):
+                    problem["schema"] = reference
 
 
 def _is_problem(start: Message) -> bool:

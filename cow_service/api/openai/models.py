@@ -39,8 +39,8 @@ def answerer(service: Service, model: str) -> Answerer:
     """Who answers under that name. Raises `ModelNotFound`."""
     known = answerers(service)
     if model not in known:
-        told = f"There is no model '{shortened(model, SHOWN_CHARACTERS)}'. There are: {', '.join(known)}."
-        raise ModelNotFound(told, errors=(FieldError("/model", "no model has that name"),))
+        detail = f"There is no model '{shortened(model, SHOWN_CHARACTERS)}'. There are: {', '.join(known)}."
+        raise ModelNotFound(detail, errors=(FieldError("/model", "no model has that name"),))
     return known[model]
 
 

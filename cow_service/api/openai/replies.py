@@ -8,7 +8,7 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any
 
-from cow_service.api.openai.reading import Chat
+from cow_service.api.openai.parsing import ParsedChat
 from cow_service.api.openai.records import ChatChoice, ChatDelta, ChatProgress, ChatReply, ChatUsage, ChunkChoice
 from cow_service.records import Job
 
@@ -17,22 +17,19 @@ SEPARATORS = (",", ":")
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a job came to, for the caller of a chat.
+class ChatAnswer:
+    """The result of a chat's job. The `Answer` is plain values: validating its numbers again would take long."""
 
-    It holds the `Answer` as values: checking its thousands of numbers once more would take long.
-    """
-
-    chat: Chat
+    chat: ParsedChat
     answer: dict[str, Any]
 
     @classmethod
-    def of(cls, chat: Chat, result: str) -> Told:
-        """The result of a job. This computes: not for the event loop."""
+    def parse(cls, chat: ParsedChat, result: str) -> ChatAnswer:
+        """The result of a job as JSON, parsed. CPU work: not for the event loop."""
         answer = json.loads(result)
         content = _content(answer)
-        cut = chat.most_tokens is not None and len(content.split()) > chat.most_tokens
-        warnings = (f"The answer is longer than {chat.most_tokens} tokens: answers are not cut.",) if cut else ()
+        too_long = chat.max_tokens is not None and len(content.split()) > chat.max_tokens
+        warnings = (f"The answer is longer than {chat.max_tokens} tokens: answers are not cut.",) if too_long else ()
         answer["warnings"] = [*chat.warnings, *warnings, *answer["warnings"]]
         return cls(chat, answer)
 
@@ -51,8 +48,8 @@ class Told:
         """A `ChatCompletion` as JSON."""
         head = _head(self.answer["id"], "chat.completion", self.answer["created_at"], self.chat.model)
         choice = ChatChoice(message=self.reply)
-        told = {"choices": [choice.model_dump()], "usage": self.usage.model_dump(), "cow": self.answer}
-        return json.dumps(head | told, separators=SEPARATORS, ensure_ascii=False)
+        body = {"choices": [choice.model_dump()], "usage": self.usage.model_dump(), "cow": self.answer}
+        return json.dumps(head | body, separators=SEPARATORS, ensure_ascii=False)
 
 
 @dataclass(frozen=True)
@@ -64,23 +61,23 @@ class Chunks:
     model: str
 
     def first(self, job: Job) -> str:
-        """Says who speaks, and that the job is there."""
+        """The role of the message, and the job."""
         return self._chunk(ChatDelta(role="assistant", content=""), cow=_progress(job))
 
     def progress(self, job: Job) -> str:
-        """Adds nothing to the message."""
+        """Progress only: adds nothing to the message."""
         return self._chunk(ChatDelta(), cow=_progress(job))
 
-    def answer(self, told: Told) -> list[str]:
-        """The message, its end, and its tokens where they were asked for. This computes: not for the event loop."""
-        reply = told.reply
+    def answer(self, answer: ChatAnswer) -> list[str]:
+        """The message, its end, and its tokens where they were asked for. CPU work: not for the event loop."""
+        reply = answer.reply
         chunks: list[str] = []
         if reply.reasoning_content is not None:
             chunks.append(self._chunk(ChatDelta(reasoning_content=reply.reasoning_content)))
         chunks.append(self._chunk(ChatDelta(content=reply.content)))
-        chunks.append(self._chunk(ChatDelta(), finish_reason="stop", cow=told.answer))
-        if told.chat.with_usage:
-            chunks.append(self._write([], usage=told.usage.model_dump()))
+        chunks.append(self._chunk(ChatDelta(), finish_reason="stop", cow=answer.answer))
+        if answer.chat.with_usage:
+            chunks.append(self._write([], usage=answer.usage.model_dump()))
         return chunks
 
     def _chunk(self, delta: ChatDelta, *, finish_reason: Any = None, **others: Any) -> str:
@@ -90,8 +87,8 @@ class Chunks:
 
     def _write(self, choices: list[dict[str, Any]], **others: Any) -> str:
         head = _head(self.job, "chat.completion.chunk", self.created_at, self.model)
-        told = {"choices": choices, "usage": None} | others
-        return json.dumps(head | told, separators=SEPARATORS, ensure_ascii=False)
+        body = {"choices": choices, "usage": None} | others
+        return json.dumps(head | body, separators=SEPARATORS, ensure_ascii=False)
 
 
 def _head(job: str, kind: str, created_at: str, model: str) -> dict[str, Any]:

@@ -13,9 +13,9 @@ from pydantic_core import CoreSchema, core_schema
 from cow_service.records import Record
 from cow_service.requests import Finite, Flag, Whole
 
-MOST_MESSAGES = 1000
-MOST_PARTS = 1000  # of one message
-LONGEST_NAME = 300  # characters of a model's name
+MAX_MESSAGES = 1000
+MAX_PARTS = 1000  # of one message
+MAX_NAME = 300  # characters of a model's name
 
 Role = Literal["system", "developer", "user", "assistant"]
 PartType = Literal["text", "image_url"]
@@ -68,7 +68,7 @@ class ChatPart(Record):
         return self
 
 
-Parts = Annotated[tuple[ChatPart, ...], Field(fail_fast=True, max_length=MOST_PARTS)]
+Parts = Annotated[tuple[ChatPart, ...], Field(fail_fast=True, max_length=MAX_PARTS)]
 Content = Annotated[
     Parts | None,
     BeforeValidator(
@@ -119,9 +119,9 @@ class ChatRequest(Record):
     asks for something, a warning in `cow.warnings` of the answer says that it was not done.
     """
 
-    model: str = Field(max_length=LONGEST_NAME, description="One of `GET /v1/models`.")
+    model: str = Field(max_length=MAX_NAME, description="One of `GET /v1/models`.")
     messages: tuple[ChatMessage, ...] = Field(
-        max_length=MOST_MESSAGES,
+        max_length=MAX_MESSAGES,
         description="With exactly one image, in a user message.",
         json_schema_extra={"minItems": 1},  # checked with the image: one wrong message must not look like none
     )

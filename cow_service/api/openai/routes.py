@@ -14,14 +14,14 @@ from pydantic.json_schema import JsonSchemaMode
 from cow_service import errors
 from cow_service.api.openai.errors import ROOT, document_problems
 from cow_service.api.openai.models import answerer, usable
-from cow_service.api.openai.reading import ELSEWHERE, Chat, read_chat
+from cow_service.api.openai.parsing import FIELDS_OF_CHAT, ParsedChat, parse_chat
 from cow_service.api.openai.records import ChatChunk, ChatCompletion, ChatModel, ChatModels, ChatProblem
-from cow_service.api.openai.replies import Told
+from cow_service.api.openai.replies import ChatAnswer
 from cow_service.api.openai.requests import ChatRequest
 from cow_service.api.openai.stream import stream
 from cow_service.api.problems import documented
-from cow_service.api.routes.simulate import ACCEPTED, FAILURES, STATED
-from cow_service.api.submission import Asked, Submitting, json_response
+from cow_service.api.routes.simulate import ACCEPTED, FAILURES, PREFERENCES
+from cow_service.api.submission import Submission, Submitter, json_response
 from cow_service.errors import BodyTypeUnsupported, CowError, shortened
 from cow_service.requests import AnswerRequest
 
@@ -46,10 +46,10 @@ RECORDS: tuple[tuple[type[BaseModel], JsonSchemaMode], ...] = (
 )
 
 
-def chat_routes(submitting: Submitting) -> APIRouter:
+def chat_routes(submitter: Submitter) -> APIRouter:
     """The operations, bound to an engine."""
     router = APIRouter(prefix=ROOT.rstrip("/"), tags=[TAG])
-    engine = submitting.engine
+    engine = submitter.engine
     created = int(time.time())
 
     @router.post(
@@ -70,7 +70,7 @@ def chat_routes(submitting: Submitting) -> APIRouter:
                 "required": True,
                 "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=ChatRequest.__name__)}}},
             },
-            "parameters": STATED,
+            "parameters": PREFERENCES,
         },
     )
     async def chat(request: Request) -> Response:
@@ -79,13 +79,13 @@ def chat_routes(submitting: Submitting) -> APIRouter:
         `cow` in the request holds all else that `/answer` takes, and `cow` in the response all that it returns. A job
         that fails while it streams ends the stream with its problem as `data`.
         """
-        asked = submitting.asked(request, "answer")
+        submission = submitter.submission(request, "answer")
         body = await _body(request)
-        read = await submitting.apart(partial(read_chat, body, engine.service))
+        parsed = await submitter.in_thread(partial(parse_chat, body, engine.service))
         try:
-            return await _answered(submitting, request, asked, read)
+            return await _answered(submitter, request, submission, parsed)
         except CowError as error:
-            raise read.places.moved(error) from error
+            raise parsed.pointers.translate_error(error) from error
 
     @router.get("/models", operation_id="chatModels", summary="Models to chat with")
     def models() -> ChatModels:
@@ -118,7 +118,7 @@ def document_chat(document: dict[str, Any]) -> None:
         "type": "object",
         "additionalProperties": False,
         "description": "An `AnswerRequest` without what messages and model say.",
-        "properties": {name: schema for name, schema in others.items() if name not in ELSEWHERE},
+        "properties": {name: schema for name, schema in others.items() if name not in FIELDS_OF_CHAT},
     }
     own = schemas[ChatRequest.__name__]["properties"]["cow"]
     own["anyOf"] = [{"$ref": REFERENCE.format(model=EXTENSION)}, {"type": "null"}]
@@ -134,12 +134,12 @@ async def _body(request: Request) -> bytes:
     return await request.body()
 
 
-async def _answered(submitting: Submitting, request: Request, asked: Asked, chat: Chat) -> Response:
-    """The response to a chat that was read. Errors point into its `AnswerRequest`."""
+async def _answered(submitter: Submitter, request: Request, submission: Submission, chat: ParsedChat) -> Response:
+    """The response to a chat. Errors point into its `AnswerRequest`."""
     if chat.stream:
-        is_new = await submitting.take(asked, lambda: (chat.request, None))
-        return stream(submitting, asked, chat, is_new)
-    result = await submitting.result(request, asked, lambda: (chat.request, None))
+        created_at = await submitter.submit(submission, lambda: (chat.request, None))
+        return stream(submitter, submission, chat, created_at)
+    result = await submitter.result(request, submission, lambda: (chat.request, None))
     if result is None:
-        return await submitting.accepted(asked)
-    return json_response(await to_thread.run_sync(lambda: Told.of(chat, result).completion()))
+        return await submitter.accepted(submission)
+    return json_response(await to_thread.run_sync(lambda: ChatAnswer.parse(chat, result).completion()))

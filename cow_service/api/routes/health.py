@@ -1,16 +1,18 @@
-"""`GET /livez`, `GET /readyz` and `GET /models`."""
+"""`GET /livez`, `GET /readyz`, `GET /models` and `GET /metrics`."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 from fastapi import APIRouter
+from fastapi.responses import PlainTextResponse, Response
 from pydantic import BaseModel
 
 from cow_service import errors
 from cow_service.api.problems import documented
-from cow_service.jobs.engine import Engine
+from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
+from cow_service.observability.metrics import MEDIA_TYPE
 from cow_service.records import Models
 
 
@@ -20,8 +22,8 @@ class Health(BaseModel):
     status: Literal["ok"] = "ok"
 
 
-def health_routes(engine: Engine, readiness: Readiness) -> APIRouter:
-    """Probes and the list of backends, bound to an engine and what it needs."""
+def health_routes(engine: JobEngine, readiness: Readiness) -> APIRouter:
+    """Probes, backends and metrics, bound to an engine and what it needs."""
     router = APIRouter()
 
     @router.get("/livez", operation_id="livez", tags=["health"], summary="The process answers")
@@ -54,5 +56,16 @@ def health_routes(engine: Engine, readiness: Readiness) -> APIRouter:
     def models() -> Models:
         """What each is, what it needs, and whether it is ready."""
         return engine.service.models()
+
+    @router.get(
+        "/metrics",
+        operation_id="metrics",
+        tags=["health"],
+        summary="Counters for Prometheus",
+        response_class=PlainTextResponse,
+    )
+    def metrics() -> Response:
+        """Requests, stages, jobs, queues, memory of the process and of its GPUs, in Prometheus' text format."""
+        return Response(engine.service.metrics.exposition(), headers={"Content-Type": MEDIA_TYPE})
 
     return router

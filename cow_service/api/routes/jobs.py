@@ -1,24 +1,42 @@
-"""`GET /jobs`, `GET /jobs/{id}`, its cancellation and deletion."""
+"""`GET /jobs`, `GET /jobs/{id}`, its events, cancellation and deletion."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import AsyncGenerator
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from anyio import to_thread
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 from pydantic import AwareDatetime
+from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from cow_service import errors
 from cow_service.api.problems import documented
 from cow_service.api.submission import json_response, owner_of
-from cow_service.jobs.engine import Engine
-from cow_service.jobs.reports import Filters
-from cow_service.records import Job, JobKind, JobPage, JobStatus
+from cow_service.jobs.engine import JobEngine
+from cow_service.jobs.events import END, follow
+from cow_service.jobs.state import JobFilters
+from cow_service.records import TERMINAL, Job, JobKind, JobPage, JobStatus
 
 JobId = Annotated[str, Path(max_length=64, pattern=r"^[A-Za-z0-9-]+$", description="As the job says.")]
 GONE = (errors.JobNotFound, errors.InvalidRequest, errors.StorageUnavailable)
 
+PING_SECONDS = 15  # between comments that keep the connection open
 
-def job_routes(engine: Engine) -> APIRouter:
+EVENT: dict[str, Any] = {
+    "type": "object",
+    "required": ["event", "data"],
+    "properties": {
+        "event": {
+            "enum": ["queued", "running", "stage", "progress", "succeeded", "failed", "canceled", "deleted"],
+        },
+        "id": {"type": "string", "description": "Not of `progress`."},
+        "data": {"type": "string", "contentMediaType": "application/json", "description": "A `Job`, or `{}`."},
+    },
+}
+
+
+def job_routes(engine: JobEngine) -> APIRouter:
     """The operations, bound to an engine. A caller sees the jobs of its own key alone."""
     router = APIRouter(tags=["jobs"])
 
@@ -40,7 +58,7 @@ def job_routes(engine: Engine) -> APIRouter:
         ] = None,
     ) -> JobPage:
         """Without their results. Jobs that come or go between two pages are neither shown twice nor hide others."""
-        filters = Filters(tuple(status or ()), kind, created_after, created_before, limit, cursor)
+        filters = JobFilters(tuple(status or ()), kind, created_after, created_before, limit, cursor)
         return engine.page(owner_of(request), filters)
 
     @router.get("/jobs/{id}", operation_id="job", summary="A job", response_model=Job, responses=documented(*GONE))
@@ -69,5 +87,41 @@ def job_routes(engine: Engine) -> APIRouter:
     def delete(request: Request, id: JobId) -> None:
         """Ends it first where it has not ended. Its artifacts go unless another job holds them."""
         engine.delete(id, owner_of(request))
+
+    @router.get(
+        "/jobs/{id}/events",
+        operation_id="events",
+        summary="Follow a job",
+        response_class=Response,
+        responses={
+            200: {
+                "description": "`queued`, `running`, `stage` (one is done), `progress`, then `succeeded`, `failed`, "
+                "`canceled` or `deleted`. The data is the job without its result.",
+                "content": {"text/event-stream": {"schema": EVENT}},
+            },
+            204: {"description": "The job has ended, and the caller has heard of it: no need to come back."},
+            **documented(*GONE),
+        },
+    )
+    async def events(
+        request: Request,
+        id: JobId,
+        last_event_id: Annotated[str | None, Header(description="The id of the last event that was heard.")] = None,
+    ) -> Response:
+        """Events have ids, the same after a restart of the server; progress has none and is not repeated."""
+        owner = owner_of(request)
+        found = await to_thread.run_sync(lambda: engine.find(id, owner, full=False))
+        seen = last_event_id or ""
+        after = int(seen) if seen.isascii() and seen.isdigit() and len(seen) < 10 else 0
+        if after >= END and found.job.status in TERMINAL:
+            return Response(status_code=204)
+
+        async def stream() -> AsyncGenerator[ServerSentEvent]:
+            async for event in follow(engine, id, owner, after):
+                data = "{}" if event.job is None else event.job.model_dump_json()
+                number = None if event.number is None else str(event.number)
+                yield ServerSentEvent(data, event=event.name, id=number, sep="\n")
+
+        return EventSourceResponse(stream(), ping=PING_SECONDS, sep="\n", headers={"Cache-Control": "no-store"})
 
     return router

@@ -1,4 +1,4 @@
-"""`POST /simulate`."""
+"""`POST /simulate` and `POST /answer`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from fastapi import APIRouter, Request, Response
 from cow_service import errors
 from cow_service.api.body import body_of
 from cow_service.api.problems import documented
-from cow_service.api.submission import Submitting
-from cow_service.records import Job, Simulation
-from cow_service.requests import SimulateRequest
+from cow_service.api.submission import Submitter
+from cow_service.records import Answer, Job, Simulation
+from cow_service.requests import AnswerRequest, SimulateRequest
 
 FAILURES = (
     errors.MalformedBody,
@@ -63,15 +63,15 @@ def _header(name: str, description: str) -> dict[str, Any]:
     return {"name": name, "in": "header", "required": False, "description": description, "schema": {"type": "string"}}
 
 
-STATED = [
+PREFERENCES = [
     _header("Prefer", "`respond-async`: answer with the job at once; `wait=N`: after N seconds (RFC 7240)."),
     _header("Idempotency-Key", "The same key and body come to the same job, however often they are sent."),
     _header("Cache-Control", "`no-cache`: take no results of earlier requests."),
 ]
 
 
-def simulate_routes(submitting: Submitting) -> APIRouter:
-    """The operation, bound to an engine."""
+def simulate_routes(submitter: Submitter) -> APIRouter:
+    """The operations, bound to an engine."""
     router = APIRouter()
 
     @router.post(
@@ -81,7 +81,7 @@ def simulate_routes(submitting: Submitting) -> APIRouter:
         tags=["simulation"],
         summary="Imagine the future of an image",
         responses={**ACCEPTED, **documented(*FAILURES)},
-        openapi_extra={"requestBody": body_of(SimulateRequest), "parameters": STATED},
+        openapi_extra={"requestBody": body_of(SimulateRequest), "parameters": PREFERENCES},
     )
     async def simulate(request: Request) -> Response:
         """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once.
@@ -89,6 +89,22 @@ def simulate_routes(submitting: Submitting) -> APIRouter:
         A caller who closes the connection ends the work, a video model after the step that it is in, unless a header
         `Prefer` or `Idempotency-Key` says that somebody comes back.
         """
-        return await submitting.run(request, "simulate", SimulateRequest)
+        return await submitter.run(request, "simulate", SimulateRequest)
+
+    @router.post(
+        "/answer",
+        operation_id="answer",
+        response_model=Answer,
+        tags=["answering"],
+        summary="Look, then answer",
+        responses={**ACCEPTED, **documented(*FAILURES)},
+        openapi_extra={"requestBody": body_of(AnswerRequest), "parameters": PREFERENCES},
+    )
+    async def answer(request: Request) -> Response:
+        """Imagines the future of the image, then has the reader answer the question from the image and those frames.
+
+        A simulation that fails does not lose the answer: it is then given from the image alone, and `warnings` says so.
+        """
+        return await submitter.run(request, "answer", AnswerRequest)
 
     return router

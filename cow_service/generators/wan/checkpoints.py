@@ -1,6 +1,6 @@
-"""Loads Wan transformers from every form in which their weights are published, and refuses what does not fit exactly.
+"""Loads Wan transformers from every format in which their weights are published; refuses what does not fit exactly.
 
-Forms: a diffusers folder; the original folder (class `WanModel`, sharded, original names); one safetensors file in
+Formats: a diffusers folder; the original folder (class `WanModel`, sharded, original names); one safetensors file in
 either naming, in any floating type, fp8 with or without scales, with or without a prefix. Names and shapes are compared
 with the model's before a single weight is read. Safetensors only: a pickle can run code, and is never opened.
 """
@@ -29,7 +29,6 @@ SCALE = ".scale_weight"  # one number per fp8 weight: what it is multiplied by
 UNUSED = (".scale_input", "scaled_fp8")  # for fp8 arithmetic, and the marker that scales are there
 PICKLES = {".pth", ".pt", ".bin", ".ckpt", ".pkl", ".pickle"}
 FLOATING = {"F64", "F32", "F16", "BF16", "F8_E4M3", "F8_E5M2"}
-SHOWN = 8  # names per kind in an error
 IMAGE_DIM = 1280  # of the image encoder, fixed in the original models
 IN_CHANNELS = 36  # noise, mask and image
 TEXT_LENGTH = 512  # tokens, fixed by the model
@@ -58,9 +57,9 @@ def load_transformer(
     folder, files = checkpoint_files(path)
     config, original = _configuration(folder, architecture)
     entries = _headers(files)
-    model = _empty(config)
-    plan = _plan(entries, model.state_dict(), original)
-    _fill(model, plan, entries, dtype, device)
+    model = _empty_model(config)
+    sources = _match_names(entries, model.state_dict(), original)
+    _load_weights(model, sources, entries, dtype, device)
     return model.eval().requires_grad_(False)
 
 
@@ -179,7 +178,7 @@ def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
     return entries
 
 
-def _empty(config: dict[str, Any]) -> WanTransformer3DModel:
+def _empty_model(config: dict[str, Any]) -> WanTransformer3DModel:
     try:
         with init_empty_weights():
             return WanTransformer3DModel(**config)
@@ -187,22 +186,20 @@ def _empty(config: dict[str, Any]) -> WanTransformer3DModel:
         raise CheckpointInvalid(f"The configuration does not make a Wan transformer: {error}.") from error
 
 
-def _plan(entries: dict[str, _Entry], wanted: Mapping[str, Tensor], original: bool | None) -> dict[str, str]:
-    """For each of the model's names, the checkpoint's. Raises `CheckpointInvalid` for all that does not fit."""
+def _match_names(entries: dict[str, _Entry], wanted: Mapping[str, Tensor], original: bool | None) -> dict[str, str]:
+    """For each of the model's names, the checkpoint's. Raises `CheckpointInvalid` listing all that does not fit."""
     weights = {name for name in entries if not name.endswith((SCALE, *UNUSED))}
     if original is None:
         original = not any(name.startswith("condition_embedder.") for name in weights)
-    # The converter renames keys and looks at no value of this model: names stand in for the tensors.
-    names = {name: name for name in sorted(weights)}
-    plan = cast("dict[str, str]", convert_wan_transformer_to_diffusers(dict(names)) if original else names)
-    unknown = sorted(set(plan.values()) - {plan[name] for name in plan.keys() & wanted.keys()})
-    unknown += sorted(weights - set(plan.values()))  # two names became one
+    sources = diffusers_names(sorted(weights)) if original else {name: name for name in sorted(weights)}
+    unknown = sorted(set(sources.values()) - {sources[name] for name in sources.keys() & wanted.keys()})
+    unknown += sorted(weights - set(sources.values()))  # two names became one
     unknown += sorted(n for n in entries if n.endswith(SCALE) and n.removesuffix(SCALE) + ".weight" not in weights)
-    missing = sorted(wanted.keys() - plan.keys())
+    missing = sorted(wanted.keys() - sources.keys())
     shapes = [
-        f"{plan[name]} is {list(entries[plan[name]].shape)}, not {list(tensor.shape)}"
+        f"{sources[name]} is {list(entries[sources[name]].shape)}, not {list(tensor.shape)}"
         for name, tensor in wanted.items()
-        if name in plan and entries[plan[name]].shape != tuple(tensor.shape)
+        if name in sources and entries[sources[name]].shape != tuple(tensor.shape)
     ]
     shapes += [
         f"{name} is {list(entry.shape)}, not one number"
@@ -210,16 +207,17 @@ def _plan(entries: dict[str, _Entry], wanted: Mapping[str, Tensor], original: bo
         if name.endswith(SCALE) and math.prod(entry.shape) != 1
     ]
     types = [f"{name} is {entries[name].dtype}" for name in sorted(weights) if entries[name].dtype not in FLOATING]
-    kinds = (("unknown", unknown), ("missing", missing), ("of another shape", shapes), ("not floating-point", types))
-    told = [f"{len(found)} {kind}: {listed(found)}" for kind, found in kinds if found]
-    if told:
-        raise CheckpointInvalid(f"The checkpoint does not fit the model. {'; '.join(told)}.")
-    return plan
+    misfits = counted({
+        "unknown": unknown, "missing": missing, "of another shape": shapes, "not floating-point": types,
+    })  # fmt: skip
+    if misfits:
+        raise CheckpointInvalid(f"The checkpoint does not fit the model. {misfits}.")
+    return sources
 
 
-def _fill(
+def _load_weights(
     model: WanTransformer3DModel,
-    plan: Mapping[str, str],
+    sources: Mapping[str, str],
     entries: Mapping[str, _Entry],
     dtype: torch.dtype,
     device: torch.device,
@@ -228,7 +226,7 @@ def _fill(
     precise = tuple(model._keep_in_fp32_modules or ())  # pyright: ignore[reportPrivateUsage]
     state: dict[str, Tensor] = {}
     for file in sorted({entry.file for entry in entries.values()}):
-        here = [(name, source) for name, source in plan.items() if entries[source].file == file]
+        here = [(name, source) for name, source in sources.items() if entries[source].file == file]
         try:
             with safe_open(file, framework="pt", device=str(device)) as opened:
                 for name, source in here:
@@ -241,7 +239,7 @@ def _fill(
         except (SafetensorError, OSError) as error:
             raise CheckpointInvalid(f"{file.name} is damaged ({_reason(error)}). Download it again.") from error
     model.load_state_dict(state, strict=True, assign=True)
-    cast(Any, model).to(device)  # the tables of the rotary embedding, which no checkpoint holds
+    cast(Any, model).to(device)  # for the tables of the rotary embedding, which no checkpoint holds
 
 
 def _scale(entry: _Entry, device: torch.device) -> Tensor:
@@ -254,7 +252,21 @@ def _unprefixed(key: str) -> str:
     return key.removeprefix(prefix)
 
 
-def listed(names: Sequence[str]) -> str:
-    """The first few of many names, and how many more there are."""
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+def diffusers_names(originals: Iterable[str]) -> dict[str, str]:
+    """Names of the original Wan checkpoint by their names in diffusers' model.
+
+    The second and third norm of a block are swapped there. diffusers' converter renames keys and reads no value of
+    this model, so names stand in for the tensors.
+    """
+    return cast("dict[str, str]", convert_wan_transformer_to_diffusers({name: name for name in originals}))
+
+
+def counted(kinds: Mapping[str, Sequence[str]]) -> str:
+    """For an error: how many names there are of each kind, and the first of them; empty where there are none."""
+    return "; ".join(f"{len(names)} {kind}: {listed(names)}" for kind, names in kinds.items() if names)
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """The first `most` names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

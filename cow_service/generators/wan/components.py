@@ -1,4 +1,4 @@
-"""Loads what stands around the transformer from a diffusers folder: VAE, text encoder, image encoder, tokenizer."""
+"""Loads the other parts from a diffusers folder: VAE, text encoder, image encoder, tokenizer, image processor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from transformers import AutoTokenizer, CLIPImageProcessor, CLIPVisionModel, UMT5EncoderModel
 
 from cow_service.errors import CheckpointInvalid
-from cow_service.generators.wan.checkpoints import listed
+from cow_service.generators.wan.checkpoints import counted
 from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
 
 
@@ -42,19 +42,12 @@ def assemble(
 
 
 def _model(kind: Any, base: Path, part: str, dtype: torch.dtype) -> Any:
-    """A model whose checkpoint fits it name by name: the libraries themselves only warn, and make up the rest."""
+    """A model whose checkpoint fits it name by name: the libraries only warn, and initialise the rest at random."""
     model, report = _part(kind, base, part, torch_dtype=dtype, use_safetensors=True, output_loading_info=True)
-    told = [
-        f"{len(report[key])} {word}: {listed(sorted(map(str, report[key])))}"
-        for key, word in (
-            ("unexpected_keys", "unknown"),
-            ("missing_keys", "missing"),
-            ("mismatched_keys", "of another shape"),
-        )
-        if report.get(key)
-    ]
-    if told:
-        raise CheckpointInvalid(f"The weights of '{part}' do not fit. {'; '.join(told)}.")
+    kinds = {"unknown": "unexpected_keys", "missing": "missing_keys", "of another shape": "mismatched_keys"}
+    misfits = counted({kind: sorted(map(str, report.get(key) or ())) for kind, key in kinds.items()})
+    if misfits:
+        raise CheckpointInvalid(f"The weights of '{part}' do not fit. {misfits}.")
     return model.eval().requires_grad_(False)
 
 

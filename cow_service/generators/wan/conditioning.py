@@ -1,24 +1,43 @@
-"""How tracks change the condition of Wan2.1's image-to-video model: 4 mask channels, then 16 latent channels.
+"""ATI and Wan-Move: how tracks change the condition of Wan2.1's image-to-video model.
 
-Both methods carry features of the image's own latent frame along the tracks; latent frame 0 stays as it is.
-Any device and dtype; computed in float32. Shapes: T latent frames of h x w cells, N tracks, and F = 4 (T - 1) + 1 clip
-frames.
+The condition [20, T, h, w] is 4 mask channels, then 16 latent channels. Both methods copy features of the image's own
+latent frame along the tracks; latent frame 0 is not changed. Any device and dtype; computed in float32.
+Shapes: T latent frames of h x w cells, N tracks, and F = 4 (T - 1) + 1 clip frames.
 
 Sources: the public implementations of ATI (arXiv 2505.22944) and Wan-Move (arXiv 2512.08765).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from cow_service.generators.wan.tracks import STRIDE
+from cow_service.generators.wan.tracks import STRIDE, Tracks, to_ati_file, to_ati_tensor
 
 MASK_CHANNELS = 4
 CELL = 8  # px of the clip per latent cell, each way
 SHARPNESS = 220.0  # of ATI's Gaussian; positions are in half short sides of the image
 NEAREST = 2  # tracks that count at a cell
+
+# (condition [20, T, h, w], tracks in px of the clip, its width, its height) -> guided and unconditional condition
+TrackConditioning: TypeAlias = Callable[[Tensor, Tracks, int, int], tuple[Tensor, Tensor]]
+
+
+def ati(condition: Tensor, tracks: Tracks, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """ATI: both passes are conditioned on the tracks."""
+    tensor = torch.from_numpy(to_ati_tensor(to_ati_file(tracks), width, height))
+    changed = ati_condition(condition, tensor)
+    return changed, changed
+
+
+def wan_move(condition: Tensor, tracks: Tracks, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Wan-Move: only the guided pass is conditioned on the tracks."""
+    points, visible = torch.from_numpy(tracks.points), torch.from_numpy(tracks.visible)
+    return wan_move_condition(condition, points, visible), condition
 
 
 def ati_condition(condition: Tensor, tracks: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 
 import numpy as np
 import torch
@@ -12,19 +13,20 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.errors import FieldError, InvalidRequest
-from cow_service.generators.base import Shot
-from cow_service.generators.wan.device import alone_on, on_threads, within_memory
-from cow_service.generators.wan.encodings import Encodings
-from cow_service.generators.wan.methods import Method
-from cow_service.generators.wan.pipeline import Guide, WanTrackPipeline, latent_shape
+from cow_service.generators.base import GeneratorInput
+from cow_service.generators.wan.conditioning import TrackConditioning
+from cow_service.generators.wan.embedding_cache import EmbeddingCache
+from cow_service.generators.wan.execution import exclusive_use, within_memory
+from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, latent_shape
 from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tracks import nearest_lengths, tracks_of
 from cow_service.records import GeneratorInfo
+from cow_service.weights.device import cpu_threads
 
-SIDE_UNIT = 16  # px: the sides of a clip are multiples of it
-LONGEST_SIDE = 1024 * SIDE_UNIT  # px: the model knows 1024 positions each way
-STEPS_SHARE = 0.9  # of the progress; the rest is decoding
+SIDE_MULTIPLE = 16  # px: the sides of a clip are multiples of it
+MAX_SIDE = 1024 * SIDE_MULTIPLE  # px: the model has 1024 positions each way
+DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
 
 Image = NDArray[np.uint8]
 
@@ -50,14 +52,24 @@ class Model:
     repository: str | None
     revision: str | None
     revisions: dict[str, str]  # of the other parts that were pulled
+    weights_identity: str  # as `weights.lock.weights_identity`, taken before the weights were loaded
     pipeline: WanTrackPipeline
     device: torch.device
     profile_name: str
     profile: Profile
-    method: Method
+    conditioning: TrackConditioning
     max_area: int  # px per frame
     negative_prompt: str
-    threads: int | None  # CPU threads; null leaves PyTorch's own number
+    threads: int | None  # CPU threads; None keeps PyTorch's own number
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of everything that decides a clip besides its input."""
+        parts = (
+            *(self.name, self.repository, self.revision, sorted(self.revisions.items()), self.weights_identity),
+            *(self.device.type, self.profile_name, self.profile.model_dump_json(), self.max_area, self.negative_prompt),
+        )
+        return sha256(repr(parts).encode()).hexdigest()
 
 
 class WanGenerator:
@@ -67,8 +79,9 @@ class WanGenerator:
     concurrency = 1
 
     def __init__(self, model: Model) -> None:
+        self.fingerprint = model.fingerprint
         self._model = model
-        self._encodings = Encodings(model.pipeline)
+        self._embeddings = EmbeddingCache(model.pipeline)
 
     def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
         """4n + 1 frames, 5 to 81."""
@@ -82,21 +95,23 @@ class WanGenerator:
         area = self._model.max_area
         sides = math.sqrt(area * width / height), math.sqrt(area * height / width)
         # The small term keeps an exact 480 from becoming 464 when the root is a hair below it.
-        across, down = (max(SIDE_UNIT, int(side / SIDE_UNIT + 1e-6) * SIDE_UNIT) for side in sides)
-        if max(across, down) > LONGEST_SIDE:
+        clip_width, clip_height = (
+            max(SIDE_MULTIPLE, int(side / SIDE_MULTIPLE + 1e-6) * SIDE_MULTIPLE) for side in sides
+        )
+        if max(clip_width, clip_height) > MAX_SIDE:
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
             raise InvalidRequest(f"`image`: {detail}.", errors=(FieldError("/image", detail),))
-        return across, down
+        return clip_width, clip_height
 
-    def describe(self, shot: Shot) -> GeneratorInfo:
+    def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""
-        model, sampling = self._model, self._sampling(shot)
+        model, options, sampling = self._model, _options(given), self._sampling(given)
         acceleration = model.profile.acceleration.model_dump(exclude_defaults=True, mode="json")
         return GeneratorInfo(
             name=model.name,
             model=model.repository,
             revision=model.revision,
-            seed=shot.seed,
+            seed=given.seed,
             steps=sampling.steps,
             options={
                 "profile": model.profile_name,
@@ -107,9 +122,9 @@ class WanGenerator:
                 "dtype": model.profile.dtype,
                 "vae_dtype": model.profile.vae_dtype,
                 "device": model.device.type,
-                "prompt": self._prompt(shot),
-                "negative_prompt": self._negative_prompt(shot) if sampling.guided else "",
-                "clean_cues": _options(shot).clean_cues,
+                "prompt": _prompt(given),
+                "negative_prompt": self._negative_prompt(options) if sampling.guided else "",
+                "clean_cues": options.clean_cues,
             }
             | {f"{part}_revision": revision for part, revision in model.revisions.items()}
             | {
@@ -118,69 +133,72 @@ class WanGenerator:
             },
         )
 
-    def render(self, shot: Shot, wanted: Sequence[int], progress: Callable[[float], None]) -> Iterator[Image]:
-        """The wanted frames, RGB [h, w, 3]. Raises `GeneratorOutOfMemory`, and whatever `progress` raises.
+    def render(
+        self, given: GeneratorInput, indices: Sequence[int], progress: Callable[[float], None]
+    ) -> Iterator[Image]:
+        """The frames of these indices, RGB [h, w, 3]. Raises `GeneratorOutOfMemory`, and whatever `progress` raises.
 
-        `progress` hears of every denoising step; once it has raised, nothing more is computed.
+        `progress` is called after every denoising step; once it has raised, nothing more is computed.
         """
-        model, frames = self._model, len(shot.trajectory.points)
-        width, height = self.size(shot.scene.width, shot.scene.height)
-        clip = f"A clip of {frames} frames at {width} x {height}"
+        model, num_frames = self._model, len(given.trajectory.points)
+        width, height = self.size(given.scene.width, given.scene.height)
         with (
-            alone_on(model.device, lambda: progress(0.0)),
-            on_threads(model.threads),
-            within_memory(model.device, self._encodings.forget, clip),
+            exclusive_use(model.device, lambda: progress(0.0)),
+            cpu_threads(model.threads),
+            within_memory(model.device, self._embeddings.clear, f"A clip of {num_frames} frames at {width} x {height}"),
         ):
-            video = self._video(shot, width, height, progress)
+            video = self._video(given, width, height, progress)
         progress(1.0)
-        for index in wanted:
+        for index in indices:
             yield video[index]
 
-    def _video(self, shot: Shot, width: int, height: int, progress: Callable[[float], None]) -> Image:
+    def _video(self, given: GeneratorInput, width: int, height: int, progress: Callable[[float], None]) -> Image:
         """All frames [F, height, width, 3]."""
-        pipeline, frames = self._model.pipeline, len(shot.trajectory.points)
+        pipeline, num_frames = self._model.pipeline, len(given.trajectory.points)
         # Drawn on the CPU: a seed gives the same noise whatever the device.
-        drawn = torch.Generator().manual_seed(shot.seed)
-        noise = torch.randn(latent_shape(width, height, frames), generator=drawn)
+        random = torch.Generator().manual_seed(given.seed)
+        noise = torch.randn(latent_shape(width, height, num_frames), generator=random)
         progress(0.0)
         try:
-            sampling = self._sampling(shot)
-            guide = self._guide(shot, width, height, guided=sampling.guided)
+            sampling = self._sampling(given)
+            conditioning = self._conditioning(given, width, height, guided=sampling.guided)
             progress(0.0)
-            latents = pipeline.denoise(noise, guide, sampling, lambda done, steps: progress(STEPS_SHARE * done / steps))
+            latents = pipeline.denoise(
+                noise, conditioning, sampling, lambda done, total: progress(DENOISING_SHARE * done / total)
+            )
             return pipeline.decode(latents)
         finally:
             pipeline.vae.clear_cache()  # features of a clip that was not decoded to its end
             pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure
 
-    def _guide(self, shot: Shot, width: int, height: int, *, guided: bool) -> Guide:
-        scene, frames = shot.scene, len(shot.trajectory.points)
-        first = scene.clean if _options(shot).clean_cues else scene.image
-        picture = self._encodings.picture(first, width, height, frames)
-        tracks = tracks_of(shot.trajectory, scene.width, scene.height)
+    def _conditioning(self, given: GeneratorInput, width: int, height: int, *, guided: bool) -> Conditioning:
+        scene, options = given.scene, _options(given)
+        first_frame = scene.clean if options.clean_cues else scene.image
+        image = self._embeddings.image(first_frame, width, height, len(given.trajectory.points))
+        tracks = tracks_of(given.trajectory, scene.width, scene.height)
         # In pixels of the clip: its sides are rounded, so that its aspect ratio is not quite the image's.
         tracks = tracks.scaled(width / scene.width, height / scene.height)
-        condition, plain = self._model.method(picture.condition, tracks, width, height)
-        return Guide(
-            prompt=self._encodings.text(self._prompt(shot)),
-            negative=self._encodings.text(self._negative_prompt(shot)) if guided else None,
-            image=picture.embeds,
+        condition, unconditional = self._model.conditioning(image.condition, tracks, width, height)
+        return Conditioning(
+            prompt=self._embeddings.text(_prompt(given)),
+            negative_prompt=self._embeddings.text(self._negative_prompt(options)) if guided else None,
+            image=image.embeds,
             condition=condition,
-            plain=plain,
+            unconditional=unconditional,
         )
 
-    def _sampling(self, shot: Shot) -> Sampling:
-        given = _options(shot).model_dump(include={"steps", "shift", "guidance_scale"}, exclude_none=True)
-        return self._model.profile.sampling.model_copy(update=given)
+    def _sampling(self, given: GeneratorInput) -> Sampling:
+        update = _options(given).model_dump(include={"steps", "shift", "guidance_scale"}, exclude_none=True)
+        return self._model.profile.sampling.model_copy(update=update)
 
-    def _prompt(self, shot: Shot) -> str:
-        given = _options(shot).prompt
-        return shot.motion.sentence if given is None else given
-
-    def _negative_prompt(self, shot: Shot) -> str:
-        given = _options(shot).negative_prompt
-        return self._model.negative_prompt if given is None else given
+    def _negative_prompt(self, options: WanOptions) -> str:
+        return self._model.negative_prompt if options.negative_prompt is None else options.negative_prompt
 
 
-def _options(shot: Shot) -> WanOptions:
-    return shot.options if isinstance(shot.options, WanOptions) else WanOptions()
+def _options(given: GeneratorInput) -> WanOptions:
+    return given.options if isinstance(given.options, WanOptions) else WanOptions()
+
+
+def _prompt(given: GeneratorInput) -> str:
+    prompt = _options(given).prompt
+    return given.motion.sentence if prompt is None else prompt

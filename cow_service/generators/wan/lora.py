@@ -1,7 +1,7 @@
-"""Adds a LoRA to a transformer's weights for good, so that it costs nothing per step.
+"""Merges a LoRA into a transformer's weights, so that it costs nothing per step.
 
-Distilled LoRAs hold more than pairs of low-rank weights: whole differences of norms, biases and modulation. diffusers'
-`load_lora_weights` drops those without a word, and layers that the model lacks with a warning; here either every tensor
+Distilled LoRAs hold more than pairs of low-rank matrices: full differences of norms, biases and modulation. diffusers'
+`load_lora_weights` silently drops those, and layers that the model lacks with a warning only; here either every tensor
 of the file is added or the file is refused. Names may be diffusers' or those of the original Wan.
 """
 
@@ -18,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
+from cow_service.generators.wan.checkpoints import diffusers_names, listed
 
 PREFIXES = ("base_model.model.", "model.", "diffusion_model.", "transformer.")
 # How a tensor's name ends, which part of its layer's change it is, and the parameter of the layer that it changes.
@@ -34,7 +35,7 @@ ENDS = (
     (".lora_B.bias", "whole", ".bias"),
     (".diff_m", "whole", ".modulation"),
 )
-SHOWN = 3  # names in a message
+MAX_LISTED = 3  # names in a message
 
 
 @dataclass(frozen=True)
@@ -106,20 +107,20 @@ def _read(file: Path) -> dict[str, Tensor]:
 
 
 def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], file: str) -> dict[str, _Change]:
-    """By name of the parameter."""
+    """The changes by the name of their parameter. Raises `CheckpointInvalid` where the file does not fit."""
     found: dict[str, dict[str, Tensor]] = {}
-    strangers: list[str] = []
+    unknown: list[str] = []
     for key, tensor in tensors.items():
         target, part = _target(key)
         layer = found.setdefault(target, {})
         if not part or part in layer:
-            strangers.append(key)
+            unknown.append(key)
         layer[part] = tensor
     names = _in_diffusers(found, parameters)
-    strangers += [target for target in found if names[target] not in parameters]
-    if strangers or not found:
+    unknown += [target for target in found if names[target] not in parameters]
+    if unknown or not found:
         raise CheckpointInvalid(
-            f"LoRA '{file}' is not one for this model, which has no place for {_some(strangers) or 'an empty one'}."
+            f"LoRA '{file}' is not one for this model, which has no place for {_some(unknown) or 'an empty one'}."
         )
     changes = {names[target]: _Change(**parts) for target, parts in found.items()}
     if misfits := [name for name, change in changes.items() if not change.fits(parameters[name])]:
@@ -141,16 +142,12 @@ def _target(key: str) -> tuple[str, str]:
 
 
 def _in_diffusers(targets: Iterable[str], parameters: Mapping[str, Tensor]) -> dict[str, str]:
-    """Their names in diffusers' model. In the original the second and third norm of a block are the other way round."""
-    from diffusers.loaders import single_file_utils  # noqa: PLC0415
-
+    """Their names in diffusers' model."""
     names = {target: target for target in targets}
     if all(name in parameters for name in names):
         return names
-    renamed = cast(Any, single_file_utils).convert_wan_transformer_to_diffusers(dict(names))
-    return {old: new for new, old in renamed.items()}
+    return {original: name for name, original in diffusers_names(names).items()}
 
 
 def _some(names: list[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(sorted(names)[:SHOWN]) + more
+    return listed(sorted(names), MAX_LISTED)

@@ -1,7 +1,7 @@
-"""diffusers' image-to-video pipeline in three parts that can be timed, cached and stopped: encode, denoise, decode.
+"""diffusers' image-to-video pipeline in three parts that can be timed, cached and canceled: encode, denoise, decode.
 
-The parent's own methods do the encoding and its models all the work; what is added is a condition that differs between
-the guided and the plain pass, guidance over a window of steps, and a caller who hears of every step.
+The encoding methods and the models are those of the parent class. Added are a condition that differs between the
+guided and the unconditional pass, guidance over a window of steps, and a callback after every step.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from cow_service.generators.wan.sampling import Sampling
 
 LATENT_CHANNELS = 16
 
-StepListener = Callable[[int, int], None]
+StepCallback = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Picture:
-    """What the model is told of the first frame."""
+class ImageEmbedding:
+    """The first frame as the model takes it."""
 
     embeds: Tensor  # [1, tokens, C] of the image encoder
     condition: Tensor  # [20, T, h, w] float32: 4 mask channels, 16 latent channels
 
 
 @dataclass(frozen=True)
-class Guide:
-    """What one clip is denoised under."""
+class Conditioning:
+    """All that conditions the denoising of one clip."""
 
     prompt: Tensor  # [1, 512, C] text embeddings
-    negative: Tensor | None  # the same, of what is to be avoided; null where no step is guided
-    image: Tensor  # [1, tokens, C]
+    negative_prompt: Tensor | None  # [1, 512, C]; None where no step is guided
+    image: Tensor  # [1, tokens, C] of the image encoder
     condition: Tensor  # [20, T, h, w] of the guided pass
-    plain: Tensor  # [20, T, h, w] of the unconditional pass
+    unconditional: Tensor  # [20, T, h, w] of the unconditional pass
 
 
 def compose(**parts: Any) -> WanTrackPipeline:
     """A pipeline of `transformer`, `vae`, `text_encoder`, `image_encoder`, `tokenizer` and `image_processor`.
 
-    Its scheduler is there because the parent wants one: every clip is sampled with one of its own.
+    The parent class requires a scheduler, which is not used: every clip is sampled with one of its own.
     """
     scheduler = UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True, flow_shift=3.0)
     return WanTrackPipeline(scheduler=scheduler, **parts)  # pyright: ignore[reportArgumentType]: any flow scheduler
@@ -60,7 +60,7 @@ def latent_shape(width: int, height: int, num_frames: int) -> tuple[int, int, in
 
 
 class WanTrackPipeline(WanImageToVideoPipeline):
-    """The parts of one clip. Not safe for two clips at a time."""
+    """The steps of making one clip. Not safe for two clips at a time."""
 
     @torch.no_grad()
     def embed_text(self, text: str) -> Tensor:
@@ -74,12 +74,12 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         return embeds
 
     @torch.no_grad()
-    def embed_picture(self, image: NDArray[np.uint8], width: int, height: int, num_frames: int) -> Picture:
+    def embed_image(self, image: NDArray[np.uint8], width: int, height: int, num_frames: int) -> ImageEmbedding:
         """Both encodings of the first frame, RGB [H, W, 3] of any size, for a clip of `width` x `height` px."""
         device = self._execution_device
         picture = Image.fromarray(image)
-        # The image encoder takes a square: the whole image, squeezed, as in the public implementation. The processor of
-        # the pipeline would cut out its middle.
+        # The image encoder takes a square: the whole image is squeezed, as in the public implementation. The pipeline's
+        # own processor would crop its centre.
         side = self.image_encoder.config.image_size
         embeds = self.encode_image(picture.resize((side, side), Image.Resampling.BICUBIC), device)
         pixels = self.video_processor.preprocess(picture, height=height, width=width).to(device, torch.float32)
@@ -92,26 +92,26 @@ class WanTrackPipeline(WanImageToVideoPipeline):
             num_frames=num_frames,
             dtype=torch.float32,
             device=device,
-            latents=torch.empty(0),  # the noise is drawn for each clip; only the condition is wanted here
+            latents=torch.empty(0),  # unused: only the condition is taken from here, the noise is drawn per clip
         )
-        return Picture(embeds, condition[0])
+        return ImageEmbedding(embeds, condition[0])
 
     @torch.no_grad()
-    def denoise(self, noise: Tensor, guide: Guide, sampling: Sampling, on_step: StepListener) -> Tensor:
-        """Latents [1, 16, T, h, w] from noise of that shape. `on_step` hears (done, all) and stops it by raising."""
+    def denoise(self, noise: Tensor, given: Conditioning, sampling: Sampling, on_step: StepCallback) -> Tensor:
+        """Latents [1, 16, T, h, w] from noise of that shape. `on_step(done, total)` may raise to cancel."""
         device = self._execution_device
         dtype = cast(torch.dtype, self.transformer.dtype)  # found by a walk over all weights: once per clip
         schedule = sampling.schedule(device)
         latents = noise.to(device, torch.float32)
-        guided, plain_condition = (part.to(latents)[None] for part in (guide.condition, guide.plain))
-        image, prompt = guide.image.to(dtype), guide.prompt.to(dtype)
-        negative = None if guide.negative is None else guide.negative.to(dtype)
+        guided, unguided = (part.to(latents)[None] for part in (given.condition, given.unconditional))
+        image, prompt = given.image.to(dtype), given.prompt.to(dtype)
+        negative = None if given.negative_prompt is None else given.negative_prompt.to(dtype)
         reset_cache(self.transformer, sampling.steps)
         for step, time in enumerate(schedule.timesteps):
             states = torch.cat([latents, guided], dim=1).to(dtype)
             velocity = self._velocity("cond", states, time, prompt, image)
             if negative is not None and sampling.guides(step):
-                states = torch.cat([latents, plain_condition], dim=1).to(dtype)
+                states = torch.cat([latents, unguided], dim=1).to(dtype)
                 plain = self._velocity("uncond", states, time, negative, image)
                 velocity = plain + sampling.guidance_scale * (velocity - plain)
             latents = schedule.step(velocity, time, latents, return_dict=False)[0]

@@ -7,12 +7,69 @@ from typing import Literal
 from pydantic import Field, ValidationError, model_validator
 
 from cow_service.errors import GeneratorUnavailable
-from cow_service.generators.wan.acceleration import Acceleration
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.records import Record
 from cow_service.weights.manifests import Manifest
 
 Precision = Literal["float32", "bfloat16", "float16"]
+
+
+class Acceleration(Record):
+    """How the model is run. Each option says what it gains, what it costs, and whether it changes the frames."""
+
+    attention: str = Field(
+        default="native",
+        description="Attention backend, by its name in diffusers. native is PyTorch's own and needs nothing. flash and "
+        "_flash_3 (Hopper GPUs only) are exact to rounding and faster; sage computes in 8 bits, faster still, with "
+        "small visible differences. Names that end in _hub download their kernel from the Hugging Face hub at start.",
+    )
+    compile: Literal["none", "regional"] = Field(
+        default="none",
+        description="regional compiles the transformer's block once for all of its layers; the same to rounding. The "
+        "first clips of new shapes wait for the compiler.",
+    )
+    cache: Literal["none", "first-block", "mag"] = Field(
+        default="none",
+        description="Skips the transformer in steps that would change little, and so changes the frames. first-block "
+        "runs the first layer of every step and skips the others if its output changed by less than `cache_threshold`. "
+        "mag decides by `mag_ratios` alone: never in the first fifth of the steps, never more than 3 in a row. Both "
+        "keep one to three copies of the hidden states per guidance branch. Of no use with few, distilled steps.",
+    )
+    cache_threshold: float = Field(
+        default=0.05,
+        ge=0,
+        description="For first-block, relative change of the first layer's output; for mag, the error that may add up. "
+        "0 skips nothing; the larger, the faster and the worse.",
+    )
+    mag_ratios: tuple[float, ...] = Field(
+        default=(),
+        description="For mag: by how much the model's residual grows from each step to the next, measured on these "
+        "weights. They are spread over the steps of a clip.",
+    )
+    fp8: Literal["none", "weights", "dynamic"] = Field(
+        default="none",
+        description="Stores the linear layers of the transformer's blocks as float8, half of bfloat16's memory; norms, "
+        "embeddings and the last layer stay as they are. Both change the frames slightly. weights computes in the "
+        "model's precision, and is slower than none; dynamic also computes in float8, and is faster where compiled.",
+    )
+    offload: Literal["none", "model", "group", "sequential"] = Field(
+        default="none",
+        description="Keeps parts in the CPU's memory; the frames stay the same. model moves one whole part at a time, "
+        "which costs seconds per clip. group moves one block while the one before it computes: far less memory, and "
+        "little time where the connection is fast; it pins the transformer in the CPU's memory. sequential moves every "
+        "layer by itself: the least memory of all, and many times slower.",
+    )
+    vae_tiling: bool = Field(
+        default=False,
+        description="Encodes and decodes in overlapping tiles of 256 px: less memory, more time, faint seams at most.",
+    )
+    context_parallel: int = Field(
+        default=1,
+        ge=1,
+        description="GPUs among which the video's tokens are split in every layer (Ulysses); the same to rounding. As "
+        "many processes, started with torchrun, must all make the same clip. It must divide the number of attention "
+        "heads and that of tokens: latent frames x height / 16 x width / 16.",
+    )
 
 
 class Lora(Record):

@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
 from diffusers import FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler
 from pydantic import Field, model_validator
-from torch import Tensor
 
 from cow_service.records import Record
 
 TRAIN_STEPS = 1000
-
-
-class Schedule(Protocol):
-    """What is used of diffusers' schedulers."""
-
-    timesteps: Tensor
-
-    def step(self, model_output: Tensor, timestep: Tensor, sample: Tensor, *, return_dict: bool) -> tuple[Tensor, ...]:
-        """The sample at the next noise level."""
-        ...
 
 
 class Sampling(Record):
@@ -64,7 +53,7 @@ class Sampling(Record):
         """Passes through the transformer for the whole clip."""
         return self.steps + sum(self.guides(step) for step in range(self.steps))
 
-    def schedule(self, device: torch.device) -> Schedule:
+    def schedule(self, device: torch.device) -> FlowMatchEulerDiscreteScheduler | UniPCMultistepScheduler:
         """A fresh scheduler with its steps set; it holds the state of one clip.
 
         UniPC starts at the noise level of the public Wan2.1 implementation, 0.999 before the shift (diffusers: 1.0).
@@ -74,7 +63,7 @@ class Sampling(Record):
             euler = FlowMatchEulerDiscreteScheduler(num_train_timesteps=TRAIN_STEPS, shift=self.shift)
             euler.set_timesteps(sigmas=[1 - i / self.steps for i in range(self.steps)], device=device)
             euler.set_begin_index(0)
-            return cast(Schedule, euler)
+            return euler
         unipc = UniPCMultistepScheduler(
             num_train_timesteps=TRAIN_STEPS,
             prediction_type="flow_prediction",
@@ -85,4 +74,4 @@ class Sampling(Record):
         unipc.set_timesteps(sigmas=cast(Any, np.linspace(highest, 0, self.steps + 1)[:-1]), device=device)
         # Steps are counted: found by their times, which are whole numbers, two with the same would be taken for one.
         unipc.set_begin_index(0)
-        return cast(Schedule, unipc)
+        return unipc

@@ -1,6 +1,6 @@
-"""Wan2.1 at toy size: the real classes with seeded random weights and a toy tokenizer, made here from nothing.
+"""Wan2.1 at toy size: the real classes with seeded random weights and a toy tokenizer.
 
-It runs the whole way in a second on a CPU. What it shows means nothing: it is for tests, and to try a deployment out.
+It makes a clip in a second on a CPU. The frames mean nothing: it is for tests, and to try a deployment out.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _vae() -> AutoencoderKLWan:
 
 def _text_encoder(width: int) -> UMT5EncoderModel:
     return UMT5EncoderModel(
-        UMT5Config(vocab_size=_tokenizer_size(), d_model=width, d_kv=8, d_ff=2 * width, num_layers=1, num_heads=2)
+        UMT5Config(vocab_size=len(_vocabulary()), d_model=width, d_kv=8, d_ff=2 * width, num_layers=1, num_heads=2)
     )
 
 
@@ -74,10 +74,6 @@ def _image_encoder(width: int) -> CLIPVisionModel:
 def _vocabulary() -> dict[str, int]:
     """Every byte is a token; 0 pads and 1 ends, as in T5."""
     return {token: i for i, token in enumerate(["<pad>", "</s>", *sorted(pre_tokenizers.ByteLevel.alphabet())])}
-
-
-def _tokenizer_size() -> int:
-    return len(_vocabulary())
 
 
 def _tokenizer() -> PreTrainedTokenizerFast:

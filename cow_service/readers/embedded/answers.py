@@ -16,7 +16,7 @@ from cow_service.readers.question.choices import not_sure_option, plain, says_no
 from cow_service.readers.question.relations import AskedRelation, Relation, read_relation
 from cow_service.readers.question.sentences import Question
 from cow_service.records import AnswerOption, EncounterKind, Grounding, LocatedObject, Simulation, Vector
-from cow_service.vision.obstacles import Obstacle, obstacles_of
+from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
 
 # Encounters that make the answer yes. What touches a thing in the picture stands before a part of it.
@@ -107,7 +107,7 @@ def _by_landing(scene: Scene, asked: AskedRelation, simulation: Simulation) -> D
     target = _located(asked, grounding.others)
     if asked.relation != "touches" or target is None or direction is None:
         return Decision(None, NOT_FOUND if target is None else NO_LANDING)
-    obstacles = obstacles_of(scene, grounding.bbox, grounding.others)
+    obstacles = scene.obstacles(grounding.bbox, grounding.others)
     happens = rolls_into(scene, grounding.bbox, direction, target.bbox, obstacles)
     return Decision(happens, NO_LANDING if happens is None else LANDING)
 
@@ -121,7 +121,7 @@ def _stays_clear(scene: Scene, question: Question, asked: AskedRelation, groundi
     if target is None or mover is None or mover.head not in VEHICLES or question.motion.forward is None:
         return False
     axis = _axis(scene, grounding)
-    obstacles = [o for o in obstacles_of(scene, grounding.bbox, grounding.others) if o.name == target.object]
+    obstacles = [o for o in scene.obstacles(grounding.bbox, grounding.others) if o.name == target.object]
     if axis is None or not obstacles:
         return False
     offsets = np.arange(-AXIS_ERROR, AXIS_ERROR + HEADING_STEP / 2, HEADING_STEP)

@@ -51,10 +51,10 @@ def inside_drawn_box(scene: Scene, phrase: ObjectPhrase, remedy: str) -> BBox:
     x0, y0, x1, y1 = scene.boxes[0].bbox
     inside = np.zeros((scene.height, scene.width), bool)
     inside[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1] = True
-    held = [r for r in scene.regions if r.cutting.shared_with(inside) > WHOLE * r.cutting.area]
+    held = [r for r in scene.regions if r.mask.shared_with(inside) > WHOLE * r.mask.area]
     if phrase.colour is not None:
         held = best_matches(held, phrase)
-    return max(held, key=lambda region: region.cutting.area).bbox if held else scene.boxes[0].bbox
+    return max(held, key=lambda region: region.mask.area).bbox if held else scene.boxes[0].bbox
 
 
 def is_known(phrase: ObjectPhrase) -> bool:

@@ -21,10 +21,10 @@ from cow_service.readers.local.batch_generator import BatchGenerator
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.processors import load_processor
 from cow_service.readers.local.tiny import make_tiny
-from cow_service.readers.local.worker import is_out_of_memory
 from cow_service.readers.mllm.models import mllm_manifests
 from cow_service.records import Record
 from cow_service.settings import Settings
+from cow_service.weights.device import choose_device, is_out_of_memory
 from cow_service.weights.lock import verify
 from cow_service.weights.manifests import Manifest
 
@@ -91,14 +91,7 @@ def device_map(device: str, spread: str) -> str | dict[str, str]:
     """Where the weights go, as accelerate takes it. Raises `ReaderUnavailable` for a GPU that is not here."""
     if device == "auto":
         return spread if torch.cuda.is_available() else {"": "cpu"}
-    if device == "cpu":
-        return {"": "cpu"}
-    index = int(device.partition(":")[2] or 0)
-    if index >= torch.cuda.device_count():
-        raise ReaderUnavailable(
-            f"There is no GPU '{device}': PyTorch {torch.__version__} sees {torch.cuda.device_count()}. Set COW_DEVICE."
-        )
-    return {"": f"cuda:{index}"}
+    return {"": str(choose_device(device, ReaderUnavailable))}
 
 
 def _manifest(name: str | None) -> Manifest:
@@ -175,7 +168,7 @@ def _translated(name: str) -> Generator[None]:
     except Exception as error:
         # The failed frames hold what was half loaded, and live as long as the traceback does.
         traceback.clear_frames(error.__traceback__)
-        if isinstance(error, RuntimeError) and is_out_of_memory(error):
+        if is_out_of_memory(error):
             raise ReaderUnavailable(
                 f"'{name}' does not fit into memory. Set COW_MLLM to a smaller model, or COW_DEVICE to a larger device."
             ) from error

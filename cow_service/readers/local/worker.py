@@ -12,9 +12,7 @@ import torch
 
 from cow_service.errors import MllmUnavailable
 from cow_service.readers.local.batch_generator import BatchGenerator, Generation, GenerationRequest, PendingGeneration
-
-# What the CPU's allocator, the CUDA runtime and cuBLAS say, all in plain runtime errors.
-OUT_OF_MEMORY = ("can't allocate memory", "CUDA error: out of memory", "_STATUS_ALLOC_FAILED")
+from cow_service.weights.device import is_out_of_memory
 
 
 class BatchWorker:
@@ -85,7 +83,7 @@ class BatchWorker:
             failed = error
         else:
             return None
-        if isinstance(failed, RuntimeError) and is_out_of_memory(failed):
+        if is_out_of_memory(failed):
             failed = MllmUnavailable(
                 f"'{self._name}' ran out of memory on {self._generator.device} while it wrote {len(batch)} "
                 f"repl{'y' if len(batch) == 1 else 'ies'}. Send a smaller image or fewer frames, or set COW_MLLM to a "
@@ -95,8 +93,3 @@ class BatchWorker:
         if self._generator.device.type == "cuda":
             torch.cuda.empty_cache()
         return failed
-
-
-def is_out_of_memory(error: RuntimeError) -> bool:
-    """Whether an error of PyTorch says that memory ran out."""
-    return isinstance(error, torch.OutOfMemoryError) or any(words in str(error) for words in OUT_OF_MEMORY)

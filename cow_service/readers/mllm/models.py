@@ -62,7 +62,7 @@ def find_manifest(settings: Settings) -> tuple[Manifest, str | None, str]:
 
 def mllm_manifests() -> dict[str, Manifest]:
     """The manifests of multimodal LLMs by name."""
-    return {name: manifest for name, manifest in load_manifests().items() if manifest.door == "mllm"}
+    return {name: manifest for name, manifest in load_manifests().items() if manifest.role == "mllm"}
 
 
 def manifest_for(model: str) -> Manifest:

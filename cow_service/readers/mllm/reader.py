@@ -24,7 +24,7 @@ from cow_service.readers.mllm.scale import Scaled, scale_call
 from cow_service.readers.question.sentences import parse, parse_noun_phrase
 from cow_service.records import AnswerOption, BBox, Cue, Grounding, MotionKind, ReaderInfo, Source
 from cow_service.settings import Settings
-from cow_service.weights.resources import prompt_names, read_prompt_text
+from cow_service.weights.resources import PROMPTS
 
 DIRECTED: tuple[MotionKind, ...] = ("linear", "projectile")
 FALLING: tuple[MotionKind, ...] = ("projectile", "fall")
@@ -53,7 +53,7 @@ class MllmReader:
         """The model, where it is served from, how its family is asked, and the words of all prompts."""
         parts = (
             __version__, self.info.name, self._model.name, self._origin, self._model.manifest.model_dump_json(),
-            self._model.family.model_dump_json(), *map(read_prompt_text, prompt_names()),
+            self._model.family.model_dump_json(), *map(PROMPTS.read, PROMPTS.names()),
         )  # fmt: skip
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 

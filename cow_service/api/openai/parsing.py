@@ -1,4 +1,4 @@
-"""From a chat to the question that it asks: which text, which image, which model, and what is not read."""
+"""From a chat to the `AnswerRequest` that it asks for: its question, image and model, and what of it is not used."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from cow_service.api.json_body import read_object
+from cow_service.api.body import read_object
 from cow_service.api.openai.models import answerer
 from cow_service.api.openai.requests import NEUTRAL, ChatMessage, ChatPart, ChatRequest
 from cow_service.api.problems import invalid
@@ -15,75 +15,75 @@ from cow_service.errors import CowError, FieldError, InvalidRequest
 from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 
-ELSEWHERE = ("image", "question", "imagine", "reader")  # of an `AnswerRequest`: messages and model say them
+FIELDS_OF_CHAT = ("image", "question", "imagine", "reader")  # of an `AnswerRequest`: from messages and model
 
 
 @dataclass(frozen=True)
-class Places:
-    """Where in a chat the fields of its `AnswerRequest` stand, as JSON Pointers."""
+class FieldPointers:
+    """JSON Pointers into a chat for the fields of its `AnswerRequest`."""
 
     image: str
     question: str
     seed: str
 
-    def of(self, pointer: str) -> str:
-        """The place in the chat of a place in the `AnswerRequest`."""
+    def translate(self, pointer: str) -> str:
+        """The pointer into the chat for one into the `AnswerRequest`."""
         head = "/".join(pointer.split("/")[:2])
         own = {"": "", "/image": self.image, "/question": self.question, "/seed": self.seed, "/reader": "/model"}
         return own.get(head, "/cow" + pointer)
 
-    def moved(self, error: CowError) -> CowError:
+    def translate_error(self, error: CowError) -> CowError:
         """An error of the `AnswerRequest`, pointing into the chat."""
-        fields = tuple(FieldError(self.of(field.pointer), field.detail) for field in error.errors)
+        fields = tuple(FieldError(self.translate(field.pointer), field.detail) for field in error.errors)
         return type(error)(error.detail, errors=fields, headers=error.headers)
 
 
 @dataclass(frozen=True)
-class Chat:
-    """A chat that was read and checked. It is not a job yet."""
+class ParsedChat:
+    """A chat that was parsed and validated. It is not a job yet."""
 
     model: str
     request: AnswerRequest
-    places: Places
-    warnings: tuple[str, ...]  # what of it was not read or done
-    most_tokens: int | None
+    pointers: FieldPointers
+    warnings: tuple[str, ...]  # what of it has no effect
+    max_tokens: int | None
     stream: bool
     with_usage: bool
 
 
-def read_chat(body: bytes, service: Service) -> Chat:
+def parse_chat(body: bytes, service: Service) -> ParsedChat:
     """The chat of a body. Raises `MalformedBody`, `InvalidRequest`, `ModelNotFound`."""
     try:
         chat = ChatRequest.model_validate(read_object(body, "The body"))
     except ValidationError as error:
         raise invalid(error) from error
-    asked = answerer(service, chat.model)
+    model = answerer(service, chat.model)
     image, image_place = _image_of(chat.messages)
     place = max(place for place, message in enumerate(chat.messages) if message.role == "user")
     question = "\n".join(_texts(chat.messages[place]))
     if not question.strip():
         raise _wrong(f"/messages/{place}/content", "the last user message has no text: put the question there")
     given = chat.cow or {}
-    for name in ELSEWHERE:
+    for name in FIELDS_OF_CHAT:
         if name in given:
             raise _wrong(f"/cow/{name}", "is said by `messages` and `model`; leave it out")
     seeds: dict[str, int] = {} if chat.seed is None else {"seed": chat.seed}
     if seeds and "seed" in given:
         raise _wrong("/cow/seed", "stands in `seed`, too; give it once")
-    places = Places(image_place, f"/messages/{place}/content", "/seed" if seeds else "/cow/seed")
+    pointers = FieldPointers(image_place, f"/messages/{place}/content", "/seed" if seeds else "/cow/seed")
     is_data = image[:5].lower() == "data:"
     fields = {**given, **seeds, "question": question, "image": image if is_data else {"url": image}}
     try:
-        request = AnswerRequest.model_validate({**fields, "reader": asked.reader, "imagine": asked.imagine})
+        request = AnswerRequest.model_validate({**fields, "reader": model.reader, "imagine": model.imagine})
     except ValidationError as error:
-        raise invalid(error, places.of) from error
+        raise invalid(error, pointers.translate) from error
     limits = [limit for limit in (chat.max_tokens, chat.max_completion_tokens) if limit is not None]
-    return Chat(
+    return ParsedChat(
         model=chat.model,
         request=request,
-        places=places,
+        pointers=pointers,
         warnings=tuple(_warnings(chat, place)),
-        most_tokens=min(limits, default=None),
+        max_tokens=min(limits, default=None),
         stream=bool(chat.stream),
         with_usage=chat.stream_options is not None and bool(chat.stream_options.include_usage),
     )
@@ -125,7 +125,7 @@ def _texts(message: ChatMessage) -> list[str]:
 
 
 def _warnings(chat: ChatRequest, question: int) -> Iterator[str]:
-    """What a caller may have hoped for in vain."""
+    """What of the chat has no effect."""
     unread = [
         f"{place} ({message.role})"
         for place, message in enumerate(chat.messages)

@@ -1,4 +1,4 @@
-"""What a job is told to do: JSON values, kept by the job database from the moment that the request is accepted."""
+"""What a job has to do: JSON values that the job database keeps from the moment that the request is accepted."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.stages.results import digest_of
 
 
-class Order(Record):
-    """One accepted request. Its image is an artifact: no order holds bytes."""
+class JobSpec(Record):
+    """One accepted request. Its image is an artifact: a spec has no bytes. Databases store the field names."""
 
     kind: JobKind
     request: dict[str, Any]
@@ -26,10 +26,10 @@ class Order(Record):
 
     @property
     def digest(self) -> str:
-        """The same for requests that ask for the same."""
+        """Equal for requests that ask for the same."""
         return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
 
     def parsed(self) -> SimulateRequest | AnswerRequest:
-        """The request, as it was checked when it came."""
+        """The request, as it was validated when it came."""
         model = AnswerRequest if self.kind == "answer" else SimulateRequest
         return model.model_validate({**self.request, "reader": self.reader, "generator": self.generator})

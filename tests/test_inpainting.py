@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.vision.discs import as_disc
-from cow_service.vision.fill import draw_in, erase_drawing, fill_hole
+from cow_service.vision.inpainting import erase_drawing, fill_hole, push_pull
 
 
 @given(
@@ -24,7 +24,7 @@ def test_a_plain_surface_stays_plain_whatever_is_unknown(width: int, height: int
     if not known.any():
         return
     source = np.where(known[..., None], 140.0, 0.0).repeat(3, axis=2).astype(np.float32)
-    assert np.abs(draw_in(source, known) - 140).max() < 1
+    assert np.abs(push_pull(source, known) - 140).max() < 1
 
 
 @pytest.mark.parametrize("radius", [8, 30, 80])

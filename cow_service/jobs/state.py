@@ -1,4 +1,4 @@
-"""Jobs as callers see them, from what the database and this process know."""
+"""The state of jobs as callers see it, from the database and from what this process runs."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from typing import Any, cast, get_args
 from dbos import DBOS, WorkflowStatus
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest
+from cow_service.jobs.active import ActiveJobs, share_done
 from cow_service.jobs.database import database_errors
-from cow_service.jobs.live import Live, share_done
-from cow_service.problems import problem_of
-from cow_service.records import Job, JobKind, JobPage, JobStatus
+from cow_service.records import Job, JobKind, JobPage, JobStatus, Problem
 
 KINDS: tuple[JobKind, ...] = get_args(JobKind)
 GENERATOR, CREATED = "generator", "created_at"  # attributes of a workflow
@@ -30,14 +29,14 @@ STATUS: dict[str, JobStatus] = {
 }
 OPEN = ["ENQUEUED", "DELAYED", "PENDING"]
 ENDED = [name for name in STATUS if name not in OPEN]
-AT_ONCE = 200  # jobs asked for together, where some of them may not fit
-LATE = timedelta(seconds=30)  # that the database may have a job later than it came: as long as writers wait
+MIN_BATCH = 200  # jobs read at a time where filters may drop some of them
+MAX_DELAY = timedelta(seconds=30)  # from the creation of a job to its row: as long as writers wait
 EPOCH = datetime.fromtimestamp(0, UTC)
-HALF = timedelta(microseconds=500)  # milliseconds as floating point come out a little too small
+HALF_MILLISECOND = timedelta(microseconds=500)  # milliseconds as floating point come out a little too small
 
 
 @dataclass(frozen=True)
-class Filters:
+class JobFilters:
     """Which jobs a caller wants to see. Times are RFC 3339."""
 
     status: tuple[JobStatus, ...] = ()
@@ -49,8 +48,8 @@ class Filters:
 
 
 @dataclass(frozen=True)
-class Found:
-    """A job, the key that it belongs to, and its result as JSON where it was asked for."""
+class JobState:
+    """A job, the name of its owner's key, and its result as JSON where it was asked for."""
 
     job: Job
     owner: str | None
@@ -59,32 +58,33 @@ class Found:
     ended: float | None = None  # seconds since 1970
 
     def as_json(self) -> str:
-        """The job with its result, which is put in as it stands: reading it only to write it again takes long."""
-        text = self.job.model_dump_json()
-        return text if self.result is None else text.replace('"result":null', f'"result":{self.result}', 1)
+        """The job with its result, which is JSON already: parsing it only to write it again takes long."""
+        if self.result is None:
+            return self.job.model_dump_json()
+        return f'{self.job.model_dump_json(exclude={"result"})[:-1]},"result":{self.result}}}'
 
 
-def find(job_id: str, live: Live, *, full: bool = True) -> Found | None:
+def find(job_id: str, active: ActiveJobs, *, full: bool = True) -> JobState | None:
     """A job by its id; without its result and problem unless `full`."""
     with database_errors():
         found = DBOS.list_workflows(workflow_ids=[job_id], load_input=False, load_output=full)
-    return _found(found[0], live) if found and found[0].name in KINDS else None
+    return _state(found[0], active) if found and found[0].name in KINDS else None
 
 
-def page(owner: str | None, filters: Filters, live: Live) -> JobPage:
+def page(owner: str | None, filters: JobFilters, active: ActiveJobs) -> JobPage:
     """Jobs of an owner, newest first; of everybody where there are no owners. Raises `InvalidRequest` for a cursor."""
     before, seen = _read_cursor(filters.cursor)
     after, latest = filters.created_after, filters.created_before
     if latest is not None and latest < datetime.now(UTC):
-        before = min(before or latest + LATE, latest + LATE)
+        before = min(before or latest + MAX_DELAY, latest + MAX_DELAY)
     jobs: list[Job] = []
     while True:
-        most = max(filters.limit, AT_ONCE) if after or latest or filters.status else filters.limit
+        most = max(filters.limit, MIN_BATCH) if after or latest or filters.status else filters.limit
         rest = [one for one in _listed(owner, filters, before, most + len(seen) + 1) if one.workflow_id not in seen]
         taken = 0
         for one in rest[:most]:
             taken += 1
-            job = _found(one, live).job
+            job = _state(one, active).job
             came = datetime.fromisoformat(job.created_at)
             fits = not filters.status or job.status in filters.status
             if fits and (after is None or after <= came) and (latest is None or came <= latest):
@@ -94,13 +94,13 @@ def page(owner: str | None, filters: Filters, live: Live) -> JobPage:
         more = len(rest) > taken
         if not more or len(jobs) == filters.limit:
             break
-        before, seen = _place(rest[:taken], seen, before)
+        before, seen = _position(rest[:taken], seen, before)
     jobs.sort(key=lambda job: job.created_at, reverse=True)
-    return JobPage(jobs=tuple(jobs), next=_cursor(*_place(rest[:taken], seen, before)) if more else None)
+    return JobPage(jobs=tuple(jobs), next=_cursor(*_position(rest[:taken], seen, before)) if more else None)
 
 
-def _listed(owner: str | None, filters: Filters, before: datetime | None, limit: int) -> list[WorkflowStatus]:
-    """Jobs by the times of the database, which may be those of the whole second."""
+def _listed(owner: str | None, filters: JobFilters, before: datetime | None, limit: int) -> list[WorkflowStatus]:
+    """Jobs by the times of the database, which may be whole seconds."""
     after = filters.created_after
     wanted = [name for name, status in STATUS.items() if status in filters.status]
     if "queued" in filters.status:
@@ -111,7 +111,7 @@ def _listed(owner: str | None, filters: Filters, before: datetime | None, limit:
             status=wanted or None,
             user=owner,
             start_time=None if after is None or after < EPOCH else after.replace(microsecond=0).isoformat(),
-            end_time=None if before is None else (max(before, EPOCH) + HALF).isoformat(),
+            end_time=None if before is None else (max(before, EPOCH) + HALF_MILLISECOND).isoformat(),
             sort_desc=True,
             limit=limit,
             load_input=False,
@@ -143,31 +143,31 @@ def existing(jobs: list[str], owner: str | None = None) -> set[str]:
     return {one.workflow_id for one in found}
 
 
-def _found(status: WorkflowStatus, live: Live) -> Found:
+def _state(status: WorkflowStatus, active: ActiveJobs) -> JobState:
     kind = cast(JobKind, status.name)
-    told = STATUS[status.status]
-    running = live.look(status.workflow_id) if told == "running" else None
-    stage, progress = None, 1.0 if told == "succeeded" else 0.0
+    shown = STATUS[status.status]
+    running = active.get(status.workflow_id) if shown == "running" else None
+    stage, progress = None, 1.0 if shown == "succeeded" else 0.0
     if running is not None:
         stage, progress = running.stage, share_done(kind, running.stage, running.done)
-    if told == "running" and status.executor_id == DBOS.executor_id and (running is None or running.stage is None):
-        told = "queued"  # it was taken from the queue, but nobody works on it yet
-    error = _error(status) if told == "failed" else None
+    if shown == "running" and status.executor_id == DBOS.executor_id and (running is None or running.stage is None):
+        shown = "queued"  # it was taken from the queue, but no thread works on it yet
+    error = _error(status) if shown == "failed" else None
     created = (status.attributes or {}).get(CREATED) or _time(status.created_at)
     job = Job(
         id=status.workflow_id,
         kind=kind,
-        status=told,
+        status=shown,
         stage=stage,
         progress=progress,
         created_at=created,
         # Times in SQLite may be whole seconds, and before the job came.
         finished_at=None if status.completed_at is None else max(_time(status.completed_at), created),
         generator=(status.attributes or {}).get(GENERATOR, ""),
-        problem=None if error is None else problem_of(error),
+        problem=None if error is None else Problem(**error.as_problem()),
     )
     ended = None if status.completed_at is None else status.completed_at / 1000
-    return Found(job, status.authenticated_user, status.output if told == "succeeded" else None, error, ended)
+    return JobState(job, status.authenticated_user, status.output if shown == "succeeded" else None, error, ended)
 
 
 def _error(status: WorkflowStatus) -> CowError | None:
@@ -182,8 +182,8 @@ def _time(milliseconds: int | None) -> str:
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def _place(taken: list[WorkflowStatus], seen: set[str], before: datetime | None) -> tuple[datetime, set[str]]:
-    """Where it goes on: the time of the last job, and the jobs of that very time that were taken."""
+def _position(taken: list[WorkflowStatus], seen: set[str], before: datetime | None) -> tuple[datetime, set[str]]:
+    """Where the next page begins: the time of the last job, and the jobs of that same time that were shown."""
     last = taken[-1].created_at or 0
     same = {one.workflow_id for one in taken if one.created_at == last}
     if before is not None and last == _milliseconds(before):
@@ -196,8 +196,8 @@ def _milliseconds(moment: datetime) -> int:
 
 
 def _cursor(before: datetime, seen: set[str]) -> str:
-    told = json.dumps([_milliseconds(before), sorted(seen)], separators=(",", ":"))
-    return base64.urlsafe_b64encode(told.encode()).decode().rstrip("=")
+    text = json.dumps([_milliseconds(before), sorted(seen)], separators=(",", ":"))
+    return base64.urlsafe_b64encode(text.encode()).decode().rstrip("=")
 
 
 def _read_cursor(cursor: str | None) -> tuple[datetime | None, set[str]]:

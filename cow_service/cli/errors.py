@@ -1,0 +1,47 @@
+"""How the command line shows errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from cow_service.errors import CowError
+
+_GIVE_PLACE = "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME)."
+HINTS = {  # the options that an error's remedy asks for, by the error's code
+    "cannot-ground": _GIVE_PLACE,
+    "object-not-found": _GIVE_PLACE,
+    "cannot-read-direction": "Here: --direction DX,DY.",
+}
+
+
+class Commands(TyperGroup):
+    """A group of commands whose errors are a few plain lines on standard error.
+
+    Exit code 1; 2 for bad settings.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs a command."""
+        from cow_service.settings import SettingsError  # noqa: PLC0415 - not needed for --help
+
+        try:
+            return super().invoke(ctx)
+        except CowError as error:
+            typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
+            typer.echo(printable(error.detail), err=True)
+            if error.code in HINTS:
+                typer.echo(HINTS[error.code], err=True)
+            for field in error.errors:
+                typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
+            raise typer.Exit(1) from error
+        except SettingsError as error:
+            typer.secho(str(error), fg="red", err=True)
+            raise typer.Exit(2) from error
+
+
+def printable(text: str) -> str:
+    """The text without what a terminal would obey: control characters, escapes, marks that turn the direction."""
+    return "".join(character if character.isprintable() or character == "\n" else "\ufffd" for character in text)

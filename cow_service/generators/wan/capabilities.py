@@ -1,0 +1,194 @@
+"""What a device and the installed packages support, and which options of an `Acceleration` they do not."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import sysconfig
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from pydantic import Field
+
+from cow_service.generators.wan.profiles import Acceleration
+from cow_service.records import Record
+
+ComputeCapability = tuple[int, int]
+HOPPER, ADA, AMPERE, VOLTA = (9, 0), (8, 9), (8, 0), (7, 0)
+
+
+class AttentionBackend(NamedTuple):
+    """What one of diffusers' attention backends needs. Without `at_least` it runs on any device."""
+
+    package: str | None = None
+    at_least: ComputeCapability | None = None
+    at_most: ComputeCapability | None = None
+    context_parallel: bool = False  # whether several GPUs can share one clip
+
+
+ATTENTION_BACKENDS: Mapping[str, AttentionBackend] = {
+    "native": AttentionBackend(context_parallel=True),
+    "_native_math": AttentionBackend(),
+    "_native_flash": AttentionBackend(None, AMPERE, context_parallel=True),
+    "_native_cudnn": AttentionBackend(None, AMPERE, context_parallel=True),
+    "_native_efficient": AttentionBackend(None, VOLTA),
+    "flash": AttentionBackend("flash-attn", AMPERE, context_parallel=True),
+    "flash_hub": AttentionBackend("kernels", AMPERE, context_parallel=True),
+    "_flash_3": AttentionBackend("flash-attn-3", HOPPER, HOPPER),
+    "_flash_3_hub": AttentionBackend("kernels", HOPPER, HOPPER, context_parallel=True),
+    "sage": AttentionBackend("sageattention", AMPERE, context_parallel=True),
+    "sage_hub": AttentionBackend("kernels", AMPERE, context_parallel=True),
+    "_sage_qk_int8_pv_fp16_cuda": AttentionBackend("sageattention", AMPERE),
+    "_sage_qk_int8_pv_fp8_cuda_sm90": AttentionBackend("sageattention", HOPPER, HOPPER),
+    "xformers": AttentionBackend("xformers", VOLTA),
+}
+# Distributions and the minimum versions that diffusers accepts (a test compares them).
+MINIMUM_VERSIONS: Mapping[str, str] = {
+    "accelerate": "0.17.0",
+    "flash-attn": "2.6.3",
+    "flash-attn-3": "3.0.0",
+    "kernels": "0.12",
+    "sageattention": "2.1.1",
+    "torchao": "0.15.0",
+    "triton": "3.0.0",
+    "xformers": "0.0.29",
+}
+
+
+class Capabilities(Record):
+    """What a device and the installed packages support. It does not say how much memory is free."""
+
+    device: str = Field(description="cuda, cpu, ...")
+    name: str
+    compute_capability: ComputeCapability | None = Field(default=None, description="Null without an NVIDIA GPU.")
+    memory: int = Field(ge=0, description="Bytes, of the device.")
+    gpus: int = Field(ge=0, description="GPUs that PyTorch sees.")
+    packages: tuple[str, ...] = Field(default=(), description="Installed in at least the minimum version.")
+    compiler: bool = Field(description="A C++ compiler and Python's headers are installed.")
+    world_size: int = Field(default=1, ge=1, description="Processes that torchrun started.")
+
+    @property
+    def description(self) -> str:
+        """The device in words, for messages."""
+        kind = "" if self.compute_capability is None else f" of compute capability {dotted(self.compute_capability)}"
+        return f"this device is {self.name}{kind}" if kind else f"this device is the {self.device.upper()}"
+
+
+def dotted(capability: ComputeCapability) -> str:
+    """A compute capability as NVIDIA writes it."""
+    return f"{capability[0]}.{capability[1]}"
+
+
+def detect_capabilities(device: torch.device) -> Capabilities:
+    """What this machine supports on a device."""
+    gpu = torch.cuda.get_device_properties(device) if device.type == "cuda" else None
+    return Capabilities(
+        device=device.type,
+        name=gpu.name if gpu else platform.machine(),
+        compute_capability=(gpu.major, gpu.minor) if gpu else None,
+        memory=gpu.total_memory if gpu else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        gpus=torch.cuda.device_count(),
+        packages=tuple(name for name, least in MINIMUM_VERSIONS.items() if _is_installed(name, least)),
+        compiler=_has_compiler(),
+        world_size=int(os.environ.get("WORLD_SIZE", "1")),
+    )
+
+
+def refusals(acceleration: Acceleration, available: Capabilities) -> tuple[str, ...]:
+    """One sentence, with reason and remedy, for each option that is not supported; empty if all are."""
+    checks = (_attention, _compiling, _caching, _float8, _offloading, _splitting)
+    return tuple(sentence for check in checks for sentence in check(acceleration, available))
+
+
+def _attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+    name, backend = wanted.attention, ATTENTION_BACKENDS.get(wanted.attention)
+    if backend is None:
+        yield f"attention: there is no '{name}'; choose one of {', '.join(ATTENTION_BACKENDS)}."
+        return
+    low, high, own = backend.at_least, backend.at_most, available.compute_capability
+    if low and (own is None or not low <= own <= (high or own)):
+        least = dotted(low) if low == high else f"{dotted(low)} or more"
+        needed = f"a GPU of compute capability {least}"
+        yield f"attention: '{name}' needs {needed}, and {available.description}; choose native."
+    if backend.package and backend.package not in available.packages:
+        yield f"attention: '{name}' needs {_package(backend.package)}; install it, or choose native."
+
+
+def _compiling(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+    if wanted.compile == "none":
+        return
+    if available.device == "cuda" and "triton" not in available.packages:
+        yield f"compile: regional needs {_package('triton')}; install it, or choose none."
+    if not available.compiler:
+        yield "compile: regional needs a C++ compiler and Python's headers; install them, or choose none."
+    if wanted.offload == "sequential":
+        yield "compile: sequential offload moves every layer by itself, which leaves nothing to compile; choose none."
+
+
+def _caching(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+    if wanted.cache == "mag" and not wanted.mag_ratios:
+        yield "cache: mag needs `mag_ratios`, measured on these weights; give them, or choose first-block."
+    if wanted.cache == "first-block" and wanted.context_parallel > 1:
+        # Each GPU measures the change of its own shard; if only some skip, the others wait for their tensors forever.
+        yield "cache: GPUs that share a video would not skip the same steps with first-block; choose mag or none."
+
+
+def _float8(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+    if wanted.fp8 == "none":
+        return
+    if "torchao" not in available.packages:
+        yield f"fp8: {wanted.fp8} needs {_package('torchao')}; install it, or choose none."
+    own, needed = available.compute_capability, f"compute capability {dotted(ADA)} or more"
+    if wanted.fp8 == "dynamic" and (own or (0, 0)) < ADA:
+        yield f"fp8: dynamic needs a GPU of {needed}, and {available.description}; choose none."
+    if wanted.fp8 == "weights" and wanted.compile != "none" and own and own < ADA:  # Triton has no float8 there
+        yield f"fp8: weights can only be compiled for {needed}, and {available.description}; choose `compile: none`."
+
+
+def _offloading(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+    if wanted.offload == "none":
+        return
+    if available.device != "cuda":
+        yield f"offload: {wanted.offload} needs a GPU to move weights to, and {available.description}; choose none."
+    if "accelerate" not in available.packages:
+        yield f"offload: {wanted.offload} needs {_package('accelerate')}; install it, or choose none."
+
+
+def _splitting(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+    count = wanted.context_parallel
+    if count == 1:
+        return
+    if available.gpus < count:
+        yield f"context_parallel: {count} needs as many GPUs, and there are {available.gpus}; choose 1."
+    if available.world_size != count:
+        remedy = f"start them with `torchrun --nproc-per-node {count}`, or choose 1"
+        yield f"context_parallel: {count} needs as many processes, and there are {available.world_size}; {remedy}."
+    if not ATTENTION_BACKENDS.get(wanted.attention, ATTENTION_BACKENDS["native"]).context_parallel:
+        able = ", ".join(name for name, backend in ATTENTION_BACKENDS.items() if backend.context_parallel)
+        yield f"context_parallel: attention '{wanted.attention}' cannot be split among GPUs; choose one of {able}."
+
+
+def _package(name: str) -> str:
+    return f"the package {name} {MINIMUM_VERSIONS[name]} or newer, which is not installed"
+
+
+def _is_installed(name: str, least: str) -> bool:
+    try:
+        return _numbers(metadata.version(name)) >= _numbers(least)
+    except metadata.PackageNotFoundError:
+        return False
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])
+
+
+def _has_compiler() -> bool:
+    """PyTorch's compiler builds C++ for the CPU, and Triton a C launcher for the GPU, both against Python's headers."""
+    header = Path(sysconfig.get_paths()["include"]) / "Python.h"
+    return header.is_file() and any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "clang++"))

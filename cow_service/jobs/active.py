@@ -1,0 +1,172 @@
+"""The jobs that this process runs or waits for: progress, cancellation requests, decoded images, waiting callers."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from cow_service.errors import Canceled, CowError
+from cow_service.media.images import DecodedImage
+from cow_service.requests import Stage
+
+STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")
+STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation the last is left out
+
+
+@dataclass
+class ActiveJob:
+    """One job that this process works on."""
+
+    stage: Stage | None = None
+    done: float = 0.0  # share of the stage
+    cancel_requested: threading.Event = field(default_factory=threading.Event)
+    finished: bool = False  # the work is over, though the database may not have its outcome yet
+
+    def check(self) -> None:
+        """Raises `Canceled` where its end was requested."""
+        if self.cancel_requested.is_set():
+            raise Canceled("The job was canceled.")
+
+
+@dataclass(eq=False)
+class Waiter:
+    """A caller on an event loop who wants to hear of a job."""
+
+    loop: asyncio.AbstractEventLoop
+    changed: asyncio.Event = field(default_factory=asyncio.Event)  # progress, or the end
+    ended: asyncio.Event = field(default_factory=asyncio.Event)  # the database has the answer
+    outcome: str | CowError | None = None  # the result as JSON, or the error, where this process has it at hand
+    outcome_of: str | None = None  # `created_at` of the job that it is of; None where it applies to any
+
+    def notify(self, outcome: str | CowError | None, created_at: str | None) -> None:
+        """The job has ended, or is not waited for any more."""
+        if self.outcome_of is None or created_at is not None:
+            self.outcome, self.outcome_of = outcome, created_at
+        self.ended.set()
+        self.changed.set()
+
+    def take(self) -> tuple[str | CowError | None, str | None]:
+        """The outcome that was notified, and the creation time of its job; resets both, as another may follow."""
+        taken = self.outcome, self.outcome_of
+        self.outcome = self.outcome_of = None
+        self.ended.clear()
+        return taken
+
+
+class ActiveJobs:
+    """The jobs that this process runs or waits for. Safe to use from every thread.
+
+    An idempotency key that is used again after its job was deleted comes to the same id: a message about an id may be
+    about the earlier job. Images are therefore checked by digest, and outcomes carry the time of their job.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: dict[str, ActiveJob] = {}
+        self._waiters: dict[str, list[Waiter]] = {}
+        self._images: dict[str, DecodedImage] = {}
+
+    def put_image(self, job: str, image: DecodedImage) -> None:
+        """Keeps the pixels of a job that starts at once, so that they are not decoded again."""
+        with self._lock:
+            self._images[job] = image
+
+    def take_image(self, job: str, sha256: str) -> DecodedImage | None:
+        """The pixels that were kept, once, if they are those of the image with that digest."""
+        with self._lock:
+            image = self._images.get(job)
+            if image is None or image.info.sha256 != sha256:
+                return None
+            return self._images.pop(job)
+
+    def drop_image(self, job: str) -> None:
+        """Forgets the pixels of a job that was not started."""
+        with self._lock:
+            self._images.pop(job, None)
+
+    @contextmanager
+    def running(self, job: str) -> Generator[ActiveJob]:
+        """Around the work on a job."""
+        active = ActiveJob()
+        with self._lock:
+            self._running[job] = active
+        try:
+            yield active
+        finally:
+            with self._lock:
+                self._images.pop(job, None)
+                active.finished = True
+
+    def progress(self, job: str, active: ActiveJob, stage: Stage | None, done: float) -> None:
+        """Records how far the work on a job is, and wakes its waiters. Raises `Canceled` on request."""
+        active.check()
+        if stage is None:
+            return
+        if stage != active.stage or done > active.done:
+            active.stage, active.done = stage, done
+            for waiter in self._waiters_of(job):
+                waiter.loop.call_soon_threadsafe(waiter.changed.set)
+
+    def get(self, job: str) -> ActiveJob | None:
+        """The state of a job that this process runs."""
+        with self._lock:
+            return self._running.get(job)
+
+    def ids(self) -> list[str]:
+        """The jobs that this process works on."""
+        with self._lock:
+            return [job for job, active in self._running.items() if not active.finished]
+
+    def forget(self, job: str) -> None:
+        """Drops the state of a job whose work is over."""
+        with self._lock:
+            active = self._running.get(job)
+            if active is not None and active.finished:
+                del self._running[job]
+
+    def request_cancel(self, job: str) -> None:
+        """Has the work on a job end at its next step."""
+        active = self.get(job)
+        if active is not None:
+            active.cancel_requested.set()
+
+    @contextmanager
+    def waiting(self, job: str) -> Generator[Waiter]:
+        """Around a wait for a job, on the running event loop."""
+        waiter = Waiter(asyncio.get_running_loop())
+        with self._lock:
+            self._waiters.setdefault(job, []).append(waiter)
+        try:
+            yield waiter
+        finally:
+            with self._lock:
+                self._waiters[job].remove(waiter)
+                if not self._waiters[job]:
+                    del self._waiters[job]
+
+    def awaited(self) -> list[str]:
+        """The jobs that somebody waits for in this process."""
+        with self._lock:
+            return list(self._waiters)
+
+    def notify_ended(self, job: str, outcome: str | CowError | None, created_at: str | None = None) -> None:
+        """Tells waiters that a job has ended. `outcome` where it is at hand, and of which job of that id it is."""
+        self.forget(job)
+        for waiter in self._waiters_of(job):
+            waiter.loop.call_soon_threadsafe(waiter.notify, outcome, created_at)
+
+    def _waiters_of(self, job: str) -> list[Waiter]:
+        with self._lock:
+            return [waiter for waiter in self._waiters.get(job, []) if not waiter.loop.is_closed()]
+
+
+def share_done(kind: str, stage: str | None, done: float) -> float:
+    """Share of all work, 0 to 1, when a stage is so far."""
+    shares = STAGE_SHARES if kind == "answer" else STAGE_SHARES[:-1]
+    if stage not in STAGES[: len(shares)]:
+        return 0.0
+    place = STAGES.index(stage)
+    return round(min(1.0, (sum(shares[:place]) + shares[place] * done) / sum(shares)), 4)

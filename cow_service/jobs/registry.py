@@ -1,0 +1,78 @@
+"""What all parts of a job engine share: the service, the database, and the open jobs."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+
+from dbos import DBOS
+
+from cow_service.errors import CowError
+from cow_service.jobs import state
+from cow_service.jobs.active import ActiveJobs
+from cow_service.jobs.database import Database, database_errors
+from cow_service.jobs.webhooks import attempt_ids
+from cow_service.service import Service
+
+
+class JobRegistry:
+    """Knows which jobs are open: queued or running, in this process or another. It starts none."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.database = Database(service.settings)
+        self.active = ActiveJobs()
+        self.lock = threading.RLock()
+        self._open: dict[str, str] = {}  # open jobs, and the generator of each
+        self._changes: list[tuple[str, str | None]] | None = None  # to the open jobs, while `recount` reads them
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def count(self, generator: str) -> int:
+        """How many jobs of a generator are open."""
+        with self.lock:
+            return sum(each == generator for each in self._open.values())
+
+    def record(self, job_id: str, generator: str | None) -> None:
+        """A job is open with a generator, or, with None, no longer open."""
+        with self.lock:
+            if self._changes is not None:
+                self._changes.append((job_id, generator))
+            if generator is None:
+                self._open.pop(job_id, None)
+            else:
+                self._open[job_id] = generator
+
+    def recount(self) -> None:
+        """Reads the open jobs from the database, those of other processes included."""
+        with self.lock:
+            self._changes = []
+        found = state.open_jobs()
+        with self.lock:
+            changes, self._changes = self._changes, None
+            self._open = found
+            for job_id, generator in changes or ():  # what happened while the database was asked
+                self.record(job_id, generator)
+
+    def depth(self) -> Counter[tuple[str, str]]:
+        """How many jobs of each generator are queued, and how many running."""
+        with self.lock:
+            jobs = dict(self._open)
+        depth: Counter[tuple[str, str]] = Counter()
+        for job_id, generator in jobs.items():
+            active = self.active.get(job_id)
+            depth[generator, "queued" if active is None or active.stage is None else "running"] += 1
+        return depth
+
+    def ended(self, job_id: str, outcome: str | CowError | None, created_at: str | None = None) -> None:
+        """The database says that a job has ended. `outcome` and `created_at` as in `ActiveJobs.notify_ended`."""
+        self.record(job_id, None)
+        self.active.notify_ended(job_id, outcome, created_at)
+
+    def remove(self, jobs: list[str], untouched_since: float) -> None:
+        """Removes jobs that have ended, and those of their artifacts that were not used since (Unix time, s)."""
+        with database_errors():
+            DBOS.delete_workflows([*jobs, *(attempt for job_id in jobs for attempt in attempt_ids(job_id))])
+        for sha256 in self.database.remove_jobs(jobs):
+            self.service.artifacts.delete(sha256, untouched_since + 1)

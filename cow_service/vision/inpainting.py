@@ -1,0 +1,221 @@
+"""Inpainting: fills what is left behind when a thin drawing or a whole object is taken out of an image."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.vision.masks import Image, Mask, scaled_size, window_of
+
+INPAINT_RADIUS = 4  # px
+MARGIN = 8  # px around a drawing that the fill may look at
+TEXTURE_SIGMA = 3.0  # px: finer detail than this is texture, coarser is shading
+VARIED = 18.0  # grey levels of standard deviation around a hole
+RIM, RIM_LEAST = 0.04, 3.0  # of the hole's size, px: next to it the fill fades out, and nothing is learnt
+SHADOW_STEP = 14.0  # grey levels
+LEAST_WEIGHT = 1e-3  # of a pyramid cell known: with less, the coarser level says more
+FADE = 0.14  # of the hole's size: how far out its shadow is taken away
+FADE_MOST = 0.011  # of the image's longer side: and no further
+SHIFTS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))  # in sizes of the hole
+COARSE_SIDE = 128  # px: the crop is searched at this size
+TILE = 9  # px at the coarse size: what one patch fills
+CONTEXT = 5  # px around a tile that must fit
+FEATHER = 3  # px over which patches overlap
+
+Floats = NDArray[np.float32]
+
+
+def erase_drawing(image: Image, mask: Mask) -> Image:
+    """The image [H, W, 3] with thin masked strokes inpainted by Telea's method."""
+    crop = window_of(mask, MARGIN)
+    if crop is None:
+        return image
+    result = image.copy()
+    result[crop] = cv2.inpaint(image[crop], mask[crop].astype(np.uint8), INPAINT_RADIUS, cv2.INPAINT_TELEA)
+    return result
+
+
+def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
+    """The image [H, W, 3] with a hole [H, W] closed: shading drawn in from the rim, texture taken from beside it.
+
+    Pixels of `avoid` (other objects) give neither shading nor texture, unless nothing else is left. The object's own
+    shadow around the hole gives none either; it fades out over the few pixels next to it.
+    """
+    size = float(np.sqrt(hole.sum()))
+    crop = window_of(hole, max(24, int(0.6 * size)))
+    if crop is None:
+        return image
+    inside = hole[crop]
+    known = ~(inside | avoid[crop]) if avoid is not None else ~inside
+    if not known.any():
+        known = ~inside
+    if not known.any():
+        return image
+    source = image[crop].astype(np.float32)
+    away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
+    rim = max(RIM_LEAST, RIM * size)
+    shadow = _contact_shadow(source, inside, known)
+    trusted = known & ~shadow & (away > rim)
+    if not trusted.any():
+        trusted = known
+    shading = push_pull(source, trusted)
+    if _is_varied(source, inside, trusted):
+        filled = exemplar_inpaint(source, inside | (away <= rim), ~trusted, shading)
+    else:
+        filled = shading + _texture(image, hole, avoid, crop)
+    fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
+    reach = np.where(cv2.dilate(shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, max(fade, rim), rim)
+    share = np.where(inside, 1.0, np.where(known, np.clip(1 - away / reach, 0, 1), 0.0))[..., None].astype(np.float32)
+    result = image.copy()
+    result[crop] = np.clip(filled * share + source * (1 - share) + 0.5, 0, 255).astype(np.uint8)
+    return result
+
+
+def _is_varied(source: Floats, inside: Mask, known: Mask) -> bool:
+    """Whether what lies around the hole is no plain surface: it has texture, or several colours."""
+    reach = 2 * max(4, int(0.25 * np.sqrt(inside.sum()))) + 1
+    ring = (cv2.dilate(inside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & known
+    return bool(ring.any()) and float(source[ring].std(axis=0).max()) > VARIED
+
+
+def _contact_shadow(source: Floats, inside: Mask, known: Mask) -> Mask:
+    """Known pixels at the hole's rim that are much darker than most: the object's own shadow, no shading to draw in."""
+    reach = 2 * max(3, int(0.15 * np.sqrt(inside.sum()))) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    rim = (cv2.dilate(inside.astype(np.uint8), kernel) > 0) & known
+    grey = source.mean(axis=2)
+    if not rim.any():
+        return rim
+    return rim & (grey < np.percentile(grey[rim], 65) - SHADOW_STEP)
+
+
+def push_pull(source: Floats, known: Mask) -> Floats:
+    """Unknown pixels of [h, w, 3] from known ones: averages down a pyramid, then back up (push-pull)."""
+    weight = known.astype(np.float32)
+    levels = [(source * weight[..., None], weight)]
+    while min(levels[-1][1].shape) > 1 and not (levels[-1][1] > LEAST_WEIGHT).all():
+        colours, weights = (np.asarray(cv2.pyrDown(layer), np.float32) for layer in levels[-1])
+        levels.append((colours, weights))
+    colours, weights = levels[-1]
+    value = colours / np.maximum(weights, LEAST_WEIGHT)[..., None]
+    for colours, weights in reversed(levels[:-1]):
+        coarse = cv2.resize(value, (weights.shape[1], weights.shape[0]), interpolation=cv2.INTER_LINEAR)
+        trust = np.minimum(weights, 1)[..., None]
+        value = np.where(
+            trust > LEAST_WEIGHT, colours / np.maximum(weights, LEAST_WEIGHT)[..., None], 0
+        ) * trust + coarse * (1 - trust)
+    for _ in range(2):
+        value = np.where(known[..., None], source, cv2.GaussianBlur(value, (0, 0), 2.0))
+    return np.asarray(value, np.float32)
+
+
+def _texture(image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, slice]) -> Floats:
+    """Fine detail for the crop, from the calmest neighbouring place of the hole's shape; zero where there is none."""
+    rows, columns = crop
+    height, width = hole.shape
+    inner = window_of(hole, 2) or crop
+    step_y, step_x = inner[0].stop - inner[0].start, inner[1].stop - inner[1].start
+    unusable = hole if avoid is None else hole | avoid
+    shape = hole[inner]
+    best: tuple[float, Floats] | None = None
+    for sx, sy in SHIFTS:
+        y, x = inner[0].start + sy * step_y, inner[1].start + sx * step_x
+        if y < 0 or x < 0 or y + step_y > height or x + step_x > width:
+            continue
+        place = slice(y, y + step_y), slice(x, x + step_x)
+        if (unusable[place] & shape).any():
+            continue
+        patch = image[place].astype(np.float32)
+        detail = patch - cv2.GaussianBlur(patch, (0, 0), TEXTURE_SIGMA)
+        unrest = float(np.percentile(np.abs(detail[shape]), 99))
+        if best is None or unrest < best[0]:
+            best = unrest, detail
+    texture = np.zeros((rows.stop - rows.start, columns.stop - columns.start, 3), np.float32)
+    if best is not None:
+        top, left = inner[0].start - rows.start, inner[1].start - columns.start
+        texture[top : top + step_y, left : left + step_x] = best[1]
+    return texture
+
+
+def exemplar_inpaint(source: Floats, unknown: Mask, forbidden: Mask, shading: Floats) -> Floats:
+    """Pixels [h, w, 3] for the unknown ones [h, w], copied from places that are neither unknown nor forbidden.
+
+    Patches are chosen from the rim inwards at a coarse size, where a search is cheap, and copied at full size, so that
+    texture stays sharp. `shading`, a smooth first guess of the whole crop, steers the choice, and stays where no patch
+    is found. After Criminisi, Perez, Toyama, "Region filling and object removal by exemplar-based inpainting", 2004.
+    """
+    height, width = unknown.shape
+    scale = min(1.0, COARSE_SIDE / max(height, width))
+    size = scaled_size(width, height, scale)
+    guess = np.where(unknown[..., None], shading, source)
+    coarse = np.asarray(cv2.resize(guess, size, interpolation=cv2.INTER_AREA), np.float32)
+    todo = cv2.resize(unknown.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
+    barred = cv2.resize((unknown | forbidden).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
+    result, weight = np.zeros_like(source), np.zeros(unknown.shape, np.float32)
+    inner = todo.copy()
+    while inner.any():
+        depth = cv2.distanceTransform(np.pad(inner, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+        depth[~inner] = np.inf
+        y, x = (int(v) for v in np.unravel_index(int(depth.argmin()), depth.shape))
+        tile = _around(y, TILE // 2, coarse.shape[0]), _around(x, TILE // 2, coarse.shape[1])
+        offset = _best_offset(coarse, inner, barred, y, x)
+        if offset is not None:
+            _copy(result, weight, source, tile, offset, scale)
+            moved = tuple(slice(s.start + o, s.stop + o) for s, o in zip(tile, offset, strict=True))
+            coarse[tile] = np.where(inner[tile][..., None], coarse[moved], coarse[tile])
+        inner[tile] = False
+    mixed = result / np.maximum(weight, 1e-6)[..., None]
+    return np.where((weight > 1e-3)[..., None], mixed, shading).astype(np.float32)
+
+
+def _around(centre: int, reach: int, length: int) -> slice:
+    return slice(max(0, centre - reach), min(length, centre + reach + 1))
+
+
+def _best_offset(coarse: Floats, todo: Mask, barred: Mask, y: int, x: int) -> tuple[int, int] | None:
+    """Rows and columns from a tile to the place that fits its surroundings best, or None where there is no place."""
+    reach = TILE // 2 + CONTEXT
+    window = _around(y, reach, coarse.shape[0]), _around(x, reach, coarse.shape[1])
+    template = coarse[window]
+    trust = np.where(todo[window], 0.05, 1.0).astype(np.float32)  # the smooth guess counts a little
+    error = cv2.matchTemplate(coarse, template, cv2.TM_SQDIFF, mask=np.repeat(trust[..., None], 3, axis=2))
+    # A place may be used where the tile itself would take no barred pixel.
+    tile_y, tile_x = _around(y, TILE // 2, coarse.shape[0]), _around(x, TILE // 2, coarse.shape[1])
+    top, left = tile_y.start - window[0].start, tile_x.start - window[1].start
+    counts = cv2.integral(barred.astype(np.uint8))
+    rows, columns = error.shape
+    y0, y1 = top, top + tile_y.stop - tile_y.start
+    x0, x1 = left, left + tile_x.stop - tile_x.start
+    taken = (
+        counts[y1 : y1 + rows, x1 : x1 + columns]
+        - counts[y0 : y0 + rows, x1 : x1 + columns]
+        - counts[y1 : y1 + rows, x0 : x0 + columns]
+        + counts[y0 : y0 + rows, x0 : x0 + columns]
+    )
+    error[(taken > 0) | ~np.isfinite(error)] = np.inf
+    best = np.unravel_index(int(error.argmin()), error.shape)
+    if not np.isfinite(error[best]):
+        return None
+    return int(best[0]) - window[0].start, int(best[1]) - window[1].start
+
+
+def _copy(
+    result: Floats, weight: Floats, source: Floats, tile: tuple[slice, slice], offset: tuple[int, int], scale: float
+) -> None:
+    """Adds the full-size patch of a coarse tile, fading out at its rim."""
+    height, width = weight.shape
+    grow = FEATHER / scale
+    y0, y1 = max(0, int(tile[0].start / scale - grow)), min(height, int(tile[0].stop / scale + grow))
+    x0, x1 = max(0, int(tile[1].start / scale - grow)), min(width, int(tile[1].stop / scale + grow))
+    dy, dx = round(offset[0] / scale), round(offset[1] / scale)
+    y0, y1 = max(y0, -dy), min(y1, height - dy)
+    x0, x1 = max(x0, -dx), min(x1, width - dx)
+    if y1 <= y0 or x1 <= x0:
+        return
+    ramp_y, ramp_x = (
+        np.minimum(np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1)) / grow, 1.0) for n in (y1 - y0, x1 - x0)
+    )
+    fade = np.outer(ramp_y, ramp_x).astype(np.float32) ** 2
+    result[y0:y1, x0:x1] += source[y0 + dy : y1 + dy, x0 + dx : x1 + dx] * fade[..., None]
+    weight[y0:y1, x0:x1] += fade

@@ -1,0 +1,196 @@
+"""Segments an object with GrabCut: from its box, from a point on it, or from a first guess of its mask."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.records import BBox
+from cow_service.vision.masks import Image, Mask, bbox_of, outline_of, scaled
+
+WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
+POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
+ITERATIONS = 2
+GROW, SHRINK = 0.05, 0.04  # of its size: how far a guess may be from the object, outwards and inwards
+LEAST_BACKGROUND = 0.15  # of a crop, to learn the background from
+CORE, LARGE_CORE = 0.25, 0.6  # of the box: the ellipse in its middle that is surely the object
+SPAN = 0.7  # of the box's sides: a box is tight, so a cut that spans less is tried again with the large core
+GAMMA = 0.5  # brightens what is cut: dark hair on a dark wall differs by few grey levels
+MARGIN = 0.25  # of the box, kept around it as sure background
+STEADY = 0.6  # weight of a mask that stays the same when more is looked at
+POINT_REACHES = (0.07, 0.11, 0.16, 0.24, 0.34)  # half sides tried around a point, of the image's shorter side
+
+
+def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
+    """Mask [H, W] of the object in a box, by GrabCut; a guess [H, W] of it makes the cut surer and faster.
+
+    Falls back to the ellipse in the box where colour tells nothing apart. Never empty.
+    """
+    height, width = image.shape[:2]
+    x0, y0, x1, y1 = _inside(bbox, width, height)
+    pad = MARGIN * max(x1 - x0, y1 - y0) + 6
+    rows = slice(max(0, int(y0 - pad)), min(height, int(np.ceil(y1 + pad))))
+    columns = slice(max(0, int(x0 - pad)), min(width, int(np.ceil(x1 + pad))))
+    crop = image[rows, columns]
+    scale = min(1.0, WORKING_SIDE / max(crop.shape[:2]))
+    small = scaled(crop, scale)
+    h, w = small.shape[:2]
+    box = np.array([x0 - columns.start, y0 - rows.start, x1 - columns.start, y1 - rows.start]) * scale
+    if guess is None:
+        cut = _grabcut(small, _labels_from_box(h, w, box, CORE))
+        if not _spans(_tidy(cut, box), box):  # a part of the object, such as a face
+            cut = _grabcut(small, _labels_from_box(h, w, box, LARGE_CORE))
+    else:
+        near = cv2.resize(guess[rows, columns].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA)
+        cut = _grabcut(small, _labels_from_guess(np.asarray(near, np.uint8)))
+    if guess is not None:  # a guess may have missed a highlight: its box is not the object's
+        grow = GROW * float(np.sqrt((box[2] - box[0]) * (box[3] - box[1])))
+        box = box + grow * np.array([-1, -1, 1, 1])
+    soft = cv2.GaussianBlur(_tidy(cut, box).astype(np.float32), (0, 0), 0.7)
+    mask = np.zeros((height, width), bool)
+    mask[rows, columns] = cv2.resize(soft, (crop.shape[1], crop.shape[0]), interpolation=cv2.INTER_LINEAR) > 0.5
+    share = mask.sum() / max(1.0, (x1 - x0) * (y1 - y0))
+    if not 0.12 < share < 1.3:
+        mask = guess.copy() if guess is not None else _ellipse(height, width, (x0, y0, x1, y1))
+    return mask
+
+
+def mask_from_point(image: Image, point: tuple[float, float]) -> Mask:
+    """Mask [H, W] of the object at a point [x, y]: of several sizes, the one whose outline lies best on edges."""
+    height, width = image.shape[:2]
+    best: tuple[float, Mask] | None = None
+    tries = [_cut_around(image, point, reach * min(height, width)) for reach in POINT_REACHES]
+    for (score, mask), (_, larger) in zip(tries, [*tries[1:], (0.0, None)], strict=True):
+        if mask is None:
+            continue
+        steady = 0.0 if larger is None else float((mask & larger).sum() / (mask | larger).sum())
+        if best is None or score + STEADY * steady > best[0] + 0.02:
+            best = score + STEADY * steady, mask
+    if best is None:
+        half = POINT_REACHES[0] * min(height, width)
+        box = (point[0] - half, point[1] - half, point[0] + half, point[1] + half)
+        return _ellipse(height, width, _inside(box, width, height))
+    return mask_from_bbox(image, bbox_of(best[1]), best[1])
+
+
+def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[float, Mask | None]:
+    """One try around a point: the mask [H, W] of a thing about `half` px in reach, and how well edges bear it out."""
+    height, width = image.shape[:2]
+    outer = 1.6 * half
+    rows = slice(max(0, int(point[1] - outer)), min(height, int(point[1] + outer) + 1))
+    columns = slice(max(0, int(point[0] - outer)), min(width, int(point[0] + outer) + 1))
+    crop = image[rows, columns]
+    scale = min(1.0, POINT_WORKING_SIDE / max(crop.shape[:2]))
+    small = scaled(crop, scale)
+    h, w = small.shape[:2]
+    x, y, r = (point[0] - columns.start) * scale, (point[1] - rows.start) * scale, half * scale
+    box = _inside((x - r, y - r, x + r, y + r), w, h)
+    labels = np.full((h, w), cv2.GC_BGD, np.uint8)
+    cv2.rectangle(labels, (int(box[0]), int(box[1])), (int(box[2]), int(box[3])), int(cv2.GC_PR_BGD), -1)
+    cv2.circle(labels, (round(x), round(y)), max(3, int(0.6 * r)), int(cv2.GC_PR_FGD), -1)
+    cv2.circle(labels, (round(x), round(y)), max(2, int(0.15 * r)), int(cv2.GC_FGD), -1)
+    cut = _component_at(_grabcut(small, labels), x, y)
+    if cut.sum() < 30:
+        return 0.0, None
+    lab = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32), (0, 0), 1.2)
+    dx, dy = cv2.Sobel(lab, cv2.CV_32F, 1, 0), cv2.Sobel(lab, cv2.CV_32F, 0, 1)
+    edges = np.sqrt((dx * dx + dy * dy).sum(axis=2))
+    outline = outline_of(cut)
+    on_edge = float(np.minimum(edges[outline] / (float(np.percentile(edges, 90)) + 1e-3), 1.5).mean())
+    left, top, right, bottom = bbox_of(cut)
+    cramped = float(np.mean([left <= box[0] + 1, top <= box[1] + 1, right >= box[2] - 1, bottom >= box[3] - 1]))
+    soft = cv2.resize(cv2.GaussianBlur(cut.astype(np.float32), (0, 0), 0.8), (crop.shape[1], crop.shape[0]))
+    mask = np.zeros((height, width), bool)
+    mask[rows, columns] = soft > 0.5
+    return on_edge - 0.6 * cramped, mask if mask.any() else None
+
+
+def _inside(bbox: BBox, width: int, height: int) -> BBox:
+    """The part of a box inside the image, at least 2 px each way."""
+    x0, y0 = min(max(0.0, bbox[0]), width - 2.0), min(max(0.0, bbox[1]), height - 2.0)
+    return x0, y0, min(max(bbox[2], x0 + 2), float(width)), min(max(bbox[3], y0 + 2), float(height))
+
+
+def _spans(cut: Mask, box: NDArray[np.float64]) -> bool:
+    """Whether a cut reaches across most of its box both ways."""
+    if not cut.any():
+        return False
+    left, top, right, bottom = bbox_of(cut)
+    return right - left >= SPAN * (box[2] - box[0]) and bottom - top >= SPAN * (box[3] - box[1])
+
+
+def _labels_from_box(height: int, width: int, box: NDArray[np.float64], core: float) -> NDArray[np.uint8]:
+    """GrabCut's labels: outside the box is background, the ellipse in it perhaps the object, its `core` surely."""
+    labels = np.full((height, width), cv2.GC_BGD, np.uint8)
+    x0, y0, x1, y1 = (int(v) for v in np.round(box))
+    labels[max(0, y0) : y1, max(0, x0) : x1] = cv2.GC_PR_BGD
+    centre, axes = ((x0 + x1) // 2, (y0 + y1) // 2), (max(1, (x1 - x0) // 2), max(1, (y1 - y0) // 2))
+    cv2.ellipse(labels, centre, axes, 0, 0, 360, int(cv2.GC_PR_FGD), -1)
+    inner = max(1, int(core * axes[0])), max(1, int(core * axes[1]))
+    cv2.ellipse(labels, centre, inner, 0, 0, 360, int(cv2.GC_FGD), -1)
+    if np.mean(labels == cv2.GC_BGD) < LEAST_BACKGROUND:  # the box fills the image: its upper corners must serve
+        rise, run = max(2, (y1 - y0) // 7), max(2, (x1 - x0) // 7)
+        for corner in (labels[: y0 + rise, : x0 + run], labels[: y0 + rise, x1 - run :]):
+            corner[:] = cv2.GC_BGD
+    return labels
+
+
+def _labels_from_guess(guess: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    size = float(np.sqrt(guess.sum()))
+    outer, inner = (
+        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        for reach in (max(2, int(GROW * size)), max(1, int(SHRINK * size)))
+    )
+    labels = np.full(guess.shape, cv2.GC_BGD, np.uint8)
+    labels[cv2.dilate(guess, outer) > 0] = cv2.GC_PR_BGD
+    labels[guess > 0] = cv2.GC_PR_FGD
+    labels[cv2.erode(guess, inner, borderValue=1) > 0] = cv2.GC_FGD
+    return labels
+
+
+def _grabcut(image: Image, labels: NDArray[np.uint8]) -> Mask:
+    """GrabCut from labels; the labels' own guess where it has nothing to learn from."""
+    sure = {int(value) for value in np.unique(labels)}
+    foreground, background = {int(cv2.GC_FGD), int(cv2.GC_PR_FGD)}, {int(cv2.GC_BGD), int(cv2.GC_PR_BGD)}
+    if sure & foreground and sure & background:
+        light = np.clip(255 * (image / 255.0) ** GAMMA, 0, 255).astype(np.uint8)
+        cv2.setRNGSeed(0)  # its clustering draws random numbers: the same image must give the same mask
+        no_box, models = (0, 0, 0, 0), (np.zeros((1, 65)), np.zeros((1, 65)))  # labels say it all
+        cv2.grabCut(light, labels, no_box, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+
+
+def _tidy(cut: Mask, box: NDArray[np.float64]) -> Mask:
+    """Keeps the main blob inside the box, and closes its holes."""
+    x0, y0, x1, y1 = box
+    kept = np.zeros(cut.shape, np.uint8)
+    window = slice(max(0, int(y0) - 1), int(np.ceil(y1)) + 1), slice(max(0, int(x0) - 1), int(np.ceil(x1)) + 1)
+    kept[window] = cut[window]
+    kept = cv2.morphologyEx(kept, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    contours, _ = cv2.findContours(kept, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return kept.astype(bool)
+    biggest = max(contours, key=cv2.contourArea)
+    whole = np.zeros(cut.shape, np.uint8)
+    cv2.drawContours(whole, [biggest], -1, 1, -1)
+    holes = (whole > 0) & (kept == 0)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8), connectivity=4)
+    for i in range(1, count):
+        if stats[i][4] > 0.04 * whole.sum():  # the hole of a handle stays one
+            whole[labels == i] = 0
+    return whole.astype(bool)
+
+
+def _component_at(mask: Mask, x: float, y: float) -> Mask:
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    label = labels[min(mask.shape[0] - 1, max(0, round(y))), min(mask.shape[1] - 1, max(0, round(x)))]
+    return labels == label if label else np.zeros_like(mask)
+
+
+def _ellipse(height: int, width: int, box: BBox) -> Mask:
+    mask = np.zeros((height, width), np.uint8)
+    centre = (round((box[0] + box[2]) / 2), round((box[1] + box[3]) / 2))
+    axes = (max(1, round((box[2] - box[0]) / 2)), max(1, round((box[3] - box[1]) / 2)))
+    cv2.ellipse(mask, centre, axes, 0, 0, 360, 1, -1)
+    return mask.astype(bool)

@@ -1,0 +1,134 @@
+"""Many requests at the same time: every picture goes with its own question, and every answer to its own caller."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import mllm_server as say
+import numpy as np
+import pytest
+from engines import app_for
+from mllm_server import MllmServer
+from numpy.typing import NDArray
+from servers import data_url
+
+from cow_service.jobs.registry import JobRegistry
+from cow_service.media.images import encode_png
+from cow_service.service import Service
+from cow_service.settings import Settings
+
+SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))  # 1 in CI, 10 for a soak test
+REQUESTS = 24 * SCALE
+BITS = 12
+WIDTH, HEIGHT = 16 * BITS, 96
+
+
+def picture(number: int) -> str:
+    """A number as black and white bars."""
+    bars = [255 * (number >> bit & 1) for bit in range(BITS)]
+    row = np.repeat(np.array(bars, np.uint8), WIDTH // BITS)
+    return data_url(encode_png(np.repeat(np.tile(row, (HEIGHT, 1))[..., None], 3, axis=2)))
+
+
+def number_in(pixels: NDArray[np.uint8]) -> int:
+    """The number that a picture shows, whatever its size."""
+    bars = np.array_split(pixels[pixels.shape[0] // 2, :, 0], BITS)
+    return sum(int(bar[len(bar) // 2] > 127) << bit for bit, bar in enumerate(bars))
+
+
+class Witness:
+    """A multimodal LLM that answers with the number in its picture, and notes where the question means another."""
+
+    def __init__(self, server: MllmServer) -> None:
+        self.wrong: list[tuple[int, list[int]]] = []
+        self.delay = 0.0  # seconds
+        server.say(self.reply)
+
+    def reply(self, handler: Any) -> None:
+        time.sleep(self.delay)
+        asked = int(re.findall(r"picture (\d+)", say.text_of(handler.body))[-1])
+        seen = [number_in(pixels) for pixels in say.images_of(handler.body)]
+        if seen != [asked]:
+            self.wrong.append((asked, seen))
+        handler.send(200, say.completion(f'{{"reasoning": "", "answer": "{seen[0]}"}}'))
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[Service, Witness]]:
+    with say.mllm_server() as server:
+        settings = Settings(data_dir=tmp_path, mllm="qwen3-vl-8b", mllm_base_url=server.address, queue_limit=10_000)
+        with Service(settings) as service:
+            yield service, Witness(server)
+
+
+def body(number: int, **others: Any) -> dict[str, Any]:
+    return {"image": picture(number), "question": f"What is in picture {number}?", "imagine": "never", **others}
+
+
+def test_no_request_gets_the_picture_or_the_answer_of_another(served: tuple[Service, Witness]) -> None:
+    service, witness = served
+    transport = httpx.ASGITransport(app_for(service))
+
+    async def ask(client: httpx.AsyncClient, number: int) -> tuple[int, Any]:
+        """In the ways in which a job's image can get to it: at once or from the queue, alone, in votes, again."""
+        way = number % 4
+        headers = {"Cache-Control": "no-cache"} if way == 1 else {}
+        if way == 2:
+            # The key comes with another picture, whose job is deleted, and then with this one.
+            headers = {"Idempotency-Key": f"key-{number}"}
+            first = await client.post(
+                "/answer", json=body(number + REQUESTS), headers=headers | {"Prefer": "respond-async"}
+            )
+            assert (await client.delete(f"/jobs/{first.json()['id']}")).status_code == 204
+        told = await client.post("/answer", json=body(number, votes=3 if way == 3 else 1), headers=headers)
+        assert told.status_code == 200, told.text
+        again = await client.post("/answer", json=body(number, votes=3 if way == 3 else 1))
+        assert again.json()["answer"] == told.json()["answer"]
+        return number, told.json()["answer"]
+
+    async def all_at_once() -> list[tuple[int, Any]]:
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=110) as client:
+            return await asyncio.gather(*(ask(client, number) for number in range(REQUESTS)))
+
+    answers = asyncio.run(all_at_once())
+    assert answers == [(number, str(number)) for number in range(REQUESTS)]
+    assert witness.wrong == []
+
+
+def test_a_late_message_about_a_deleted_job_is_not_taken_for_the_next_one(
+    served: tuple[Service, Witness], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A key that is used again after a deletion has the same job id: what is said of the first job may come late."""
+    service, witness = served
+    transport = httpx.ASGITransport(app_for(service))
+    announce, held = JobRegistry.ended, threading.Event()
+
+    def late(registry: JobRegistry, job_id: str, outcome: Any, created_at: str | None = None) -> None:
+        if isinstance(outcome, str) and json.loads(outcome)["answer"] == "1":
+            held.wait(20)
+        announce(registry, job_id, outcome, created_at)
+
+    async def calls() -> str:
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
+            key = {"Idempotency-Key": "late"}
+            first = (await client.post("/answer", json=body(1), headers=key | {"Prefer": "respond-async"})).json()["id"]
+            while (await client.get(f"/jobs/{first}")).json()["status"] != "succeeded":
+                await asyncio.sleep(0.02)
+            await client.delete(f"/jobs/{first}")
+            witness.delay = 1.0
+            second = asyncio.create_task(client.post("/answer", json=body(2), headers=key))
+            await asyncio.sleep(0.5)
+            held.set()
+            return (await second).json()["answer"]
+
+    monkeypatch.setattr(JobRegistry, "ended", late)
+    assert asyncio.run(calls()) == "2"
