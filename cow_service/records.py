@@ -18,6 +18,8 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 Source = Literal["mllm", "embedded", "request"]
 MotionKind = Literal["linear", "projectile", "fall", "static"]
+DIRECTED_KINDS: tuple[MotionKind, ...] = ("linear", "projectile")  # these need a direction, and have a speed
+FALLING_KINDS: tuple[MotionKind, ...] = ("projectile", "fall")  # these are in the air, and gravity acts on them
 Cue = Literal["arrow", "trail", "orientation", "text", "gravity", "request"]
 EncounterKind = Literal["touches", "occludes", "occluded-by"]
 FramePolicy = Literal["initial", "uniform", "events"]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
-from cow_service.records import BBox, FramePolicy, MotionKind, Point, Record, Sha256, Vector
+from cow_service.records import DIRECTED_KINDS, BBox, FramePolicy, MotionKind, Point, Record, Sha256, Vector
 
 MAX_FRAMES = 481
 MAX_TRACKS = 1024
@@ -102,9 +102,9 @@ class MotionRequest(Record):
 
     @model_validator(mode="after")
     def _goes_somewhere(self) -> MotionRequest:
-        if self.kind in ("linear", "projectile") and self.direction is None:
+        if self.kind in DIRECTED_KINDS and self.direction is None:
             raise ValueError(f"a {self.kind} motion needs a `direction` [dx, dy]")
-        if self.kind in ("fall", "static") and (self.direction is not None or self.speed is not None or self.depth):
+        if self.kind not in DIRECTED_KINDS and (self.direction is not None or self.speed is not None or self.depth):
             raise ValueError(
                 f"a {self.kind} motion takes no `direction`, `speed` or `depth`; a throw is a `projectile`"
             )

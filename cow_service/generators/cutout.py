@@ -15,7 +15,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.media.images import fit_within
 from cow_service.physics.camera import has_passed
 from cow_service.physics.encounters import box_at, boxes_overlap, stands_nearer
-from cow_service.records import BBox, GeneratorInfo
+from cow_service.records import FALLING_KINDS, BBox, GeneratorInfo
 from cow_service.settings import Settings
 from cow_service.vision.inpainting import fill_hole, push_pull
 from cow_service.vision.masks import Image, Mask, resized_mask, scaled_size, window_of
@@ -72,7 +72,7 @@ class CutoutGenerator:
         """The frames of these indices, RGB [h, w, 3]; only the window of the mover is composed."""
         layers = _layers(given)
         start = np.array(given.grounding.point)
-        airborne = given.motion.kind in ("projectile", "fall")
+        airborne = given.motion.kind in FALLING_KINDS
         depths = np.array([state[2] for state in given.trajectory.states])
         gone = has_passed(depths, depths[0])
         for done, index in enumerate(indices):

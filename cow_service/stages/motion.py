@@ -7,13 +7,10 @@ import math
 from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.readers.base import MotionReading
 from cow_service.readers.question.wording import motion_sentence
-from cow_service.records import Grounding, MetresPerPixel, Motion, Source, Vector
+from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Source, Vector
 from cow_service.requests import MotionRequest, TrajectoryRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
-
-MOVING = ("linear", "projectile")
-FALLING = ("projectile", "fall")
 
 
 def read_motion(run: Run, grounding: Grounding) -> StageResult[Motion]:
@@ -48,7 +45,7 @@ def _complete(
         source="default",
         note=f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object",
     )
-    moves = reading.kind in MOVING
+    moves = reading.kind in DIRECTED_KINDS
     direction = _unit(reading.direction) if moves and reading.direction is not None else None
     depth = reading.depth if moves else 0.0
     return Motion(
@@ -58,7 +55,7 @@ def _complete(
         cue=reading.cue,
         along_arrow=reading.along_arrow,
         speed=(DEFAULT_SPEED * image_width if speed is None else speed) if moves else 0.0,
-        gravity=_gravity(reading.down, scale) if reading.kind in FALLING else (0.0, 0.0),
+        gravity=_gravity(reading.down, scale) if reading.kind in FALLING_KINDS else (0.0, 0.0),
         metres_per_pixel=scale,
         sentence=motion_sentence(grounding.object, reading.kind, direction, depth, reading.sentence),
         source=source,

@@ -11,7 +11,7 @@ from cow_service.physics.anchors import points_inside, spread_anchors
 from cow_service.physics.camera import Camera
 from cow_service.physics.dynamics import roll_out
 from cow_service.physics.encounters import Sweep, find_encounters, swept_mask
-from cow_service.records import Grounding, Motion, Trajectory
+from cow_service.records import FALLING_KINDS, Grounding, Motion, Trajectory
 from cow_service.requests import TrajectoryRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
@@ -57,7 +57,7 @@ def trajectory_of(
     if given is not None and given.visible is not None:
         visible &= np.array(given.visible)[_latest(given, times)]
     mask = scene.silhouette(grounding.bbox)
-    airborne = motion.kind in ("projectile", "fall")
+    airborne = motion.kind in FALLING_KINDS
     sweep = Sweep(mask, grounding.bbox, np.array(grounding.point), points, scale, visible, airborne)
     movable = swept_mask(sweep)
     for obstacle in obstacles:

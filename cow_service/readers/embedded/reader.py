@@ -14,7 +14,7 @@ from cow_service.readers.embedded.matching import best_matches, describe, inside
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question, parse
-from cow_service.records import AnswerOption, BBox, Grounding, LocatedObject, ReaderInfo, Source, Vector
+from cow_service.records import DIRECTED_KINDS, AnswerOption, BBox, Grounding, LocatedObject, ReaderInfo, Source, Vector
 from cow_service.settings import Settings
 from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
 from cow_service.vision.scene import SAME_OBJECT, Scene, iou
@@ -141,7 +141,7 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
-    if kind in ("static", "fall"):  # neither has a direction
+    if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "text" if kind == "static" else "gravity")
     if words.arrow is not None:
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction

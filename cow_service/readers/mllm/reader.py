@@ -22,12 +22,20 @@ from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.mllm.scale import Scaled, scale_call
 from cow_service.readers.question.sentences import parse, parse_noun_phrase
-from cow_service.records import AnswerOption, BBox, Cue, Grounding, MotionKind, ReaderInfo, Source
+from cow_service.records import (
+    DIRECTED_KINDS,
+    FALLING_KINDS,
+    AnswerOption,
+    BBox,
+    Cue,
+    Grounding,
+    MotionKind,
+    ReaderInfo,
+    Source,
+)
 from cow_service.settings import Settings
 from cow_service.weights.resources import PROMPTS
 
-DIRECTED: tuple[MotionKind, ...] = ("linear", "projectile")
-FALLING: tuple[MotionKind, ...] = ("projectile", "fall")
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
 GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y down."
@@ -103,12 +111,12 @@ class MllmReader:
             _, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
         kind = hints.kind or _kind(given, None)
         reading = MotionReading(kind, None, "text", sentence=hints.sentence)
-        if kind in FALLING:
+        if kind in FALLING_KINDS:
             reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
             if hints.scale_error:
                 warning = f"The scale of the scene could not be read ({hints.scale_error}): the default one was taken."
                 reading = replace(reading, warnings=(warning,))
-        return self._directed(given, grounding, reading, hints) if kind in DIRECTED else reading
+        return self._directed(given, grounding, reading, hints) if kind in DIRECTED_KINDS else reading
 
     def answer(
         self,
@@ -142,9 +150,9 @@ class MllmReader:
         """
         kind = _kind(given, identified)
         others = identified.others if identified is not None and bbox is None else ()
-        wants_direction = given.motion_wanted and kind in DIRECTED
+        wants_direction = given.motion_wanted and kind in DIRECTED_KINDS
         wants_place = bbox is None or wants_direction
-        wants_scale = given.motion_wanted and kind in FALLING
+        wants_scale = given.motion_wanted and kind in FALLING_KINDS
         calls: list[PromptCall[Any]] = []
         if wants_place:
             calls.append(locate_call(given.question, image, name, bbox, others, wants_direction, self._reasoning))
