@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, cast
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 import torch
 from diffusers import FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler
 from pydantic import Field, model_validator
+from torch import Tensor
 
 from cow_service.records import Record
 
 TRAIN_STEPS = 1000
+
+
+class Schedule(Protocol):
+    """What is used of diffusers' schedulers, whose own annotations are too narrow."""
+
+    timesteps: Tensor
+
+    def step(self, model_output: Tensor, timestep: Tensor, sample: Tensor, *, return_dict: bool) -> tuple[Tensor, ...]:
+        """The sample at the next noise level."""
+        ...
 
 
 class Sampling(Record):
@@ -48,7 +59,7 @@ class Sampling(Record):
         """Whether any step takes the second pass."""
         return any(self.guides(step) for step in range(self.steps))
 
-    def schedule(self, device: torch.device) -> FlowMatchEulerDiscreteScheduler | UniPCMultistepScheduler:
+    def schedule(self, device: torch.device) -> Schedule:
         """A fresh scheduler with its steps set; it holds the state of one clip.
 
         UniPC starts at the noise level of the public Wan2.1 implementation, 0.999 before the shift (diffusers: 1.0).
@@ -58,7 +69,7 @@ class Sampling(Record):
             euler = FlowMatchEulerDiscreteScheduler(num_train_timesteps=TRAIN_STEPS, shift=self.shift)
             euler.set_timesteps(sigmas=[1 - i / self.steps for i in range(self.steps)], device=device)
             euler.set_begin_index(0)
-            return euler
+            return cast(Schedule, euler)
         unipc = UniPCMultistepScheduler(
             num_train_timesteps=TRAIN_STEPS,
             prediction_type="flow_prediction",
@@ -69,4 +80,4 @@ class Sampling(Record):
         unipc.set_timesteps(sigmas=cast(Any, np.linspace(highest, 0, self.steps + 1)[:-1]), device=device)
         # Steps are counted: found by their times, which are whole numbers, two with the same would be taken for one.
         unipc.set_begin_index(0)
-        return unipc
+        return cast(Schedule, unipc)
