@@ -164,6 +164,6 @@ def test_a_backend_that_failed_to_load_is_not_tried_at_every_request(monkeypatch
         with pytest.raises(errors.WeightsUnavailable, match="Pull them"):
             registry.get("slow")
     assert len(tries) == 1
-    monkeypatch.setattr(plugins, "RETRY", 0.0)
+    monkeypatch.setattr(plugins, "RETRY_SECONDS", 0.0)
     assert registry.get("slow") is registry.get("slow")
     assert len(tries) == 2
