@@ -25,8 +25,6 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Runs a command."""
-        from cow_service.settings import SettingsError  # noqa: PLC0415 - not needed for --help
-
         try:
             return super().invoke(ctx)
         except CowError as error:
@@ -37,7 +35,11 @@ class Commands(TyperGroup):
             for field in error.errors:
                 typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
             raise typer.Exit(1) from error
-        except SettingsError as error:
+        except Exception as error:
+            from cow_service.settings import SettingsError  # noqa: PLC0415 - its import would slow down --help
+
+            if not isinstance(error, SettingsError):
+                raise
             typer.secho(str(error), fg="red", err=True)
             raise typer.Exit(2) from error
 

@@ -10,7 +10,7 @@ import typer
 
 from cow_service.errors import InvalidRequest
 
-app = typer.Typer(help="Make API keys.", no_args_is_help=True)
+app = typer.Typer(rich_markup_mode=None, help="Make API keys.", no_args_is_help=True)
 
 
 @app.callback()

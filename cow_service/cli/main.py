@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     cls=Commands,
+    rich_markup_mode=None,  # plain help: rich takes twice as long to import as everything else
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

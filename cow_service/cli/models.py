@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cow_service.weights.hub import Download, DownloadProgress, ProgressCallback
     from cow_service.weights.manifests import Manifest, Source
 
-app = typer.Typer(help="List readers and generators; pull and check weights.")
+app = typer.Typer(rich_markup_mode=None, help="List readers and generators; pull and check weights.")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="As `cow models` lists it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

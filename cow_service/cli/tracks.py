@@ -12,7 +12,9 @@ from cow_service.errors import InvalidRequest
 
 Result = TypeVar("Result")
 
-app = typer.Typer(no_args_is_help=True, help="Write and read the track files of ATI and Wan-Move.")
+app = typer.Typer(
+    rich_markup_mode=None, no_args_is_help=True, help="Write and read the track files of ATI and Wan-Move."
+)
 
 STILL = 1.0  # px: a track that never leaves its start by more is an anchor
 
