@@ -52,7 +52,9 @@ def _at_events(trajectory: Trajectory, count: int) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def generate(run: Run, grounding: Grounding, motion: Motion, trajectory: Trajectory) -> StageResult[Clip]:
+def generate(
+    run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory
+) -> StageResult[Clip]:
     """Renders the clip once, storing the chosen frames, the overlay and, where it is wanted, the video.
 
     Raises `InvalidRequest`, `GeneratorOutOfMemory`, `Canceled`.

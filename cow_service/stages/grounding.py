@@ -6,7 +6,7 @@ from cow_service.errors import FieldError, InvalidRequest
 from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import GroundingReading
 from cow_service.records import BBox, Grounding, Point
-from cow_service.requests import GroundingRequest
+from cow_service.requests import GroundingRequest, SimulateRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.vision.scene import Scene
@@ -14,17 +14,19 @@ from cow_service.vision.scene import Scene
 DEFAULT_NAME = "object"
 
 
-def ground(run: Run) -> StageResult[Grounding]:
+def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     """The mover, from the request where it says so, else from the reader; its mask [H, W] is stored as PNG.
 
     Raises `InvalidRequest` for a place outside the image, and what the reader raises.
     """
-    place, source = run.request.place, "request"
+    place = run.request.place
+    source: Source = "request"
     if place is None:
         reading, source = run.reader.ground(run.reader_input("grounding")), run.reader.source
-    with run.cpu():
-        if place is not None:
+    else:
+        with run.cpu():
             reading = _given(run.scene, place)
+    with run.cpu():
         mask = run.backends.artifacts.put(encode_png(run.scene.silhouette(reading.bbox)), "image/png")
     grounding = Grounding(
         object=reading.object,
@@ -37,7 +39,7 @@ def ground(run: Run) -> StageResult[Grounding]:
     return StageResult(value=grounding, warnings=reading.warnings, artifacts=(mask.sha256,), hints=reading.hints)
 
 
-def recall_mask(run: Run, grounding: Grounding) -> None:
+def recall_mask(run: Run[SimulateRequest], grounding: Grounding) -> None:
     """Has the scene use the stored mask of a grounding that was found again.
 
     A mask cut again from its box may differ from one that was cut around a point.

@@ -8,18 +8,19 @@ from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRA
 from cow_service.readers.base import MotionReading
 from cow_service.readers.question.wording import motion_sentence
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Source, Vector
-from cow_service.requests import MotionRequest, TrajectoryRequest
+from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 
 
-def read_motion(run: Run, grounding: Grounding) -> StageResult[Motion]:
+def read_motion(run: Run[SimulateRequest], grounding: Grounding) -> StageResult[Motion]:
     """The motion, from the request where it gives one or a whole path, else from the reader.
 
     Raises what the reader raises.
     """
     given, path = run.request.motion, run.request.trajectory
-    speed, source = None, "request"
+    speed: float | None = None
+    source: Source = "request"
     if given is not None:
         reading, speed = _given(given), given.speed
     elif path is not None:

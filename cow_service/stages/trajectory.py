@@ -12,7 +12,7 @@ from cow_service.physics.camera import Camera
 from cow_service.physics.dynamics import roll_out
 from cow_service.physics.encounters import Sweep, find_encounters, swept_mask
 from cow_service.records import FALLING_KINDS, Grounding, Motion, Trajectory
-from cow_service.requests import TrajectoryRequest
+from cow_service.requests import SimulateRequest, TrajectoryRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.warnings import warnings_of
@@ -22,7 +22,7 @@ from cow_service.vision.scene import Scene
 Floats = NDArray[np.float64]
 
 
-def compute_trajectory(run: Run, grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
+def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
     """The path over the whole clip, rolled out from the motion or taken from the request, and what it meets."""
     request = run.request
     with run.cpu():
