@@ -20,7 +20,7 @@ class _Waiter:
 
 
 def _never_canceled() -> None:
-    """Nobody cancels."""
+    """Does nothing."""
 
 
 class PrioritySemaphore:

@@ -8,7 +8,7 @@ from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.stages.answering import answer_question
 from cow_service.stages.generation import generate
-from cow_service.stages.grounding import ground, recall_mask
+from cow_service.stages.grounding import ground, use_stored_mask
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
@@ -20,10 +20,10 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
     Raises the errors of its stages: `InvalidRequest`, `CannotGround`, `CannotReadDirection`, `GeneratorUnavailable`,
     `Canceled`...
     """
-    run.check_options()
+    run.check_request()
     grounding = run.stage("grounding", ground)
-    recall_mask(run, grounding)
-    motion = run.stage("motion", read_motion, grounding)
+    use_stored_mask(run, grounding)
+    motion = run.stage("motion", read_motion, grounding, run.hints)
     trajectory = run.stage("trajectory", compute_trajectory, grounding, motion)
     clip = run.stage("generation", generate, grounding, motion, trajectory)
     return Simulation(

@@ -30,7 +30,7 @@ def ignore(done: float) -> None:
 def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion) -> GeneratorInput:
     run = run_of(image, grounding={"point": CENTRE}, motion=motion, num_frames=frames, fps=fps)
     grounding = ground(run).value
-    moving = read_motion(run, grounding).value
+    moving = read_motion(run, grounding, None).value
     trajectory = compute_trajectory(run, grounding, moving).value
     obstacles = run.scene.obstacles(grounding.bbox)
     options = CutoutOptions(clean_cues=clean)

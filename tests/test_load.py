@@ -21,7 +21,7 @@ from mllm_server import MllmServer
 from numpy.typing import NDArray
 from servers import data_url
 
-from cow_service.jobs.registry import JobRegistry
+from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.media.images import encode_png
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -110,9 +110,9 @@ def test_a_late_message_about_a_deleted_job_is_not_taken_for_the_next_one(
     """A key that is used again after a deletion has the same job id: what is said of the first job may come late."""
     service, witness = served
     transport = httpx.ASGITransport(app_for(service))
-    announce, held = JobRegistry.ended, threading.Event()
+    announce, held = OpenJobs.ended, threading.Event()
 
-    def late(registry: JobRegistry, job_id: str, outcome: Any, created_at: str | None = None) -> None:
+    def late(registry: OpenJobs, job_id: str, outcome: Any, created_at: str | None = None) -> None:
         if isinstance(outcome, str) and json.loads(outcome)["answer"] == "1":
             held.wait(20)
         announce(registry, job_id, outcome, created_at)
@@ -130,5 +130,5 @@ def test_a_late_message_about_a_deleted_job_is_not_taken_for_the_next_one(
             held.set()
             return (await second).json()["answer"]
 
-    monkeypatch.setattr(JobRegistry, "ended", late)
+    monkeypatch.setattr(OpenJobs, "ended", late)
     assert asyncio.run(calls()) == "2"

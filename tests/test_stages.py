@@ -17,6 +17,7 @@ from cow_service.records import Encounter, Grounding, Motion, Trajectory
 from cow_service.requests import FramesRequest, SimulateRequest, TrajectoryRequest
 from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
+from cow_service.stages.keys import key_of
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import trajectory_of
 from cow_service.vision.masks import CroppedMask
@@ -44,7 +45,7 @@ def grounded(scene: Scene, **place) -> Grounding:
 
 def moved(scene: Scene, path: TrajectoryRequest | None = None, **motion) -> Motion:
     given = ({"motion": motion} if motion else {}) | ({} if path is None else {"trajectory": path})
-    return read_motion(run(scene, **given), grounded(scene, **POINT)).value
+    return read_motion(run(scene, **given), grounded(scene, **POINT), None).value
 
 
 def rolled(scene: Scene, motion: Motion, path: TrajectoryRequest | None = None, frames=81, fps=16.0) -> Trajectory:
@@ -230,7 +231,38 @@ def test_a_reader_is_asked_where_the_request_is_silent(scene: Scene) -> None:
             assert hints is None
             return MotionReading("linear", (0.0, -2.0), "text", warnings=("careful",))
 
-    result = read_motion(run(scene, reader=OneReader, question="Where to?"), grounded(scene, **POINT))
+    result = read_motion(run(scene, reader=OneReader, question="Where to?"), grounded(scene, **POINT), None)
     assert result.value.direction == (0, -1)
     assert result.value.source == "embedded"
     assert result.warnings == ("careful",)
+
+
+class TestKeys:
+    """What decides a stage's key, and what does not."""
+
+    def key(self, scene: Scene, stage="generation", inputs=(), identity=lambda role: {"name": role}, **request):
+        one = run(scene, **request)
+        return key_of(stage, one.image.info.sha256, one.request, inputs, identity)
+
+    def test_another_wording_renders_no_clip_again(self, scene: Scene) -> None:
+        assert self.key(scene, question="a") == self.key(scene, question="b")
+        assert self.key(scene, seed=1) != self.key(scene, seed=2)
+        assert self.key(scene, inputs=(None,)) != self.key(scene)
+
+    def test_what_the_request_gives_decides_alone(self, scene: Scene) -> None:
+        given = {"grounding": POINT, "motion": {"kind": "fall"}}
+        for stage in ("grounding", "motion"):
+            assert self.key(scene, stage, question="a", **given) == self.key(scene, stage, question="b", **given)
+            assert self.key(scene, stage, question="a") != self.key(scene, stage, question="b")
+            assert self.key(scene, stage) != self.key(scene, stage, identity=lambda role: {"name": "another"})
+
+    def test_a_point_given_beside_a_path_is_not_a_path_alone(self, scene: Scene) -> None:
+        path = {"trajectory": {"points": [(200, 200), (300, 200)]}}
+        assert self.key(scene, "grounding", grounding=POINT, **path) == self.key(scene, "grounding", **path)
+        assert self.key(scene, "trajectory", grounding=POINT, **path) != self.key(scene, "trajectory", **path)
+
+    def test_a_backend_that_does_not_say_what_decides_it_shares_nothing(self, scene: Scene) -> None:
+        one, other = (self.key(scene, identity=lambda role: None, seed=seed) for seed in (1, 2))
+        assert not one.shareable
+        assert one.digest != other.digest
+        assert self.key(scene).shareable

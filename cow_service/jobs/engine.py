@@ -32,7 +32,7 @@ from cow_service.jobs import state, workflows
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.leases import ExecutorLease
 from cow_service.jobs.maintenance import Maintenance
-from cow_service.jobs.registry import JobRegistry
+from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.serializer import JsonSerializer
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.state import CREATED, GENERATOR, JobFilters, JobState
@@ -52,11 +52,11 @@ class JobEngine:
     """Runs the jobs of one service, from `start` to `close`. Its methods block: not for an event loop."""
 
     def __init__(self, service: Service) -> None:
-        self.registry = JobRegistry(service)
-        self.active, self.database = self.registry.active, self.registry.database
+        self.open_jobs = OpenJobs(service)
+        self.active, self.database = self.open_jobs.active, self.open_jobs.database
         self.webhooks = Webhooks(service.settings)
         self._lease = ExecutorLease(service.settings.data_dir / "executors")
-        self._maintenance = Maintenance(self.registry, self._lease)
+        self._maintenance = Maintenance(self.open_jobs, self._lease)
         self._stopping = False
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
         self._queues: set[str] = set()
@@ -67,11 +67,11 @@ class JobEngine:
     @property
     def service(self) -> Service:
         """The service that does the work."""
-        return self.registry.service
+        return self.open_jobs.service
 
     def use(self, service: Service) -> None:
         """Runs the jobs of another service from now on, on the same database."""
-        self.registry.service = service
+        self.open_jobs.service = service
         self.webhooks.use(service.settings)
 
     @property
@@ -99,7 +99,7 @@ class JobEngine:
             use_listen_notify=False,
             log_level="WARNING",
         )
-        workflows.set_runner(Worker(self.registry, self.webhooks, self.work_ended))
+        workflows.set_runner(Worker(self.open_jobs, self.webhooks, self.work_ended))
         try:
             self.database.create_tables()
             DBOS(config=config)
@@ -115,8 +115,8 @@ class JobEngine:
             raise
         self._stopping = False
         self._threads = ThreadPoolExecutor(thread_name_prefix="cow-job", max_workers=1024)
-        self.registry.recount()
-        self.service.metrics.queue_depth = self.registry.depth
+        self.open_jobs.recount()
+        self.service.metrics.queue_depth = self.open_jobs.depth
         self._maintenance.start()
 
     def drain(self) -> None:
@@ -159,9 +159,9 @@ class JobEngine:
         limit = self.service.settings.queue_limit
         if self._stopping:
             raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
-        if len(self.registry) >= limit:
+        if len(self.open_jobs) >= limit:
             raise QueueFull(
-                f"{len(self.registry)} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later."
+                f"{len(self.open_jobs)} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later."
             )
 
     def submit(self, job_id: str, spec: JobSpec, owner: str | None, key: str | None, image: DecodedImage) -> bool:
@@ -182,10 +182,10 @@ class JobEngine:
             return stored is not None and stored.created_at == spec.created_at
 
     def _submit(self, job_id: str, spec: JobSpec, owner: str | None, image: DecodedImage) -> None:
-        with self.registry.lock:  # the count must not change between the check and the record
+        with self.open_jobs.lock:  # the count must not change between the check and the record
             self.check_room()
-            starts_now = self.registry.count(spec.generator) < self.room
-            self.registry.record(job_id, spec.generator)
+            starts_now = self.open_jobs.count(spec.generator) < self.room
+            self.open_jobs.record(job_id, spec.generator)
         try:
             # Before the job exists: its image must not be removed before work on it starts.
             self.database.add_references(job_id, [image.info.sha256])
@@ -196,7 +196,7 @@ class JobEngine:
                 self._enqueue(job_id, spec, owner)
         except BaseException:
             self.active.drop_image(job_id)
-            self.registry.record(job_id, None)
+            self.open_jobs.record(job_id, None)
             raise
 
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> JobState:
@@ -225,7 +225,7 @@ class JobEngine:
             with database_errors():
                 DBOS.cancel_workflow(job_id)
         self.active.request_cancel(job_id)
-        self.registry.ended(job_id, None)
+        self.open_jobs.ended(job_id, None)
         found = self.find(job_id, owner)
         if found.job.status == "canceled":
             self.service.metrics.job(found.job.kind, "canceled")
@@ -236,7 +236,7 @@ class JobEngine:
         found = self.find(job_id, owner, full=False)
         if found.job.status not in TERMINAL:
             found = self.cancel(job_id, owner)
-        self.registry.remove([job_id], found.ended or 0)
+        self.open_jobs.remove([job_id], found.ended or 0)
 
     def may_read(self, sha256: str, owner: str | None) -> None:
         """Raises `ArtifactNotFound` for an artifact that no job of the owner refers to."""
@@ -293,7 +293,7 @@ class JobEngine:
             self._followed.discard(job_id)
         # A job of the same id, of a key that was used again after a deletion, may not have ended.
         if outcome is not None or self._has_ended(job_id):
-            self.registry.ended(job_id, outcome, created_at)
+            self.open_jobs.ended(job_id, outcome, created_at)
         else:
             self.active.forget(job_id)
 

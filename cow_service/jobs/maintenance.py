@@ -15,7 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from cow_service.errors import CowError
 from cow_service.jobs import state
 from cow_service.jobs.leases import ExecutorLease
-from cow_service.jobs.registry import JobRegistry
+from cow_service.jobs.open_jobs import OpenJobs
 
 OUTCOME_POLL_SECONDS = 0.005  # while the database has not got the outcome of finished work
 OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own polling
@@ -33,8 +33,8 @@ log = logging.getLogger("cow_service")
 class Maintenance:
     """Two threads beside an engine's own."""
 
-    def __init__(self, registry: JobRegistry, lease: ExecutorLease) -> None:
-        self._registry = registry
+    def __init__(self, open_jobs: OpenJobs, lease: ExecutorLease) -> None:
+        self._open_jobs = open_jobs
         self._lease = lease
         self._finished: dict[str, float] = {}  # jobs whose outcome is awaited, and until when
         self._has_finished = threading.Event()
@@ -65,11 +65,11 @@ class Maintenance:
 
     def collect_garbage(self) -> None:
         """Removes jobs past their retention, and artifacts without references."""
-        registry = self._registry
-        before = datetime.now(UTC) - timedelta(hours=registry.service.settings.job_retention_hours)
+        open_jobs = self._open_jobs
+        before = datetime.now(UTC) - timedelta(hours=open_jobs.service.settings.job_retention_hours)
         while not self._stop.is_set() and (jobs := state.ended_before(before, MAX_REMOVED_JOBS)):
-            registry.remove(jobs, before.timestamp())
-        known = registry.database.job_ids()
+            open_jobs.remove(jobs, before.timestamp())
+        known = open_jobs.database.job_ids()
         for start in range(0, len(known), MAX_REMOVED_JOBS):  # what jobs left that were deleted while they ran
             if self._stop.is_set():
                 return
@@ -77,11 +77,11 @@ class Maintenance:
             missing = set(chunk) - state.existing(chunk)
             # A job that is being submitted refers to its image a moment before it is in the database.
             if missing and not self._stop.wait(SUBMIT_SECONDS):
-                registry.database.remove_jobs(sorted(missing - state.existing(sorted(missing))))
+                open_jobs.database.remove_jobs(sorted(missing - state.existing(sorted(missing))))
         moment = time.time() - ARTIFACT_GRACE_SECONDS
-        untouched = list(registry.service.artifacts.untouched_since(moment))
-        needed = registry.database.referenced(untouched)
-        removed = sum(registry.service.artifacts.delete(one, moment) for one in untouched if one not in needed)
+        untouched = list(open_jobs.service.artifacts.untouched_since(moment))
+        needed = open_jobs.database.referenced(untouched)
+        removed = sum(open_jobs.service.artifacts.delete(one, moment) for one in untouched if one not in needed)
         if removed:
             log.info("removed %d artifacts that no job refers to", removed)
 
@@ -97,11 +97,11 @@ class Maintenance:
         for job_id, until in list(self._finished.items()):
             if now > until:
                 del self._finished[job_id]
-                self._registry.active.forget(job_id)
+                self._open_jobs.active.forget(job_id)
                 continue
-            found = state.find(job_id, self._registry.active, full=False)
+            found = state.find(job_id, self._open_jobs.active, full=False)
             if found is None or found.ended is not None:
-                self._registry.ended(job_id, None)
+                self._open_jobs.ended(job_id, None)
                 del self._finished[job_id]
 
     def _maintain(self) -> None:
@@ -114,17 +114,17 @@ class Maintenance:
                 recovered = now
                 self._logged(self._recover)
                 self._logged(self._resume_stalled)
-                self._logged(self._registry.recount)
+                self._logged(self._open_jobs.recount)
             if now - collected > GARBAGE_SECONDS:
                 collected = now
                 self._logged(self.collect_garbage)
 
     def _poll_cancellations(self) -> None:
         """Another process may have canceled or deleted a job that runs here."""
-        for job_id in self._registry.active.ids():
-            found = state.find(job_id, self._registry.active, full=False)
+        for job_id in self._open_jobs.active.ids():
+            found = state.find(job_id, self._open_jobs.active, full=False)
             if found is None or found.job.status == "canceled":
-                self._registry.active.request_cancel(job_id)
+                self._open_jobs.active.request_cancel(job_id)
 
     def _recover(self) -> None:
         """Returns the jobs of processes that have ended to the queue, from which any live process takes them."""
@@ -143,7 +143,7 @@ class Maintenance:
             load_input=False,
             load_output=False,
         )
-        idle = {one.workflow_id for one in pending} - set(self._registry.active.ids())
+        idle = {one.workflow_id for one in pending} - set(self._open_jobs.active.ids())
         for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
             log.warning("job %s was stalled, and is resumed", job_id)
             DBOS.resume_workflow(job_id)

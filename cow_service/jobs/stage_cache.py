@@ -8,11 +8,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from pydantic import ValidationError
+
 from cow_service.errors import ArtifactNotFound
 from cow_service.jobs.database import Database
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.observability.metrics import Metrics
 from cow_service.requests import Stage
+from cow_service.stages.keys import StageKey
 from cow_service.stages.results import RESULT_TYPES, StageResult, digest_of
 
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for another one's result checks whether it was canceled
@@ -58,13 +61,14 @@ class StoredStep:
     check_canceled: Callable[[], None]
 
     def __call__(
-        self, stage: Stage, key: str | None, compute: Callable[[], StageResult[Any]]
+        self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
     ) -> tuple[StageResult[Any], bool]:
         """The stage's result, and whether another job had computed it."""
-        if self.fresh or key is None:
-            key = digest_of({"job": self.job_id, "stage": stage, "key": key})
-        with self.locks.held(key, self.check_canceled):
-            found = self._find(stage, key)
+        digest = key.digest
+        if self.fresh or not key.shareable:
+            digest = digest_of({"job": self.job_id, "key": key.digest})
+        with self.locks.held(digest, self.check_canceled):
+            found = self._find(stage, digest)
             if found is not None:
                 result, reused = found
                 self.metrics.stage_cache(stage, hit=reused)
@@ -73,19 +77,20 @@ class StoredStep:
                 return result, reused
             self.metrics.stage_cache(stage, hit=False)
             result = compute()
-            self.database.store_result(key, self.job_id, stage, result.model_dump_json(), result.artifacts)
+            self.check_canceled()  # the job may have been deleted: nothing may be stored for it
+            self.database.store_result(digest, self.job_id, stage, result.model_dump_json(), result.artifacts)
             return result, False
 
-    def _find(self, stage: Stage, key: str) -> tuple[StageResult[Any], bool] | None:
+    def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:
         """A stored result all of whose artifacts are there, and whether it is another job's."""
-        row = self.database.find_result(key)
+        row = self.database.find_result(digest)
         if row is None:
             return None
         job_id, text = row
-        result = RESULT_TYPES[stage].model_validate_json(text)
         try:
+            result = RESULT_TYPES[stage].model_validate_json(text)
             for sha256 in result.artifacts:
                 self.artifacts.touch(sha256)
-        except ArtifactNotFound:
+        except (ArtifactNotFound, ValidationError):  # lost, or of another version
             return None
         return result, job_id != self.job_id

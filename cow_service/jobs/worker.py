@@ -12,7 +12,7 @@ from dbos import DBOS
 from cow_service.errors import Canceled, CowError, InternalError
 from cow_service.jobs import state
 from cow_service.jobs.active import ActiveJob
-from cow_service.jobs.registry import JobRegistry
+from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.stage_cache import KeyLocks, StoredStep
 from cow_service.jobs.webhooks import Webhooks
@@ -34,10 +34,10 @@ class JobAborted(BaseException):
 class Worker:
     """Does the work of an engine's jobs, in whatever threads it is called."""
 
-    def __init__(self, registry: JobRegistry, webhooks: Webhooks, left: Callable[[str], None]) -> None:
-        self._registry = registry
+    def __init__(self, open_jobs: OpenJobs, webhooks: Webhooks, on_work_ended: Callable[[str], None]) -> None:
+        self._open_jobs = open_jobs
         self._webhooks = webhooks
-        self._left = left  # the work on a job is over
+        self._on_work_ended = on_work_ended
         self._locks = KeyLocks()
 
     def run(self, job_id: str, spec: dict[str, Any]) -> str:
@@ -50,11 +50,11 @@ class Worker:
             with (
                 bound(request=job.request_id, job=job_id),
                 tracing.span(f"job {job.kind}", parent=job.traceparent, job_id=job_id),
-                self._registry.active.running(job_id) as running,
+                self._open_jobs.active.running(job_id) as running,
             ):
                 return self._outcome(job_id, job, running)
         finally:
-            self._left(job_id)
+            self._on_work_ended(job_id)
 
     def deliver(self, job_id: str, url: str, attempt: int) -> None:
         """Calls a webhook, and sees to another attempt where that failed."""
@@ -66,7 +66,7 @@ class Worker:
     def _delivered(self, job_id: str, url: str, attempt: int) -> float | None:
         """Seconds until another attempt is to follow, where one is."""
         for _ in range(MAX_POLLS):
-            found = state.find(job_id, self._registry.active)
+            found = state.find(job_id, self._open_jobs.active)
             if found is None:
                 return None  # deleted: there is nothing to tell any more
             if found.ended is not None:
@@ -75,7 +75,7 @@ class Worker:
         return self._webhooks.wait_after(job_id, attempt, "the job had not ended")  # a crash came between
 
     def _outcome(self, job_id: str, spec: JobSpec, running: ActiveJob) -> str:
-        metrics = self._registry.service.metrics
+        metrics = self._open_jobs.service.metrics
         try:
             result = self._result(job_id, spec, running)
         except Canceled as error:
@@ -98,15 +98,15 @@ class Worker:
         return result.model_dump_json()
 
     def _result(self, job_id: str, spec: JobSpec, running: ActiveJob) -> Simulation | Answer:
-        registry, service = self._registry, self._registry.service
+        open_jobs, service = self._open_jobs, self._open_jobs.service
 
         def progress(stage: Stage | None, done: float) -> None:
-            registry.active.progress(job_id, running, stage, done)
+            open_jobs.active.progress(job_id, running, stage, done)
 
         step = StoredStep(
             job_id=job_id,
             fresh=spec.fresh,
-            database=registry.database,
+            database=open_jobs.database,
             artifacts=service.artifacts,
             metrics=service.metrics,
             locks=self._locks,
@@ -114,6 +114,6 @@ class Worker:
         )
         request = spec.parsed()
         assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
-        image = registry.active.take_image(job_id, request.image.artifact)
+        image = open_jobs.active.take_image(job_id, request.image.artifact)
         run = service.prepare(request, progress, image, step, job_id, spec.created_at)
         return answer(run) if isinstance(run.request, AnswerRequest) else simulate(run)

@@ -42,7 +42,7 @@ class CallLog:
 
 
 def _never_canceled() -> None:
-    """Nobody cancels."""
+    """Does nothing."""
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def generate(
     request, scene, artifacts = run.request, run.scene, run.backends.artifacts
     with run.cpu():
         obstacles = scene.obstacles(grounding.bbox, grounding.others)
-    given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, request.seed, run.options)
+    given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, request.seed, run.generator_options)
     with run.device():
         frames, video = _render(given, run.generator, request, artifacts, run.report_share)
     with run.cpu():

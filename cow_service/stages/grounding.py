@@ -5,7 +5,7 @@ from __future__ import annotations
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import GroundingReading
-from cow_service.records import BBox, Grounding, Point
+from cow_service.records import BBox, Grounding, Point, Source
 from cow_service.requests import GroundingRequest, SimulateRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
@@ -39,7 +39,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     return StageResult(value=grounding, warnings=reading.warnings, artifacts=(mask.sha256,), hints=reading.hints)
 
 
-def recall_mask(run: Run[SimulateRequest], grounding: Grounding) -> None:
+def use_stored_mask(run: Run[SimulateRequest], grounding: Grounding) -> None:
     """Has the scene use the stored mask of a grounding that was found again.
 
     A mask cut again from its box may differ from one that was cut around a point.
@@ -47,7 +47,7 @@ def recall_mask(run: Run[SimulateRequest], grounding: Grounding) -> None:
     mask = grounding.mask
     if mask is not None:
         read = run.backends.artifacts.read
-        run.scene.recall(grounding.bbox, lambda: decode_own(read(mask.sha256))[..., 0] > 0)
+        run.scene.preset_mask(grounding.bbox, lambda: decode_own(read(mask.sha256))[..., 0] > 0)
 
 
 def _given(scene: Scene, place: GroundingRequest) -> GroundingReading:

@@ -13,34 +13,44 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from cow_service import __version__
+from cow_service.readers.prompts import load_prompt
 from cow_service.records import Record, Simulation
 from cow_service.requests import SimulateRequest, Stage
 from cow_service.stages.results import digest_of
 
-Backend = Literal["reader", "generator"]
+BackendRole = Literal["reader", "generator"]
 FORMAT = 2  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
-class DecidedBy:
+class StageKey:
+    """Names a stage's result."""
+
+    digest: str  # SHA-256, hexadecimal
+    shareable: bool = True  # False where a backend does not say what decides its work: then it is this job's alone
+
+
+@dataclass(frozen=True)
+class KeyFields:
     """Names of what decides one stage, all of them attributes of the request."""
 
     fields: tuple[str, ...]
-    backend: Backend | None = None
-    given: tuple[str, ...] = ()  # where the request sets one of these, they decide alone: nobody is asked
+    backend: BackendRole | None = None
+    set_by_request: tuple[str, ...] = ()  # where the request sets one of these, they decide alone: no reader is asked
+    prompt: str | None = None  # whose version decides, too
 
 
-READING = ("question", "seed", "left_to_reader")
-TRACED = ("place", "motion", "trajectory", "question", "num_frames", "fps")
-DECIDED_BY: dict[Stage, DecidedBy] = {
-    "grounding": DecidedBy(READING, "reader", given=("place",)),
-    "motion": DecidedBy(READING, "reader", given=("motion", "trajectory")),
-    "trajectory": DecidedBy(TRACED),
-    "generation": DecidedBy((*TRACED, "seed", "frames", "video"), "generator"),
-    "answering": DecidedBy((*READING, "options", "votes", "baseline", "imagine"), "reader"),
+READER_FIELDS = ("question", "seed", "left_to_reader")
+TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "question", "num_frames", "fps")
+KEY_FIELDS: dict[Stage, KeyFields] = {
+    "grounding": KeyFields(READER_FIELDS, "reader", set_by_request=("place",)),
+    "motion": KeyFields(READER_FIELDS, "reader", set_by_request=("motion", "trajectory"), prompt="motion-sentence"),
+    "trajectory": KeyFields(TRAJECTORY_FIELDS),
+    "generation": KeyFields(("seed", "frames", "video"), "generator"),
+    "answering": KeyFields(("question", "seed", "options", "votes", "baseline", "imagine"), "reader"),
 }
 # Of a simulation its id and times do not decide an answer.
-_SEEN = {"grounding", "motion", "trajectory", "frames"}
+_SIMULATION_FIELDS = {"grounding", "motion", "trajectory", "frames"}
 
 
 def key_of(
@@ -48,35 +58,35 @@ def key_of(
     image_sha256: str,
     request: SimulateRequest,
     inputs: tuple[Record | None, ...],
-    identity_of: Callable[[Backend], Mapping[str, Any] | None],
-) -> str | None:
-    """The key (SHA-256, hexadecimal) of a stage's result; None where the backend does not say what decides it.
+    identity_of: Callable[[BackendRole], Mapping[str, Any] | None],
+) -> StageKey:
+    """The key of a stage's result. `inputs` are the results of stages before it.
 
-    `identity_of` a backend is all that decides its work, as JSON values; it is asked only where the table says so.
+    `identity_of` a backend is all that decides its work, as JSON values, or None where it does not say; it is asked
+    only where the table names a backend.
     """
-    decided = DECIDED_BY[stage]
-    known: dict[str, Any] = {
+    decided = KEY_FIELDS[stage]
+    parts: dict[str, Any] = {
         "format": FORMAT,
         "version": __version__,
         "stage": stage,
         "image": image_sha256,
         "inputs": [_digest(value) for value in inputs],
+        "prompt": None if decided.prompt is None else load_prompt(decided.prompt).version,
     }
-    given = {name: _plain(value) for name in decided.given if (value := getattr(request, name)) is not None}
+    given = {name: _plain(value) for name in decided.set_by_request if (value := getattr(request, name)) is not None}
     if given:
-        return digest_of(known | {"given": given})
-    known["request"] = {name: _plain(getattr(request, name)) for name in decided.fields}
-    if decided.backend is not None:
-        identity = identity_of(decided.backend)
-        if identity is None:
-            return None
-        known["backend"] = identity
-    return digest_of(known)
+        return StageKey(digest_of(parts | {"given": given}))
+    parts["request"] = {name: _plain(getattr(request, name)) for name in decided.fields}
+    if decided.backend is None:
+        return StageKey(digest_of(parts))
+    identity = identity_of(decided.backend)
+    return StageKey(digest_of(parts | {"backend": identity}), shareable=identity is not None)
 
 
 def _digest(value: Record | None) -> str | None:
     if isinstance(value, Simulation):
-        return digest_of(value.model_dump(mode="json", include=_SEEN))
+        return digest_of(value.model_dump(mode="json", include=_SIMULATION_FIELDS))
     return None if value is None else digest_of(value)
 
 

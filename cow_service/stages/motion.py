@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
-from cow_service.readers.base import MotionReading
+from cow_service.readers.base import MotionHints, MotionReading
 from cow_service.readers.question.wording import motion_sentence
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Source, Vector
 from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
@@ -13,8 +13,8 @@ from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 
 
-def read_motion(run: Run[SimulateRequest], grounding: Grounding) -> StageResult[Motion]:
-    """The motion, from the request where it gives one or a whole path, else from the reader.
+def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHints | None) -> StageResult[Motion]:
+    """The motion, from the request where it gives one or a whole path, else from the reader, which gave the `hints`.
 
     Raises what the reader raises.
     """
@@ -26,7 +26,7 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding) -> StageResult[
     elif path is not None:
         reading, speed = _along(path)
     else:
-        reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, run.hints), run.reader.source
+        reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, hints), run.reader.source
     motion = _complete(run.scene.width, grounding, reading, speed, source)
     return StageResult(value=motion, warnings=(*reading.warnings, *_assumed(motion, speed)))
 

@@ -21,7 +21,7 @@ from cow_service.readers.base import CallLog, MotionHints, Reader, ReaderInput
 from cow_service.records import Grounding, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.checks import check_request
-from cow_service.stages.keys import Backend, key_of
+from cow_service.stages.keys import BackendRole, StageKey, key_of
 from cow_service.stages.results import StageResult, Value
 from cow_service.vision.scene import Scene
 
@@ -36,18 +36,18 @@ class Step(Protocol):
     """Runs a stage: directly, or as a step whose result is stored and found again."""
 
     def __call__(
-        self, stage: Stage, key: str | None, compute: Callable[[], StageResult[Any]]
+        self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
     ) -> tuple[StageResult[Any], bool]:
-        """The stage's result, and whether another request had computed it. `key` is None for one of no other's use."""
+        """The stage's result, and whether another request had computed it."""
         ...
 
 
 def ignore_progress(stage: Stage | None, done: float) -> None:
-    """Nobody listens."""
+    """Does nothing."""
 
 
 def compute_directly(
-    stage: Stage, key: str | None, compute: Callable[[], StageResult[Any]]
+    stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
 ) -> tuple[StageResult[Any], bool]:
     """Computes every time: for runs that are not resumed."""
     return compute(), False
@@ -103,13 +103,13 @@ class Run(Generic[Request_co]):
         return self.backends.generator()
 
     @cached_property
-    def options(self) -> BaseModel:
+    def generator_options(self) -> BaseModel:
         """The generator's options, once the request was found to be one that it can do. Raises `InvalidRequest`."""
         return check_request(self.generator, self.request)
 
-    def check_options(self) -> None:
-        """Raises `InvalidRequest` for what the generator cannot do, before any work is done."""
-        _ = self.options
+    def check_request(self) -> None:
+        """Raises `InvalidRequest` for what the generator cannot do: to be called before any work is done."""
+        _ = self.generator_options
 
     @property
     def simulation_id(self) -> str:
@@ -176,7 +176,7 @@ class Run(Generic[Request_co]):
 
     @property
     def usage(self) -> Usage:
-        """What this request asked of a multimodal LLM, by stages that failed and before a restart, too."""
+        """What this request asked of a multimodal LLM, failed stages of this process included."""
         before = [
             result.usage
             for stage, result in self.results.items()
@@ -197,12 +197,12 @@ class Run(Generic[Request_co]):
         """The warnings of some stages."""
         return tuple(warning for stage in stages for warning in self.results[stage].warnings)
 
-    def _identity(self, backend: Backend) -> dict[str, Any] | None:
+    def _identity(self, backend: BackendRole) -> dict[str, Any] | None:
         """All that decides the work of a backend; None where one of another package does not say."""
         fingerprint = getattr(self.reader if backend == "reader" else self.generator, "fingerprint", None)
         if fingerprint is None or backend == "reader":
             return None if fingerprint is None else {"reader": fingerprint}
-        return {"generator": fingerprint, "options": self.options.model_dump(mode="json")}
+        return {"generator": fingerprint, "options": self.generator_options.model_dump(mode="json")}
 
     def _compute(self, name: Stage, function: Callable[..., StageResult[Any]], inputs: tuple[Any, ...]) -> Any:
         result = function(self, *inputs)

@@ -28,7 +28,7 @@ class Scene:
 
     image: Image
     _masks: dict[BBox, Mask] = field(default_factory=dict, repr=False)
-    _recalled: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
+    _preset: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
     _obstacles: dict[tuple[BBox, tuple[LocatedObject, ...]], tuple[Obstacle, ...]] = field(
         default_factory=dict, repr=False
     )
@@ -85,7 +85,7 @@ class Scene:
         """Mask [H, W] of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
         with self._lock:
             if bbox not in self._masks:
-                self._masks[bbox] = self._recalled[bbox]() if bbox in self._recalled else self._segmented(bbox)
+                self._masks[bbox] = self._preset[bbox]() if bbox in self._preset else self._segmented(bbox)
             return self._masks[bbox]
 
     def _segmented(self, bbox: BBox) -> Mask:
@@ -94,10 +94,10 @@ class Scene:
             return region.mask.full()
         return mask_from_bbox(self.clean, bbox, None if region is None else region.mask.full())
 
-    def recall(self, bbox: BBox, mask: Callable[[], Mask]) -> None:
+    def preset_mask(self, bbox: BBox, mask: Callable[[], Mask]) -> None:
         """Gives the mask that an earlier run segmented for a box; it may have been segmented from a point instead."""
         with self._lock:
-            self._recalled[bbox] = mask
+            self._preset[bbox] = mask
 
     def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
         """The objects beside the mover in a box, `named` ones by their name; found once for the same arguments."""

@@ -15,7 +15,7 @@ from cow_service.jobs.webhooks import attempt_ids
 from cow_service.service import Service
 
 
-class JobRegistry:
+class OpenJobs:
     """Knows which jobs are open: queued or running, in this process or another. It starts none."""
 
     def __init__(self, service: Service) -> None:
