@@ -1,4 +1,4 @@
-"""The nouns of the service: frozen records that cross every wall, the SDK and the wire alike.
+"""Frozen records that the server, the SDK and the HTTP API share.
 
 Coordinates are pixels of the upright input image, x right, y down, (0, 0) the image's top left corner.
 Times are seconds from the first frame. Records hold no pixels and do no I/O: bytes are named by their SHA-256.

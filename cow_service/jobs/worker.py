@@ -32,7 +32,7 @@ class JobAborted(BaseException):
 
 
 class Worker:
-    """Does the work of an engine's jobs, in whatever threads it is called."""
+    """Does the work of an engine's jobs. Thread-safe."""
 
     def __init__(self, open_jobs: OpenJobs, webhooks: Webhooks, on_work_ended: Callable[[str], None]) -> None:
         self._open_jobs = open_jobs
@@ -115,5 +115,6 @@ class Worker:
         request = spec.parsed()
         assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
         image = open_jobs.active.take_image(job_id, request.image.artifact)
-        run = service.prepare(request, progress, image, step, job_id, spec.created_at)
-        return answer(run) if isinstance(run.request, AnswerRequest) else simulate(run)
+        if isinstance(request, AnswerRequest):
+            return answer(service.prepare(request, progress, image, step, job_id, spec.created_at))
+        return simulate(service.prepare(request, progress, image, step, job_id, spec.created_at))
