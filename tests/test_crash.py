@@ -35,5 +35,5 @@ def test_nothing_acknowledged_is_lost(database: str | None, tmp_path: Path) -> N
     assert report.redone == [], "clips that the database held were made again"
     assert report.begun_twice > 0, "no kill cut off a clip: the test shows nothing"
     assert report.corrupt == report.missing == []
-    assert len(report.back_at_work_s) >= KILLS // 2, "too few kills met a running job"
-    assert max(report.back_at_work_s) <= 5, report.back_at_work_s
+    # How fast they are is a figure of the benchmark, not of this test.
+    assert len(report.back_at_work_s) >= KILLS // 2, "too few jobs went on after a kill"

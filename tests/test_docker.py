@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cow_service import __version__
 from cow_service.cli.main import app
 from cow_service.jobs.engine import HANDOVER_SECONDS
-from cow_service.server import BEYOND
+from cow_service.server import CLOSE_SECONDS
 from cow_service.settings import Settings, load_settings
 from cow_service.weights.manifests import load_manifests
 
@@ -295,7 +295,7 @@ def test_the_commands_of_the_comments_are_right(file: Path, monkeypatch: pytest.
 
 def longest_stop(settings: Settings) -> float:
     """Seconds: open connections, then jobs, each with the grace and what is added to it."""
-    return 2 * settings.shutdown_grace + BEYOND + HANDOVER_SECONDS
+    return 2 * settings.shutdown_grace + CLOSE_SECONDS + HANDOVER_SECONDS
 
 
 # --- the health checks, run for real
