@@ -76,8 +76,8 @@ def read_request(service: Service, image: Path, body: dict[str, Any], model: typ
     try:
         return model.model_validate({"image": {"artifact": artifact.sha256}, **body}), decoded
     except ValidationError as error:
-        told = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
-        raise InvalidRequest(told) from error
+        faults = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
+        raise InvalidRequest(faults) from error
 
 
 @contextmanager
@@ -144,9 +144,7 @@ def print_models(models: Models, *, as_json: bool) -> None:
     if as_json:
         print(models.model_dump_json(indent=2))
         return
-    table = Table(box=None, pad_edge=False)
-    for heading in ("role", "name", "ready", "what it is"):
-        table.add_column(heading)
+    table = Table("role", "name", "ready", "what it is", box=None, pad_edge=False)
     for role, backends in (("reader", models.readers), ("generator", models.generators)):
         for backend in backends:
             table.add_row(

@@ -80,9 +80,7 @@ def print_report(report: Report, *, as_json: bool) -> None:
     console.print(f"cow {report.cow}, Python {report.python}, {report.platform}", highlight=False)
     free = "" if report.free_disk_gb is None else f" ({report.free_disk_gb:.1f} GB free)"
     console.print(f"data folder: {report.data_folder}{free}", highlight=False, soft_wrap=True)
-    table = Table(box=None, pad_edge=False)
-    for heading in ("backend", "ready", "missing", "get it with"):
-        table.add_column(heading)
+    table = Table("backend", "ready", "missing", "get it with", box=None, pad_edge=False)
     for backend in report.backends:
         ready = {True: "[green]yes[/]", False: "[yellow]no[/]", None: "unknown"}[backend.ready]
         table.add_row(
