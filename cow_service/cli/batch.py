@@ -1,4 +1,4 @@
-"""`cow batch`: a file of questions, asked of a server, into a folder of outcomes."""
+"""`cow batch`: sends the questions of a file to a server, and writes the outcomes into a folder."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def batch(
         str | None, typer.Option(help="The server.", show_default="COW_BASE_URL, http://127.0.0.1:8000")
     ] = None,
 ) -> None:
-    """Ask many questions of a server; the same command goes on where it was killed.
+    """Ask a server many questions; the same command resumes a batch that was interrupted.
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
     """

@@ -1,4 +1,4 @@
-"""What is installed here, what is missing for which backend, and the line that installs it."""
+"""`cow doctor`: the installed packages, whether each backend is ready, and the command that installs what it lacks."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class Report(BaseModel):
 
     @property
     def healthy(self) -> bool:
-        """The default request can be served."""
+        """Whether the default request can be served."""
         return self.problem is None
 
 
 def examine(service: Service) -> Report:
-    """Looks at this machine. Nothing heavy is imported, nothing but an empty probe file is written."""
+    """Inspects this installation. Imports no heavy package, and writes only an empty file, which it removes."""
     problem = None
     try:
         service.check()

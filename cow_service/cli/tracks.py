@@ -1,4 +1,4 @@
-"""`cow tracks`: trajectories into the track files of ATI and Wan-Move, and back. Heavy imports stand inside."""
+"""`cow tracks`: converts trajectories to track files of ATI and Wan-Move, and back. Heavy imports stand inside."""
 
 from __future__ import annotations
 
