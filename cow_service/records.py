@@ -184,13 +184,6 @@ class Usage(Record):
             output_tokens=self.output_tokens + other.output_tokens,
         )
 
-    def __sub__(self, earlier: Usage) -> Usage:
-        return Usage(
-            calls=self.calls - earlier.calls,
-            input_tokens=self.input_tokens - earlier.input_tokens,
-            output_tokens=self.output_tokens - earlier.output_tokens,
-        )
-
 
 class GeneratorInfo(Record):
     """Who made the frames, and what would have to be the same to make them again."""

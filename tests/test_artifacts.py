@@ -89,21 +89,6 @@ def test_put_file_moves_the_file_in(store, folder, tmp_path):
     assert files(folder) == [f"{SHA256[:2]}/{SHA256}.mp4"]
 
 
-@pytest.mark.skipif(
-    not Path("/dev/shm").is_dir() or Path("/dev/shm").stat().st_dev == Path("/tmp").stat().st_dev,
-    reason="needs two disks",
-)
-def test_put_file_from_another_disk(store, tmp_path):
-    source = Path("/dev/shm") / f"cow-{os.getpid()}"
-    source.write_bytes(DATA)
-    try:
-        store.put_file(source, "video/mp4")
-        assert store.read(SHA256) == DATA
-        assert not source.exists()
-    finally:
-        source.unlink(missing_ok=True)
-
-
 def test_another_store_on_the_same_folder_finds_it(store, folder):
     artifact = store.put(DATA, "image/jpeg")
     assert ArtifactStore(folder).get(SHA256).artifact == artifact

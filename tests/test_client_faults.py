@@ -720,7 +720,7 @@ def relay() -> Iterator[Relay]:
 def test_a_wait_outlives_a_server_that_is_killed(connect: Connect, relay: Relay, tmp_path: Path) -> None:
     with Served(tmp_path) as served:
         relay.to = served.host_and_port
-        client = connect(relay.url)
+        client = connect(relay.url, retries=12)  # over a minute: as long as `Served.start` may take on a busy machine
         body = slow(4, seed=5)
         options = {name: value for name, value in body.items() if name not in ("image", "question")}
         handle = client.submit(data_url(IMAGE), QUESTION, **options)

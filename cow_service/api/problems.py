@@ -53,6 +53,11 @@ def respond(error: CowError) -> JSONResponse:
     return JSONResponse(error.as_problem(), error.status, headers=headers | error.headers, media_type=MEDIA_TYPE)
 
 
+def unforeseen_error() -> InternalError:
+    """The error for an exception that no code expects."""
+    return InternalError("The server met an error that it did not foresee; its log has the trace.")
+
+
 def install_problem_handlers(app: FastAPI) -> None:
     """Makes every error of the app a problem, those of the framework and unforeseen ones included."""
 
@@ -72,7 +77,7 @@ def install_problem_handlers(app: FastAPI) -> None:
 
     async def unforeseen(request: Request, error: Exception) -> JSONResponse:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return respond(InternalError("The server met an error that it did not foresee; its log has the trace."))
+        return respond(unforeseen_error())
 
     async def gone(request: Request, _: Exception) -> Response:
         log.info("%s %s: the caller left before its body was in", request.method, request.url.path)

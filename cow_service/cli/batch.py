@@ -1,4 +1,4 @@
-"""`cow batch`: a file of questions, asked of a server, into a folder of outcomes."""
+"""`cow batch`: sends the questions of a file to a server, and writes the outcomes into a folder."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def batch(
         str | None, typer.Option(help="The server.", show_default="COW_BASE_URL, http://127.0.0.1:8000")
     ] = None,
 ) -> None:
-    """Ask many questions of a server; the same command goes on where it was killed.
+    """Ask a server many questions; the same command resumes a batch that was interrupted.
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
     """
@@ -78,8 +78,8 @@ def batch(
         sys.stderr.flush()
         os._exit(EXIT_INTERRUPTED)  # threads that wait for jobs are not waited for
     except OSError as error:
-        told = error.strerror or str(error)
-        raise StorageUnavailable(f"'{out}' cannot be written: {told}. {RESUME_HINT}") from error
+        reason = error.strerror or str(error)
+        raise StorageUnavailable(f"'{out}' cannot be written: {reason}. {RESUME_HINT}") from error
     except Unauthorized as error:
         error.detail += " Here: set COW_API_KEY."
         raise
@@ -119,8 +119,8 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
                 _check(question, kind)
                 items.append(item)
             except InvalidRequest as error:
-                told = [f"`{field.pointer.rpartition('/')[2]}` {field.detail}." for field in error.errors]
-                faults.append(f"{path.name}, line {number}: {' '.join(told) or error.detail}")
+                fields = [f"`{field.pointer.rpartition('/')[2]}` {field.detail}." for field in error.errors]
+                faults.append(f"{path.name}, line {number}: {' '.join(fields) or error.detail}")
     if faults:
         more = f"\n... and {len(faults) - MAX_FAULTS_SHOWN} more" if len(faults) > MAX_FAULTS_SHOWN else ""
         raise InvalidRequest("\n".join(faults[:MAX_FAULTS_SHOWN]) + more)
@@ -153,8 +153,8 @@ def _check_images(asked: list[Question], path: Path) -> None:
     if missing:
         verb = "is" if len(missing) == 1 else "are"
         names = ", ".join(file.name for file in missing[:MAX_FAILURES_SHOWN])
-        told = f"{len(missing)} of {len(files)} images {verb} not there: {names}"
-        typer.echo(printable(told + (", ..." if len(missing) > MAX_FAILURES_SHOWN else "")), err=True)
+        warning = f"{len(missing)} of {len(files)} images {verb} not there: {names}"
+        typer.echo(printable(warning + (", ..." if len(missing) > MAX_FAILURES_SHOWN else "")), err=True)
 
 
 def _defaults(text: str | None) -> dict[str, Any]:
@@ -200,8 +200,8 @@ def _print_summary(out: Path) -> int:
     if not failures:
         return 0
     typer.echo(", ".join(f"{code} {times}" for code, times in codes.most_common()), err=True)
-    for told in failures[:MAX_FAILURES_SHOWN]:
-        typer.echo(printable(told), err=True)
+    for failure in failures[:MAX_FAILURES_SHOWN]:
+        typer.echo(printable(failure), err=True)
     if len(failures) > MAX_FAILURES_SHOWN:
         typer.echo(f"  ... and {len(failures) - MAX_FAILURES_SHOWN} more", err=True)
     return EXIT_SOME_FAILED

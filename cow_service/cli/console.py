@@ -1,4 +1,4 @@
-"""What `simulate`, `answer` and `models` do and show: stages as they run, results into a folder, tables."""
+"""`simulate`, `answer` and `models`: progress of the stages, results in a folder, tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Body = TypeVar("Body", bound=SimulateRequest)
 
 
 def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Path, *, as_json: bool) -> None:
-    """Simulates, showing each stage as it runs, writes the results into a folder, and says what came out."""
+    """Simulates with progress of each stage, writes the results into a folder, and prints a summary."""
     console = console_for(as_json)
     make_folder(out)
     request, decoded = read_request(service, image, body, SimulateRequest)
@@ -41,7 +41,7 @@ def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Pat
 
 
 def run_answer(service: Service, image: Path, body: dict[str, Any], out: Path | None, *, as_json: bool) -> None:
-    """Answers, showing each stage as it runs, and says what came out; results go into a folder where one is given."""
+    """Answers with progress of each stage, and prints a summary; writes the results where a folder is given."""
     console = console_for(as_json)
     if out is not None:
         make_folder(out)
@@ -66,23 +66,23 @@ def run_answer(service: Service, image: Path, body: dict[str, Any], out: Path | 
 
 
 def console_for(as_json: bool) -> Console:
-    """Where people read; silent where a program does."""
+    """A console on standard output; with JSON a silent one, since that output is for a program."""
     return Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)
 
 
 def read_request(service: Service, image: Path, body: dict[str, Any], model: type[Body]) -> tuple[Body, DecodedImage]:
-    """The checked request and its image, which the service keeps. Raises `InvalidRequest` naming the fields."""
+    """The validated request, and its image, which is stored. Raises `InvalidRequest` that names the fields."""
     artifact, decoded = service.keep_image(read_file(image))
     try:
         return model.model_validate({"image": {"artifact": artifact.sha256}, **body}), decoded
     except ValidationError as error:
-        told = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
-        raise InvalidRequest(told) from error
+        faults = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
+        raise InvalidRequest(faults) from error
 
 
 @contextmanager
 def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], None]]:
-    """Bars for the stages, as they run."""
+    """Progress bars for the stages; yields the function that updates them."""
     columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[Stage, TaskID] = {}
@@ -100,19 +100,19 @@ def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], 
 
 
 def print_stages(console: Console, simulation: Simulation) -> None:
-    """A line for each stage of what came out of it."""
+    """Prints a line for each stage: its time and its result."""
     for stage, line in _stage_lines(simulation).items():
         console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {escape(line)}")
 
 
 def print_warnings(console: Console, warnings: Iterable[str]) -> None:
-    """A line for each."""
+    """Prints a line for each warning."""
     for warning in warnings:
         console.print(f"[yellow]warning[/]: {escape(warning)}")
 
 
 def make_folder(out: Path) -> None:
-    """Before any work is done, so that it is not lost."""
+    """Creates the folder for the results: before the work, so that its results are not lost."""
     with writable(out):
         out.mkdir(parents=True, exist_ok=True)
 
@@ -132,7 +132,7 @@ def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
 
 @contextmanager
 def writable(out: Path) -> Generator[None]:
-    """Says which folder could not be written, where one could not."""
+    """Translates `OSError` to a `CowError` that names the folder."""
     try:
         yield
     except OSError as error:
@@ -140,13 +140,11 @@ def writable(out: Path) -> Generator[None]:
 
 
 def print_models(models: Models, *, as_json: bool) -> None:
-    """A table of backends, or their JSON."""
+    """Prints a table of backends, or their JSON."""
     if as_json:
         print(models.model_dump_json(indent=2))
         return
-    table = Table(box=None, pad_edge=False)
-    for heading in ("role", "name", "ready", "what it is"):
-        table.add_column(heading)
+    table = Table("role", "name", "ready", "what it is", box=None, pad_edge=False)
     for role, backends in (("reader", models.readers), ("generator", models.generators)):
         for backend in backends:
             table.add_row(
@@ -166,7 +164,7 @@ def _readiness(backend: BackendInfo) -> str:
 
 
 def _stage_lines(simulation: Simulation) -> dict[Stage, str]:
-    """One line per stage of what came out of it."""
+    """The result of each stage in one line."""
     grounding, motion, trajectory = simulation.grounding, simulation.motion, simulation.trajectory
     x, y = grounding.point
     way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"

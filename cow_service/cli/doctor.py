@@ -1,4 +1,4 @@
-"""What is installed here, what is missing for which backend, and the line that installs it."""
+"""`cow doctor`: the installed packages, whether each backend is ready, and the command that installs what it lacks."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class Report(BaseModel):
 
     @property
     def healthy(self) -> bool:
-        """The default request can be served."""
+        """Whether the default request can be served."""
         return self.problem is None
 
 
 def examine(service: Service) -> Report:
-    """Looks at this machine. Nothing heavy is imported, nothing but an empty probe file is written."""
+    """Inspects this installation. Imports no heavy package, and writes only an empty file, which it removes."""
     problem = None
     try:
         service.check()
@@ -80,9 +80,7 @@ def print_report(report: Report, *, as_json: bool) -> None:
     console.print(f"cow {report.cow}, Python {report.python}, {report.platform}", highlight=False)
     free = "" if report.free_disk_gb is None else f" ({report.free_disk_gb:.1f} GB free)"
     console.print(f"data folder: {report.data_folder}{free}", highlight=False, soft_wrap=True)
-    table = Table(box=None, pad_edge=False)
-    for heading in ("backend", "ready", "missing", "get it with"):
-        table.add_column(heading)
+    table = Table("backend", "ready", "missing", "get it with", box=None, pad_edge=False)
     for backend in report.backends:
         ready = {True: "[green]yes[/]", False: "[yellow]no[/]", None: "unknown"}[backend.ready]
         table.add_row(

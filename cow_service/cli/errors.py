@@ -45,5 +45,5 @@ class Commands(TyperGroup):
 
 
 def printable(text: str) -> str:
-    """The text without what a terminal would obey: control characters, escapes, marks that turn the direction."""
+    """The text without characters that control a terminal: control codes, escapes, marks of writing direction."""
     return "".join(character if character.isprintable() or character == "\n" else "\ufffd" for character in text)

@@ -1,4 +1,4 @@
-"""`cow keys`: keys for those who may call a server."""
+"""`cow keys`: creates API keys."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import typer
 
 from cow_service.errors import InvalidRequest
 
-app = typer.Typer(rich_markup_mode=None, help="Make API keys.", no_args_is_help=True)
+app = typer.Typer(rich_markup_mode=None, help="Create API keys.", no_args_is_help=True)
 
 
 @app.callback()
 def keys() -> None:
-    """Make API keys."""
+    """Create API keys."""
 
 
 @app.command()
 def new(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Whose key it is; logs and limits go by it.")],
 ) -> None:
-    """Make a key for NAME, and the line that tells the server about it. Nothing is stored."""
+    """Create a key for NAME, and print the setting with which the server accepts it. Nothing is stored."""
     from cow_service.api.middleware.keys import hash_of, new_key  # noqa: PLC0415
     from cow_service.settings import KEY_NAME, load_settings  # noqa: PLC0415
 

@@ -19,7 +19,7 @@ from cow_service.cli import tracks as tracks_cli
 from cow_service.cli.errors import Commands
 from cow_service.cli.options import with_request_options
 
-# Notes that these libraries print when they are imported, such as on optional packages, are not for our users.
+# Log levels of libraries that print notes when they are imported, such as on optional packages.
 QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def serve(
 
 @app.command()
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
-    """Say what is installed, what is missing for which backend, and the line that installs it."""
+    """Show what is installed, what each backend lacks, and the command that installs it."""
     from cow_service.cli.doctor import examine, print_report  # noqa: PLC0415
 
     with _service() as service:

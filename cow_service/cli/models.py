@@ -1,4 +1,4 @@
-"""`cow models`: what there is, and how weights come here and are checked. Heavy imports stand inside the commands."""
+"""`cow models`: lists backends, downloads weights and verifies them. Heavy imports stand inside the commands."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def pull(
 
     weights_dir = _weights_dir()
     console = Console(highlight=False, soft_wrap=True, markup=False)
-    console.print("Looking at what is there, and at what is here ...")
+    console.print("Comparing the repository with the files that are here ...")
     downloads = _downloads(manifest, weights_dir, revisions)
     count, size = sum(len(each.files) for each in downloads), sum(each.size for each in downloads)
     pending, needed = sum(len(each.pending) for each in downloads), sum(each.pending_size for each in downloads)

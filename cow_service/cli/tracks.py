@@ -1,14 +1,17 @@
-"""`cow tracks`: trajectories into the track files of ATI and Wan-Move, and back. Heavy imports stand inside."""
+"""`cow tracks`: converts trajectories to track files of ATI and Wan-Move, and back. Heavy imports stand inside."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 from cow_service.errors import InvalidRequest
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 Result = TypeVar("Result")
 
@@ -16,7 +19,7 @@ app = typer.Typer(
     rich_markup_mode=None, no_args_is_help=True, help="Write and read the track files of ATI and Wan-Move."
 )
 
-STILL = 1.0  # px: a track that never leaves its start by more is an anchor
+ANCHOR_MAX_MOVE_PX = 1.0  # a track that never moves further from its start is an anchor
 
 
 @app.command(name="export")
@@ -36,9 +39,7 @@ def export_tracks(
     try:
         record = Simulation.model_validate_json(simulation.read_bytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise InvalidRequest(f"{simulation.name} is not a simulation: {place}: {first['msg']}.") from error
+        raise _invalid(f"{simulation.name} is not a simulation", error, "the file") from error
     tracks = tracks_of(record.trajectory, record.image.width, record.image.height)
     written = _written(out, lambda: write_tracks(tracks, out))
     moving, still = len(record.trajectory.tracks), len(record.trajectory.anchors)
@@ -75,10 +76,14 @@ def import_tracks(
         raise InvalidRequest(f"{file.name} has {read.points.shape[1]} tracks, and none of them is ever visible.")
     tracks = read.held()
     moves = (
-        np.abs(tracks.points - tracks.points[:1]).max(axis=(0, 2)) > STILL if tracks.points.size else np.zeros(0, bool)
+        np.abs(tracks.points - tracks.points[:1]).max(axis=(0, 2)) > ANCHOR_MAX_MOVE_PX
+        if tracks.points.size
+        else np.zeros(0, bool)
     )
     if not moves.any():
-        raise InvalidRequest(f"{file.name} has {moves.size} tracks, and none of them moves by more than {STILL:g} px.")
+        raise InvalidRequest(
+            f"{file.name} has {moves.size} tracks, and none of them moves by more than {ANCHOR_MAX_MOVE_PX:g} px."
+        )
     moving = tracks.points[:, moves].astype(float).round(3)
     try:
         trajectory = TrajectoryRequest(
@@ -90,14 +95,19 @@ def import_tracks(
             anchors=tuple(map(tuple, tracks.points[0, ~moves].astype(float).round(3).tolist())),
         )
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "trajectory"
-        raise InvalidRequest(f"{file.name} does not make a trajectory: {place}: {first['msg']}.") from error
+        raise _invalid(f"{file.name} does not make a trajectory", error, "trajectory") from error
     if out is None:
         typer.echo(trajectory.model_dump_json())
         return
     _written(out, lambda: out.write_text(trajectory.model_dump_json(), encoding="utf-8"))
     typer.echo(f"{int(moves.sum())} moving and {int((~moves).sum())} static tracks: {out}")
+
+
+def _invalid(fault: str, error: ValidationError, whole: str) -> InvalidRequest:
+    """The first fault of a file, with its place; `whole` names the place where it is none of the fields."""
+    first = error.errors()[0]
+    place = ".".join(map(str, first["loc"])) or whole
+    return InvalidRequest(f"{fault}: {place}: {first['msg']}.")
 
 
 def _written(out: Path, write: Callable[[], Result]) -> Result:

@@ -101,7 +101,7 @@ class OutageTimer:
     def __init__(
         self, seconds: float = MAX_OUTAGE_SECONDS, on_change: Callable[[CowError | None], None] | None = None
     ) -> None:
-        """`on_change` is told what the batch waits for, and None when that is over."""
+        """`on_change` is called with what the batch waits for, and with None when that is over."""
         self._seconds = seconds
         self._on_change = on_change
         self._lock = threading.Lock()

@@ -49,8 +49,8 @@ def one_line(text: str, most: int = 120) -> str:
 def describe_encounters(simulation: Simulation) -> str:
     """What the mover encounters, in words."""
     fps = simulation.trajectory.fps
-    told = [f"{MEETINGS[e.kind]} {e.object} at {e.first_frame / fps:.1f} s" for e in simulation.trajectory.encounters]
-    return ", ".join(told) or ("meets nothing" if simulation.encounters_known else "encounters were not computed")
+    met = [f"{MEETINGS[e.kind]} {e.object} at {e.first_frame / fps:.1f} s" for e in simulation.trajectory.encounters]
+    return ", ".join(met) or ("meets nothing" if simulation.encounters_known else "encounters were not computed")
 
 
 def describe_answer(answer: Verdict) -> str:
@@ -71,8 +71,8 @@ def answer_html(answer: Answer, get: GetBytes) -> str:
     if answer.reasoning:
         parts.append(f'<div style="{_LONG_TEXT}">{escape(answer.reasoning)}</div>')
     if sum(answer.votes.values()) > 1:
-        told = ", ".join(f"{name} {count}" for name, count in answer.votes.items())
-        parts.append(f'<div style="{_DIM}">votes: {escape(told)}</div>')
+        votes = ", ".join(f"{name} {count}" for name, count in answer.votes.items())
+        parts.append(f'<div style="{_DIM}">votes: {escape(votes)}</div>')
     if answer.baseline is not None:
         parts.append(f'<div style="{_DIM}">without frames: {escape(describe_answer(answer.baseline))}</div>')
     if answer.simulation is not None:

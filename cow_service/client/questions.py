@@ -17,12 +17,7 @@ from cow_service.errors import FieldError, InvalidRequest
 # A mapping has `image` and `question`, maybe `id` and `meta`, and else fields of the request; a pair has the first two.
 QuestionLike: TypeAlias = "Question | Mapping[str, Any] | tuple[ImageLike, str]"
 MAX_ID_CHARACTERS = 200
-_OWN_FIELDS = {
-    "id",
-    "image",
-    "meta",
-    "question",
-}  # fields of a question that are none of the request's, or its very own
+_OWN_FIELDS = {"id", "image", "meta", "question"}  # of each question: no defaults are taken for them
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 

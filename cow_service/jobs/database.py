@@ -57,7 +57,7 @@ _SAVE = (
     "created_at = excluded.created_at"
 )
 _DONE = "INSERT INTO cow_job_stages (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
-_REFER = "INSERT INTO cow_holds (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
+_ADD_REFERENCES = "INSERT INTO cow_holds (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
 
 
 class Database:
@@ -114,14 +114,14 @@ class Database:
         return None if row is None else (row[0], row[1])
 
     def store_result(self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str]) -> None:
-        """Refers to a stage's artifacts, then saves its result: in this order, each is valid without the other."""
+        """Adds references to a stage's artifacts, then saves its result: in this order, each is valid alone."""
         with self._cursor() as cursor:
             self._add_references(cursor, job, artifacts)
             cursor.execute(self._plain(_SAVE), (key, job, stage, result, time.time()))
             cursor.execute(self._plain(_DONE), (job, stage))
 
     def reuse_result(self, job: str, stage: str, artifacts: Iterable[str]) -> None:
-        """Refers to the artifacts of a result that another job had computed."""
+        """Adds references to the artifacts of a result that another job had computed."""
         with self._cursor() as cursor:
             self._add_references(cursor, job, artifacts)
             cursor.execute(self._plain(_DONE), (job, stage))
@@ -190,7 +190,7 @@ class Database:
     def _add_references(self, cursor: Any, job: str, artifacts: Iterable[str]) -> None:
         rows = [value for sha256 in dict.fromkeys(artifacts) for value in (sha256, job)]
         if rows:
-            cursor.execute(self._plain(_REFER.format(", ".join(["(?, ?)"] * (len(rows) // 2)))), rows)
+            cursor.execute(self._plain(_ADD_REFERENCES.format(", ".join(["(?, ?)"] * (len(rows) // 2)))), rows)
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """The job engine: accepts job specs, has DBOS run them durably, and reports their state.
 
-One process has one engine, because DBOS is one per process. A job is a DBOS workflow. Where this process has room for
+One process has one engine, because DBOS is one per process. A job is a DBOS workflow. Where this process can run
 it, the workflow starts at once; else it waits in the DBOS queue of its generator, from which any process on the same
 database may take it. Either way it is in the database before its submission is acknowledged.
 """
@@ -35,7 +35,7 @@ from cow_service.jobs.maintenance import Maintenance
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.serializer import JsonSerializer
 from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.state import CREATED, GENERATOR, JobFilters, JobState
+from cow_service.jobs.state import ATTRIBUTE_CREATED_AT, ATTRIBUTE_GENERATOR, JobFilters, JobState
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.jobs.worker import JobAborted, Worker
 from cow_service.media.images import DecodedImage
@@ -70,12 +70,12 @@ class JobEngine:
         return self.open_jobs.service
 
     def use(self, service: Service) -> None:
-        """Runs the jobs of another service from now on, on the same database."""
+        """Runs the jobs of another service from now on, on the same database. Only tests do this."""
         self.open_jobs.service = service
         self.webhooks.use(service.settings)
 
     @property
-    def room(self) -> int:
+    def max_running_jobs_per_generator(self) -> int:
         """How many jobs of one generator this process runs: those that compute, and those that wait for an MLLM."""
         settings = self.service.settings
         return settings.concurrency + settings.mllm_concurrency
@@ -129,7 +129,7 @@ class JobEngine:
             self._grace = threading.Timer(self.service.settings.shutdown_grace, self._interrupt)
             self._grace.daemon = True
             self._grace.start()
-        self._tell_stopping(set(self.active.awaited()) - set(self.active.ids()))
+        self._notify_stopping(set(self.active.awaited()) - set(self.active.ids()))
 
     def close(self) -> None:
         """Waits for running jobs during the grace period, then interrupts them: they continue after the next start."""
@@ -154,7 +154,7 @@ class JobEngine:
             raise ShuttingDown("The server is stopping. Ask another one, or this one again in a while.")
         self.database.check()
 
-    def check_room(self) -> None:
+    def check_capacity(self) -> None:
         """Raises `QueueFull` where another job would be too many, `ShuttingDown` where none is accepted."""
         limit = self.service.settings.queue_limit
         if self._stopping:
@@ -183,8 +183,8 @@ class JobEngine:
 
     def _submit(self, job_id: str, spec: JobSpec, owner: str | None, image: DecodedImage) -> None:
         with self.open_jobs.lock:  # the count must not change between the check and the record
-            self.check_room()
-            starts_now = self.open_jobs.count(spec.generator) < self.room
+            self.check_capacity()
+            starts_now = self.open_jobs.count(spec.generator) < self.max_running_jobs_per_generator
             self.open_jobs.record(job_id, spec.generator)
         try:
             # Before the job exists: its image must not be removed before work on it starts.
@@ -311,7 +311,7 @@ class JobEngine:
             if name not in self._queues:
                 DBOS.register_queue(
                     name,
-                    worker_concurrency=self.room,
+                    worker_concurrency=self.max_running_jobs_per_generator,
                     polling_interval_sec=QUEUE_POLL_SECONDS,
                     on_conflict="always_update",
                 )
@@ -323,9 +323,9 @@ class JobEngine:
         """Has running jobs end without an outcome: they continue after the next start."""
         for job_id in self.active.ids():
             self.active.request_cancel(job_id)
-        self._tell_stopping(self.active.awaited())
+        self._notify_stopping(self.active.awaited())
 
-    def _tell_stopping(self, jobs: Iterable[str]) -> None:
+    def _notify_stopping(self, jobs: Iterable[str]) -> None:
         for job_id in jobs:
             error = ShuttingDown(
                 f"The server is stopping. The job {job_id} goes on when it is back: GET /jobs/{job_id}.",
@@ -337,7 +337,7 @@ class JobEngine:
 @contextmanager
 def _attributes(job_id: str, spec: JobSpec, owner: str | None) -> Generator[None]:
     """What DBOS keeps beside a workflow. Times in SQLite are whole seconds: that of the spec is exact."""
-    attributes = SetWorkflowAttributes({GENERATOR: spec.generator, CREATED: spec.created_at})
+    attributes = SetWorkflowAttributes({ATTRIBUTE_GENERATOR: spec.generator, ATTRIBUTE_CREATED_AT: spec.created_at})
     with SetWorkflowID(job_id), DBOSContextSetAuth(owner, None), attributes:
         yield
 

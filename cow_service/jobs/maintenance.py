@@ -136,13 +136,7 @@ class Maintenance:
 
     def _resume_stalled(self) -> None:
         """Resumes jobs of this process that no thread works on: their outcome could not be written, for example."""
-        pending = DBOS.list_workflows(
-            name=list(state.KINDS),
-            status="PENDING",
-            executor_id=DBOS.executor_id,
-            load_input=False,
-            load_output=False,
-        )
+        pending = state.workflows_of_jobs(status="PENDING", executor_id=DBOS.executor_id)
         idle = {one.workflow_id for one in pending} - set(self._open_jobs.active.ids())
         for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
             log.warning("job %s was stalled, and is resumed", job_id)

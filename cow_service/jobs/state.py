@@ -14,10 +14,11 @@ from dbos import DBOS, WorkflowStatus
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest
 from cow_service.jobs.active import ActiveJobs, share_done
 from cow_service.jobs.database import database_errors
+from cow_service.observability.timestamps import rfc3339
 from cow_service.records import Job, JobKind, JobPage, JobStatus, Problem
 
 KINDS: tuple[JobKind, ...] = get_args(JobKind)
-GENERATOR, CREATED = "generator", "created_at"  # attributes of a workflow
+ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT = "generator", "created_at"  # what DBOS keeps beside a workflow
 STATUS: dict[str, JobStatus] = {
     "ENQUEUED": "queued",
     "DELAYED": "queued",
@@ -66,9 +67,8 @@ class JobState:
 
 def find(job_id: str, active: ActiveJobs, *, full: bool = True) -> JobState | None:
     """A job by its id; without its result and problem unless `full`."""
-    with database_errors():
-        found = DBOS.list_workflows(workflow_ids=[job_id], load_input=False, load_output=full)
-    return _state(found[0], active) if found and found[0].name in KINDS else None
+    found = workflows_of_jobs(workflow_ids=[job_id], load_output=full)
+    return _state(found[0], active) if found else None
 
 
 def page(owner: str | None, filters: JobFilters, active: ActiveJobs) -> JobPage:
@@ -105,42 +105,42 @@ def _listed(owner: str | None, filters: JobFilters, before: datetime | None, lim
     wanted = [name for name, status in STATUS.items() if status in filters.status]
     if "queued" in filters.status:
         wanted = sorted({*wanted, "PENDING"})  # of those taken from the queue, some still wait
+    return workflows_of_jobs(
+        name=[filters.kind] if filters.kind else list(KINDS),
+        status=wanted or None,
+        user=owner,
+        start_time=None if after is None or after < EPOCH else after.replace(microsecond=0).isoformat(),
+        end_time=None if before is None else (max(before, EPOCH) + HALF_MILLISECOND).isoformat(),
+        sort_desc=True,
+        limit=limit,
+    )
+
+
+def workflows_of_jobs(**filters: Any) -> list[WorkflowStatus]:
+    """The workflows of jobs that match filters of `DBOS.list_workflows`; without results unless `load_output`."""
+    defaults: dict[str, Any] = {"name": list(KINDS), "load_input": False, "load_output": False}
     with database_errors():
-        return DBOS.list_workflows(
-            name=[filters.kind] if filters.kind else list(KINDS),
-            status=wanted or None,
-            user=owner,
-            start_time=None if after is None or after < EPOCH else after.replace(microsecond=0).isoformat(),
-            end_time=None if before is None else (max(before, EPOCH) + HALF_MILLISECOND).isoformat(),
-            sort_desc=True,
-            limit=limit,
-            load_input=False,
-            load_output=False,
-        )
+        return DBOS.list_workflows(**(defaults | filters))
 
 
 def open_jobs() -> dict[str, str]:
     """The jobs that wait or run anywhere, and the generator of each."""
-    with database_errors():
-        found = DBOS.list_workflows(name=list(KINDS), status=OPEN, load_input=False, load_output=False)
-    return {one.workflow_id: (one.attributes or {}).get(GENERATOR, "") for one in found}
+    return {one.workflow_id: _attribute(one, ATTRIBUTE_GENERATOR) for one in workflows_of_jobs(status=OPEN)}
 
 
 def ended_before(moment: datetime, limit: int) -> list[str]:
     """Some jobs that ended before a time."""
-    with database_errors():
-        found = DBOS.list_workflows(
-            name=list(KINDS), status=ENDED, completed_before=moment.isoformat(), limit=limit,
-            load_input=False, load_output=False,
-        )  # fmt: skip
+    found = workflows_of_jobs(status=ENDED, completed_before=moment.isoformat(), limit=limit)
     return [one.workflow_id for one in found]
 
 
 def existing(jobs: list[str], owner: str | None = None) -> set[str]:
     """Those of some jobs that the database knows, of an owner where one is given."""
-    with database_errors():
-        found = DBOS.list_workflows(workflow_ids=jobs, user=owner, load_input=False, load_output=False)
-    return {one.workflow_id for one in found}
+    return {one.workflow_id for one in workflows_of_jobs(workflow_ids=jobs, user=owner)}
+
+
+def _attribute(status: WorkflowStatus, name: str) -> str:
+    return (status.attributes or {}).get(name, "")
 
 
 def _state(status: WorkflowStatus, active: ActiveJobs) -> JobState:
@@ -153,7 +153,7 @@ def _state(status: WorkflowStatus, active: ActiveJobs) -> JobState:
     if shown == "running" and status.executor_id == DBOS.executor_id and (running is None or running.stage is None):
         shown = "queued"  # it was taken from the queue, but no thread works on it yet
     error = _error(status) if shown == "failed" else None
-    created = (status.attributes or {}).get(CREATED) or _time(status.created_at)
+    created = _attribute(status, ATTRIBUTE_CREATED_AT) or _time(status.created_at)
     job = Job(
         id=status.workflow_id,
         kind=kind,
@@ -163,7 +163,7 @@ def _state(status: WorkflowStatus, active: ActiveJobs) -> JobState:
         created_at=created,
         # Times in SQLite may be whole seconds, and before the job came.
         finished_at=None if status.completed_at is None else max(_time(status.completed_at), created),
-        generator=(status.attributes or {}).get(GENERATOR, ""),
+        generator=_attribute(status, ATTRIBUTE_GENERATOR),
         problem=None if error is None else Problem(**error.as_problem()),
     )
     ended = None if status.completed_at is None else status.completed_at / 1000
@@ -178,8 +178,7 @@ def _error(status: WorkflowStatus) -> CowError | None:
 
 
 def _time(milliseconds: int | None) -> str:
-    moment = datetime.fromtimestamp((milliseconds or 0) / 1000, UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return rfc3339((milliseconds or 0) / 1000)
 
 
 def _position(taken: list[WorkflowStatus], seen: set[str], before: datetime | None) -> tuple[datetime, set[str]]:

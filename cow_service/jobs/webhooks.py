@@ -52,7 +52,7 @@ class Webhooks:
         return Egress(None) if self._given is None else self._given
 
     def use(self, settings: Settings) -> None:
-        """Takes the secret from other settings."""
+        """Takes the secret from other settings. Only tests do this."""
         self._secret = settings.webhook_secret
 
     def check(self, url: str) -> None:

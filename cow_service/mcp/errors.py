@@ -54,5 +54,5 @@ def _argument(pointer: str) -> str:
     begin = next((known for known in _ARGUMENTS if pointer == known or pointer.startswith(f"{known}/")), None)
     if begin is None:
         return pointer.lstrip("/") or "arguments"
-    told = (_ARGUMENTS[begin] + pointer[len(begin) :]).lstrip("/")
-    return told or ("`object`, `bbox`, `point`" if begin == "/grounding" else "`direction`, `motion_kind`, `speed`")
+    argument = (_ARGUMENTS[begin] + pointer[len(begin) :]).lstrip("/")
+    return argument or ("`object`, `bbox`, `point`" if begin == "/grounding" else "`direction`, `motion_kind`, `speed`")

@@ -101,7 +101,7 @@ class SimulateInput(ToolInput):
     video: bool | None = Field(default=False, description="Make an mp4 of the whole clip, too.")
 
     def request_fields(self) -> dict[str, Any]:
-        """See above."""
+        """The same, and whether a video is wanted."""
         return super().request_fields() | {"video": bool(self.video)}
 
 
@@ -124,7 +124,7 @@ class AnswerInput(ToolInput):
     )
 
     def request_fields(self) -> dict[str, Any]:
-        """See above."""
+        """The same, and how to answer."""
         return super().request_fields() | _given(options=self.options, votes=self.votes, baseline=self.baseline)
 
 

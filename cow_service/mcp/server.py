@@ -151,7 +151,7 @@ class _Tools:
         return ListToolsResult(tools=self._listed)
 
     async def call(self, context: ServerRequestContext[Any], params: CallToolRequestParams) -> CallToolResult:
-        """What a tool returns; every error is told in it, since that is where a model looks."""
+        """What a tool returns; an error is text in it, since that is where a model looks."""
         if params.name not in INPUTS:
             raise MCPError(code=INVALID_PARAMS, message=f"Unknown tool: {params.name[:80]!r}")
         tool = params.name

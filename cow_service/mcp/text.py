@@ -73,8 +73,8 @@ def _verdict(answer: str | None, option: str | None) -> str:
 
 
 def _baseline(baseline: Verdict) -> str:
-    told = _verdict(baseline.answer, baseline.option)
-    return f"{told}; votes {_votes(baseline.votes)}" if sum(baseline.votes.values()) > 1 else told
+    verdict = _verdict(baseline.answer, baseline.option)
+    return f"{verdict}; votes {_votes(baseline.votes)}" if sum(baseline.votes.values()) > 1 else verdict
 
 
 def _votes(votes: dict[str, int]) -> str:

@@ -9,7 +9,6 @@ import errno
 import hashlib
 import os
 import re
-import shutil
 import threading
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
@@ -36,7 +35,7 @@ _MAX_SHOWN_CHARACTERS = 80
 
 
 def media_type_of(data: bytes) -> str | None:
-    """The media type of an image or MP4 file, told by its first 12 bytes; None for anything else."""
+    """The media type of an image or MP4 file, by its first 12 bytes; None for anything else."""
     for signature, media_type in _SIGNATURES.items():
         if data.startswith(signature):
             return media_type
@@ -83,7 +82,7 @@ class ArtifactStore:
                 return self._commit(temporary, target, sha256)
 
     def put_file(self, path: Path, media_type: str) -> Artifact:
-        """Moves a finished file in, hashing it in chunks; afterwards `path` no longer exists.
+        """Moves in a finished file of `scratch`, hashing it in chunks; afterwards `path` no longer exists.
 
         Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
         """
@@ -94,7 +93,7 @@ class ArtifactStore:
                 _sync(file)
             target = self._target(sha256, extension)
             with _temporary_beside(target) as temporary:
-                _move(path, temporary)
+                path.replace(temporary)
                 return self._commit(temporary, target, sha256)
 
     def get(self, sha256: str) -> StoredArtifact:
@@ -195,18 +194,6 @@ def _temporary_beside(target: Path) -> Generator[Path]:
         yield temporary
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _move(source: Path, destination: Path) -> None:
-    try:
-        source.replace(destination)
-    except OSError as error:
-        if error.errno != errno.EXDEV:
-            raise
-        with source.open("rb") as reader, destination.open("xb") as writer:
-            shutil.copyfileobj(reader, writer)
-            _sync(writer)
-        source.unlink()
 
 
 def _sync(file: BinaryIO) -> None:

@@ -127,7 +127,7 @@ class DecodedImage:
 
 
 def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT) -> DecodedImage:
-    """Decode one PNG, JPEG or WebP file, told by its content, to upright 8-bit RGB.
+    """Decode one PNG, JPEG or WebP file, recognised by its content, to upright 8-bit RGB.
 
     The EXIF orientation is applied, transparency is laid on white, and 16 bits become 8. Colours are taken as sRGB: an
     embedded ICC profile is ignored. The size is read from the header and refused before any pixel is decoded; text,

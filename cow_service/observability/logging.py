@@ -9,10 +9,10 @@ import json
 import logging
 import re
 import sys
-from datetime import UTC, datetime
 from typing import Any, TextIO
 
 from cow_service.observability import context
+from cow_service.observability.timestamps import rfc3339
 from cow_service.settings import Settings
 
 ACCESS = "cow_service.access"
@@ -60,7 +60,7 @@ class JsonFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """One line, whatever the record holds."""
         fields: dict[str, Any] = {
-            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
+            "time": rfc3339(record.created),
             "level": record.levelname.lower(),
             "logger": record.name,
             "message": record.getMessage(),

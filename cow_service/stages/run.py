@@ -7,7 +7,6 @@ import uuid
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -17,6 +16,7 @@ from cow_service.concurrency import PrioritySemaphore
 from cow_service.generators.base import Generator
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import DecodedImage
+from cow_service.observability.timestamps import rfc3339
 from cow_service.readers.base import CallLog, MotionHints, Reader, ReaderInput
 from cow_service.records import Grounding, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
@@ -55,7 +55,7 @@ def compute_directly(
 
 def now() -> str:
     """RFC 3339, UTC."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return rfc3339(time.time())
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from cow_service.api.middleware.rate_limit import Buckets, address_of, is_probe,
 from cow_service.api.problems import respond
 from cow_service.errors import CowError, Unauthorized
 
-MAX_FAILURES = 30  # per minute from one address, before it is told to wait
+MAX_FAILURES = 30  # per minute from one address, before it has to wait
 
 
 class ApiKeys:

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from cow_service.api.body import read_object
 from cow_service.api.openai.models import answerer
-from cow_service.api.openai.requests import NEUTRAL, ChatMessage, ChatPart, ChatRequest
+from cow_service.api.openai.requests import ChatMessage, ChatPart, ChatRequest, Neutral
 from cow_service.api.problems import invalid
 from cow_service.errors import CowError, FieldError, InvalidRequest
 from cow_service.requests import AnswerRequest
@@ -137,7 +137,10 @@ def _warnings(chat: ChatRequest, question: int) -> Iterator[str]:
             "that matters must stand in the last user message."
         )
     unused = [
-        name for name, neutral in NEUTRAL.items() if (value := getattr(chat, name)) is not None and value not in neutral
+        name
+        for name, field in ChatRequest.model_fields.items()
+        for neutral in field.metadata
+        if isinstance(neutral, Neutral) and getattr(chat, name) not in (None, *neutral.values)
     ]
     if unused:
         yield f"Not used: {', '.join(f'`{name}`' for name in unused)}. COW asks with settings of its own."

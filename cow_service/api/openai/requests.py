@@ -41,6 +41,13 @@ class Only:
         raise ValueError(self.remedy)
 
 
+class Neutral:
+    """Values of a parameter that is not used for which no warning is given: they ask for nothing."""
+
+    def __init__(self, *values: Any) -> None:
+        self.values = values
+
+
 def _listed(made: Callable[[str], Any]) -> Callable[[Any], Any]:
     """A text alone as a list of one."""
     return lambda value: [made(value)] if isinstance(value, str) else value
@@ -109,7 +116,7 @@ class StreamOptions(Record):
     include_obfuscation: Flag | None = Field(default=None, description="Not used.")
 
 
-UNUSED = "Not used."
+NOT_USED: Any = Field(default=None, description="Not used.")
 
 
 class ChatRequest(Record):
@@ -133,7 +140,7 @@ class ChatRequest(Record):
     n: Annotated[Any, Only("takes only 1: `cow.votes` has the model asked more often", (1,))] = None
     tools: Annotated[Any, Only(NO_TOOLS, ([],))] = None
     tool_choice: Annotated[Any, Only(NO_TOOLS, ("none", "auto"))] = None
-    parallel_tool_calls: Flag | None = Field(default=None, description=UNUSED)
+    parallel_tool_calls: Flag | None = NOT_USED
     functions: Annotated[Any, Only(NO_TOOLS, ([],))] = None
     function_call: Annotated[Any, Only(NO_TOOLS, ("none", "auto"))] = None
     logprobs: Annotated[Any, Only("COW knows no probabilities: leave it out; `cow.votes` gives a split", (False,))] = (
@@ -149,41 +156,25 @@ class ChatRequest(Record):
     web_search_options: Annotated[Any, Only("COW searches nothing: leave it out")] = None
     moderation: Annotated[Any, Only("COW moderates nothing: leave it out")] = None
 
-    temperature: Finite | None = Field(default=None, description=UNUSED)
-    top_p: Finite | None = Field(default=None, description=UNUSED)
-    top_k: Whole | None = Field(default=None, description=UNUSED)
-    min_p: Finite | None = Field(default=None, description=UNUSED)
-    presence_penalty: Finite | None = Field(default=None, description=UNUSED)
-    frequency_penalty: Finite | None = Field(default=None, description=UNUSED)
-    repetition_penalty: Finite | None = Field(default=None, description=UNUSED)
-    logit_bias: dict[str, Any] | None = Field(default=None, description=UNUSED)
-    stop: Stops = Field(default=None, description=UNUSED)
+    temperature: Annotated[Finite | None, Neutral(0, 1)] = NOT_USED
+    top_p: Annotated[Finite | None, Neutral(1)] = NOT_USED
+    top_k: Annotated[Whole | None, Neutral(-1, 0, 1)] = NOT_USED
+    min_p: Annotated[Finite | None, Neutral(0)] = NOT_USED
+    presence_penalty: Annotated[Finite | None, Neutral(0)] = NOT_USED
+    frequency_penalty: Annotated[Finite | None, Neutral(0)] = NOT_USED
+    repetition_penalty: Annotated[Finite | None, Neutral(1)] = NOT_USED
+    logit_bias: Annotated[dict[str, Any] | None, Neutral({})] = NOT_USED
+    stop: Annotated[Stops, Neutral(())] = NOT_USED
     max_tokens: Whole | None = Field(default=None, description="Not used: answers are not cut.")
     max_completion_tokens: Whole | None = Field(default=None, description="Not used: answers are not cut.")
-    reasoning_effort: str | None = Field(default=None, description=UNUSED)
-    verbosity: str | None = Field(default=None, description=UNUSED)
-    prediction: Any = Field(default=None, description=UNUSED)
-    user: str | None = Field(default=None, description=UNUSED)
-    safety_identifier: str | None = Field(default=None, description=UNUSED)
-    metadata: dict[str, Any] | None = Field(default=None, description=UNUSED)
-    store: Flag | None = Field(default=None, description=UNUSED)
-    service_tier: str | None = Field(default=None, description=UNUSED)
-    prompt_cache_key: str | None = Field(default=None, description=UNUSED)
-    prompt_cache_options: Any = Field(default=None, description=UNUSED)
-    prompt_cache_retention: str | None = Field(default=None, description=UNUSED)
-
-
-# Values of parameters that change nothing where nothing is done about them.
-NEUTRAL: dict[str, tuple[Any, ...]] = {
-    "temperature": (0, 1),
-    "top_p": (1,),
-    "top_k": (-1, 0, 1),
-    "min_p": (0,),
-    "presence_penalty": (0,),
-    "frequency_penalty": (0,),
-    "repetition_penalty": (1,),
-    "logit_bias": ({},),
-    "stop": ((),),
-    "reasoning_effort": ("medium",),
-    "verbosity": ("medium",),
-}
+    reasoning_effort: Annotated[str | None, Neutral("medium")] = NOT_USED
+    verbosity: Annotated[str | None, Neutral("medium")] = NOT_USED
+    prediction: Any = NOT_USED
+    user: str | None = NOT_USED
+    safety_identifier: str | None = NOT_USED
+    metadata: dict[str, Any] | None = NOT_USED
+    store: Flag | None = NOT_USED
+    service_tier: str | None = NOT_USED
+    prompt_cache_key: str | None = NOT_USED
+    prompt_cache_options: Any = NOT_USED
+    prompt_cache_retention: str | None = NOT_USED

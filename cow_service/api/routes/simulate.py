@@ -13,35 +13,12 @@ from cow_service.api.submission import Submitter
 from cow_service.records import Answer, Job, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
 
-FAILURES = (
-    errors.MalformedBody,
-    errors.InvalidRequest,
-    errors.ArtifactNotFound,
-    errors.BodyTooLarge,
-    errors.BodyTooSlow,
-    errors.BodyTypeUnsupported,
-    errors.ImageTooLarge,
-    errors.ImageUnreadable,
-    errors.ImageTypeUnsupported,
-    errors.ImageUrlNotAllowed,
-    errors.CannotGround,
-    errors.ObjectNotFound,
-    errors.CannotReadDirection,
-    errors.ReaderUnavailable,
-    errors.MllmBadReply,
-    errors.MllmUnavailable,
-    errors.GeneratorUnavailable,
-    errors.WeightsUnavailable,
-    errors.CheckpointInvalid,
-    errors.GeneratorOutOfMemory,
-    errors.StorageUnavailable,
-    errors.ImageUrlUnreachable,
-    errors.IdempotencyKeyReused,
-    errors.WebhookNotAllowed,
-    errors.QueueFull,
-    errors.ShuttingDown,
-    errors.Canceled,
-)
+_ELSEWHERE = (  # errors of the server as a whole, and of other operations
+    errors.CowError, errors.InternalError, errors.NotFound, errors.MethodNotAllowed, errors.Unauthorized,
+    errors.OriginNotAllowed, errors.RateLimited, errors.RangeNotSatisfiable, errors.ModelNotFound, errors.JobNotFound,
+    errors.NotReady,
+)  # fmt: skip
+FAILURES = tuple(kind for kind in errors.kinds().values() if kind not in _ELSEWHERE)
 ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {
         "model": Job,
