@@ -31,7 +31,7 @@ from cow_service.errors import ReaderUnavailable
 from cow_service.media.images import encode_png
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.mllm.answer import read_answer
-from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.identify import read_identified
 from cow_service.readers.mllm.locate import read_located
 from cow_service.readers.mllm.models import manifest_for
@@ -150,7 +150,7 @@ def asked(case: dict[str, Any], mllm: MllmServer, service: Service) -> dict[str,
 
 def read(case: dict[str, Any]) -> dict[str, Any]:
     """What the reading of a case's stage makes of it by itself, in the terms of `expect`."""
-    view = View(*case["image"], tuple(case["sent"]), load_families()[case["family"]].coordinates)
+    view = CoordinateFrame(*case["image"], tuple(case["sent"]), load_families()[case["family"]].coordinates)
     stage, raw = case["stage"], case["raw"]
     try:
         if stage == "identify":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
@@ -92,8 +93,8 @@ def create(settings: Settings) -> CutoutGenerator:
 
 
 def _layers(given: GeneratorInput) -> _Layers:
-    scene, options = given.scene, given.options
-    clean = not isinstance(options, CutoutOptions) or options.clean_cues
+    scene = given.scene
+    clean = cast(CutoutOptions, given.options).clean_cues  # the generator's own `options_model`
     image = fit_within(scene.clean if clean else scene.image, MAX_SIDE)
     size = image.shape[1], image.shape[0]
     factor = image.shape[1] / scene.width

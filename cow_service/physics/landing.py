@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from cow_service.physics.camera import FOCAL_WIDTHS, PITCH
 from cow_service.physics.encounters import REACH, floor_gap
 from cow_service.records import BBox
+from cow_service.vision.masks import iou
 from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.scene import SAME_OBJECT, Scene, iou
+from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.scene import Scene
 from cow_service.vision.shadows import Shadow, find_shadow
 
 MIN_SIDEWAYS = 0.5  # of the heading's length, sideways in the image: less is up, down or away
@@ -72,7 +74,7 @@ def rolls_into(
     if verdict is None:
         return None
     for obstacle in obstacles:
-        if iou(obstacle.bbox, target) >= SAME_OBJECT or iou(obstacle.bbox, mover) >= SAME_OBJECT:
+        if iou(obstacle.bbox, target) >= SAME_OBJECT_IOU or iou(obstacle.bbox, mover) >= SAME_OBJECT_IOU:
             continue
         before = sense * (obstacle.bbox[0] + obstacle.bbox[2] - target[0] - target[2]) < 0
         if before and _verdict(scene, landings, sense, obstacle.bbox) is not False:
@@ -91,7 +93,7 @@ def _verdict(scene: Scene, landings: Sequence[Landing], sense: float, bbox: BBox
 
 @dataclass(frozen=True)
 class _Target:
-    """What stands on the floor."""
+    """An object on the floor that the ball may roll into, taken for a ball or for a block."""
 
     bbox: BBox  # px
     is_ball: bool
@@ -135,19 +137,19 @@ def landings_below(shadow: Shadow, ball: BBox, size: tuple[int, int]) -> tuple[L
     Each pair lies one standard deviation from it, one pair for each independent doubt. Empty where no likely camera
     and light would make that shadow of a ball in the air.
     """
-    view = _View.of(ball, size)
-    fit = _fit(view, shadow)
+    model = _ShadowModel.of(ball, size)
+    fit = _fit(model, shadow)
     if fit is None:
         return ()
     parameters, covariance = fit
     values, axes = np.linalg.eigh(covariance)
     steps = axes * np.sqrt(np.maximum(values, 0))
     around = [parameters, *(parameters + sign * steps[:, i] for i in range(len(values)) for sign in (-1, 1))]
-    return tuple(view.landing(_bounded(each)) for each in around)
+    return tuple(model.landing(_bounded(each)) for each in around)
 
 
 @dataclass(frozen=True)
-class _View:
+class _ShadowModel:
     """A ball seen by a pinhole camera, in radii of the ball: x right, y down, z ahead."""
 
     focal: float  # px
@@ -155,11 +157,11 @@ class _View:
     ball: Floats  # [3]: its centre
 
     @staticmethod
-    def of(bbox: BBox, size: tuple[int, int]) -> _View:
+    def of(bbox: BBox, size: tuple[int, int]) -> _ShadowModel:
         focal, middle = FOCAL_WIDTHS * size[0], np.array(size) / 2
         radius = (bbox[2] - bbox[0] + bbox[3] - bbox[1]) / 4
         centre = np.array([bbox[0] + bbox[2], bbox[1] + bbox[3]]) / 2
-        return _View(focal, middle, np.array([*((centre - middle) / radius), focal / radius]))
+        return _ShadowModel(focal, middle, np.array([*((centre - middle) / radius), focal / radius]))
 
     def image(self, points: Floats) -> Floats:
         """Image points [N, 2] (px) of points [N, 3]."""
@@ -199,20 +201,20 @@ def _bounded(parameters: Floats) -> Floats:
     return np.clip(parameters, [0.1, 1.0, -1.5, -1.5], [1.3, 40.0, 1.5, 1.5])
 
 
-def _fit(view: _View, shadow: Shadow) -> tuple[Floats, Floats] | None:
+def _fit(model: _ShadowModel, shadow: Shadow) -> tuple[Floats, Floats] | None:
     """Pitch, height and slant of the light [4] with their covariance [4, 4], by Gauss-Newton from the prior_mean.
 
     None where no likely camera and light would make that shadow of the ball in the air.
     """
     prior_mean, prior_sigma = np.array(PRIOR_MEAN), np.array(PRIOR_SIGMA)
-    radius = view.focal / view.ball[2]
+    radius = model.focal / model.ball[2]
 
     def residuals(parameters: Floats) -> Floats:
         seen = _features(np.array([*shadow.centre, *shadow.spread]), radius)
-        made = _features(view.shadow(_bounded(parameters)), radius)
+        made = _features(model.shadow(_bounded(parameters)), radius)
         return np.concatenate([(made - seen) / np.array(MEASUREMENT_SIGMA), (parameters - prior_mean) / prior_sigma])
 
-    drop = shadow.centre[1] - float(view.image(view.ball[None])[0, 1])
+    drop = shadow.centre[1] - float(model.image(model.ball[None])[0, 1])
     parameters = _bounded(np.array([prior_mean[0], drop / radius / math.cos(prior_mean[0]), *prior_mean[2:]]))
     slopes = np.zeros((9, 4))
     for _ in range(MAX_ITERATIONS):

@@ -27,7 +27,7 @@ SHARP_SHARE = 0.65  # of an outline that must lie on edges
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
 MIN_AREA = 0.0004  # of the image
 MAX_AREA = 0.25
-SAME_OBJECT = 0.5  # intersection over union from which a region is the object of a box
+SAME_OBJECT_IOU = 0.5  # intersection over union from which a region is the object of a box
 MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
 CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
 SPLIT_HUE = 36.0  # degrees: another colour, hence another object
@@ -107,7 +107,7 @@ def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
 def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
     """The region that best overlaps a box [x0, y0, x1, y1], if it is the same object."""
     best = max(regions, key=lambda region: iou(region.bbox, bbox), default=None)
-    return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT else None
+    return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT_IOU else None
 
 
 def _view(small: NDArray[np.uint8]) -> _View:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from typing import cast
 
 import numpy as np
 import torch
@@ -45,7 +46,7 @@ class WanOptions(BaseModel):
 
 
 @dataclass(frozen=True)
-class Model:
+class LoadedModel:
     """A loaded model, and what would have to be the same to make its clips again."""
 
     name: str
@@ -78,7 +79,7 @@ class WanGenerator:
     options_model = WanOptions
     concurrency = 1
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: LoadedModel) -> None:
         self.fingerprint = model.fingerprint
         self._model = model
         self._embeddings = EmbeddingCache(model.pipeline)
@@ -196,7 +197,7 @@ class WanGenerator:
 
 
 def _options(given: GeneratorInput) -> WanOptions:
-    return given.options if isinstance(given.options, WanOptions) else WanOptions()
+    return cast(WanOptions, given.options)  # the generator's own `options_model`
 
 
 def _prompt(given: GeneratorInput) -> str:

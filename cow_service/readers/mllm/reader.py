@@ -22,6 +22,7 @@ from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.mllm.scale import Scaled, scale_call
 from cow_service.readers.question.sentences import parse, parse_noun_phrase
+from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
@@ -38,8 +39,6 @@ from cow_service.weights.resources import PROMPTS
 
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
-GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y down."
-GIVE_PLACE = "Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the request."
 
 
 class MllmReader:
@@ -163,14 +162,16 @@ class MllmReader:
         scaled: Scaled | CowError | None = next(results) if wants_scale else None
         if isinstance(located, CowError):
             raise located
-        found: dict[str, Any] = {"kind": kind, "sentence": identified.sentence if identified else None}
-        if located is not None and located.line is not None:
-            found |= vars(located.line)
+        hints = MotionHints(kind=kind, sentence=identified.sentence if identified else None)
+        if located is not None and (line := located.line) is not None:
+            hints = hints.model_copy(
+                update={"ends": line.ends, "cue": line.cue, "along_arrow": line.along_arrow, "camera": line.camera}
+            )
         if isinstance(scaled, CowError):
-            found["scale_error"] = scaled.code
+            hints = hints.model_copy(update={"scale_error": scaled.code})
         elif scaled is not None:
-            found |= vars(scaled)
-        return located, MotionHints(**found)
+            hints = hints.model_copy(update={"metres_per_pixel": scaled.metres_per_pixel, "down": scaled.down})
+        return located, hints
 
     def _directed(
         self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.coordinates import CoordinateFrame
 
 Schema = dict[str, Any]
 
@@ -34,9 +34,9 @@ def nullable(schema: Schema) -> Schema:
     return {"anyOf": [schema, {"type": "null"}]}
 
 
-def numbers(view: View, count: int) -> Schema:
-    """`count` coordinates as the view's family writes them."""
-    units = view.coordinates.units
-    highest = max(view.seen) if units == "pixels" else {"thousandths": 1000, "fractions": 1}[units]
+def numbers(frame: CoordinateFrame, count: int) -> Schema:
+    """`count` coordinates as the frame's family writes them."""
+    units = frame.coordinates.units
+    highest = max(frame.seen) if units == "pixels" else {"thousandths": 1000, "fractions": 1}[units]
     number = {"type": "number" if units == "fractions" else "integer", "minimum": 0, "maximum": highest}
     return {"type": "array", "items": number, "minItems": count, "maxItems": count}

@@ -48,7 +48,7 @@ def motion_sentence(
     name = " ".join(object.split())[:MAX_OBJECT].rstrip()
     determiner = next((word for word in _DETERMINERS if name.lower().startswith(word)), "")
     words = direction_words(direction, depth)
-    told = "" if sentence is None else sentence.strip().rstrip(".") + "."
+    declared = "" if sentence is None else sentence.strip().rstrip(".") + "."
     prompt = load_prompt("motion-sentence")
-    text = prompt.render(object=name[len(determiner) :], kind=kind, words=words, told=told)
+    text = prompt.render(object=name[len(determiner) :], kind=kind, words=words, sentence=declared)
     return " ".join(text.split())
