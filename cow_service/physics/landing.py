@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.physics.camera import FOCAL_WIDTHS, PITCH
 from cow_service.physics.encounters import REACH, floor_gap
@@ -23,6 +22,7 @@ from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.regions import SAME_OBJECT_IOU
 from cow_service.vision.scene import Scene
 from cow_service.vision.shadows import Shadow, find_shadow
+from cow_service.vision.types import Floats
 
 MIN_SIDEWAYS = 0.5  # of the heading's length, sideways in the image: less is up, down or away
 SURE = 0.88  # probability from which an answer is given
@@ -35,8 +35,6 @@ MEASUREMENT_SIGMA = (0.05, 0.05, 0.06, 0.08, 0.05)
 MAX_COST = 14.0  # squared deviations in all: a patch that fits worse is not the ball's shadow
 MIN_HEIGHT = 1.4  # radii, from the floor to the ball's centre: lower, it stands
 MAX_ITERATIONS = 12  # of the fit
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -86,34 +84,26 @@ def _verdict(scene: Scene, landings: Sequence[Landing], sense: float, bbox: BBox
     """Whether the ball meets what stands in a box, where that is sure, be a round thing a ball or a block."""
     region = scene.region_of(bbox)
     shapes = (False, True) if region is not None and region.is_disc else (False,)
-    chances = [_chance(landings, sense, _Target(bbox, is_ball)) for is_ball in shapes]
+    chances = [_chance(landings, sense, bbox, is_ball) for is_ball in shapes]
     verdicts = {None if chance is None or 1 - SURE < chance < SURE else chance >= SURE for chance in chances}
     return verdicts.pop() if len(verdicts) == 1 else None
 
 
-@dataclass(frozen=True)
-class _Target:
-    """An object on the floor that the ball may roll into, taken for a ball or for a block."""
-
-    bbox: BBox  # px
-    is_ball: bool
-
-
-def _standing(thing: _Target, landing: Landing) -> BBox:
-    """The box of a thing, down to the foot of its footprint: a ball is seen further down than that."""
-    left, top, right, bottom = thing.bbox
-    if not thing.is_ball:
-        return thing.bbox
+def _standing(bbox: BBox, is_ball: bool, landing: Landing) -> BBox:
+    """The box of an object, down to the foot of its footprint: a ball's silhouette ends above that."""
+    if not is_ball:
+        return bbox
+    left, top, right, bottom = bbox
     overhang = (math.cos(landing.pitch) + landing.squash - 1) * (right - left) / 2
     return left, top, right, bottom + overhang
 
 
-def _chance(landings: Sequence[Landing], sense: float, other: _Target) -> float | None:
+def _chance(landings: Sequence[Landing], sense: float, bbox: BBox, is_ball: bool) -> float | None:
     """How likely the ball, rolling on along its row of the image, comes within reach of what stands in a box.
 
     None where it may come down upon that very thing, or beside it.
     """
-    gaps = [floor_gap(landing.footprint, _standing(other, landing), landing.squash) for landing in landings]
+    gaps = [floor_gap(landing.footprint, _standing(bbox, is_ball, landing), landing.squash) for landing in landings]
     ratios = [away / (REACH * reach) for _, away, reach in gaps]
     variance = sum(((more - less) / 2) ** 2 for less, more in zip(ratios[1::2], ratios[2::2], strict=True))
     deviation = math.sqrt(variance + REACH_SIGMA**2)

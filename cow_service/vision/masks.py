@@ -6,12 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox
-
-Image = NDArray[np.uint8]  # RGB [H, W, 3]
-Mask = NDArray[np.bool_]  # [H, W]
+from cow_service.vision.types import Floats32, Image, Mask
 
 
 def scaled(image: Image, scale: float) -> Image:
@@ -116,7 +113,7 @@ class CroppedMask:
         mask[self.rows, self.columns] |= self.patch
 
 
-def enlarged(soft: NDArray[np.float32], shape: tuple[int, int]) -> CroppedMask:
+def enlarged(soft: Floats32, shape: tuple[int, int]) -> CroppedMask:
     """Where a smooth mask [h, w] of 0..1, not empty, exceeds one half when resized to an image [H, W] of `shape`."""
     fy, fx = shape[0] / soft.shape[0], shape[1] / soft.shape[1]
     rows, columns = window_of(soft > 0.05) or (slice(0, 1), slice(0, 1))

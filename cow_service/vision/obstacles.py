@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.masks import CroppedMask, iou
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region, region_of
+from cow_service.vision.types import Mask
 
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
 
@@ -27,7 +27,7 @@ class Obstacle:
 
 def find_obstacles(
     regions: Sequence[Region],
-    silhouette: Callable[[BBox], NDArray[np.bool_]],
+    silhouette: Callable[[BBox], Mask],
     mover: BBox,
     named: Sequence[LocatedObject],
 ) -> tuple[Obstacle, ...]:

@@ -12,11 +12,12 @@ from cow_service.records import BBox, LocatedObject
 from cow_service.vision.arrows import Arrow, find_arrows
 from cow_service.vision.boxes import DrawnBox, find_boxes
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import Image, Mask, bbox_of
+from cow_service.vision.masks import bbox_of
 from cow_service.vision.obstacles import Obstacle, find_obstacles
 from cow_service.vision.regions import Region, find_regions, region_of
 from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
+from cow_service.vision.types import Image, Mask
 
 
 @dataclass(frozen=True, eq=False)

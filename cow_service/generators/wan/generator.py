@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 from typing import cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.errors import FieldError, InvalidRequest
@@ -23,13 +21,12 @@ from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tracks import nearest_lengths, tracks_of
 from cow_service.records import GeneratorInfo
+from cow_service.vision.types import Image
 from cow_service.weights.device import cpu_threads
 
 SIDE_MULTIPLE = 16  # px: the sides of a clip are multiples of it
 MAX_SIDE = 1024 * SIDE_MULTIPLE  # px: the model has 1024 positions each way
 DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
-
-Image = NDArray[np.uint8]
 
 
 class WanOptions(BaseModel):
