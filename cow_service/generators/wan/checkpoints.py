@@ -168,7 +168,8 @@ def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
         try:
             with safe_open(file, framework="pt") as opened:
                 for key in tuple(opened.keys()):
-                    name, part = _unprefixed(key), opened.get_slice(key)
+                    prefix = next((prefix for prefix in PREFIXES if key.startswith(prefix)), "")
+                    name, part = key.removeprefix(prefix), opened.get_slice(key)
                     if name in entries:
                         raise CheckpointInvalid(f"'{name}' is both in {entries[name].file.name} and in {file.name}.")
                     entries[name] = _Entry(file, key, tuple(part.get_shape()), part.get_dtype())
@@ -246,11 +247,6 @@ def _load_weights(
 def _scale(entry: _Entry, device: torch.device) -> Tensor:
     with safe_open(entry.file, framework="pt", device=str(device)) as opened:
         return opened.get_tensor(entry.key).float()
-
-
-def _unprefixed(key: str) -> str:
-    prefix = next((prefix for prefix in PREFIXES if key.startswith(prefix)), "")
-    return key.removeprefix(prefix)
 
 
 def diffusers_names(originals: Iterable[str]) -> dict[str, str]:

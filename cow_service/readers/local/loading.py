@@ -146,15 +146,12 @@ def _check(folder: Path, manifest: Manifest) -> None:
     if not any(name.endswith(".safetensors") for name in files):
         raise CheckpointInvalid(f"'{folder.name}' has no safetensors files, and pickles are never opened.")
     # How places are written goes with the family. Another one's would be read wrong without a sign of it.
-    if manifest.family is not None and not _letters(kind).startswith(_letters(manifest.family)):
+    bare_kind, bare_family = (re.sub(r"[^a-z0-9]", "", name.lower()) for name in (kind, manifest.family or ""))
+    if not bare_kind.startswith(bare_family):
         raise CheckpointInvalid(
             f"'{folder.name}' is of the type '{kind}', and '{manifest.name}' of the family '{manifest.family}', which "
             f"writes places in its own way. Name it under a manifest of its family in COW_CHECKPOINTS."
         )
-
-
-def _letters(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 @contextmanager

@@ -38,17 +38,17 @@ _CAMERA: dict[str, CameraSense] = {
 class Line:
     """Which way the object moves, as far as the reply tells: `ends` in px of the upright image, or null."""
 
-    ends: tuple[Point, Point] | None
-    cue: Cue | None
-    along_arrow: bool | None
-    camera: CameraSense | None
+    ends: tuple[Point, Point] | None = None
+    cue: Cue | None = None
+    along_arrow: bool | None = None
+    camera: CameraSense | None = None
 
 
 def line_in(values: Sequence[object], said: str, frame: CoordinateFrame) -> Line:
     """The one line that a reply gives. Raises `ReplyError` where it gives none, several, or one that cannot be."""
     lines = [line for value in values for line in _lines(value, frame)]
     if not lines and not values and "<" not in said and (corners := CORNER_PAIRS.search(said)):
-        lines = [Line(frame.ends(list(corners.groups())), None, None, None)]
+        lines = [Line(frame.ends(list(corners.groups())))]
     if not lines:
         raise ReplyError("`direction` is missing; give two points on the line of the motion, or null")
     if any(not _same_way(line, lines[0]) for line in lines):
@@ -65,7 +65,7 @@ def _lines(value: object, frame: CoordinateFrame) -> Iterator[Line]:
     if isinstance(value, list):
         held = cast("list[object]", value)
         if len(held) == 4 and all(is_number(part) for part in held):
-            yield Line(frame.ends(held), None, None, None)
+            yield Line(frame.ends(held))
         for part in held:
             if isinstance(part, dict):
                 yield from _lines(part, frame)

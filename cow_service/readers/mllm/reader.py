@@ -15,6 +15,7 @@ from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, 
 from cow_service.readers.mllm.answer import answer_calls
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
 from cow_service.readers.mllm.client import MllmClient, PromptCall
+from cow_service.readers.mllm.directions import Line
 from cow_service.readers.mllm.identify import Identified, identify_call
 from cow_service.readers.mllm.images import EncodedImage, encode
 from cow_service.readers.mllm.locate import Located, locate_call
@@ -162,16 +163,19 @@ class MllmReader:
         scaled: Scaled | CowError | None = next(results) if wants_scale else None
         if isinstance(located, CowError):
             raise located
-        hints = MotionHints(kind=kind, sentence=identified.sentence if identified else None)
-        if located is not None and (line := located.line) is not None:
-            hints = hints.model_copy(
-                update={"ends": line.ends, "cue": line.cue, "along_arrow": line.along_arrow, "camera": line.camera}
-            )
-        if isinstance(scaled, CowError):
-            hints = hints.model_copy(update={"scale_error": scaled.code})
-        elif scaled is not None:
-            hints = hints.model_copy(update={"metres_per_pixel": scaled.metres_per_pixel, "down": scaled.down})
-        return located, hints
+        line = Line() if located is None or located.line is None else located.line
+        scale = scaled if isinstance(scaled, Scaled) else Scaled()
+        return located, MotionHints(
+            kind=kind,
+            sentence=identified.sentence if identified else None,
+            ends=line.ends,
+            camera=line.camera,
+            cue=line.cue,
+            along_arrow=line.along_arrow,
+            metres_per_pixel=scale.metres_per_pixel,
+            down=scale.down,
+            scale_error=scaled.code if isinstance(scaled, CowError) else None,
+        )
 
     def _directed(
         self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints

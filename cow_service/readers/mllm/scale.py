@@ -31,8 +31,8 @@ LEAST_SPAN = 4.0  # px: measuring less is guessing
 class Scaled:
     """The scale of the scene at the object, null where nothing was known of any size, and which way things fall."""
 
-    metres_per_pixel: MetresPerPixel | None
-    down: Vector
+    metres_per_pixel: MetresPerPixel | None = None
+    down: Vector = DOWN["bottom"]
 
 
 def scale_call(image: EncodedImage, name: str, reasoning_length: int) -> PromptCall[Scaled]:
@@ -66,7 +66,7 @@ def read_scaled(reply: str, frame: CoordinateFrame) -> Scaled:
     down = _down(fields.get("down"))
     metres, ends = _metres(first_of(fields, "metres", "meters", "length")), fields.get("ends")
     if metres is None or is_none(ends):
-        return Scaled(None, down)
+        return Scaled(down=down)
     span = math.dist(*frame.ends(ends))
     if span < LEAST_SPAN:
         raise ReplyError("`ends` are too close to measure by; take a longer thing")
