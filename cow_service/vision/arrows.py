@@ -199,13 +199,7 @@ def _is_arrow_like(profile: _Profile) -> bool:
 
 
 def _overlap(
-    patch: Mask,
-    tail: Floats,
-    tip: Floats,
-    thickness: float,
-    head_width: float,
-    head_length: float,
-    filled: bool,
+    patch: Mask, tail: Floats, tip: Floats, thickness: float, head_width: float, head_length: float, filled: bool
 ) -> float:
     """Intersection over union of the patch and the ideal arrow of these measures."""
     axis = (tip - tail) / np.linalg.norm(tip - tail)

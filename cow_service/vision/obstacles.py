@@ -26,10 +26,7 @@ class Obstacle:
 
 
 def find_obstacles(
-    regions: Sequence[Region],
-    silhouette: Callable[[BBox], Mask],
-    mover: BBox,
-    named: Sequence[LocatedObject],
+    regions: Sequence[Region], silhouette: Callable[[BBox], Mask], mover: BBox, named: Sequence[LocatedObject]
 ) -> tuple[Obstacle, ...]:
     """Everything but the mover: first what the question names, by that name, then other regions, by their colour.
 

@@ -11,12 +11,7 @@ Schema = dict[str, Any]
 
 def object_of(**properties: Schema) -> Schema:
     """An object with exactly these fields, in this order: reasoning comes first."""
-    return {
-        "type": "object",
-        "properties": properties,
-        "required": list(properties),
-        "additionalProperties": False,
-    }
+    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
 def words(longest: int) -> Schema:

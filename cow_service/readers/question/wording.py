@@ -12,12 +12,7 @@ ALONG_AXIS = 0.95  # sine of the angle out of the image plane from which only th
 IN_PLANE = 0.3  # and up to which it is not
 
 # 16 sectors of 22.5 degrees, from the right, turning upwards.
-_QUARTERS = (
-    ("to the right", "up"),
-    ("up", "to the left"),
-    ("to the left", "down"),
-    ("down", "to the right"),
-)
+_QUARTERS = (("to the right", "up"), ("up", "to the left"), ("to the left", "down"), ("down", "to the right"))
 _DETERMINERS = ("the ", "a ", "an ", "this ", "that ")
 
 
