@@ -33,7 +33,8 @@ from cow_service.records import BBox, Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.scene import Scene, iou
+from cow_service.vision.masks import iou
+from cow_service.vision.scene import Scene
 
 DRAWN = 40  # grey levels between image and clean image where something was drawn
 AWAY = 15  # px around the true mover, its hole and the drawing that may differ

@@ -11,7 +11,8 @@ from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
-from cow_service.vision.scene import Scene, iou
+from cow_service.vision.masks import iou
+from cow_service.vision.scene import Scene
 
 RED, BLUE, GREEN, ORANGE = (200, 30, 30), (50, 80, 200), (50, 150, 50), (235, 130, 40)
 reader = EmbeddedReader()

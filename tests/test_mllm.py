@@ -31,10 +31,10 @@ from cow_service.errors import ReaderUnavailable
 from cow_service.media.images import encode_png
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.mllm.answer import read_answer
-from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.identify import read_identified
 from cow_service.readers.mllm.locate import read_located
-from cow_service.readers.mllm.models import manifest_for
+from cow_service.readers.mllm.models import manifest_for, resolve_model
 from cow_service.readers.mllm.replies import ReplyError, values_in
 from cow_service.readers.question.choices import read_choices
 from cow_service.records import Grounding
@@ -150,7 +150,7 @@ def asked(case: dict[str, Any], mllm: MllmServer, service: Service) -> dict[str,
 
 def read(case: dict[str, Any]) -> dict[str, Any]:
     """What the reading of a case's stage makes of it by itself, in the terms of `expect`."""
-    view = View(*case["image"], tuple(case["sent"]), load_families()[case["family"]].coordinates)
+    view = CoordinateFrame(*case["image"], tuple(case["sent"]), load_families()[case["family"]].coordinates)
     stage, raw = case["stage"], case["raw"]
     try:
         if stage == "identify":
@@ -514,6 +514,23 @@ def test_large_images_are_made_smaller_before_they_are_sent(mllm: MllmServer, ma
 )
 def test_a_served_name_finds_its_manifest(served: str, manifest: str) -> None:
     assert manifest_for(served).name == manifest
+
+
+@pytest.mark.parametrize(
+    ("name", "base_url", "provider"),
+    [
+        ("claude-opus-4-6", None, "anthropic"),
+        ("claude-opus-4-6", "http://127.0.0.1:8001/v1", None),  # served by one's own server, whoever made the model
+        ("anthropic:claude-opus-4-6", "http://127.0.0.1:8001", "anthropic"),
+    ],
+)
+def test_a_manifest_with_a_base_url_has_no_provider(name: str, base_url: str | None, provider: str | None) -> None:
+    resolved = resolve_model(Settings(mllm=name, mllm_base_url=base_url))
+    assert (resolved.manifest.name, resolved.provider, resolved.name) == (
+        "claude-opus-4-6",
+        provider,
+        "claude-opus-4-6",
+    )
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,9 @@ from cow_service.media.data_urls import decode_data_url
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
+from cow_service.vision.masks import iou
 from cow_service.vision.regions import MAX_REGIONS
-from cow_service.vision.scene import Scene, iou
+from cow_service.vision.scene import Scene
 
 RED, BLUE = (210, 20, 20), (50, 80, 200)
 DRAWN = png_bytes(block(ball(floor(), (150, 200), 40, RED), (430, 160, 510, 250), BLUE))

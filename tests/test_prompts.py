@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from jinja2.exceptions import SecurityError
 
 from cow_service.readers.mllm import answer, identify, locate, scale
-from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.prompts import load_prompt, parse_prompt
 from cow_service.readers.question.choices import read_choices
 from cow_service.readers.question.wording import direction_words, motion_sentence
@@ -18,7 +18,7 @@ from cow_service.records import MotionKind, Vector
 from cow_service.weights.manifests import Coordinates
 from cow_service.weights.resources import PROMPTS
 
-HEAD = "---\nstage: motion\nversion: 1\ninputs: [name]\noutput: text\n---\n"
+HEAD = "---\nversion: 1\ninputs: [name]\n---\n"
 
 
 @pytest.mark.parametrize("name", PROMPTS.names())
@@ -32,15 +32,14 @@ def test_every_shipped_prompt_loads(name: str) -> None:
 
 def test_fields() -> None:
     prompt = load_prompt("motion-sentence")
-    assert (prompt.stage, prompt.version, prompt.output) == ("motion", 2, "text")
-    assert prompt.inputs == ("object", "kind", "words", "told")
+    assert prompt.version == 2
+    assert prompt.inputs == ("object", "kind", "words", "sentence")
 
 
 SAMPLES: dict[str, object] = {
     "object": "red ball",
     "kind": "linear",
     "words": "to the left",
-    "told": "",
     "question": "If the ball moves,\nwill it hit the vase?",
     "others": ("blue vase",),
     "bbox": "[1, 2, 3, 4]",
@@ -76,21 +75,22 @@ def test_every_shipped_prompt_renders_its_inputs_and_no_others(name: str) -> Non
             prompt.render(**{key: value for key, value in inputs.items() if key != prompt.inputs[0]})
 
 
-VIEW = View(640, 480, (640, 480), Coordinates(units="thousandths"))
+FRAME = CoordinateFrame(640, 480, (640, 480), Coordinates(units="thousandths"))
 SCHEMAS = {
-    "identified": identify.schema(100),
-    "located": locate.schema(VIEW, True, True, True, 100),
-    "scaled": scale.schema(VIEW, 100),
-    "answered": answer.schema(read_choices("", ["Yes", "No"]), 100),
+    "identify": identify.schema(100),
+    "locate": locate.schema(FRAME, True, True, True, 100),
+    "scale": scale.schema(FRAME, 100),
+    "answer-from-image": answer.schema(read_choices("", ["Yes", "No"]), 100),
+    "answer-with-frames": answer.schema(read_choices("", ["Yes", "No"]), 100),
 }
 
 
-@pytest.mark.parametrize("name", [name for name in PROMPTS.names() if load_prompt(name).output != "text"])
+@pytest.mark.parametrize("name", [name for name in PROMPTS.names() if name not in {"looking", "motion-sentence"}])
 def test_a_prompt_shows_the_fields_of_its_schema(name: str) -> None:
     prompt = load_prompt(name)
     text = prompt.render(**{each: SAMPLES[each] for each in prompt.inputs})
     shape = text.splitlines()[-1]
-    fields = list(SCHEMAS[prompt.output]["properties"])
+    fields = list(SCHEMAS[name]["properties"])
     places = [shape.index(f'"{field}"') for field in fields]
     assert places == sorted(places), "the shape names the fields in the schema's order"
     assert fields[0] == "reasoning"
@@ -135,8 +135,8 @@ def test_body_is_sandboxed() -> None:
     ("text", "problem"),
     [
         ("Hello", "front matter"),
-        ("---\nstage: x\n", "front matter"),
-        ("---\nstage: x\n---\nHello", "exactly these fields"),
+        ("---\nversion: 1\n", "front matter"),
+        ("---\nversion: 1\n---\nHello", "exactly these fields"),
         ("---\n- a\n---\nHello", "exactly these fields"),
         (HEAD.replace("version: 1", "version: one"), "version must be of type int"),
         (HEAD.replace("version: 1", "version: true"), "version must be of type int"),

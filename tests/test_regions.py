@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.vision.colours import colour_name, colour_names
-from cow_service.vision.masks import bbox_of
+from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.regions import find_regions
-from cow_service.vision.scene import Scene, iou
+from cow_service.vision.scene import Scene
 from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 
 RGB = {

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service import __version__
@@ -18,14 +18,13 @@ from cow_service.physics.encounters import box_at, boxes_overlap, stands_nearer
 from cow_service.records import FALLING_KINDS, BBox, GeneratorInfo
 from cow_service.settings import Settings
 from cow_service.vision.inpainting import fill_hole, push_pull
-from cow_service.vision.masks import Image, Mask, resized_mask, scaled_size, window_of
+from cow_service.vision.masks import resized_mask, scaled_size, window_of
 from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
 EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge
 HOLE_GROWTH = 0.03  # of the object's size: the rim, mixed with the background, is inpainted too
-
-Floats = NDArray[np.float32]
 
 
 class CutoutOptions(BaseModel):
@@ -41,9 +40,9 @@ class _Layers:
     """What is composed, at the clip's size."""
 
     background: Image  # [h, w, 3] with the mover taken out
-    sprite: Floats  # [a, b, 4] the mover, colours times alpha, then alpha 0..1
+    sprite: Floats32  # [a, b, 4] the mover, colours times alpha, then alpha 0..1
     origin: tuple[float, float]  # x, y of the sprite's top left corner at the first frame, px
-    occluders: tuple[tuple[BBox, Floats], ...]  # boxes (px of the image) and alphas [h, w] of other objects
+    occluders: tuple[tuple[BBox, Floats32], ...]  # boxes (px of the image) and alphas [h, w] of other objects
     factor: float  # clip px per image px
 
 
@@ -92,8 +91,8 @@ def create(settings: Settings) -> CutoutGenerator:
 
 
 def _layers(given: GeneratorInput) -> _Layers:
-    scene, options = given.scene, given.options
-    clean = not isinstance(options, CutoutOptions) or options.clean_cues
+    scene = given.scene
+    clean = cast(CutoutOptions, given.options).clean_cues  # the generator's own `options_model`
     image = fit_within(scene.clean if clean else scene.image, MAX_SIDE)
     size = image.shape[1], image.shape[0]
     factor = image.shape[1] / scene.width
@@ -122,7 +121,7 @@ def _near(given: GeneratorInput) -> list[Obstacle]:
     return [other for other in given.obstacles if any(boxes_overlap(box, other.bbox) for box in boxes)]
 
 
-def _sprite(image: Image, mover: Mask) -> tuple[Floats, tuple[float, float]]:
+def _sprite(image: Image, mover: Mask) -> tuple[Floats32, tuple[float, float]]:
     """The mover with a soft edge, and where its corner lies. Colours at the edge are the mover's own, not mixed."""
     inside = window_of(mover, 4) or (slice(0, 1), slice(0, 1))
     mask, colours = mover[inside], image[inside].astype(np.float32)
@@ -134,9 +133,7 @@ def _sprite(image: Image, mover: Mask) -> tuple[Floats, tuple[float, float]]:
     return sprite, (float(inside[1].start), float(inside[0].start))
 
 
-def _compose(
-    layers: _Layers, start: NDArray[np.float64], point: NDArray[np.float64], scale: float, in_front: list[Floats]
-) -> Image:
+def _compose(layers: _Layers, start: Floats, point: Floats, scale: float, in_front: list[Floats32]) -> Image:
     """One frame: the sprite's corner moves with the object, to a fraction of a pixel."""
     height, width = layers.background.shape[:2]
     corner = layers.factor * point + scale * (np.array(layers.origin) - layers.factor * start)
@@ -157,6 +154,6 @@ def _compose(
     return frame
 
 
-def _soft(mask: Mask) -> Floats:
+def _soft(mask: Mask) -> Floats32:
     """Alpha 0..1 of a mask: half at its outline."""
     return np.asarray(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), EDGE_SIGMA), np.float32)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cow_service.vision.masks import Mask, window_of
+from cow_service.vision.masks import window_of
+from cow_service.vision.types import Floats, Mask
 
 ANCHORS = 8
 TRACKS = 5
 GRID = 14  # candidates along the longer side
 CLEARANCE = 0.02  # of the shorter side, kept between an anchor and what may move
-
-Floats = NDArray[np.float64]
 
 
 def spread_anchors(movable: Mask, count: int = ANCHORS) -> tuple[tuple[float, float], ...]:

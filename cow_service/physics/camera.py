@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.vision.types import Floats
+
 FOCAL_WIDTHS = 1.0  # focal length in image widths: a horizontal field of view of 53 degrees
 PITCH = math.radians(30)  # how far the camera looks down on a floor, for motion towards or away from it
 NEAREST = 0.08  # of the first depth: closer than this the object has passed the camera
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,12 @@ Source: the state and the motion model of arXiv 2601.13304, section on the Causa
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from cow_service.vision.types import Floats
 
 GRAVITY = 9.81  # m/s^2
 DEFAULT_SPEED = 0.26  # image widths per second
 DEFAULT_SCENE_WIDTH = 3.0  # m across the image at the object's depth, where nothing tells the scale
-
-Floats = NDArray[np.float64]
 
 
 def roll_out(position: Floats, velocity: Floats, acceleration: Floats, times: Floats) -> Floats:

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from cow_service.physics.camera import PITCH
 from cow_service.records import BBox, Encounter, EncounterKind
-from cow_service.vision.masks import Mask, resized_mask, scaled_size
+from cow_service.vision.masks import resized_mask, scaled_size
 from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.types import Floats, Mask
 
 WORKING_SIDE = 320  # px: masks are swept at this size
 LEAST_OVERLAP = 0.03  # of the smaller silhouette: less is no encounter
 REACH = 0.95  # of the summed half widths: corners and handles do not reach all around
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

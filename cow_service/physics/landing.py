@@ -13,14 +13,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.physics.camera import FOCAL_WIDTHS, PITCH
 from cow_service.physics.encounters import REACH, floor_gap
 from cow_service.records import BBox
+from cow_service.vision.masks import iou
 from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.scene import SAME_OBJECT, Scene, iou
+from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.scene import Scene
 from cow_service.vision.shadows import Shadow, find_shadow
+from cow_service.vision.types import Floats
 
 MIN_SIDEWAYS = 0.5  # of the heading's length, sideways in the image: less is up, down or away
 SURE = 0.88  # probability from which an answer is given
@@ -33,8 +35,6 @@ MEASUREMENT_SIGMA = (0.05, 0.05, 0.06, 0.08, 0.05)
 MAX_COST = 14.0  # squared deviations in all: a patch that fits worse is not the ball's shadow
 MIN_HEIGHT = 1.4  # radii, from the floor to the ball's centre: lower, it stands
 MAX_ITERATIONS = 12  # of the fit
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def rolls_into(
     if verdict is None:
         return None
     for obstacle in obstacles:
-        if iou(obstacle.bbox, target) >= SAME_OBJECT or iou(obstacle.bbox, mover) >= SAME_OBJECT:
+        if iou(obstacle.bbox, target) >= SAME_OBJECT_IOU or iou(obstacle.bbox, mover) >= SAME_OBJECT_IOU:
             continue
         before = sense * (obstacle.bbox[0] + obstacle.bbox[2] - target[0] - target[2]) < 0
         if before and _verdict(scene, landings, sense, obstacle.bbox) is not False:
@@ -84,34 +84,26 @@ def _verdict(scene: Scene, landings: Sequence[Landing], sense: float, bbox: BBox
     """Whether the ball meets what stands in a box, where that is sure, be a round thing a ball or a block."""
     region = scene.region_of(bbox)
     shapes = (False, True) if region is not None and region.is_disc else (False,)
-    chances = [_chance(landings, sense, _Target(bbox, is_ball)) for is_ball in shapes]
+    chances = [_chance(landings, sense, bbox, is_ball) for is_ball in shapes]
     verdicts = {None if chance is None or 1 - SURE < chance < SURE else chance >= SURE for chance in chances}
     return verdicts.pop() if len(verdicts) == 1 else None
 
 
-@dataclass(frozen=True)
-class _Target:
-    """What stands on the floor."""
-
-    bbox: BBox  # px
-    is_ball: bool
-
-
-def _standing(thing: _Target, landing: Landing) -> BBox:
-    """The box of a thing, down to the foot of its footprint: a ball is seen further down than that."""
-    left, top, right, bottom = thing.bbox
-    if not thing.is_ball:
-        return thing.bbox
+def _standing(bbox: BBox, is_ball: bool, landing: Landing) -> BBox:
+    """The box of an object, down to the foot of its footprint: a ball's silhouette ends above that."""
+    if not is_ball:
+        return bbox
+    left, top, right, bottom = bbox
     overhang = (math.cos(landing.pitch) + landing.squash - 1) * (right - left) / 2
     return left, top, right, bottom + overhang
 
 
-def _chance(landings: Sequence[Landing], sense: float, other: _Target) -> float | None:
+def _chance(landings: Sequence[Landing], sense: float, bbox: BBox, is_ball: bool) -> float | None:
     """How likely the ball, rolling on along its row of the image, comes within reach of what stands in a box.
 
     None where it may come down upon that very thing, or beside it.
     """
-    gaps = [floor_gap(landing.footprint, _standing(other, landing), landing.squash) for landing in landings]
+    gaps = [floor_gap(landing.footprint, _standing(bbox, is_ball, landing), landing.squash) for landing in landings]
     ratios = [away / (REACH * reach) for _, away, reach in gaps]
     variance = sum(((more - less) / 2) ** 2 for less, more in zip(ratios[1::2], ratios[2::2], strict=True))
     deviation = math.sqrt(variance + REACH_SIGMA**2)
@@ -135,19 +127,19 @@ def landings_below(shadow: Shadow, ball: BBox, size: tuple[int, int]) -> tuple[L
     Each pair lies one standard deviation from it, one pair for each independent doubt. Empty where no likely camera
     and light would make that shadow of a ball in the air.
     """
-    view = _View.of(ball, size)
-    fit = _fit(view, shadow)
+    model = _ShadowModel.of(ball, size)
+    fit = _fit(model, shadow)
     if fit is None:
         return ()
     parameters, covariance = fit
     values, axes = np.linalg.eigh(covariance)
     steps = axes * np.sqrt(np.maximum(values, 0))
     around = [parameters, *(parameters + sign * steps[:, i] for i in range(len(values)) for sign in (-1, 1))]
-    return tuple(view.landing(_bounded(each)) for each in around)
+    return tuple(model.landing(_bounded(each)) for each in around)
 
 
 @dataclass(frozen=True)
-class _View:
+class _ShadowModel:
     """A ball seen by a pinhole camera, in radii of the ball: x right, y down, z ahead."""
 
     focal: float  # px
@@ -155,11 +147,11 @@ class _View:
     ball: Floats  # [3]: its centre
 
     @staticmethod
-    def of(bbox: BBox, size: tuple[int, int]) -> _View:
+    def of(bbox: BBox, size: tuple[int, int]) -> _ShadowModel:
         focal, middle = FOCAL_WIDTHS * size[0], np.array(size) / 2
         radius = (bbox[2] - bbox[0] + bbox[3] - bbox[1]) / 4
         centre = np.array([bbox[0] + bbox[2], bbox[1] + bbox[3]]) / 2
-        return _View(focal, middle, np.array([*((centre - middle) / radius), focal / radius]))
+        return _ShadowModel(focal, middle, np.array([*((centre - middle) / radius), focal / radius]))
 
     def image(self, points: Floats) -> Floats:
         """Image points [N, 2] (px) of points [N, 3]."""
@@ -199,20 +191,20 @@ def _bounded(parameters: Floats) -> Floats:
     return np.clip(parameters, [0.1, 1.0, -1.5, -1.5], [1.3, 40.0, 1.5, 1.5])
 
 
-def _fit(view: _View, shadow: Shadow) -> tuple[Floats, Floats] | None:
+def _fit(model: _ShadowModel, shadow: Shadow) -> tuple[Floats, Floats] | None:
     """Pitch, height and slant of the light [4] with their covariance [4, 4], by Gauss-Newton from the prior_mean.
 
     None where no likely camera and light would make that shadow of the ball in the air.
     """
     prior_mean, prior_sigma = np.array(PRIOR_MEAN), np.array(PRIOR_SIGMA)
-    radius = view.focal / view.ball[2]
+    radius = model.focal / model.ball[2]
 
     def residuals(parameters: Floats) -> Floats:
         seen = _features(np.array([*shadow.centre, *shadow.spread]), radius)
-        made = _features(view.shadow(_bounded(parameters)), radius)
+        made = _features(model.shadow(_bounded(parameters)), radius)
         return np.concatenate([(made - seen) / np.array(MEASUREMENT_SIGMA), (parameters - prior_mean) / prior_sigma])
 
-    drop = shadow.centre[1] - float(view.image(view.ball[None])[0, 1])
+    drop = shadow.centre[1] - float(model.image(model.ball[None])[0, 1])
     parameters = _bounded(np.array([prior_mean[0], drop / radius / math.cos(prior_mean[0]), *prior_mean[2:]]))
     slopes = np.zeros((9, 4))
     for _ in range(MAX_ITERATIONS):

@@ -16,7 +16,7 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from cow_service.weights.resources import PROMPTS
 
-FIELDS = ("stage", "version", "inputs", "output")
+FIELDS = {"version": int, "inputs": list}
 _FENCE = "---"
 
 # No autoescape: prompts are plain text for a model, and HTML entities would change the words it reads.
@@ -25,13 +25,11 @@ _ENVIRONMENT = ImmutableSandboxedEnvironment(autoescape=False, undefined=StrictU
 
 @dataclass(frozen=True)
 class Prompt:
-    """A prompt with its declared inputs; `output` names a schema, or is "text". It does not call a model."""
+    """A prompt with its declared inputs. It does not call a model."""
 
     name: str
-    stage: str
     version: int
     inputs: tuple[str, ...]
-    output: str
     body: str
 
     def render(self, /, **inputs: object) -> str:
@@ -69,13 +67,12 @@ def parse_prompt(name: str, text: str) -> Prompt:
     undeclared = find_undeclared_variables(_ENVIRONMENT.parse(body)) - set(inputs)
     if undeclared:
         raise ValueError(f"Prompt {name!r} uses inputs that it does not declare: {', '.join(sorted(undeclared))}.")
-    return Prompt(name, head["stage"], head["version"], inputs, head["output"], body)
+    return Prompt(name, head["version"], inputs, body)
 
 
 def _check(name: str, head: Any) -> None:
     if not isinstance(head, dict) or set(head) != set(FIELDS):
         raise ValueError(f"Prompt {name!r} needs exactly these fields in its front matter: {', '.join(FIELDS)}.")
-    kinds = {"stage": str, "version": int, "inputs": list, "output": str}
-    for field, kind in kinds.items():
+    for field, kind in FIELDS.items():
         if not isinstance(head[field], kind) or isinstance(head[field], bool):
             raise ValueError(f"Prompt {name!r}: {field} must be of type {kind.__name__}, not {head[field]!r}.")

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from cow_service.errors import CannotReadDirection
 from cow_service.records import BBox, Grounding
 from cow_service.vision.arrows import Arrow
-from cow_service.vision.regions import Region
-from cow_service.vision.scene import SAME_OBJECT, Scene, iou
+from cow_service.vision.masks import iou
+from cow_service.vision.regions import SAME_OBJECT_IOU, Region
+from cow_service.vision.scene import Scene
 
 REACH = 1.5  # sizes of an object: an arrow further away is not its own
 RIVAL = 0.6  # of a rival's distance: what is nearer than that is clearly the nearest
@@ -74,7 +75,7 @@ def _starts_elsewhere(scene: Scene, arrow: Arrow, bbox: BBox) -> bool:
     x, y = arrow.tail
     for region in scene.regions:
         x0, y0, x1, y1 = region.bbox
-        if iou(region.bbox, bbox) < SAME_OBJECT and x0 <= x < x1 and y0 <= y < y1 and gap(arrow, bbox) > REACH / 4:
+        if iou(region.bbox, bbox) < SAME_OBJECT_IOU and x0 <= x < x1 and y0 <= y < y1 and gap(arrow, bbox) > REACH / 4:
             return True
     return False
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask, full_size
+from cow_service.vision.types import Floats, Mask
 
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
 CERTAIN_FIT = 0.88  # from here on, later strokes at the same place are skipped
@@ -28,7 +29,7 @@ class Arrow:
     tip: tuple[float, float]
     colour: tuple[int, int, int]  # RGB
     filled: bool
-    mask: NDArray[np.bool_]  # [H, W]: the drawing with its outline and its fringe
+    mask: Mask  # [H, W]: the drawing with its outline and its fringe
     fit: float  # intersection over union with the ideal arrow, 0..1
 
     @property
@@ -41,8 +42,8 @@ class Arrow:
 
 @dataclass(frozen=True)
 class _Shape:
-    tail: NDArray[np.float64]
-    tip: NDArray[np.float64]
+    tail: Floats
+    tip: Floats
     filled: bool
     fit: float
 
@@ -51,7 +52,7 @@ class _Shape:
 class _Profile:
     """The width of a patch along an axis from tail to tip, and the axis that its shaft then has."""
 
-    extent: NDArray[np.float64]  # [n] px: the width at every px along the axis; NaN where nothing lies
+    extent: Floats  # [n] px: the width at every px along the axis; NaN where nothing lies
     start: float  # px along the axis, from the centre that the points were measured from
     end: float
     thickness: float
@@ -59,8 +60,8 @@ class _Profile:
     peak: int  # where along the axis it is widest
     neck: int  # where the head begins
     middle: float  # px beside the axis: the middle of the head
-    axis: NDArray[np.float64]  # unit vector along the shaft
-    centre: NDArray[np.float64]  # a point on it
+    axis: Floats  # unit vector along the shaft
+    centre: Floats  # a point on it
 
 
 def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[Arrow, ...]:
@@ -102,7 +103,7 @@ def _same_place(a: Stroke, b: Stroke) -> bool:
     return all(abs(p - q) <= 3 for p, q in corners)
 
 
-def fit_arrow(patch: NDArray[np.bool_]) -> _Shape | None:
+def fit_arrow(patch: Mask) -> _Shape | None:
     """The arrow that a patch [h, w] is, or None. Coordinates are those of the patch."""
     ys, xs = np.nonzero(patch)
     points = np.stack([xs, ys], axis=1).astype(np.float64)
@@ -121,9 +122,7 @@ def fit_arrow(patch: NDArray[np.bool_]) -> _Shape | None:
     return best if best is not None and best.fit >= MIN_FIT else None
 
 
-def _measure(
-    points: NDArray[np.float64], centre: NDArray[np.float64], axis: NDArray[np.float64], patch: NDArray[np.bool_]
-) -> _Shape | None:
+def _measure(points: Floats, centre: Floats, axis: Floats, patch: Mask) -> _Shape | None:
     """Reads shaft and head off the width profile along `axis` (tail to tip); the axis is refined on the shaft."""
     profile = _profile(points, centre, axis)
     for _ in range(2):
@@ -139,7 +138,7 @@ def _measure(
     return _Shape(tail, tip, filled, fits[filled])
 
 
-def _profile(points: NDArray[np.float64], centre: NDArray[np.float64], axis: NDArray[np.float64]) -> _Profile | None:
+def _profile(points: Floats, centre: Floats, axis: Floats) -> _Profile | None:
     """The widths of a patch's points [N, 2] along an axis, or None where they are no shaft followed by a wider head."""
     normal = np.array([-axis[1], axis[0]])
     along, across = (points - centre) @ axis, (points - centre) @ normal
@@ -200,13 +199,7 @@ def _is_arrow_like(profile: _Profile) -> bool:
 
 
 def _overlap(
-    patch: NDArray[np.bool_],
-    tail: NDArray[np.float64],
-    tip: NDArray[np.float64],
-    thickness: float,
-    head_width: float,
-    head_length: float,
-    filled: bool,
+    patch: Mask, tail: Floats, tip: Floats, thickness: float, head_width: float, head_length: float, filled: bool
 ) -> float:
     """Intersection over union of the patch and the ideal arrow of these measures."""
     axis = (tip - tail) / np.linalg.norm(tip - tail)
@@ -217,7 +210,7 @@ def _overlap(
     base = tip - axis * head_length
     barbs = [base + normal * half, base - normal * half]
 
-    def fixed(points: list[NDArray[np.float64]]) -> NDArray[np.int32]:
+    def fixed(points: list[Floats]) -> NDArray[np.int32]:
         return np.round((np.array(points) + pad) * 16).astype(np.int32)
 
     w = max(0.5, thickness / 2 - 0.25)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.vision.strokes import Stroke, WorkingImage, drawing_mask, full_size
+from cow_service.vision.types import Mask
 
 MIN_SIDE = 14  # px at the working size
 ON_OUTLINE = 0.93  # share of the stroke that lies on its own bounding rectangle
@@ -22,7 +23,7 @@ class DrawnBox:
 
     bbox: tuple[float, float, float, float]  # x0, y0, x1, y1, px: inside the line
     colour: tuple[int, int, int]  # RGB
-    mask: NDArray[np.bool_]  # [H, W]: the line with its fringe
+    mask: Mask  # [H, W]: the line with its fringe
 
 
 def find_boxes(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[DrawnBox, ...]:
@@ -42,7 +43,7 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, 
     return tuple(sorted(boxes, key=lambda box: -(box.bbox[2] - box.bbox[0]) * (box.bbox[3] - box.bbox[1])))
 
 
-def _line_width(patch: NDArray[np.bool_]) -> int | None:
+def _line_width(patch: Mask) -> int | None:
     """Width in px of the line, where the patch [h, w] is the outline of an upright rectangle; else None."""
     h, w = patch.shape
     if min(h, w) < MIN_SIDE:

@@ -22,11 +22,7 @@ HUES = (
     (360.0, "pink"),
 )
 
-HUE_MARGIN, CHROMA_MARGIN, LIGHTNESS_MARGIN = (
-    7.0,
-    2.5,
-    5.0,
-)  # near a border, both names are valid
+HUE_MARGIN, CHROMA_MARGIN, LIGHTNESS_MARGIN = 7.0, 2.5, 5.0  # degrees, Lab units: near a border both names are valid
 
 
 def colour_name(lightness: float, a: float, b: float) -> str:

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cow_service.vision.masks import Mask
+from cow_service.vision.types import Floats, Floats32, Mask
 
 TRIES = 120  # circles through three points of the outline
 NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
@@ -20,7 +19,7 @@ SAMPLES = 72  # points tried on the circle
 LEAST_RADIUS = 5.0  # px
 
 
-def as_disc(part: Mask, edges: NDArray[np.float32], edge_threshold: float) -> Mask | None:
+def as_disc(part: Mask, edges: Floats32, edge_threshold: float) -> Mask | None:
     """The disc [h, w] that a part is, or None. `edges` [h, w] are gradients, edges above `edge_threshold`."""
     contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     outline = np.asarray(max(contours, key=len)[:, 0], np.float64)
@@ -43,7 +42,7 @@ def as_disc(part: Mask, edges: NDArray[np.float32], edge_threshold: float) -> Ma
     return disc if both > FILLED * disc.sum() and both > (1 - SPILLED) * part.sum() else None
 
 
-def _best_circle(outline: NDArray[np.float64]) -> tuple[float, float, float] | None:
+def _best_circle(outline: Floats) -> tuple[float, float, float] | None:
     """Centre and radius (px) of the circle on which most points [N, 2] lie, refined on those; None where too few do."""
     rng = np.random.default_rng(0)  # the same outline must give the same circle
     circles = _circles_through(outline[rng.integers(0, len(outline), (TRIES, 3))])
@@ -62,7 +61,7 @@ def _best_circle(outline: NDArray[np.float64]) -> tuple[float, float, float] | N
     return float(a), float(b), float(np.sqrt(max(c + a * a + b * b, 0.0)))
 
 
-def _circles_through(triples: NDArray[np.float64]) -> NDArray[np.float64]:
+def _circles_through(triples: Floats) -> Floats:
     """Circles [T, 3] (x, y, radius) through triples of points [T, 3, 2]; not finite where they lie on a line."""
     a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
     ab, ac = b - a, c - a

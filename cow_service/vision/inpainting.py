@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cow_service.vision.masks import Image, Mask, scaled_size, window_of
+from cow_service.vision.masks import scaled_size, window_of
+from cow_service.vision.types import Floats32, Image, Mask
 
 INPAINT_RADIUS = 4  # px
 MARGIN = 8  # px around a drawing that inpainting may use
@@ -22,8 +22,6 @@ COARSE_SIDE = 128  # px: the crop is searched at this size
 TILE = 9  # px at the coarse size: what one patch fills
 CONTEXT = 5  # px around a tile that must fit
 FEATHER = 3  # px over which patches overlap
-
-Floats = NDArray[np.float32]
 
 
 def erase_drawing(image: Image, mask: Mask) -> Image:
@@ -72,14 +70,14 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
     return result
 
 
-def _is_varied(source: Floats, inside: Mask, known: Mask) -> bool:
+def _is_varied(source: Floats32, inside: Mask, known: Mask) -> bool:
     """Whether what lies around the hole is no plain surface: it has texture, or several colours."""
     reach = 2 * max(4, int(0.25 * np.sqrt(inside.sum()))) + 1
     ring = (cv2.dilate(inside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & known
     return bool(ring.any()) and float(source[ring].std(axis=0).max()) > VARIED
 
 
-def _contact_shadow(source: Floats, inside: Mask, known: Mask) -> Mask:
+def _contact_shadow(source: Floats32, inside: Mask, known: Mask) -> Mask:
     """Known pixels at the hole's rim that are much darker than most: the object's own shadow, no shading to draw in."""
     reach = 2 * max(3, int(0.15 * np.sqrt(inside.sum()))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
@@ -90,7 +88,7 @@ def _contact_shadow(source: Floats, inside: Mask, known: Mask) -> Mask:
     return rim & (grey < np.percentile(grey[rim], 65) - SHADOW_STEP)
 
 
-def push_pull(source: Floats, known: Mask) -> Floats:
+def push_pull(source: Floats32, known: Mask) -> Floats32:
     """Unknown pixels of [h, w, 3] from known ones: averages down a pyramid, then back up (push-pull)."""
     weight = known.astype(np.float32)
     levels = [(source * weight[..., None], weight)]
@@ -110,7 +108,7 @@ def push_pull(source: Floats, known: Mask) -> Floats:
     return np.asarray(value, np.float32)
 
 
-def _texture(image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, slice]) -> Floats:
+def _texture(image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, slice]) -> Floats32:
     """Fine detail for the crop, from the calmest neighbouring place of the hole's shape; zero where there is none."""
     rows, columns = crop
     height, width = hole.shape
@@ -118,7 +116,7 @@ def _texture(image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, sl
     step_y, step_x = inner[0].stop - inner[0].start, inner[1].stop - inner[1].start
     unusable = hole if avoid is None else hole | avoid
     shape = hole[inner]
-    best: tuple[float, Floats] | None = None
+    best: tuple[float, Floats32] | None = None
     for sx, sy in SHIFTS:
         y, x = inner[0].start + sy * step_y, inner[1].start + sx * step_x
         if y < 0 or x < 0 or y + step_y > height or x + step_x > width:
@@ -138,7 +136,7 @@ def _texture(image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, sl
     return texture
 
 
-def exemplar_inpaint(source: Floats, unknown: Mask, forbidden: Mask, shading: Floats) -> Floats:
+def exemplar_inpaint(source: Floats32, unknown: Mask, forbidden: Mask, shading: Floats32) -> Floats32:
     """Pixels [h, w, 3] for the unknown ones [h, w], copied from places that are neither unknown nor forbidden.
 
     Patches are chosen from the rim inwards at a coarse size, where a search is cheap, and copied at full size, so that
@@ -173,7 +171,7 @@ def _around(centre: int, reach: int, length: int) -> slice:
     return slice(max(0, centre - reach), min(length, centre + reach + 1))
 
 
-def _best_offset(coarse: Floats, todo: Mask, barred: Mask, y: int, x: int) -> tuple[int, int] | None:
+def _best_offset(coarse: Floats32, todo: Mask, barred: Mask, y: int, x: int) -> tuple[int, int] | None:
     """Rows and columns from a tile to the place that fits its surroundings best, or None where there is no place."""
     reach = TILE // 2 + CONTEXT
     window = _around(y, reach, coarse.shape[0]), _around(x, reach, coarse.shape[1])
@@ -201,7 +199,12 @@ def _best_offset(coarse: Floats, todo: Mask, barred: Mask, y: int, x: int) -> tu
 
 
 def _copy(
-    result: Floats, weight: Floats, source: Floats, tile: tuple[slice, slice], offset: tuple[int, int], scale: float
+    result: Floats32,
+    weight: Floats32,
+    source: Floats32,
+    tile: tuple[slice, slice],
+    offset: tuple[int, int],
+    scale: float,
 ) -> None:
     """Adds the full-size patch of a coarse tile, fading out at its rim."""
     height, width = weight.shape

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox
+from cow_service.vision.types import Floats32, Image, Mask
 
-Image = NDArray[np.uint8]  # RGB [H, W, 3]
-Mask = NDArray[np.bool_]  # [H, W]
+_FIRST_PIXEL = slice(0, 1), slice(0, 1)  # the window that stands for an empty mask
 
 
 def scaled(image: Image, scale: float) -> Image:
@@ -48,7 +47,10 @@ def window_of(mask: Mask, margin: int = 0) -> tuple[slice, slice] | None:
 
 def bbox_of(mask: Mask) -> BBox:
     """Tight box [x0, y0, x1, y1] of a mask that is not empty; x1 and y1 lie one past the last pixel."""
-    rows, columns = window_of(mask) or (slice(0, 1), slice(0, 1))
+    return _bbox(*(window_of(mask) or _FIRST_PIXEL))
+
+
+def _bbox(rows: slice, columns: slice) -> BBox:
     return float(columns.start), float(rows.start), float(columns.stop), float(rows.stop)
 
 
@@ -79,13 +81,13 @@ class CroppedMask:
     @staticmethod
     def of(mask: Mask) -> CroppedMask:
         """A mask [H, W], cropped; one pixel large for an empty mask."""
-        window = window_of(mask) or (slice(0, 1), slice(0, 1))
+        window = window_of(mask) or _FIRST_PIXEL
         return CroppedMask((mask.shape[0], mask.shape[1]), *window, mask[window].copy())
 
     @property
     def bbox(self) -> BBox:
         """Tight box [x0, y0, x1, y1], px; x1 and y1 lie one past the last pixel."""
-        return float(self.columns.start), float(self.rows.start), float(self.columns.stop), float(self.rows.stop)
+        return _bbox(self.rows, self.columns)
 
     @property
     def area(self) -> int:
@@ -116,10 +118,10 @@ class CroppedMask:
         mask[self.rows, self.columns] |= self.patch
 
 
-def enlarged(soft: NDArray[np.float32], shape: tuple[int, int]) -> CroppedMask:
+def enlarged(soft: Floats32, shape: tuple[int, int]) -> CroppedMask:
     """Where a smooth mask [h, w] of 0..1, not empty, exceeds one half when resized to an image [H, W] of `shape`."""
     fy, fx = shape[0] / soft.shape[0], shape[1] / soft.shape[1]
-    rows, columns = window_of(soft > 0.05) or (slice(0, 1), slice(0, 1))
+    rows, columns = window_of(soft > 0.05) or _FIRST_PIXEL
     y0, y1 = int(rows.start * fy), min(shape[0], int(np.ceil(rows.stop * fy)))
     x0, x1 = int(columns.start * fx), min(shape[1], int(np.ceil(columns.stop * fx)))
     # Pixel centres map to pixel centres, as in a resize of the whole.
@@ -127,6 +129,6 @@ def enlarged(soft: NDArray[np.float32], shape: tuple[int, int]) -> CroppedMask:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     values = cv2.warpAffine(soft, back, (x1 - x0, y1 - y0), flags=flags, borderMode=cv2.BORDER_REPLICATE)
     patch = np.asarray(values) > 0.5
-    tight = window_of(patch) or (slice(0, 1), slice(0, 1))
+    tight = window_of(patch) or _FIRST_PIXEL
     rows, columns = (slice(o + s.start, o + s.stop) for o, s in zip((y0, x0), tight, strict=True))
     return CroppedMask(shape, rows, columns, patch[tight].copy())

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.masks import CroppedMask, iou
-from cow_service.vision.regions import SAME_OBJECT, Region, region_of
+from cow_service.vision.regions import SAME_OBJECT_IOU, Region, region_of
+from cow_service.vision.types import Mask
 
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
 
@@ -26,10 +26,7 @@ class Obstacle:
 
 
 def find_obstacles(
-    regions: Sequence[Region],
-    silhouette: Callable[[BBox], NDArray[np.bool_]],
-    mover: BBox,
-    named: Sequence[LocatedObject],
+    regions: Sequence[Region], silhouette: Callable[[BBox], Mask], mover: BBox, named: Sequence[LocatedObject]
 ) -> tuple[Obstacle, ...]:
     """Everything but the mover: first what the question names, by that name, then other regions, by their colour.
 
@@ -40,17 +37,17 @@ def find_obstacles(
     near = cv2.dilate(body.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     obstacles: list[Obstacle] = []
     for other in named:
-        if iou(other.bbox, mover) < SAME_OBJECT:
+        if iou(other.bbox, mover) < SAME_OBJECT_IOU:
             region = region_of(regions, other.bbox)
             mask = CroppedMask.of(silhouette(other.bbox)) if region is None else region.mask
             obstacles.append(Obstacle(other.object, other.bbox, mask))
     for region in regions:
         area = region.mask.area
-        if iou(region.bbox, mover) >= SAME_OBJECT or region.mask.shared_with(body) > 0.5 * area:
+        if iou(region.bbox, mover) >= SAME_OBJECT_IOU or region.mask.shared_with(body) > 0.5 * area:
             continue
         if area < OWN_SHARE * body.sum() and region.mask.shared_with(near):
             continue
-        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT for other in obstacles):
+        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU for other in obstacles):
             continue
         obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask))
     return tuple(obstacles)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision.colours import colour_name, colour_names
 from cow_service.vision.discs import as_disc
-from cow_service.vision.masks import CroppedMask, Mask, enlarged, iou, outline_of, scaled
+from cow_service.vision.masks import CroppedMask, enlarged, iou, outline_of, scaled
+from cow_service.vision.types import Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
 CHROMA_STEP = 9.0  # Lab units from the surroundings
@@ -27,15 +28,13 @@ SHARP_SHARE = 0.65  # of an outline that must lie on edges
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
 MIN_AREA = 0.0004  # of the image
 MAX_AREA = 0.25
-SAME_OBJECT = 0.5  # intersection over union from which a region is the object of a box
+SAME_OBJECT_IOU = 0.5  # intersection over union from which a region is the object of a box
 MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
 CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
 SPLIT_HUE = 36.0  # degrees: another colour, hence another object
 MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
 
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
-
-Channel = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -63,11 +62,11 @@ class Region:
 class _View:
     """The image at the working size, against its surroundings."""
 
-    lab: NDArray[np.float32]  # [h, w, 3] CIE Lab
-    chroma_gap: Channel  # distance from the surroundings in the a*b* plane
-    bright: Channel  # lightness above the surroundings
-    around: Channel  # lightness of the surroundings
-    edges: Channel  # Lab gradient per px
+    lab: Floats32  # [h, w, 3] CIE Lab
+    chroma_gap: Floats32  # distance from the surroundings in the a*b* plane
+    bright: Floats32  # lightness above the surroundings
+    around: Floats32  # lightness of the surroundings
+    edges: Floats32  # Lab gradient per px
     edge_threshold: float  # gradient from which the outline of an object may lie on it
 
     def crop(self, window: tuple[slice, slice]) -> _View:
@@ -78,7 +77,7 @@ class _View:
         return _View(self.lab[window], gap, bright, around, edges, self.edge_threshold)
 
 
-def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
+def find_regions(image: Image) -> tuple[Region, ...]:
     """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
@@ -107,10 +106,10 @@ def find_regions(image: NDArray[np.uint8]) -> tuple[Region, ...]:
 def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
     """The region that best overlaps a box [x0, y0, x1, y1], if it is the same object."""
     best = max(regions, key=lambda region: iou(region.bbox, bbox), default=None)
-    return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT else None
+    return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT_IOU else None
 
 
-def _view(small: NDArray[np.uint8]) -> _View:
+def _view(small: Image) -> _View:
     """Measures every pixel against a median over half the image around it."""
     smooth = cv2.bilateralFilter(small, 5, 25, 5)
     lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
@@ -120,7 +119,7 @@ def _view(small: NDArray[np.uint8]) -> _View:
     padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)
     median = cv2.medianBlur(padded, side)[pad : pad + coarse.shape[0], pad : pad + coarse.shape[1]]
     around = cv2.resize(median, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR).astype(np.float32)
-    around_l: Channel = np.divide(around[..., 0], 2.55, dtype=np.float32)
+    around_l: Floats32 = np.divide(around[..., 0], 2.55, dtype=np.float32)
     gap = np.hypot(lab[..., 1] - (around[..., 1] - 128), lab[..., 2] - (around[..., 2] - 128))
     blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
     dx, dy = cv2.Sobel(blurred, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(blurred, cv2.CV_32F, 0, 1) / 8
@@ -238,7 +237,7 @@ def _blobs(mask: Mask, least: float) -> list[Mask]:
     return [labels == i for i in range(1, count) if stats[i][4] >= max(least, 12)]
 
 
-def _region(lab: NDArray[np.float32], part: Channel, size: tuple[int, int], is_disc: bool) -> Region:
+def _region(lab: Floats32, part: Floats32, size: tuple[int, int], is_disc: bool) -> Region:
     """A part [h, w] at the working size, with the Lab colours [N, 3] of its pixels, as a region of the image."""
     mask = enlarged(np.asarray(cv2.GaussianBlur(part, (0, 0), MASK_SIGMA), np.float32), size)
     chroma = np.hypot(lab[:, 1], lab[:, 2])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from threading import RLock
 
 import numpy as np
 
@@ -13,18 +12,20 @@ from cow_service.records import BBox, LocatedObject
 from cow_service.vision.arrows import Arrow, find_arrows
 from cow_service.vision.boxes import DrawnBox, find_boxes
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import Image, Mask, bbox_of, iou
+from cow_service.vision.masks import bbox_of
 from cow_service.vision.obstacles import Obstacle, find_obstacles
-from cow_service.vision.regions import SAME_OBJECT, Region, find_regions, region_of
+from cow_service.vision.regions import Region, find_regions, region_of
 from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
-
-__all__ = ["SAME_OBJECT", "Scene", "iou"]
+from cow_service.vision.types import Image, Mask
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An upright RGB image [H, W, 3] and what was measured in it. It knows no question and no motion."""
+    """An upright RGB image [H, W, 3] and what was measured in it. It knows no question and no motion.
+
+    For one thread: it belongs to one run.
+    """
 
     image: Image
     _masks: dict[BBox, Mask] = field(default_factory=dict, repr=False)
@@ -32,7 +33,6 @@ class Scene:
     _obstacles: dict[tuple[BBox, tuple[LocatedObject, ...]], tuple[Obstacle, ...]] = field(
         default_factory=dict, repr=False
     )
-    _lock: RLock = field(default_factory=RLock, repr=False)
 
     @property
     def width(self) -> int:
@@ -83,10 +83,9 @@ class Scene:
 
     def silhouette(self, bbox: BBox) -> Mask:
         """Mask [H, W] of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
-        with self._lock:
-            if bbox not in self._masks:
-                self._masks[bbox] = self._preset[bbox]() if bbox in self._preset else self._segmented(bbox)
-            return self._masks[bbox]
+        if bbox not in self._masks:
+            self._masks[bbox] = self._preset[bbox]() if bbox in self._preset else self._segmented(bbox)
+        return self._masks[bbox]
 
     def _segmented(self, bbox: BBox) -> Mask:
         region = self.region_of(bbox)
@@ -96,26 +95,23 @@ class Scene:
 
     def preset_mask(self, bbox: BBox, mask: Callable[[], Mask]) -> None:
         """Gives the mask that an earlier run segmented for a box; it may have been segmented from a point instead."""
-        with self._lock:
-            self._preset[bbox] = mask
+        self._preset[bbox] = mask
 
     def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
         """The objects beside the mover in a box, `named` ones by their name; found once for the same arguments."""
         key = mover, tuple(named)
-        with self._lock:
-            if key not in self._obstacles:
-                self._obstacles[key] = find_obstacles(self.regions, self.silhouette, mover, named)
-            return self._obstacles[key]
+        if key not in self._obstacles:
+            self._obstacles[key] = find_obstacles(self.regions, self.silhouette, mover, named)
+        return self._obstacles[key]
 
     def bbox_at(self, point: tuple[float, float]) -> BBox:
         """Tight box [x0, y0, x1, y1] of the object at a point [x, y]: the smallest region there, or else segmented."""
         x = min(self.width - 1, max(0, int(point[0])))
         y = min(self.height - 1, max(0, int(point[1])))
-        with self._lock:
-            under = [region for region in self.regions if region.mask.contains(x, y)]
-            if under:
-                return min(under, key=lambda region: region.mask.area).bbox
-            mask = mask_from_point(self.clean, (float(x), float(y)))
-            bbox = bbox_of(mask)
-            self._masks[bbox] = mask
-            return bbox
+        under = [region for region in self.regions if region.mask.contains(x, y)]
+        if under:
+            return min(under, key=lambda region: region.mask.area).bbox
+        mask = mask_from_point(self.clean, (float(x), float(y)))
+        bbox = bbox_of(mask)
+        self._masks[bbox] = mask
+        return bbox

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
-from cow_service.vision.masks import Image, Mask, bbox_of, outline_of, scaled
+from cow_service.vision.masks import bbox_of, outline_of, scaled
+from cow_service.vision.types import Floats, Image, Mask
 
 WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
 POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
@@ -112,7 +113,7 @@ def _inside(bbox: BBox, width: int, height: int) -> BBox:
     return x0, y0, min(max(bbox[2], x0 + 2), float(width)), min(max(bbox[3], y0 + 2), float(height))
 
 
-def _spans(cut: Mask, box: NDArray[np.float64]) -> bool:
+def _spans(cut: Mask, box: Floats) -> bool:
     """Whether a cut reaches across most of its box both ways."""
     if not cut.any():
         return False
@@ -120,7 +121,7 @@ def _spans(cut: Mask, box: NDArray[np.float64]) -> bool:
     return right - left >= SPAN * (box[2] - box[0]) and bottom - top >= SPAN * (box[3] - box[1])
 
 
-def _labels_from_box(height: int, width: int, box: NDArray[np.float64], core: float) -> NDArray[np.uint8]:
+def _labels_from_box(height: int, width: int, box: Floats, core: float) -> NDArray[np.uint8]:
     """GrabCut's labels: background outside the box, probable foreground in its ellipse, sure in the `core` of that."""
     labels = np.full((height, width), cv2.GC_BGD, np.uint8)
     x0, y0, x1, y1 = (int(v) for v in np.round(box))
@@ -161,7 +162,7 @@ def _grabcut(image: Image, labels: NDArray[np.uint8]) -> Mask:
     return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 
-def _tidy(cut: Mask, box: NDArray[np.float64]) -> Mask:
+def _tidy(cut: Mask, box: Floats) -> Mask:
     """Keeps the main blob inside the box, and closes its holes."""
     x0, y0, x1, y1 = box
     kept = np.zeros(cut.shape, np.uint8)

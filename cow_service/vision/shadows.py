@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox
-from cow_service.vision.masks import Mask, resized_mask, scaled
+from cow_service.vision.masks import resized_mask, scaled
 from cow_service.vision.scene import Scene
+from cow_service.vision.types import Floats, Floats32, Mask
 
 WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
 LEAST_WIDTH = 14.0  # px in the image: a smaller shadow is lost in the floor's texture
@@ -35,8 +35,6 @@ QUARTERS = (0.0, np.pi / 2, np.pi, -np.pi / 2)  # radians
 LEAST_PIXELS, MOST_PIXELS = 60, 700  # of the floor about a patch, at the working size
 MAX_ITERATIONS = 8  # of the fit
 
-Channel = NDArray[np.float32]
-Floats = NDArray[np.float64]
 Ellipse = tuple[float, float, float, float]  # centre and half axes, px
 
 
@@ -54,7 +52,7 @@ class Shadow:
 class _Floor:
     """The image below the object at the working size, with other objects blanked out."""
 
-    lab: NDArray[np.float32]  # [h, w, 3] CIE Lab
+    lab: Floats32  # [h, w, 3] CIE Lab
     free: Mask  # [h, w]: no object there
     box: BBox  # of the object in the air
     top: int  # px: the row of the image at which it begins
@@ -141,7 +139,7 @@ def _stands_alone(floor: _Floor, seen: Ellipse) -> bool:
     return min(steps) > MIN_EVENNESS * float(np.mean(steps))
 
 
-def _contrast(floor: _Floor, a: float, b: float) -> Channel:
+def _contrast(floor: _Floor, a: float, b: float) -> Floats32:
     """Per pixel [h, w] how much darker an ellipse there is than the ring about it, as a share; 0 beside objects."""
     ry, rx = int(np.ceil(RING[1] * b)), int(np.ceil(RING[1] * a))
     ys, xs = np.mgrid[-ry : ry + 1, -rx : rx + 1]

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import Image, Mask, scaled
+from cow_service.vision.masks import scaled
+from cow_service.vision.types import Floats32, Image, Mask
 
 WORKING_SIDE = 896  # px: longer images are searched at this size
 THIN = 41  # px: side of the median window; narrower structures stand out from it
@@ -104,7 +105,7 @@ def drawing_mask(image: Image, stroke: Stroke) -> Mask:
     return mask
 
 
-def _is_ink(ring: NDArray[np.float32]) -> bool:
+def _is_ink(ring: Floats32) -> bool:
     """Whether a ring of pixels [N, 3] has the white or black of an outline."""
     colour = np.median(ring, axis=0)
     return bool(colour.min() > 225 or colour.max() < 30)
@@ -117,7 +118,7 @@ def full_size(mask: Mask, size: tuple[int, int]) -> Mask:
     return cv2.resize(mask.astype(np.uint8), (size[1], size[0]), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def _thin_structures(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _thin_structures(image: Image) -> NDArray[np.uint8]:
     """255 where something narrow stands out from what is around it, and a little beyond."""
     half = scaled(image, 0.5)
     around = cv2.medianBlur(half, THIN // 2 | 1)
@@ -135,12 +136,8 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
     if 2 * np.count_nonzero(flat) < len(inner):
         return False
     pad = 4
-    x0, y0, x1, y1 = (
-        max(0, x - pad),
-        max(0, y - pad),
-        min(image.shape[1], x + w + pad),
-        min(image.shape[0], y + h + pad),
-    )
+    x0, y0 = max(0, x - pad), max(0, y - pad)
+    x1, y1 = min(image.shape[1], x + w + pad), min(image.shape[0], y + h + pad)
     inside = np.zeros((y1 - y0, x1 - x0), np.uint8)
     inside[y - y0 : y - y0 + h, x - x0 : x - x0 + w] = stroke.patch
     near = cv2.dilate(inside, _SQUARE, iterations=2)

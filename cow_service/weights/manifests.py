@@ -108,8 +108,7 @@ def find_manifest(name: str) -> Manifest | None:
 @cache
 def load_manifests() -> dict[str, Manifest]:
     """All shipped manifests by name."""
-    found = {name: find_manifest(name) for name in MANIFESTS.names()}
-    return {name: manifest for name, manifest in found.items() if manifest is not None}
+    return {name: manifest for name in MANIFESTS.names() if (manifest := find_manifest(name)) is not None}
 
 
 def _parse(text: str) -> Any:

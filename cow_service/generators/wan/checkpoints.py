@@ -23,6 +23,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from cow_service.errors import CheckpointInvalid
+from cow_service.weights.building import listed
 
 PREFIXES = ("model.diffusion_model.", "diffusion_model.")  # of names in one-file checkpoints
 SCALE = ".scale_weight"  # one number per fp8 weight: what it is multiplied by
@@ -103,8 +104,8 @@ def checkpoint_files(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
     files = tuple(sorted(folder.glob("*.safetensors")))
     if not files:
         pickles = [file.name for file in sorted(folder.iterdir()) if file.suffix in PICKLES]
-        told = f"only pickles ({', '.join(pickles)}), which can run code when opened" if pickles else "none"
-        raise CheckpointInvalid(f"'{path.name}' has no safetensors files: {told}.")
+        found = f"only pickles ({', '.join(pickles)}), which can run code when opened" if pickles else "none"
+        raise CheckpointInvalid(f"'{path.name}' has no safetensors files: {found}.")
     _check_shards(folder, files)
     return folder, files
 
@@ -167,7 +168,8 @@ def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
         try:
             with safe_open(file, framework="pt") as opened:
                 for key in tuple(opened.keys()):
-                    name, part = _unprefixed(key), opened.get_slice(key)
+                    prefix = next((prefix for prefix in PREFIXES if key.startswith(prefix)), "")
+                    name, part = key.removeprefix(prefix), opened.get_slice(key)
                     if name in entries:
                         raise CheckpointInvalid(f"'{name}' is both in {entries[name].file.name} and in {file.name}.")
                     entries[name] = _Entry(file, key, tuple(part.get_shape()), part.get_dtype())
@@ -247,11 +249,6 @@ def _scale(entry: _Entry, device: torch.device) -> Tensor:
         return opened.get_tensor(entry.key).float()
 
 
-def _unprefixed(key: str) -> str:
-    prefix = next((prefix for prefix in PREFIXES if key.startswith(prefix)), "")
-    return key.removeprefix(prefix)
-
-
 def diffusers_names(originals: Iterable[str]) -> dict[str, str]:
     """Names of the original Wan checkpoint by their names in diffusers' model.
 
@@ -264,9 +261,3 @@ def diffusers_names(originals: Iterable[str]) -> dict[str, str]:
 def counted(kinds: Mapping[str, Sequence[str]]) -> str:
     """For an error: how many names there are of each kind, and the first of them; empty where there are none."""
     return "; ".join(f"{len(names)} {kind}: {listed(names)}" for kind, names in kinds.items() if names)
-
-
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """The first `most` names, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -6,10 +6,9 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from typing import cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.errors import FieldError, InvalidRequest
@@ -22,13 +21,12 @@ from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tracks import nearest_lengths, tracks_of
 from cow_service.records import GeneratorInfo
+from cow_service.vision.types import Image
 from cow_service.weights.device import cpu_threads
 
 SIDE_MULTIPLE = 16  # px: the sides of a clip are multiples of it
 MAX_SIDE = 1024 * SIDE_MULTIPLE  # px: the model has 1024 positions each way
 DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
-
-Image = NDArray[np.uint8]
 
 
 class WanOptions(BaseModel):
@@ -45,7 +43,7 @@ class WanOptions(BaseModel):
 
 
 @dataclass(frozen=True)
-class Model:
+class LoadedModel:
     """A loaded model, and what would have to be the same to make its clips again."""
 
     name: str
@@ -78,7 +76,7 @@ class WanGenerator:
     options_model = WanOptions
     concurrency = 1
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: LoadedModel) -> None:
         self.fingerprint = model.fingerprint
         self._model = model
         self._embeddings = EmbeddingCache(model.pipeline)
@@ -196,7 +194,7 @@ class WanGenerator:
 
 
 def _options(given: GeneratorInput) -> WanOptions:
-    return given.options if isinstance(given.options, WanOptions) else WanOptions()
+    return cast(WanOptions, given.options)  # the generator's own `options_model`
 
 
 def _prompt(given: GeneratorInput) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from threading import Lock
 
 import torch
 
@@ -14,18 +13,16 @@ from cow_service.generators.wan.acceleration import accelerate, check_device
 from cow_service.generators.wan.checkpoints import checkpoint_files, load_transformer
 from cow_service.generators.wan.components import assemble
 from cow_service.generators.wan.execution import within_memory
-from cow_service.generators.wan.generator import Model, WanGenerator
+from cow_service.generators.wan.generator import LoadedModel, WanGenerator
 from cow_service.generators.wan.lora import add_lora
 from cow_service.generators.wan.pipeline import WanTrackPipeline
 from cow_service.generators.wan.profiles import Profile, profile_of
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
+from cow_service.weights.building import BUILD_LOCK
 from cow_service.weights.device import choose_device
 from cow_service.weights.lock import read_lock, verify, weights_identity
 from cow_service.weights.manifests import Manifest, load_manifests
-
-# Seeds and lazy initialisation are global to the process: two models built at once would mix up their weights.
-_build_lock = Lock()
 
 
 def load(name: str, track_conditioning: conditioning.TrackConditioning, settings: Settings) -> WanGenerator:
@@ -46,7 +43,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     if own is not None:
         checkpoint_files(own)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
-    with _build_lock, within_memory(device, lambda: None, f"'{name}'"):
+    with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
         if manifest.sources:
             pipeline = _from_weights(manifest, profile, settings, device)
         else:
@@ -56,7 +53,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     revisions = _revisions(manifest, profile, settings)
     repository = manifest.sources["transformer"].repository if manifest.sources else None
     return WanGenerator(
-        Model(
+        LoadedModel(
             name=name,
             repository=repository if own is None else own.name,
             revision=revisions.pop("transformer", None),

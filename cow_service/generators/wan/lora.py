@@ -18,7 +18,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
-from cow_service.generators.wan.checkpoints import diffusers_names, listed
+from cow_service.generators.wan.checkpoints import diffusers_names
+from cow_service.weights.building import listed
 
 PREFIXES = ("base_model.model.", "model.", "diffusion_model.", "transformer.")
 # How a tensor's name ends, which part of its layer's change it is, and the parameter of the layer that it changes.
@@ -119,9 +120,8 @@ def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], fi
     names = _in_diffusers(found, parameters)
     unknown += [target for target in found if names[target] not in parameters]
     if unknown or not found:
-        raise CheckpointInvalid(
-            f"LoRA '{file}' is not one for this model, which has no place for {_some(unknown) or 'an empty one'}."
-        )
+        misplaced = _some(unknown) or "an empty one"
+        raise CheckpointInvalid(f"LoRA '{file}' is not one for this model, which has no place for {misplaced}.")
     changes = {names[target]: _Change(**parts) for target, parts in found.items()}
     if misfits := [name for name, change in changes.items() if not change.fits(parameters[name])]:
         raise CheckpointInvalid(

@@ -110,5 +110,5 @@ def profile_of(manifest: Manifest, name: str) -> Profile:
             raise GeneratorUnavailable(f"'{manifest.name}' has no source '{profile.lora.source}' for its LoRA.")
         return profile
     except ValidationError as error:
-        told = "; ".join(f"{'.'.join(str(p) for p in item['loc'])}: {item['msg']}" for item in error.errors())
-        raise GeneratorUnavailable(f"Profile '{name}' of '{manifest.name}' is not valid: {told}.") from error
+        problems = "; ".join(f"{'.'.join(str(p) for p in item['loc'])}: {item['msg']}" for item in error.errors())
+        raise GeneratorUnavailable(f"Profile '{name}' of '{manifest.name}' is not valid: {problems}.") from error

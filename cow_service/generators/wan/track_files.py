@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import InvalidRequest
-from cow_service.generators.wan.tracks import FILE_SAMPLES, MAX_FRAMES, Floats, Tracks, from_ati_file, to_ati_file
+from cow_service.generators.wan.tracks import FILE_SAMPLES, MAX_FRAMES, Tracks, from_ati_file, to_ati_file
+from cow_service.vision.types import Floats32
 
 ARRAY = "array"  # its name in the .npz file
 VISIBILITY = "-visibility"  # between the name of Wan-Move's file of positions and its suffix
@@ -69,7 +70,7 @@ def read_tracks(path: Path, visibility: Path | None = None) -> Tracks:
         raise InvalidRequest(f"{path.name} cannot be read: {reason}.") from error
 
 
-def _ati_array(path: Path) -> Floats:
+def _ati_array(path: Path) -> Floats32:
     data = path.read_bytes() if path.suffix == ".npz" else _saved_bytes(path)
     if isinstance(data, bytes):
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
@@ -123,7 +124,7 @@ def _wan_move(path: Path, visibility: Path | None) -> Tracks:
     return Tracks(points, visible.astype(bool))
 
 
-def _numbers(path: Path, data: NDArray[np.generic]) -> Floats:
+def _numbers(path: Path, data: NDArray[np.generic]) -> Floats32:
     if data.size > MOST:
         raise InvalidRequest(f"{path.name} holds {data.size} numbers, more than {MOST}.")
     if not np.issubdtype(data.dtype, np.number) or np.iscomplexobj(data):
@@ -134,7 +135,7 @@ def _numbers(path: Path, data: NDArray[np.generic]) -> Floats:
     return array
 
 
-def _zipped(array: Floats) -> bytes:
+def _zipped(array: Floats32) -> bytes:
     file = io.BytesIO()
     np.savez_compressed(file, array=array)
     return file.getvalue()

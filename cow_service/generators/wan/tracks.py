@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import Trajectory
+from cow_service.vision.types import Floats, Floats32
 
 MAX_FRAMES = 81  # of a Wan2.1 clip
 STRIDE = 4  # clip frames per latent frame, after the first
@@ -22,7 +23,6 @@ FILE_SAMPLES = 121
 FILE_UNITS_PER_PIXEL = 8
 SAMPLES_PER_FRAME = 1.5
 
-Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
 
@@ -30,7 +30,7 @@ Bools = NDArray[np.bool_]
 class Tracks:
     """Where points of the image are in every frame of a clip."""
 
-    points: Floats  # [F, N, 2] x, y in px
+    points: Floats32  # [F, N, 2] x, y in px
     visible: Bools  # [F, N]
 
     @property
@@ -83,7 +83,7 @@ def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
     return Tracks(points.astype(np.float32), visible)
 
 
-def to_ati_file(tracks: Tracks) -> Floats:
+def to_ati_file(tracks: Tracks) -> Floats32:
     """[N, 121, 1, 3]: x, y (px) and visible (0 or 1), each times 8, linear between frames."""
     last = tracks.num_frames - 1
     at = np.minimum(np.arange(FILE_SAMPLES) / SAMPLES_PER_FRAME, last)
@@ -97,7 +97,7 @@ def to_ati_file(tracks: Tracks) -> Floats:
     return samples.transpose(1, 0, 2)[:, :, None].astype(np.float32)
 
 
-def from_ati_file(samples: Floats) -> Tracks:
+def from_ati_file(samples: Floats32) -> Tracks:
     """The tracks at the 81 frames of a clip from ATI's file form [N, 121, 1, 3]: each frame at its own time.
 
     ATI's own reader (`to_ati_tensor`) takes every odd frame from the sample a third of a frame before it.
@@ -109,7 +109,7 @@ def from_ati_file(samples: Floats) -> Tracks:
     return Tracks(points.astype(np.float32), values[np.rint(at).astype(int), :, 2] > 0.5)
 
 
-def to_ati_tensor(samples: Floats, width: int, height: int) -> Floats:
+def to_ati_tensor(samples: Floats32, width: int, height: int) -> Floats32:
     """[81, N, 4]: time, x, y and visible from ATI's file form [N, 121, 1, 3], on an image of this size (px).
 
     Time and visible go from -1 to 1. The image's centre is x = y = 0 and its shorter side is 2 long.
@@ -127,6 +127,6 @@ def _picked_samples() -> NDArray[np.int64]:
     return np.concatenate([[0], 1 + (3 * k + 1) // 2])
 
 
-def _inside(points: NDArray[np.float64], width: int, height: int) -> Bools:
+def _inside(points: Floats, width: int, height: int) -> Bools:
     x, y = points[..., 0], points[..., 1]
     return (x >= 0) & (x < width) & (y >= 0) & (y < height)

@@ -54,13 +54,15 @@ class Decision:
     why: str = ""
 
 
-def decide(scene: Scene, question: Question, grounding: Grounding | None, simulation: Simulation | None) -> Decision:
-    """What can be said of the question. `grounding` is given where the embedded reader grounded the mover."""
+def decide(
+    scene: Scene, question: Question, own_grounding: Grounding | None, simulation: Simulation | None
+) -> Decision:
+    """What can be said of the question. `own_grounding` is null where another reader grounded the mover."""
     asked = read_relation(question)
     if asked is None:
         return Decision(None, NOT_ASKED)
     if simulation is None:
-        stays_clear = grounding is not None and _stays_clear(scene, question, asked, grounding)
+        stays_clear = own_grounding is not None and _stays_clear(scene, question, asked, own_grounding)
         return Decision(False, AXIS) if stays_clear else Decision(None, NO_SIMULATION)
     motion = simulation.motion
     if motion.kind == "projectile" and motion.source != "request":  # its speed is assumed, and there is no floor

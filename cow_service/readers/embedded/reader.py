@@ -14,13 +14,13 @@ from cow_service.readers.embedded.matching import best_matches, describe, inside
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question, parse
+from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, AnswerOption, BBox, Grounding, LocatedObject, ReaderInfo, Source, Vector
 from cow_service.settings import Settings
 from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
-from cow_service.vision.scene import SAME_OBJECT, Scene, iou
-
-GIVE_PLACE = "Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the request."
-GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y down."
+from cow_service.vision.masks import iou
+from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.scene import Scene
 
 
 class EmbeddedReader:
@@ -63,9 +63,9 @@ class EmbeddedReader:
     ) -> tuple[AnswerReading, ...]:
         """What geometry decides, the same for every vote; not sure where it does not. It gives no reasoning."""
         simulation = None if imagined is None else imagined.simulation
-        own = grounding if grounding is not None and grounding.source == self.source else None
+        own_grounding = grounding if grounding is not None and grounding.source == self.source else None
         with given.cpu():
-            decision = decide(given.scene, parse(given.question), own, simulation)
+            decision = decide(given.scene, parse(given.question), own_grounding, simulation)
         reading = choose_option(options, decision.happens)
         again = ("The embedded reader gives the same answer every time: more votes say no more.",) if votes > 1 else ()
         notes = tuple(note for note in (decision.why, *reading.notes, *again) if note)
@@ -122,7 +122,7 @@ def _others(scene: Scene, question: Question, mover: BBox) -> tuple[LocatedObjec
 
 def _bbox_of(scene: Scene, phrase: ObjectPhrase, mover: BBox) -> BBox | None:
     """The box of the one region, besides the mover, that fits a phrase."""
-    region = match_one([region for region in scene.regions if iou(region.bbox, mover) < SAME_OBJECT], phrase)
+    region = match_one([region for region in scene.regions if iou(region.bbox, mover) < SAME_OBJECT_IOU], phrase)
     return None if region is None else region.bbox
 
 

@@ -8,7 +8,6 @@ import traceback
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Lock
 from typing import Any, Literal
 
 import torch
@@ -24,14 +23,12 @@ from cow_service.readers.local.tiny import make_tiny
 from cow_service.readers.mllm.models import mllm_manifests
 from cow_service.records import Record
 from cow_service.settings import Settings
+from cow_service.weights.building import BUILD_LOCK, listed
 from cow_service.weights.device import choose_device, is_out_of_memory
 from cow_service.weights.lock import verify
 from cow_service.weights.manifests import Manifest
 
-SHOWN = 4  # weights in an error
-
-# Seeds and lazy initialisation are the whole process's: two models made at once would get into each other's weights.
-_loading = Lock()
+MAX_LISTED = 4  # weights in an error
 
 
 class LocalOptions(Record):
@@ -68,7 +65,7 @@ def load_local(settings: Settings) -> LocalModel:
         places = ", ".join(".".join(str(part) for part in found["loc"]) for found in error.errors())
         raise ReaderUnavailable(f"The manifest of '{manifest.name}' is wrong in `local`: {places}.") from error
     places = device_map(settings.device, options.device_map)
-    with _loading, _translated(manifest.name):
+    with BUILD_LOCK, _translated(manifest.name):
         if own is None and not manifest.sources:
             model, processor = make_tiny(manifest.architecture)
             torch.nn.Module.to(model, torch.device(places[""] if isinstance(places, dict) else "cuda"))
@@ -132,7 +129,9 @@ def _from_folder(
     # transformers only warns of these, and fills what is missing with random numbers.
     for kind, what in (("missing_keys", "lacks"), ("unexpected_keys", "has, beyond its model,")):
         if names := sorted(found[kind]):
-            raise CheckpointInvalid(f"The checkpoint '{folder.name}' {what} {_listed(names)}. Download it again.")
+            raise CheckpointInvalid(
+                f"The checkpoint '{folder.name}' {what} {listed(names, MAX_LISTED)}. Download it again."
+            )
     return model, processor
 
 
@@ -147,15 +146,12 @@ def _check(folder: Path, manifest: Manifest) -> None:
     if not any(name.endswith(".safetensors") for name in files):
         raise CheckpointInvalid(f"'{folder.name}' has no safetensors files, and pickles are never opened.")
     # How places are written goes with the family. Another one's would be read wrong without a sign of it.
-    if manifest.family is not None and not _letters(kind).startswith(_letters(manifest.family)):
+    bare_kind, bare_family = (re.sub(r"[^a-z0-9]", "", name.lower()) for name in (kind, manifest.family or ""))
+    if not bare_kind.startswith(bare_family):
         raise CheckpointInvalid(
             f"'{folder.name}' is of the type '{kind}', and '{manifest.name}' of the family '{manifest.family}', which "
             f"writes places in its own way. Name it under a manifest of its family in COW_CHECKPOINTS."
         )
-
-
-def _letters(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 @contextmanager
@@ -178,8 +174,3 @@ def _translated(name: str) -> Generator[None]:
                 f"'{name}' cannot be loaded: {type(error).__name__}: {reason} Install what it names."
             ) from error
         raise CheckpointInvalid(f"'{name}' cannot be loaded: {type(error).__name__}: {reason}") from error
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more

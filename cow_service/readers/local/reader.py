@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cow_service.readers.local.loading import load_local
 from cow_service.readers.mllm.client import MllmClient
-from cow_service.readers.mllm.models import ConfiguredModel, find_manifest
+from cow_service.readers.mllm.models import ConfiguredModel, resolve_model
 from cow_service.readers.mllm.reader import MllmReader
 from cow_service.settings import Settings
 from cow_service.weights.lock import weights_identity
@@ -14,6 +14,6 @@ from cow_service.weights.manifests import load_families
 def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable`, `WeightsUnavailable`, `CheckpointInvalid`."""
     model = load_local(settings)
-    manifest, _, _ = find_manifest(settings)
+    manifest = resolve_model(settings).manifest
     configured = ConfiguredModel(model, manifest.name, manifest, load_families()[manifest.family or ""])
     return MllmReader("local", MllmClient(configured, settings), weights_identity(manifest, settings))

@@ -12,7 +12,7 @@ import torch
 
 from cow_service.errors import MllmUnavailable
 from cow_service.readers.local.batch_generator import BatchGenerator, Generation, GenerationRequest, PendingGeneration
-from cow_service.weights.device import is_out_of_memory
+from cow_service.weights.device import cpu_threads, is_out_of_memory
 
 
 class BatchWorker:
@@ -42,13 +42,9 @@ class BatchWorker:
         return pending.future
 
     def _work(self) -> None:
-        before = torch.get_num_threads()
-        torch.set_num_threads(self._threads or before)
-        try:
+        with cpu_threads(self._threads):
             while batch := self._take():
                 self._generate(batch)
-        finally:
-            torch.set_num_threads(before)  # the number is partly the whole process's
 
     def _take(self) -> list[PendingGeneration]:
         """The next batch. An empty one ends the thread, which the lock keeps a new request from missing."""

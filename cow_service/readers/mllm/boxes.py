@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from cow_service.readers.mllm.coordinates import NUMBER, View, names_corners
+from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, names_corners
 from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, is_number, name_words, text_of
 
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
@@ -41,7 +41,7 @@ class Place:
     point: Any
 
 
-def places_in(value: object, view: View, name: str = "") -> Iterator[Place]:
+def places_in(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[Place]:
     """Places in a value, each with what it is called: by a field of its own, or by the field in which it stands."""
     if isinstance(value, list):
         held = cast("list[object]", value)
@@ -49,9 +49,9 @@ def places_in(value: object, view: View, name: str = "") -> Iterator[Place]:
             yield Place(name, held, None) if len(held) == 4 else Place(name, None, held)
         for part in held:
             if isinstance(part, dict | list):
-                yield from places_in(part, view, name)
+                yield from places_in(part, frame, name)
     fields = fields_of(value)
-    boxes, points = (view.coordinates.box, *BOX_KEYS), (view.coordinates.point, *POINT_KEYS)
+    boxes, points = (frame.coordinates.box, *BOX_KEYS), (frame.coordinates.point, *POINT_KEYS)
     named = any(key in fields for key in (*boxes, *points))
     if named or names_corners(fields):
         label = next((label for key in _LABEL_KEYS if (label := text_of(fields.get(key)))), name)
@@ -59,7 +59,7 @@ def places_in(value: object, view: View, name: str = "") -> Iterator[Place]:
         return
     for key, held in fields.items():
         if isinstance(held, dict | list) and key not in NO_PLACES:
-            yield from places_in(held, view, name if key in _HEADINGS else key.replace("_", " "))
+            yield from places_in(held, frame, name if key in _HEADINGS else key.replace("_", " "))
 
 
 def tagged_places(said: str) -> Iterator[Place]:

@@ -9,7 +9,9 @@ from cow_service.readers.base import MotionReading
 from cow_service.readers.question.arrow_words import ArrowSense
 from cow_service.records import BBox, Vector
 from cow_service.vision.arrow_choice import arrow_at
-from cow_service.vision.scene import SAME_OBJECT, Scene, iou
+from cow_service.vision.masks import iou
+from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.scene import Scene
 
 ARROW_TOLERANCE = 25.0  # degrees between an arrow and what was read of it; past that the arrow is right
 MAX_BOX_SHARE = 0.9  # of the image: a box that covers so much is hardly that of one object
@@ -59,7 +61,7 @@ def box_warnings(scene: Scene, bbox: BBox, colour: str | None, clipped: bool) ->
         found.append("The reader's box covers nearly the whole image: it may not be that of one object.")
     here = None if colour is None else scene.region_of(bbox)
     if here is not None and colour not in {here.colour, *here.colours}:
-        matching = [r for r in scene.regions if r.colour == colour and iou(r.bbox, bbox) < SAME_OBJECT]
+        matching = [r for r in scene.regions if r.colour == colour and iou(r.bbox, bbox) < SAME_OBJECT_IOU]
         if matching:
             x, y = matching[0].centre
             found.append(

@@ -59,7 +59,7 @@ def size_seen(width: int, height: int, rule: ImageSize) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class View:
+class CoordinateFrame:
     """An upright image of `width` x `height` px as a model sees it: at `seen` px, in its family's coordinates."""
 
     width: int

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, cast
 
 from cow_service.readers.mllm.boxes import BOX_KEYS, CORNER_PAIRS, POINT_KEYS
-from cow_service.readers.mllm.coordinates import LEAST_LENGTH, View
+from cow_service.readers.mllm.coordinates import LEAST_LENGTH, CoordinateFrame
 from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, is_none, is_number, text_of, truth_of
 from cow_service.records import Cue, Point
 
@@ -38,17 +38,17 @@ _CAMERA: dict[str, CameraSense] = {
 class Line:
     """Which way the object moves, as far as the reply tells: `ends` in px of the upright image, or null."""
 
-    ends: tuple[Point, Point] | None
-    cue: Cue | None
-    along_arrow: bool | None
-    camera: CameraSense | None
+    ends: tuple[Point, Point] | None = None
+    cue: Cue | None = None
+    along_arrow: bool | None = None
+    camera: CameraSense | None = None
 
 
-def line_in(values: Sequence[object], said: str, view: View) -> Line:
+def line_in(values: Sequence[object], said: str, frame: CoordinateFrame) -> Line:
     """The one line that a reply gives. Raises `ReplyError` where it gives none, several, or one that cannot be."""
-    lines = [line for value in values for line in _lines(value, view)]
+    lines = [line for value in values for line in _lines(value, frame)]
     if not lines and not values and "<" not in said and (corners := CORNER_PAIRS.search(said)):
-        lines = [Line(view.ends(list(corners.groups())), None, None, None)]
+        lines = [Line(frame.ends(list(corners.groups())))]
     if not lines:
         raise ReplyError("`direction` is missing; give two points on the line of the motion, or null")
     if any(not _same_way(line, lines[0]) for line in lines):
@@ -61,37 +61,37 @@ def line_in(values: Sequence[object], said: str, view: View) -> Line:
     return line
 
 
-def _lines(value: object, view: View) -> Iterator[Line]:
+def _lines(value: object, frame: CoordinateFrame) -> Iterator[Line]:
     if isinstance(value, list):
         held = cast("list[object]", value)
         if len(held) == 4 and all(is_number(part) for part in held):
-            yield Line(view.ends(held), None, None, None)
+            yield Line(frame.ends(held))
         for part in held:
             if isinstance(part, dict):
-                yield from _lines(part, view)
+                yield from _lines(part, frame)
     fields = fields_of(value)
     if not {"start", "end"} <= set(fields) and not any(key in fields for key in _DIRECTION_KEYS):
         for key, held in fields.items():
             if isinstance(held, dict) and key not in {"others", *BOX_KEYS, *POINT_KEYS}:
-                yield from _lines(cast("dict[str, object]", held), view)
+                yield from _lines(cast("dict[str, object]", held), frame)
         return
     written = first_of(fields, *_DIRECTION_KEYS) if any(key in fields for key in _DIRECTION_KEYS) else value
     named = text_of(fields.get("cue")).lower()
     cue: Cue | None = next((cue for word, cue in _CUE_WORDS if word in named), None)
     yield Line(
-        ends=None if named == "none" and _is_zero(written) else _ends(written, view),
+        ends=None if named == "none" and _is_zero(written) else _ends(written, frame),
         cue=cue,
         along_arrow=truth_of(fields.get("along_arrow")),
         camera=_CAMERA.get(text_of(fields.get("camera")).lower().strip(" .")),
     )
 
 
-def _ends(written: object, view: View) -> tuple[Point, Point] | None:
+def _ends(written: object, frame: CoordinateFrame) -> tuple[Point, Point] | None:
     if is_none(written) or (isinstance(written, str) and written.strip().lower() == "unknown"):
         return None
     if isinstance(written, str) and not re.search(r"\d", written):
         raise ReplyError(f"`direction` is given in words ('{written[:40]}'); give two points as four numbers")
-    return view.ends(written)
+    return frame.ends(written)
 
 
 def _is_zero(written: object) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import InternalError, InvalidRequest
-from cow_service.readers.mllm.coordinates import View, size_seen
+from cow_service.readers.mllm.coordinates import CoordinateFrame, size_seen
 from cow_service.readers.mllm.replies import ReplyError
 from cow_service.weights.manifests import Family
 
@@ -24,7 +24,7 @@ class EncodedImage:
     """An image as it is sent: JPEG, and how the model sees it."""
 
     jpeg: bytes
-    view: View
+    coordinate_frame: CoordinateFrame
 
 
 def encode(pixels: NDArray[np.uint8], family: Family) -> EncodedImage:
@@ -41,4 +41,4 @@ def encode(pixels: NDArray[np.uint8], family: Family) -> EncodedImage:
     done, data = cv2.imencode(".jpg", pixels[..., ::-1], _ENCODING)
     if not done:
         raise InternalError("The image could not be encoded for the multimodal LLM.")
-    return EncodedImage(data.tobytes(), View(width, height, size, family.coordinates))
+    return EncodedImage(data.tobytes(), CoordinateFrame(width, height, size, family.coordinates))

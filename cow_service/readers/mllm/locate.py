@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from cow_service.readers.mllm.boxes import Place, chosen, places_in, tagged_places
 from cow_service.readers.mllm.client import PromptCall
-from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.directions import Line, line_in
 from cow_service.readers.mllm.identify import MAX_OTHERS
 from cow_service.readers.mllm.images import EncodedImage
@@ -44,32 +44,34 @@ def locate_call(
     reasoning_length: int,
 ) -> PromptCall[Located | None]:
     """The call that asks where the object `name` is, unless its box is known, and which way it moves."""
-    view, wants_box = image.view, bbox is None
+    frame, wants_box = image.coordinate_frame, bbox is None
     inputs: dict[str, object] = {
         "question": question,
         "object": " ".join(name.split()),
         "others": tuple(others),
-        "bbox": "" if bbox is None else str(view.write((bbox[0], bbox[1]), (bbox[2], bbox[3]))),
-        "units": view.units,
-        "box_key": view.coordinates.box,
-        "box_order": view.box_order,
-        "line_order": view.line_order,
+        "bbox": "" if bbox is None else str(frame.write((bbox[0], bbox[1]), (bbox[2], bbox[3]))),
+        "units": frame.units,
+        "box_key": frame.coordinates.box,
+        "box_order": frame.box_order,
+        "line_order": frame.line_order,
         "wants_box": wants_box,
         "wants_direction": wants_direction,
     }
-    shape = schema(view, bool(others), wants_box, wants_direction, reasoning_length)
+    shape = schema(frame, bool(others), wants_box, wants_direction, reasoning_length)
     return PromptCall(
         "locate",
         inputs,
         (image.jpeg,),
         shape,
-        lambda reply: read_located(reply, view, name, others, wants_box, wants_direction),
+        lambda reply: read_located(reply, frame, name, others, wants_box, wants_direction),
     )
 
 
-def schema(view: View, others: bool, wants_box: bool, wants_direction: bool, reasoning_length: int) -> Schema:
+def schema(
+    frame: CoordinateFrame, others: bool, wants_box: bool, wants_direction: bool, reasoning_length: int
+) -> Schema:
     """JSON schema of the reply."""
-    box_key, box = view.coordinates.box, numbers(view, 4)
+    box_key, box = frame.coordinates.box, numbers(frame, 4)
     fields: dict[str, Schema] = {"reasoning": words(reasoning_length)}
     if wants_box:
         fields |= {"label": words(MAX_LABEL), box_key: nullable(box)}
@@ -81,49 +83,51 @@ def schema(view: View, others: bool, wants_box: bool, wants_direction: bool, rea
             "cue": one_of(*CUES),
             "along_arrow": nullable({"type": "boolean"}),
             "camera": nullable(one_of("towards", "away")),
-            "direction": nullable(numbers(view, 4)),
+            "direction": nullable(numbers(frame, 4)),
         }
     return object_of(**fields)
 
 
 def read_located(
-    reply: str, view: View, wanted: str, others: Sequence[str], wants_box: bool, wants_direction: bool
+    reply: str, frame: CoordinateFrame, wanted: str, others: Sequence[str], wants_box: bool, wants_direction: bool
 ) -> Located | None:
     """What a reply says of the object `wanted`; None where it says that it does not see it. Raises `ReplyError`."""
     said = without_thinking(reply)
     values = values_in(said)
-    place = _place(values, said, view, wanted) if wants_box else None
+    place = _place(values, said, frame, wanted) if wants_box else None
     if wants_box and place is None:
         return None
-    line = line_in(values, said, view) if wants_direction else None
+    line = line_in(values, said, frame) if wants_direction else None
     if place is None:
         return Located(line=line)
-    found = _others(values, view, others)
+    found = _others(values, frame, others)
     if not is_none(place.box):
-        return Located(view.bbox(place.box), None, place.label, view.overshoots(place.box), found, line)
-    return Located(None, view.point(place.point), place.label, False, found, line)
+        return Located(frame.bbox(place.box), None, place.label, frame.overshoots(place.box), found, line)
+    return Located(None, frame.point(place.point), place.label, False, found, line)
 
 
-def _place(values: Sequence[object], said: str, view: View, wanted: str) -> Place | None:
+def _place(values: Sequence[object], said: str, frame: CoordinateFrame, wanted: str) -> Place | None:
     """The place that the reply gives for the object; None where it says that it does not see it."""
-    places = [place for value in values for place in places_in(value, view)] or list(tagged_places(said))
+    places = [place for value in values for place in places_in(value, frame)] or list(tagged_places(said))
     if not places:
         if any(is_none(value) for value in values):
             return None
-        raise ReplyError(f"`{view.coordinates.box}` is missing; give the box of '{wanted}', or null if it is not there")
+        raise ReplyError(
+            f"`{frame.coordinates.box}` is missing; give the box of '{wanted}', or null if it is not there"
+        )
     place = chosen(places, wanted)
     return None if is_none(place.box) and is_none(place.point) else place
 
 
-def _others(values: Sequence[object], view: View, wanted: Sequence[str]) -> tuple[LocatedObject, ...]:
+def _others(values: Sequence[object], frame: CoordinateFrame, wanted: Sequence[str]) -> tuple[LocatedObject, ...]:
     """Boxes of the other objects that were asked for; one that cannot be read is left out."""
     found: dict[str, LocatedObject] = {}
     for value in values:
-        for place in places_in(fields_of(value).get("others"), view):
+        for place in places_in(fields_of(value).get("others"), frame):
             name = next((name for name in wanted if name_words(name) == name_words(place.label)), None)
             if name is not None and place.box is not None:
                 try:
-                    found.setdefault(name, LocatedObject(object=name, bbox=view.bbox(place.box)))
+                    found.setdefault(name, LocatedObject(object=name, bbox=frame.bbox(place.box)))
                 except ReplyError:
                     continue  # the mover matters more than asking for this again
     return tuple(found.values())

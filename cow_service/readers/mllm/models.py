@@ -38,8 +38,17 @@ class ConfiguredModel:
         return native and bool(self.model.profile.get("supports_json_schema_output", False))
 
 
-def find_manifest(settings: Settings) -> tuple[Manifest, str | None, str]:
-    """The manifest that COW_MLLM means, the provider (null for one's own server) and the name as it is served.
+@dataclass(frozen=True)
+class ResolvedModel:
+    """What COW_MLLM means."""
+
+    manifest: Manifest
+    provider: str | None  # null where one runs one's own server
+    name: str  # as it is served
+
+
+def resolve_model(settings: Settings) -> ResolvedModel:
+    """The manifest, provider and served name of the settings. A manifest with a base URL is on one's own server.
 
     Raises `ReaderUnavailable` where COW_MLLM is not set or names nothing.
     """
@@ -51,13 +60,14 @@ def find_manifest(settings: Settings) -> tuple[Manifest, str | None, str]:
         )
     if name in manifests:
         manifest = manifests[name]
-        return manifest, manifest.provider, settings.mllm_model or manifest.model or name
+        provider = manifest.provider if settings.mllm_base_url is None else None
+        return ResolvedModel(manifest, provider, settings.mllm_model or manifest.model or name)
     provider, _, model = name.partition(":")
     if not (provider and model):
         close = get_close_matches(name, manifests, n=3, cutoff=0.5)
         names = f"Did you mean {' or '.join(close)}?" if close else f"Manifests: {', '.join(manifests)}."
         raise ReaderUnavailable(f"COW_MLLM={name!r} is no manifest and not provider:model. {names}")
-    return manifest_for(model), provider, settings.mllm_model or model
+    return ResolvedModel(manifest_for(model), provider, settings.mllm_model or model)
 
 
 def mllm_manifests() -> dict[str, Manifest]:
@@ -86,12 +96,11 @@ def _family_of(manifest: Manifest, name: str) -> Family:
 
 def configure(settings: Settings) -> ConfiguredModel:
     """The model of the settings, ready to be called; nothing is sent. Raises `ReaderUnavailable`."""
-    manifest, provider, name = find_manifest(settings)
-    family = _family_of(manifest, name)
-    base_url = settings.mllm_base_url
+    resolved = resolve_model(settings)
+    manifest, provider, name = resolved.manifest, resolved.provider, resolved.name
+    family, base_url = _family_of(manifest, name), settings.mllm_base_url
     key = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
-    own_protocol = settings.mllm is not None and settings.mllm.startswith(tuple(f"{p}:" for p in OWN_PROTOCOL))
-    if base_url is not None and not own_protocol:
+    if base_url is not None and provider not in OWN_PROTOCOL:
         return ConfiguredModel(_openai_compatible(base_url, key, name, family), name, manifest, family)
     if provider is None:
         raise ReaderUnavailable(

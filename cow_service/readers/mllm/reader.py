@@ -15,6 +15,7 @@ from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, 
 from cow_service.readers.mllm.answer import answer_calls
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
 from cow_service.readers.mllm.client import MllmClient, PromptCall
+from cow_service.readers.mllm.directions import Line
 from cow_service.readers.mllm.identify import Identified, identify_call
 from cow_service.readers.mllm.images import EncodedImage, encode
 from cow_service.readers.mllm.locate import Located, locate_call
@@ -22,6 +23,7 @@ from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.mllm.scale import Scaled, scale_call
 from cow_service.readers.question.sentences import parse, parse_noun_phrase
+from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
@@ -38,8 +40,6 @@ from cow_service.weights.resources import PROMPTS
 
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
-GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y down."
-GIVE_PLACE = "Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the request."
 
 
 class MllmReader:
@@ -163,14 +163,19 @@ class MllmReader:
         scaled: Scaled | CowError | None = next(results) if wants_scale else None
         if isinstance(located, CowError):
             raise located
-        found: dict[str, Any] = {"kind": kind, "sentence": identified.sentence if identified else None}
-        if located is not None and located.line is not None:
-            found |= vars(located.line)
-        if isinstance(scaled, CowError):
-            found["scale_error"] = scaled.code
-        elif scaled is not None:
-            found |= vars(scaled)
-        return located, MotionHints(**found)
+        line = Line() if located is None or located.line is None else located.line
+        scale = scaled if isinstance(scaled, Scaled) else Scaled()
+        return located, MotionHints(
+            kind=kind,
+            sentence=identified.sentence if identified else None,
+            ends=line.ends,
+            camera=line.camera,
+            cue=line.cue,
+            along_arrow=line.along_arrow,
+            metres_per_pixel=scale.metres_per_pixel,
+            down=scale.down,
+            scale_error=scaled.code if isinstance(scaled, CowError) else None,
+        )
 
     def _directed(
         self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from cow_service.readers.mllm.client import PromptCall
-from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.images import EncodedImage
 from cow_service.readers.mllm.replies import (
     ReplyError,
@@ -31,31 +31,31 @@ LEAST_SPAN = 4.0  # px: measuring less is guessing
 class Scaled:
     """The scale of the scene at the object, null where nothing was known of any size, and which way things fall."""
 
-    metres_per_pixel: MetresPerPixel | None
-    down: Vector
+    metres_per_pixel: MetresPerPixel | None = None
+    down: Vector = DOWN["bottom"]
 
 
 def scale_call(image: EncodedImage, name: str, reasoning_length: int) -> PromptCall[Scaled]:
     """The call that asks how large the scene is at the object `name`, and which way is down."""
-    view = image.view
-    inputs: dict[str, object] = {"object": " ".join(name.split()), "units": view.units, "line_order": view.line_order}
+    frame = image.coordinate_frame
+    inputs: dict[str, object] = {"object": " ".join(name.split()), "units": frame.units, "line_order": frame.line_order}
     return PromptCall(
-        "scale", inputs, (image.jpeg,), schema(view, reasoning_length), lambda reply: read_scaled(reply, view)
+        "scale", inputs, (image.jpeg,), schema(frame, reasoning_length), lambda reply: read_scaled(reply, frame)
     )
 
 
-def schema(view: View, reasoning_length: int) -> Schema:
+def schema(frame: CoordinateFrame, reasoning_length: int) -> Schema:
     """JSON schema of the reply."""
     return object_of(
         reasoning=words(reasoning_length),
         reference=nullable(words(200)),
         metres=nullable({"type": "number", "minimum": METRES[0], "maximum": METRES[1]}),
-        ends=nullable(numbers(view, 4)),
+        ends=nullable(numbers(frame, 4)),
         down=nullable(one_of(*DOWN)),
     )
 
 
-def read_scaled(reply: str, view: View) -> Scaled:
+def read_scaled(reply: str, frame: CoordinateFrame) -> Scaled:
     """What a reply says of the scale. Raises `ReplyError`."""
     objects = [fields for value in values_in(without_thinking(reply)) if "ends" in (fields := fields_of(value))]
     if not objects:
@@ -66,8 +66,8 @@ def read_scaled(reply: str, view: View) -> Scaled:
     down = _down(fields.get("down"))
     metres, ends = _metres(first_of(fields, "metres", "meters", "length")), fields.get("ends")
     if metres is None or is_none(ends):
-        return Scaled(None, down)
-    span = math.dist(*view.ends(ends))
+        return Scaled(down=down)
+    span = math.dist(*frame.ends(ends))
     if span < LEAST_SPAN:
         raise ReplyError("`ends` are too close to measure by; take a longer thing")
     reference = text_of(fields.get("reference"))[:200] or "an object of known size"

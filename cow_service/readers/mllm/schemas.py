@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from cow_service.readers.mllm.coordinates import View
+from cow_service.readers.mllm.coordinates import CoordinateFrame
 
 Schema = dict[str, Any]
 
 
 def object_of(**properties: Schema) -> Schema:
     """An object with exactly these fields, in this order: reasoning comes first."""
-    return {
-        "type": "object",
-        "properties": properties,
-        "required": list(properties),
-        "additionalProperties": False,
-    }
+    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
 def words(longest: int) -> Schema:
@@ -34,9 +29,9 @@ def nullable(schema: Schema) -> Schema:
     return {"anyOf": [schema, {"type": "null"}]}
 
 
-def numbers(view: View, count: int) -> Schema:
-    """`count` coordinates as the view's family writes them."""
-    units = view.coordinates.units
-    highest = max(view.seen) if units == "pixels" else {"thousandths": 1000, "fractions": 1}[units]
+def numbers(frame: CoordinateFrame, count: int) -> Schema:
+    """`count` coordinates as the frame's family writes them."""
+    units = frame.coordinates.units
+    highest = max(frame.seen) if units == "pixels" else {"thousandths": 1000, "fractions": 1}[units]
     number = {"type": "number" if units == "fractions" else "integer", "minimum": 0, "maximum": highest}
     return {"type": "array", "items": number, "minItems": count, "maxItems": count}

@@ -30,7 +30,7 @@ _HARMLESS = lex.words(
 )
 _TIMES = lex.words("moment point time times way path motion movement course trajectory future end clip video")
 _COUNTING = lex.words(
-    "two three four five both all every each another other several many twice once exactly least most",
+    "two three four five both all every each another other several many twice once exactly least most"
 )
 # Toppling, stopping and wrapping are more than touching or hiding.
 _MORE = lex.words("knock block cover crash smash overlap meet reach")

@@ -12,12 +12,7 @@ ALONG_AXIS = 0.95  # sine of the angle out of the image plane from which only th
 IN_PLANE = 0.3  # and up to which it is not
 
 # 16 sectors of 22.5 degrees, from the right, turning upwards.
-_QUARTERS = (
-    ("to the right", "up"),
-    ("up", "to the left"),
-    ("to the left", "down"),
-    ("down", "to the right"),
-)
+_QUARTERS = (("to the right", "up"), ("up", "to the left"), ("to the left", "down"), ("down", "to the right"))
 _DETERMINERS = ("the ", "a ", "an ", "this ", "that ")
 
 
@@ -48,7 +43,7 @@ def motion_sentence(
     name = " ".join(object.split())[:MAX_OBJECT].rstrip()
     determiner = next((word for word in _DETERMINERS if name.lower().startswith(word)), "")
     words = direction_words(direction, depth)
-    told = "" if sentence is None else sentence.strip().rstrip(".") + "."
+    declared = "" if sentence is None else sentence.strip().rstrip(".") + "."
     prompt = load_prompt("motion-sentence")
-    text = prompt.render(object=name[len(determiner) :], kind=kind, words=words, told=told)
+    text = prompt.render(object=name[len(determiner) :], kind=kind, words=words, sentence=declared)
     return " ".join(text.split())
