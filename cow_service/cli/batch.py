@@ -55,7 +55,9 @@ def batch(
         str | None, typer.Option(help="The server.", show_default="COW_BASE_URL, http://127.0.0.1:8000")
     ] = None,
 ) -> None:
-    """Ask a server many questions; the same command resumes a batch that was interrupted.
+    """Ask a server many questions, and resume where it stopped.
+
+    The same command resumes a batch that was interrupted.
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
     """

@@ -63,7 +63,10 @@ def simulate(
     *,
     request: dict[str, Any],
 ) -> None:
-    """Imagine one image's future: frames, video, overlay and simulation.json in a folder."""
+    """Imagine an image's future: frames, video and overlay.
+
+    They go into a folder, with simulation.json.
+    """
     from cow_service.cli.console import run_simulation  # noqa: PLC0415
 
     body = {**request, "question": question, "video": video}
@@ -94,7 +97,10 @@ def answer(
     *,
     request: dict[str, Any],
 ) -> None:
-    """Look, then answer: the answer, the votes, the baseline, tokens and time."""
+    """Answer a question after looking at the imagined future.
+
+    Shows the answer, the votes, the baseline, tokens and time.
+    """
     from cow_service.cli.console import run_answer  # noqa: PLC0415
 
     body = {
@@ -133,7 +139,10 @@ def serve(
 
 @app.command()
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
-    """Show what is installed, what each backend lacks, and the command that installs it."""
+    """Show what is installed, and what each backend lacks.
+
+    Names the command that installs it.
+    """
     from cow_service.cli.doctor import examine, print_report  # noqa: PLC0415
 
     with _service() as service:

@@ -40,7 +40,10 @@ def mcp(
         ),
     ] = None,
 ) -> None:
-    """Serve the tools `simulate` and `answer` over the Model Context Protocol."""
+    """Serve `simulate` and `answer` as tools over MCP.
+
+    MCP is the Model Context Protocol, by which agents call tools.
+    """
     import logging  # noqa: PLC0415
 
     from cow_service.observability import logging as logs  # noqa: PLC0415
