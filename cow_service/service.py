@@ -99,6 +99,7 @@ class Service:
         """
         backends = self._backends(request)
         created_at = created_at or now()
+        # Also with an image at hand: a run begins in its turn, and its job counts as queued until then.
         with self.cpu.held(created_at, partial(progress, None, 0.0)):
             image = image or self.image_of(request.image)[1]
         return Run(request, image, backends, progress, step, run_id or str(uuid.uuid4()), created_at)

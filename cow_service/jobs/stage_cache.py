@@ -50,7 +50,7 @@ class KeyLocks:
 
 @dataclass
 class StoredStep:
-    """The `Step` of one job: a result is stored the moment that it is there, so that it is never computed twice."""
+    """The `Step` of one job: a result is stored as soon as it is there, and this process does not compute it again."""
 
     job_id: str
     fresh: bool  # results of other jobs are not taken

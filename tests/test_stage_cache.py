@@ -1,0 +1,68 @@
+"""Stored stage results, on a real database: who finds them again, and what is never stored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cow_service.errors import Canceled
+from cow_service.jobs.database import Database
+from cow_service.jobs.stage_cache import KeyLocks, StoredStep
+from cow_service.media.artifacts import ArtifactStore
+from cow_service.observability.metrics import Metrics
+from cow_service.records import MetresPerPixel, Motion
+from cow_service.settings import Settings
+from cow_service.stages.keys import StageKey
+from cow_service.stages.results import StageResult
+
+SHARED, OWN = StageKey("a" * 64), StageKey("b" * 64, shareable=False)
+
+
+def never() -> None:
+    """Does nothing."""
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Database:
+    database = Database(Settings(data_dir=tmp_path))
+    database.create_tables()
+    return database
+
+
+def step(database: Database, tmp_path: Path, job_id: str, fresh: bool = False, check=never) -> StoredStep:
+    return StoredStep(job_id, fresh, database, ArtifactStore(tmp_path), Metrics(), KeyLocks(), check)
+
+
+def result(speed: float) -> StageResult[Any]:
+    scale = MetresPerPixel(value=0.01, source="default")
+    motion = Motion(
+        kind="static", direction=None, cue="text", speed=speed, metres_per_pixel=scale, sentence="", source="request"
+    )
+    return StageResult(value=motion)
+
+
+def test_a_result_is_found_by_other_jobs_only_where_it_may_be(database: Database, tmp_path: Path) -> None:
+    def speed_of(job_id: str, key: StageKey, computed: float, fresh: bool = False) -> tuple[float, bool]:
+        found, reused = step(database, tmp_path, job_id, fresh)("motion", key, lambda: result(computed))
+        return found.value.speed, reused
+
+    assert speed_of("one", SHARED, 1) == (1, False)
+    assert speed_of("one", SHARED, 2) == (1, False)  # its own, after a restart
+    assert speed_of("two", SHARED, 3) == (1, True)
+    assert speed_of("three", SHARED, 4, fresh=True) == (4, False)
+    assert speed_of("one", OWN, 5) == (5, False)
+    assert speed_of("one", OWN, 6) == (5, False)
+    assert speed_of("two", OWN, 7) == (7, False)
+    assert database.finished_stages("two") == {"motion"}
+
+
+def test_nothing_is_stored_for_a_job_that_was_canceled_meanwhile(database: Database, tmp_path: Path) -> None:
+    def canceled() -> None:
+        raise Canceled("The job was canceled.")
+
+    with pytest.raises(Canceled):
+        step(database, tmp_path, "one", check=canceled)("motion", SHARED, lambda: result(1))
+    assert database.find_result(SHARED.digest) is None
+    assert database.finished_stages("one") == set()
