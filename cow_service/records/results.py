@@ -1,0 +1,175 @@
+"""What a request comes to: frames, clip, simulation, answer, and who made them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, Field
+
+from cow_service.records.base import Artifact, ImageInfo, Record, Sha256
+from cow_service.records.motion import Grounding, Motion
+from cow_service.records.world import Trajectory
+
+FramePolicy = Literal["initial", "uniform", "events"]
+
+
+class Frame(Record):
+    """One picture of the clip."""
+
+    index: int = Field(ge=0, description="Which frame of the clip.")
+    time: float = Field(ge=0, description="Seconds.")
+    url: str
+    sha256: Sha256
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
+
+
+class Video(Record):
+    """The clip as H.264 in MP4."""
+
+    url: str
+    sha256: Sha256
+    fps: float = Field(gt=0)
+    num_frames: int = Field(gt=0)
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
+
+
+class ReaderInfo(Record):
+    """Who read the image, and what would have to be the same to read it so again."""
+
+    name: str
+    model: str | None = Field(default=None, description="The multimodal LLM, as it is served.")
+    revision: str | None = None
+    prompts: dict[str, int] = Field(default_factory=dict, description="Version of each prompt that it was sent.")
+    stages: tuple[Literal["grounding", "motion", "answering"], ...] = Field(
+        default=(), description="The stages it was asked for; the others came with the request."
+    )
+
+
+class Usage(Record):
+    """What the multimodal LLM was asked, re-asks and failed tries that it counted included."""
+
+    calls: int = Field(default=0, ge=0)
+    input_tokens: int = Field(default=0, ge=0)
+    output_tokens: int = Field(default=0, ge=0)
+
+    def __add__(self, other: Usage) -> Usage:
+        return Usage(
+            calls=self.calls + other.calls,
+            input_tokens=self.input_tokens + other.input_tokens,
+            output_tokens=self.output_tokens + other.output_tokens,
+        )
+
+
+class GeneratorInfo(Record):
+    """Who made the frames, and what would have to be the same to make them again."""
+
+    name: str
+    model: str | None = None
+    revision: str | None = None
+    seed: int
+    steps: int | None = Field(default=None, description="Sampling steps; null where there are none.")
+    options: dict[str, bool | int | float | str] = Field(default_factory=dict)
+
+
+class Clip(Record):
+    """Stage 4: the frames chosen for reasoning, the whole clip as video where it is wanted, and the overlay."""
+
+    frames: tuple[Frame, ...]
+    video: Video | None = None
+    overlay: Artifact
+    generator: GeneratorInfo
+
+
+class Simulation(Record):
+    """The whole way from image and question to frames: what `POST /simulate` returns."""
+
+    id: str
+    status: Literal["succeeded"] = "succeeded"
+    created_at: str = Field(description="RFC 3339, UTC.")
+    question: str
+    image: ImageInfo
+    grounding: Grounding
+    motion: Motion
+    trajectory: Trajectory
+    frames: tuple[Frame, ...] = Field(description="The frames chosen for reasoning.")
+    video: Video | None = Field(description="Null where the request said `video: false`.")
+    overlay: Artifact = Field(description="The input with box, point, arrow and path drawn.")
+    generator: GeneratorInfo
+    reader: ReaderInfo
+    usage: Usage = Usage()
+    timings: dict[str, float] = Field(description="Seconds per stage.")
+    reused: tuple[str, ...] = Field(
+        default=(), description="Stages whose result was found again: an earlier request had asked for the same."
+    )
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def encounters_known(self) -> bool:
+        """Whether an empty list of encounters means that nothing is met."""
+        return self.trajectory.encounters_known
+
+
+class ProblemField(BaseModel):
+    """One invalid field."""
+
+    pointer: str = Field(description="JSON Pointer (RFC 6901) into the request.")
+    detail: str
+
+
+class Problem(BaseModel):
+    """Why a request failed (RFC 9457)."""
+
+    type: str = Field(description="Stable URI; its last segment is the code.")
+    title: str = Field(description="The kind of error, the same for every occurrence.")
+    status: int
+    detail: str = Field(description="What was wrong, with the value, and what to do.")
+    errors: list[ProblemField] = Field(default_factory=list[ProblemField])
+
+    @property
+    def code(self) -> str:
+        """The last segment of the type, such as `cannot-ground`."""
+        return self.type.rpartition(":")[2]
+
+
+class AnswerOption(Record):
+    """One of the answers that a question offers."""
+
+    letter: str = Field(pattern="^[A-Z]$")
+    text: str
+
+
+class Verdict(Record):
+    """What was answered, and how sure that is. The reasoning is the answerer's own; none is made up for it."""
+
+    answer: str | None = Field(
+        description="A letter, or text for an open question; null where it is not sure and no option says so."
+    )
+    option: str | None = Field(default=None, description="Text of the option with that letter.")
+    not_sure: bool
+    reasoning: str = ""
+    votes: dict[str, int] = Field(
+        default_factory=dict, description="How often each was answered; `not sure` where no option says so."
+    )
+
+
+class Answer(Verdict):
+    """The way from image and question to an answer: what `POST /answer` returns."""
+
+    id: str
+    status: Literal["succeeded"] = "succeeded"
+    created_at: str = Field(description="RFC 3339, UTC.")
+    question: str
+    options: tuple[AnswerOption, ...] = Field(description="From the request or the question; empty where it is open.")
+    image: ImageInfo
+    simulation: Simulation | None = Field(description="Null where nothing was imagined, or that failed.")
+    simulation_problem: Problem | None = Field(default=None, description="Why imagining failed, where it did.")
+    baseline: Verdict | None = Field(description="The answer without frames, where it was asked for.")
+    reader: ReaderInfo
+    usage: Usage = Field(description="Of everything together: simulation, votes and baseline.")
+    timings: dict[str, float] = Field(description="Seconds per stage.")
+    reused: tuple[str, ...] = Field(
+        default=(), description="Stages whose result was found again: an earlier request had asked for the same."
+    )
+    warnings: tuple[str, ...] = ()

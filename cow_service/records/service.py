@@ -1,0 +1,65 @@
+"""What the service says of itself and of its jobs."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from cow_service.records.base import Record
+from cow_service.records.results import Answer, Problem, Simulation
+
+
+class BackendInfo(Record):
+    """A reader or generator: what it is, what it needs, whether it is ready."""
+
+    name: str
+    default: bool = Field(description="Used where a request names none.")
+    ready: bool | None = Field(description="Null where nothing is known of it before it is used.")
+    needs: tuple[str, ...] = Field(default=(), description="Python modules that it uses.")
+    summary: str
+    licence: str | None = None
+    weights: str | None = Field(default=None, description="Repository of its weights; null where it has none.")
+    missing: tuple[str, ...] = Field(
+        default=(), description="Python modules that are not installed, and settings (COW_...) that are not set."
+    )
+    install: str | None = Field(default=None, description="The command that installs them.")
+    pull: str | None = Field(
+        default=None, description="The command that downloads its weights, where they are not here."
+    )
+    defaults: dict[str, bool | int | float | str] = Field(default_factory=dict)
+
+
+class Models(Record):
+    """What `GET /models` returns."""
+
+    readers: tuple[BackendInfo, ...]
+    generators: tuple[BackendInfo, ...]
+    mllms: tuple[str, ...] = Field(default=(), description="Manifests of multimodal LLMs: what `COW_MLLM` may name.")
+
+
+JobKind = Literal["simulate", "answer"]
+JobStatus = Literal["queued", "running", "succeeded", "failed", "canceled"]
+TERMINAL: tuple[JobStatus, ...] = ("succeeded", "failed", "canceled")
+
+
+class Job(Record):
+    """A request that was accepted. Once its status is succeeded, failed or canceled it never changes again."""
+
+    id: str
+    kind: JobKind
+    status: JobStatus
+    stage: str | None = Field(default=None, description="The stage that it is in, or was in when it ended.")
+    progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
+    created_at: str = Field(description="RFC 3339, UTC.")
+    finished_at: str | None = Field(default=None, description="RFC 3339, UTC.")
+    generator: str = Field(description="Who makes its frames.")
+    result: Simulation | Answer | None = Field(default=None, description="Of a succeeded job, but not in lists.")
+    problem: Problem | None = Field(default=None, description="Of a failed job.")
+
+
+class JobPage(Record):
+    """Some jobs, newest first."""
+
+    jobs: tuple[Job, ...]
+    next: str | None = Field(default=None, description="`cursor` of the page after this one; null on the last.")
