@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from cow_service.records.asked import Asked
-from cow_service.records.base import BBox, Point, Position, Record, State
+from cow_service.records.base import BBox, Point, Position, Record, State, Vector
 from cow_service.records.motion import Law, Shape
 
 EncounterKind = Literal["touches", "occludes", "occluded-by"]
@@ -123,7 +123,7 @@ class Outcome(Record):
     count: int | None = Field(default=None, description="Of `how-many`: the number.")
     time: float | None = Field(default=None, description="Seconds until it first happens, the median of the worlds.")
     time_band: tuple[float, float] | None = Field(default=None, description="Its 10th and 90th percentile, s.")
-    sure: bool = Field(description="Whether an answer is given: see `rule`.")
+    sure: bool = Field(description="Whether the world is certain enough for an answer; else the answer is not sure.")
     robust: bool = Field(description="Whether no single doubt, one deviation either way, would change the answer.")
     depends_on: tuple[Doubt, ...] = Field(default=(), description="What the answer depends on, most first.")
     facts: str = Field(default="", description="What happens, in one sentence made of the facts.")
@@ -153,6 +153,11 @@ class Trajectory(Record):
     bodies: tuple[Body, ...] = ()
     paths: tuple[Path, ...] = Field(min_length=1, description="Of the bodies that move, the mover's first.")
     contacts: tuple[Contact, ...] = Field(default=(), description="In the order of their times.")
+    light: Vector | None = Field(
+        default=None,
+        description="Metres that a shadow lies to the right of what casts it, and away from the camera, per metre of "
+        "height above the floor; null where no shadow in the air tells.",
+    )
     moving_until: float | None = Field(
         default=None, ge=0, description="Seconds from which nothing moves any more, or the mover has left the image."
     )
