@@ -1,0 +1,250 @@
+"""Runs worlds of rigid bodies on a floor with Rapier: bounces, pushes, rolling, tipping, coming to rest.
+
+Many worlds run in one engine, side by side on one floor and apart, because a step of the engine costs less than
+reading its results. Coordinates are metres right, above the floor and ahead. Inside the engine lengths are scaled so
+that bodies have the size for which its tolerances are made; gravity is scaled alike, so that times stay seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from rapier3d import (
+    ActiveEvents,
+    ChannelEventCollector,
+    CoefficientCombineRule,
+    Collider,
+    ColliderBuilder,
+    InteractionGroups,
+    PhysicsWorld,
+    RigidBody,
+    RigidBodyHandle,
+)
+
+from cow_service.physics.dynamics import GRAVITY
+from cow_service.records import Shape
+from cow_service.vision.types import Floats
+
+ENGINE_SIZE = 0.15  # m inside the engine: half the width of the first body of the first world
+SPACING = 24.0  # m inside the engine, between worlds
+COLOURS = 5  # worlds so many places apart, along and across, share a collision group
+REACH = 0.9 * COLOURS * SPACING / 2  # m inside the engine: what gets further away is taken out
+LEAST_STEPS = 60.0  # steps per second, at least
+FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.3
+GAP = 1e-3  # m inside the engine: how far above what it stands on a body starts
+
+
+@dataclass(frozen=True)
+class RigidShape:
+    """A body of one world at its start. Of a pair that touches, restitution and friction are the products."""
+
+    shape: Shape
+    half_width: float  # m: the radius of a sphere, cylinder or cone, half the side of a box
+    half_height: float  # m: of a sphere, its radius
+    position: tuple[float, float, float]  # of its centre
+    yaw: float = 0.0  # radians about the vertical
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s
+    friction: float = 0.5
+    restitution: float = 0.5
+    starts: bool = False  # it is set in motion or let go; what is not sleeps until it is touched
+    glides: bool = False  # keeps its velocity, without friction, until it meets another body
+    falls: bool = True  # gravity acts on it
+    ghost: bool = False  # passes through everything; what it meets is told all the same
+    follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Two bodies of one world begin to touch; `b` is None for the floor."""
+
+    time: float  # s
+    a: int
+    b: int | None
+    impulse: float  # m/s: the change of the velocity of `a` by it
+
+
+@dataclass
+class WorldRun:
+    """What the bodies of one world did, per recorded frame."""
+
+    positions: Floats  # [B, F, 3] m
+    velocities: Floats  # [B, F, 3] m/s
+    turns: Floats  # [B, F, 4] quaternions x, y, z, w
+    meetings: list[Meeting]
+    moved: set[int]  # bodies that did not stay where they were
+
+
+def run_worlds(
+    worlds: Sequence[Sequence[RigidShape]],
+    num_frames: int,
+    fps: float,
+    every: int = 1,
+) -> list[WorldRun]:
+    """Runs worlds for the time of a clip, recording every `every`-th frame. They have equally many bodies each.
+
+    The same input gives the same output, bit by bit, whatever else runs.
+    """
+    return _Engine(worlds, num_frames, fps, every).run()
+
+
+class _Engine:
+    """One run. Bodies are named by their world and their place in it."""
+
+    def __init__(self, worlds: Sequence[Sequence[RigidShape]], num_frames: int, fps: float, every: int) -> None:
+        self.worlds, self.fps, self.every = worlds, fps, every
+        self.frames = range(0, num_frames, every)
+        self.substeps = max(1, math.ceil(LEAST_STEPS / fps))
+        self.scale = ENGINE_SIZE / worlds[0][0].half_width
+        self.world = _empty_world(1 / (fps * self.substeps), GRAVITY * self.scale)
+        self.collector = ChannelEventCollector()
+        self.world.event_handler = self.collector
+        floor = Collider.halfspace((0.0, 1.0, 0.0)).friction(FLOOR_FRICTION).restitution(FLOOR_RESTITUTION)
+        self.world.add_collider(_combined(floor))
+        self.owner: dict[int, tuple[int, int]] = {}  # world and body by the collider's index
+        side = math.ceil(math.sqrt(len(worlds)))
+        self.origin = np.array([[(k % side) * SPACING, 0.0, (k // side) * SPACING] for k in range(len(worlds))])
+        self.origin -= np.array([1.0, 0.0, 1.0]) * (side - 1) / 2 * SPACING
+        self.groups = [1 << (k % side % COLOURS * COLOURS + k // side % COLOURS) for k in range(len(worlds))]
+        self.handles = [[self._add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
+        shape = len(worlds), len(worlds[0]), len(self.frames)
+        self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
+        self.meetings: list[list[Meeting]] = [[] for _ in worlds]
+        self.awake = [{i for i, body in enumerate(bodies) if _acts(body)} for bodies in worlds]
+        self.gone: set[tuple[int, int]] = set()
+        self.measures_impulses = len(worlds) == 1
+
+    def run(self) -> list[WorldRun]:
+        for k, bodies in enumerate(self.worlds):
+            for i in range(len(bodies)):
+                self._record(k, i, 0)
+        for row in range(1, len(self.frames)):
+            self._advance(self.frames[row - 1])
+            for moving in (self.positions, self.velocities, self.turns):
+                moving[:, :, row] = moving[:, :, row - 1]
+            for k, awake in enumerate(self.awake):
+                for i in awake:
+                    self._record(k, i, row)
+        return [
+            WorldRun(self.positions[k], self.velocities[k], self.turns[k], self.meetings[k], set(self.awake[k]))
+            for k in range(len(self.worlds))
+        ]
+
+    def _add(self, k: int, i: int, body: RigidShape) -> RigidBodyHandle:
+        """Adds a body; what neither moves nor is touched costs nothing."""
+        x, y, z = (np.array(body.position) * self.scale + self.origin[k]).tolist()
+        builder = RigidBody.kinematic_position_based() if body.follows is not None else RigidBody.dynamic()
+        lift = GAP if body.falls and not body.ghost else 0.0
+        builder = builder.translation((x, y + lift, z)).rotation((0.0, body.yaw, 0.0))
+        builder = builder.gravity_scale(1.0 if body.falls else 0.0)
+        if _acts(body):
+            velocity = tuple(v * self.scale for v in body.velocity)
+            builder = builder.linvel(velocity).ccd_enabled(not body.ghost)
+            if body.glides and body.shape == "sphere":  # it rolls
+                radius = body.half_width * self.scale
+                builder = builder.angvel((velocity[2] / radius, 0.0, -velocity[0] / radius))
+        else:
+            builder = builder.sleeping(True)
+        collider = _collider(body, self.scale).friction(0.0 if body.glides else body.friction)
+        collider = _combined(collider.restitution(body.restitution)).sensor(body.ghost or body.follows is not None)
+        collider = collider.collision_groups(InteractionGroups(self.groups[k], self.groups[k]))
+        handle = self.world.add_body(builder, colliders=[collider.active_events(ActiveEvents.COLLISION_EVENTS)])
+        self.owner[self._body(handle).colliders[0].index] = k, i
+        return handle
+
+    def _body(self, handle: RigidBodyHandle) -> RigidBody:
+        return self.world.rigid_bodies[handle]
+
+    def _advance(self, frame: int) -> None:
+        """From one recorded frame to the next."""
+        for step in range(self.every * self.substeps):
+            time = frame / self.fps + step / (self.fps * self.substeps)
+            self._lead(time + 1 / (self.fps * self.substeps))
+            before = self._velocities() if self.measures_impulses else {}
+            self.world.step()
+            for event in self.collector.drain_collision_events():
+                if event.started:
+                    self._meet(time, event.collider1.index, event.collider2.index, before)
+
+    def _lead(self, time: float) -> None:
+        """Sets where bodies that follow a path are to be at a time."""
+        for k, bodies in enumerate(self.worlds):
+            for i, body in enumerate(bodies):
+                if body.follows is not None:
+                    at = min(time * self.fps, len(body.follows) - 1.0)
+                    low = min(int(at), len(body.follows) - 2)
+                    there = body.follows[low] + (at - low) * (body.follows[low + 1] - body.follows[low])
+                    there = there * self.scale + self.origin[k]
+                    self._body(self.handles[k][i]).set_next_kinematic_translation(tuple(there.tolist()))
+
+    def _velocities(self) -> dict[tuple[int, int], Floats]:
+        return {
+            (k, i): np.array(self._body(self.handles[k][i]).linvel.to_tuple())
+            for k, awake in enumerate(self.awake)
+            for i in awake
+        }
+
+    def _meet(self, time: float, first: int, second: int, before: dict[tuple[int, int], Floats]) -> None:
+        """Notes that two colliders begin to touch. The lower body comes first, the floor last."""
+        met = sorted(self.owner[index] for index in (first, second) if index in self.owner)
+        if not met:
+            return
+        (k, a), b = met[0], met[1][1] if len(met) > 1 else None
+        impulse = 0.0
+        if (k, a) in before:
+            after = np.array(self._body(self.handles[k][a]).linvel.to_tuple())
+            impulse = float(np.linalg.norm(after - before[k, a])) / self.scale
+        self.meetings[k].append(Meeting(time, a, b, impulse))
+        if b is None:
+            return
+        for i in (a, b):
+            body = self.worlds[k][i]
+            if not (self.worlds[k][a].ghost or self.worlds[k][b].ghost) and body.follows is None:
+                self.awake[k].add(i)
+                if body.glides:
+                    collider = self._body(self.handles[k][i]).colliders[0]
+                    self.world.colliders[collider].friction = body.friction
+
+    def _record(self, k: int, i: int, row: int) -> None:
+        body = self._body(self.handles[k][i])
+        if (k, i) in self.gone:
+            drift = self.velocities[k, i, row] * (self.every / self.fps)
+            self.positions[k, i, row] += drift
+            return
+        position = np.array(body.translation.to_tuple()) - self.origin[k]
+        self.positions[k, i, row] = position / self.scale
+        self.velocities[k, i, row] = np.array(body.linvel.to_tuple()) / self.scale
+        turn = body.rotation
+        self.turns[k, i, row] = turn.i, turn.j, turn.k, turn.w
+        if max(abs(position[0]), abs(position[2])) > REACH:
+            body.is_enabled = False
+            self.gone.add((k, i))
+
+
+def _empty_world(dt: float, gravity: float) -> PhysicsWorld:
+    world = PhysicsWorld(gravity=(0.0, -gravity, 0.0))
+    world.set_num_threads(1)
+    parameters = world.integration_parameters
+    parameters.dt = dt
+    parameters.normalized_max_corrective_velocity = 1.0  # m/s: bodies that overlap part slowly
+    return world
+
+
+def _acts(body: RigidShape) -> bool:
+    return body.starts or body.follows is not None
+
+
+def _combined(collider: ColliderBuilder) -> ColliderBuilder:
+    rule = CoefficientCombineRule.MULTIPLY
+    return collider.friction_combine_rule(rule).restitution_combine_rule(rule)
+
+
+def _collider(body: RigidShape, scale: float) -> ColliderBuilder:
+    width, height = body.half_width * scale, body.half_height * scale
+    if body.shape == "sphere":
+        return Collider.ball(width)
+    if body.shape == "box":
+        return Collider.cuboid(width, height, width)
+    return Collider.cylinder(height, width) if body.shape == "cylinder" else Collider.cone(height, width)
