@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import window_of
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats, Mask
 
 ANCHORS = 8
@@ -27,14 +27,15 @@ def spread_anchors(movable: Mask, count: int = ANCHORS) -> tuple[tuple[float, fl
     return tuple((float(x), float(y)) for x, y in chosen)
 
 
-def points_inside(mask: Mask, centre: tuple[float, float], count: int = TRACKS) -> tuple[tuple[float, float], ...]:
-    """The centre and points inside a mask [H, W] away from its rim (px), spread out; at least one point."""
-    window = window_of(mask)
-    if window is None:
+def points_inside(
+    mask: CroppedMask, centre: tuple[float, float], count: int = TRACKS
+) -> tuple[tuple[float, float], ...]:
+    """The centre and points inside a mask away from its rim (px), spread out; at least one point."""
+    if not mask.area:
         return (centre,)
-    deep = cv2.distanceTransform(np.pad(mask[window], 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    deep = cv2.distanceTransform(np.pad(mask.patch, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     rows, columns = np.nonzero(deep >= 0.35 * deep.max())
-    candidates = np.stack([columns + window[1].start + 0.5, rows + window[0].start + 0.5], axis=1)
+    candidates = np.stack([columns + mask.columns.start + 0.5, rows + mask.rows.start + 0.5], axis=1)
     start = candidates[int(np.linalg.norm(candidates - np.array(centre), axis=1).argmin())]
     return tuple((float(x), float(y)) for x, y in [start, *_farthest(candidates, start, count - 1)])
 

@@ -18,6 +18,7 @@ from rapier3d import (
     CoefficientCombineRule,
     Collider,
     ColliderBuilder,
+    Group,
     InteractionGroups,
     PhysicsWorld,
     RigidBody,
@@ -42,7 +43,8 @@ class RigidShape:
     """A body of one world at its start. Of a pair that touches, restitution and friction are the products."""
 
     shape: Shape
-    half_width: float  # m: the radius of a sphere, cylinder or cone, half the side of a box
+    half_width: float  # m: the radius of a sphere, cylinder or cone, half the length of a box
+    half_depth: float  # m: half the breadth of a box, else the half width
     half_height: float  # m: of a sphere, its radius
     position: tuple[float, float, float]  # of its centre
     yaw: float = 0.0  # radians about the vertical
@@ -85,7 +87,7 @@ def run_worlds(
 ) -> list[WorldRun]:
     """Runs worlds for the time of a clip, recording every `every`-th frame. They have equally many bodies each.
 
-    The same input gives the same output, bit by bit, whatever else runs.
+    The same input gives the same output, bit by bit.
     """
     return _Engine(worlds, num_frames, fps, every).run()
 
@@ -107,7 +109,7 @@ class _Engine:
         side = math.ceil(math.sqrt(len(worlds)))
         self.origin = np.array([[(k % side) * SPACING, 0.0, (k // side) * SPACING] for k in range(len(worlds))])
         self.origin -= np.array([1.0, 0.0, 1.0]) * (side - 1) / 2 * SPACING
-        self.groups = [1 << (k % side % COLOURS * COLOURS + k // side % COLOURS) for k in range(len(worlds))]
+        self.groups = [Group(1 << (k % side % COLOURS * COLOURS + k // side % COLOURS)) for k in range(len(worlds))]
         self.handles = [[self._add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
         shape = len(worlds), len(worlds[0]), len(self.frames)
         self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
@@ -246,5 +248,5 @@ def _collider(body: RigidShape, scale: float) -> ColliderBuilder:
     if body.shape == "sphere":
         return Collider.ball(width)
     if body.shape == "box":
-        return Collider.cuboid(width, height, width)
+        return Collider.cuboid(width, height, body.half_depth * scale)
     return Collider.cylinder(height, width) if body.shape == "cylinder" else Collider.cone(height, width)

@@ -40,12 +40,7 @@ class FloorCamera:
     @cached_property
     def axes(self) -> Floats:
         """Rows: right, up and ahead over the floor [3, 3], unit vectors in the frame of the camera."""
-        sine, cosine = math.sin(self.pitch), math.cos(self.pitch)
-        level = np.array([[1.0, 0.0, 0.0], [0.0, -cosine, -sine], [0.0, -sine, cosine]])
-        s, c = math.sin(self.roll), math.cos(self.roll)
-        # A roll turns the image about the optical axis: up leans to the left where it is positive.
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        return level @ turn.T
+        return axes_of(np.array([self.pitch]), np.array([self.roll]))[0]
 
     @property
     def right(self) -> Floats:
@@ -91,3 +86,14 @@ class FloorCamera:
     def from_floor(self, coordinates: Floats) -> Floats:
         """Positions [N, 3] (m) in the frame of the camera, of coordinates [N, 3] right, above the floor and ahead."""
         return (coordinates - np.array([0.0, self.height, 0.0])) @ self.axes
+
+
+def axes_of(pitch: Floats, roll: Floats) -> Floats:
+    """Unit vectors right, up and ahead over the floor [K, 3, 3] in the frames of cameras, from radians [K] each."""
+    sine, cosine, zero = np.sin(pitch), np.cos(pitch), np.zeros(len(pitch))
+    s, c = np.sin(roll), np.cos(roll)
+    # A roll turns the image about the optical axis: up leans to the left where it is positive.
+    right = np.stack([c, -s, zero], axis=1)
+    up = np.stack([-s * cosine, -c * cosine, -sine], axis=1)
+    ahead = np.stack([-s * sine, -c * sine, cosine], axis=1)
+    return np.stack([right, up, ahead], axis=1)

@@ -1,127 +1,196 @@
-"""Stage 3: where the object is in every frame of the clip, and what it meets on the way."""
+"""Stage 3: what the mover and everything it meets do over the clip, and how sure that is."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cow_service.physics.anchors import points_inside, spread_anchors
+from cow_service.physics.anchors import spread_anchors
+from cow_service.physics.ballistic import FreePath, ballistic_path, given_path, latest, sampled
+from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import Camera
-from cow_service.physics.dynamics import roll_out
-from cow_service.physics.encounters import Sweep, find_encounters, swept_mask
-from cow_service.records import FALLING_KINDS, Grounding, Motion, Trajectory
+from cow_service.physics.events import encounters
+from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.placing import flies
+from cow_service.physics.sweeping import swept
+from cow_service.physics.world import Led, WorldInput
+from cow_service.readers.question.facts import facts_of
+from cow_service.readers.question.relations import read_asked
+from cow_service.readers.question.sentences import parse
+from cow_service.records import Asked, Grounding, Motion, Outcome, Path, Trajectory
 from cow_service.requests import SimulateRequest, TrajectoryRequest
+from cow_service.stages.bodies import seen_bodies, target_of
+from cow_service.stages.camera import camera_of
+from cow_service.stages.imagining import Imagined, imagine
+from cow_service.stages.paths import (
+    body_records,
+    camera_record,
+    contact_records,
+    moving_until,
+    pairs,
+    path_records,
+    start_of,
+    tracks,
+)
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.warnings import warnings_of
 from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
-
-Floats = NDArray[np.float64]
+from cow_service.vision.types import Floats
 
 
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
-    """The path over the whole clip, rolled out from the motion or taken from the request, and what it meets."""
-    request = run.request
+    """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
         obstacles = run.scene.obstacles(grounding.bbox, grounding.others)
-        trajectory = trajectory_of(
-            run.scene, grounding, motion, obstacles, request.trajectory, request.num_frames, request.fps
-        )
-        return StageResult(value=trajectory, warnings=warnings_of(run.scene, request, grounding, trajectory))
+        trajectory = trajectory_of(run.scene, grounding, motion, obstacles, run.request)
+        return StageResult(value=trajectory, warnings=warnings_of(run.scene, run.request, grounding, trajectory))
 
 
 def trajectory_of(
+    scene: Scene, grounding: Grounding, motion: Motion, obstacles: Sequence[Obstacle], request: SimulateRequest
+) -> Trajectory:
+    """What happens in the scene over the frames of a request's clip."""
+    bodies = seen_bodies(scene, grounding, obstacles)
+    free = _free_path(scene, grounding, motion, request)
+    world = _world(scene, bodies, motion, request, free, grounding)
+    known = bool(scene.regions or obstacles)
+    asked = read_asked(parse(request.question))
+    target = None if asked is None else target_of(asked, grounding, bodies)
+    tellable = asked is not None and known and (asked.target is None or target is not None)
+    imagined = imagine(world, asked if tellable else None, target, request.ensemble)
+    trajectory = _record(scene, grounding, motion, request, world, imagined, free, known)
+    outcome = None if asked is None else _outcome(asked, target, bodies, imagined)
+    return trajectory if outcome is None else _with_facts(trajectory, outcome, grounding)
+
+
+def _free_path(scene: Scene, grounding: Grounding, motion: Motion, request: SimulateRequest) -> FreePath | None:
+    """The path that no contact changes, where the request gives it or the law is ballistic."""
+    times = np.arange(request.num_frames) / request.fps
+    camera = Camera(scene.width, scene.height, motion.metres_per_pixel.value)
+    if request.trajectory is not None:
+        return given_path(camera, request.trajectory, times)
+    return ballistic_path(camera, grounding, motion, times) if motion.law == "ballistic" else None
+
+
+def _world(
+    scene: Scene,
+    bodies: tuple[SeenBody, ...],
+    motion: Motion,
+    request: SimulateRequest,
+    free: FreePath | None,
+    grounding: Grounding,
+) -> WorldInput:
+    led = None
+    if free is not None:
+        x, y = grounding.point
+        foot = np.array(bodies[0].foot) - np.array([x, y])
+        led = Led(free.states[:, :3], free.points + foot)
+    in_air = flies(bodies[0], motion) and bodies[0].shape == "sphere"
+    fit = camera_of(scene, motion, request.camera, bodies[0].bbox if in_air else None, fixed_focal=led is not None)
+    size = scene.width, scene.height
+    return WorldInput(bodies, motion, fit, size, request.num_frames, request.fps, led)
+
+
+def _record(
     scene: Scene,
     grounding: Grounding,
     motion: Motion,
-    obstacles: Sequence[Obstacle],
-    given: TrajectoryRequest | None,
-    num_frames: int,
-    fps: float,
+    request: SimulateRequest,
+    world: WorldInput,
+    imagined: Imagined,
+    free: FreePath | None,
+    known: bool,
 ) -> Trajectory:
-    """The path over `num_frames` frames at `fps`, rolled out from the motion or taken from the request."""
-    camera = Camera(scene.width, scene.height, motion.metres_per_pixel.value)
-    times = np.arange(num_frames) / fps
-    states = _states(camera, grounding, motion, times) if given is None else _states_along(camera, given, times)
-    points, scale = camera.project(states[:, :3])
-    visible = (
-        (points[:, 0] >= 0)
-        & (points[:, 0] < scene.width)
-        & (points[:, 1] >= 0)
-        & (points[:, 1] < scene.height)
-        & ~camera.has_passed(states[:, :3])
-    )
-    if given is not None and given.visible is not None:
-        visible &= np.array(given.visible)[_latest(given, times)]
-    mask = scene.silhouette(grounding.bbox)
-    airborne = motion.kind in FALLING_KINDS
-    sweep = Sweep(mask, grounding.bbox, np.array(grounding.point), points, scale, visible, airborne)
-    movable = swept_mask(sweep)
-    for obstacle in obstacles:
-        obstacle.mask.add_to(movable)
-    if given is not None and given.tracks is not None:
-        tracks = [_sampled(np.array(track), given.fps, times) for track in given.tracks]
+    shown, size = imagined.shown, (scene.width, scene.height)
+    camera = camera_record(world.fit, shown, imagined.around)
+    if free is None:
+        paths = path_records(world.bodies, grounding.point, shown, size, imagined.around)
     else:
-        offsets = [np.array(start) - grounding.point for start in points_inside(mask, grounding.point)]
-        tracks = [points + scale[:, None] * offset for offset in offsets]
-    anchors = spread_anchors(movable) if given is None or given.anchors is None else given.anchors
+        paths = (_free_record(world.bodies[0], grounding, request, free),)
+    given = request.trajectory
+    anchors = _anchors(world.bodies, grounding, paths) if given is None or given.anchors is None else given.anchors
     return Trajectory(
-        fps=fps,
-        states=tuple(tuple(float(v) for v in state) for state in states),  # pyright: ignore[reportArgumentType]
-        points=_pairs(points),
-        visible=tuple(bool(v) for v in visible),
-        scale=tuple(float(v) for v in scale),
-        tracks=tuple(_pairs(track) for track in tracks),
-        tracks_visible=_seen(given, times),
+        law="ballistic" if free is not None else "contact",
+        fps=request.fps,
+        camera=camera,
+        bodies=body_records(world.bodies, shown),
+        paths=paths,
+        contacts=contact_records(shown, FloorCamera.of(camera, *size)),
+        light=_light(world, shown.scene.light),
+        moving_until=moving_until(paths, request.fps),
         anchors=anchors,
-        encounters=find_encounters(sweep, obstacles),
-        encounters_known=bool(scene.regions or obstacles),
+        encounters=encounters(imagined.events, imagined.around_events, world.bodies, request.fps, request.num_frames),
+        encounters_known=known,
+        ensemble=request.ensemble,
     )
 
 
-def _states(camera: Camera, grounding: Grounding, motion: Motion, times: Floats) -> Floats:
-    """States [F, 6] of the motion from the grounded point."""
-    metres = motion.metres_per_pixel.value
-    dx, dy = motion.direction or (0.0, 0.0)
-    across = float(np.sqrt(1 - motion.depth**2))
-    velocity = motion.speed * metres * np.array([across * dx, across * dy, motion.depth])
-    acceleration = metres * np.array([*motion.gravity, 0.0])
-    return roll_out(camera.lift(grounding.point), velocity, acceleration, times)
+def _light(world: WorldInput, light: Floats) -> tuple[float, float] | None:
+    """Where a shadow in the air told it."""
+    return (float(light[0, 0]), float(light[0, 1])) if world.fit.source == "shadow" else None
 
 
-def _states_along(camera: Camera, given: TrajectoryRequest, times: Floats) -> Floats:
-    """States [F, 6] at the object's first depth along given points, linear between them, at rest after the last."""
-    stamps = np.arange(len(given.points)) / given.fps
-    path = np.array([camera.lift(point) for point in given.points])
-    position = _sampled(path, given.fps, times)
-    step = np.minimum(np.searchsorted(stamps, times, side="right"), len(stamps) - 1)
-    velocity = (path[step] - path[step - 1]) * given.fps
-    velocity[times >= stamps[-1]] = 0.0
-    return np.hstack([position, velocity])
-
-
-def _sampled(path: Floats, fps: float, times: Floats) -> Floats:
-    """A path [P, D] given at `fps`, at other times: linear between its points, at rest after the last."""
-    stamps = np.arange(len(path)) / fps
-    return np.stack([np.interp(times, stamps, path[:, axis]) for axis in range(path.shape[1])], axis=1)
+def _free_record(mover: SeenBody, grounding: Grounding, request: SimulateRequest, free: FreePath) -> Path:
+    """The mover's path as it was given, or as the ballistic law has it."""
+    given, times = request.trajectory, np.arange(request.num_frames) / request.fps
+    if given is not None and given.tracks is not None:
+        found = [sampled(np.array(track), given.fps, times) for track in given.tracks]
+    else:
+        found = tracks(mover, np.array(grounding.point), free.points, free.scale, np.zeros(len(times)))
+    return Path(
+        states=tuple(tuple(state) for state in free.states.tolist()),
+        points=pairs(free.points),
+        visible=tuple(free.visible.tolist()),
+        scale=tuple(free.scale.tolist()),
+        tracks=tuple(pairs(track) for track in found),
+        tracks_visible=_seen(given, times),
+    )
 
 
 def _seen(given: TrajectoryRequest | None, times: Floats) -> tuple[tuple[bool, ...], ...] | None:
     """Per track and frame, as given."""
     if given is None or given.tracks_visible is None:
         return None
-    frames = _latest(given, times)
+    frames = latest(given, times)
     return tuple(tuple(track[frame] for frame in frames) for track in given.tracks_visible)
 
 
-def _latest(given: TrajectoryRequest, times: Floats) -> NDArray[np.int64]:
-    """The number of the given point that was reached last at each time."""
-    # The small term keeps a frame that falls on a point from landing before it.
-    return np.minimum((times * given.fps + 1e-6).astype(np.int64), len(given.points) - 1)
+def _anchors(
+    bodies: Sequence[SeenBody], grounding: Grounding, paths: Sequence[Path]
+) -> tuple[tuple[float, float], ...]:
+    """Points off every body and off the way of all that moves."""
+    starts = [np.array(start_of(bodies, path.body, grounding.point)) for path in paths]
+    movable = swept([bodies[path.body].mask for path in paths], starts, paths)
+    for body in bodies:
+        body.mask.add_to(movable)
+    return spread_anchors(movable)
 
 
-def _pairs(points: Floats) -> tuple[tuple[float, float], ...]:
-    return tuple((float(x), float(y)) for x, y in points)
+def _outcome(asked: Asked, target: int | None, bodies: Sequence[SeenBody], imagined: Imagined) -> Outcome:
+    """What the worlds say to the question; without a probability where they cannot tell."""
+    name = None if target is None else bodies[target].name
+    decided = imagined.decided
+    if decided is None:
+        return Outcome(asked=asked, object=name, sure=False, robust=False)
+    return Outcome(
+        asked=asked,
+        object=name,
+        probability=decided.probability,
+        first=None if decided.first is None else bodies[decided.first].name,
+        count=decided.count,
+        time=decided.time,
+        time_band=decided.time_band,
+        sure=decided.sure,
+        robust=decided.robust,
+        depends_on=decided.depends_on,
+    )
+
+
+def _with_facts(trajectory: Trajectory, outcome: Outcome, grounding: Grounding) -> Trajectory:
+    """The trajectory with its outcome, and the facts of it all in a sentence."""
+    told = trajectory.model_copy(update={"outcome": outcome})
+    facts = facts_of(grounding.object, told)
+    return told.model_copy(update={"outcome": outcome.model_copy(update={"facts": facts})})

@@ -1,0 +1,69 @@
+"""Paths that no contact changes: the paper's constant velocity plus gravity, or points that a request gives.
+
+They lie in the plane of the first depth unless the motion leads out of it, as the paper has it: there is no floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cow_service.physics.camera import Camera
+from cow_service.physics.dynamics import roll_out
+from cow_service.records import Grounding, Motion
+from cow_service.requests import TrajectoryRequest
+from cow_service.vision.types import Floats, Mask
+
+
+@dataclass(frozen=True)
+class FreePath:
+    """A path per frame [F]."""
+
+    states: Floats  # [F, 6] m and m/s in the frame of the camera
+    points: Floats  # [F, 2] px
+    scale: Floats  # [F]
+    visible: Mask  # [F]
+
+
+def ballistic_path(camera: Camera, grounding: Grounding, motion: Motion, times: Floats) -> FreePath:
+    """The path of the motion from the grounded point, at times [F] (s)."""
+    metres = motion.metres_per_pixel.value
+    dx, dy = motion.direction or (0.0, 0.0)
+    across = float(np.sqrt(1 - motion.depth**2))
+    velocity = motion.speed * metres * np.array([across * dx, across * dy, motion.depth])
+    acceleration = metres * np.array([*motion.gravity, 0.0])
+    return _seen(camera, roll_out(camera.lift(grounding.point), velocity, acceleration, times))
+
+
+def given_path(camera: Camera, given: TrajectoryRequest, times: Floats) -> FreePath:
+    """Given points at the object's first depth, linear between them, at rest after the last, at times [F] (s)."""
+    stamps = np.arange(len(given.points)) / given.fps
+    path = np.array([camera.lift(point) for point in given.points])
+    position = sampled(path, given.fps, times)
+    step = np.minimum(np.searchsorted(stamps, times, side="right"), len(stamps) - 1)
+    velocity = (path[step] - path[step - 1]) * given.fps
+    velocity[times >= stamps[-1]] = 0.0
+    found = _seen(camera, np.hstack([position, velocity]))
+    if given.visible is not None:
+        found.visible[:] &= np.array(given.visible)[latest(given, times)]
+    return found
+
+
+def sampled(path: Floats, fps: float, times: Floats) -> Floats:
+    """A path [P, D] given at `fps`, at other times: linear between its points, at rest after the last."""
+    stamps = np.arange(len(path)) / fps
+    return np.stack([np.interp(times, stamps, path[:, axis]) for axis in range(path.shape[1])], axis=1)
+
+
+def latest(given: TrajectoryRequest, times: Floats) -> list[int]:
+    """The number of the given point that was reached last at each time."""
+    # The small term keeps a frame that falls on a point from landing before it.
+    reached = np.minimum((times * given.fps + 1e-6).astype(np.int64), len(given.points) - 1)
+    return [int(point) for point in reached]
+
+
+def _seen(camera: Camera, states: Floats) -> FreePath:
+    points, scale = camera.project(states[:, :3])
+    inside = np.all((points >= 0) & (points < [camera.width, camera.height]), axis=1)
+    return FreePath(states, points, scale, inside & ~camera.has_passed(states[:, :3]))

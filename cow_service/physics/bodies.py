@@ -1,0 +1,91 @@
+"""What is known of the bodies of a scene before they are placed: boxes, shapes, and what stands on what."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cow_service.records import BBox, LocatedObject, ObjectPrior, Shape
+from cow_service.vision.masks import CroppedMask
+
+ON_TOP = 0.72  # of a support's height in the image, from its upper edge: a foot below that stands before it
+SHOWN = 0.1  # of a body's width: so much of its support's top is seen beside it, above its foot
+BESIDE = 3.0  # px beside a body's box where the support's upper edge is looked for
+WIDER = 1.15  # a support is so much wider than what stands on it
+
+
+@dataclass(frozen=True)
+class SeenBody:
+    """An object of the image."""
+
+    name: str
+    bbox: BBox
+    mask: CroppedMask
+    shape: Shape
+    source: str = "embedded"
+    confidence: float = 1.0
+    prior: ObjectPrior | None = None
+    elongated: bool = False  # a vehicle: longer along its heading than across
+
+    @property
+    def foot(self) -> tuple[float, float]:
+        """Where it stands, px: the middle of its box's lower edge."""
+        return (self.bbox[0] + self.bbox[2]) / 2, self.bbox[3]
+
+    @property
+    def is_flying(self) -> bool:
+        """Said to be in the air."""
+        return self.prior is not None and self.prior.stands_on == "air"
+
+
+def supports_of(bodies: Sequence[SeenBody]) -> list[int | None]:
+    """For each body the one that it stands on, by what is said of it or by where its foot is; None: the floor."""
+    return [_support(body, bodies) for body in bodies]
+
+
+def _support(body: SeenBody, bodies: Sequence[SeenBody]) -> int | None:
+    said = None if body.prior is None else body.prior.stands_on
+    if said in ("floor", "air"):
+        return None
+    if said is not None:
+        named = [i for i, other in enumerate(bodies) if other is not body and other.name == said]
+        if named:
+            return named[0]
+    under = [i for i, other in enumerate(bodies) if other is not body and _carries(other, body)]
+    return min(under, key=lambda i: bodies[i].bbox[3]) if under else None
+
+
+def _carries(support: SeenBody, body: SeenBody) -> bool:
+    """Whether the foot of a body lies on the top of a thing that is wider and lower than it.
+
+    What stands behind a thing ends at its upper edge; what stands on it has some of its top to either side.
+    """
+    x, y = body.foot
+    x0, y0, x1, y1 = support.bbox
+    width, height = x1 - x0, y1 - y0
+    possible = (
+        support.shape in ("box", "cylinder")
+        and width > WIDER * (body.bbox[2] - body.bbox[0])
+        and x0 < x < x1
+        and y0 < y < y0 + ON_TOP * height
+        and body.bbox[1] < y0
+    )
+    if not possible:
+        return False
+    tops = [_upper_edge(support.mask, column) for column in (body.bbox[0] - BESIDE, body.bbox[2] + BESIDE)]
+    return min(y - top for top in tops) > SHOWN * (body.bbox[2] - body.bbox[0])
+
+
+def _upper_edge(mask: CroppedMask, column: float) -> float:
+    """The upper row (px) of a mask in a column; infinite outside it."""
+    at = int(column) - mask.columns.start
+    rows = np.nonzero(mask.patch[:, at])[0] if 0 <= at < mask.patch.shape[1] else np.zeros(0)
+    return float(rows[0] + mask.rows.start) if len(rows) else math.inf
+
+
+def seen_body(located: LocatedObject, mask: CroppedMask, shape: Shape, confidence: float) -> SeenBody:
+    """A body of an object that a reader or a request located."""
+    return SeenBody(located.object, located.bbox, mask, shape, located.source or "embedded", confidence, located.prior)

@@ -1,0 +1,47 @@
+"""Standard normal draws for an ensemble of worlds: evenly spread, the same every time."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+
+import numpy as np
+
+from cow_service.records import Doubt
+from cow_service.vision.types import Floats
+
+PARAMETERS: dict[str, Doubt] = {
+    "pitch": "camera",
+    "focal": "camera",
+    "roll": "camera",
+    "height": "place",
+    "slant_right": "place",
+    "slant_ahead": "place",
+    "foot": "place",
+    "speed": "speed",
+    "depth": "heading",
+    "turn": "heading",
+    "size": "size",
+    "yaw": "size",
+    "friction": "friction",
+    "restitution": "friction",
+}  # what is uncertain in a world, and the kind of doubt that it belongs to
+NAMES = tuple(PARAMETERS)
+COLUMN = {name: place for place, name in enumerate(NAMES)}
+
+
+def likeliest() -> Floats:
+    """The one row [1, P] of the world in which nothing deviates."""
+    return np.zeros((1, len(NAMES)))
+
+
+def one_at_a_time() -> Floats:
+    """Rows [2 P, P] of the worlds in which one parameter deviates by one standard deviation, either way."""
+    steps = np.eye(len(NAMES))
+    return np.concatenate([steps, -steps])
+
+
+def ensemble(count: int) -> Floats:
+    """Rows [count, P] by Latin hypercube sampling: of each parameter every quantile occurs once."""
+    quantiles = np.array([NormalDist().inv_cdf((i + 0.5) / count) for i in range(count)])
+    rng = np.random.default_rng(0)  # the same request must give the same worlds
+    return np.stack([rng.permutation(quantiles) for _ in NAMES], axis=1)

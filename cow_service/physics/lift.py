@@ -1,0 +1,174 @@
+"""From boxes in the image to bodies on a floor, for many draws of what is uncertain at once.
+
+Coordinates are metres right, above the floor and ahead, the camera above their origin. Arrays have a row per draw [K].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cow_service.physics.camera_fit import CameraFit
+from cow_service.physics.draws import COLUMN
+from cow_service.physics.floor_camera import HORIZON, axes_of
+from cow_service.records import BBox, Shape
+from cow_service.vision.types import Floats
+
+SIZE_SIGMA = 0.08  # of a body's width: boxes are inexact, and a thing is not as deep as wide
+FOOT_SIGMA = 0.02  # of a body's height in the image: where it meets the floor
+SLIMMEST, TALLEST = 0.2, 12.0  # half heights, in half widths
+NEAREST, FARTHEST = 0.05, 40.0  # depths, in those of the first body: what seems to lie elsewhere is put there
+BOX_SIDE = 0.82  # of the seen width of a box whose yaw is not known: its side
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Cameras [K] of one image, as the draws have them."""
+
+    width: int  # px, of the image
+    height_px: int
+    focal: Floats  # [K] px
+    axes: Floats  # [K, 3, 3]: rows right, up and ahead over the floor
+    height: Floats  # [K] m above the floor
+
+    @staticmethod
+    def drawn(fit: CameraFit, size: tuple[int, int], draws: Floats) -> tuple[Cameras, Floats]:
+        """Cameras 1 m above the floor, and the five fitted parameters [K, 5], for draws [K, P]."""
+        names = ("pitch", "focal", "height", "slant_right", "slant_ahead")
+        normal = draws[:, [COLUMN[name] for name in names]]
+        parameters = fit.mean + normal @ np.linalg.cholesky(fit.covariance).T
+        roll = fit.roll + fit.roll_sigma * draws[:, COLUMN["roll"]]
+        pitch = np.clip(parameters[:, 0], -1.4, 1.4)
+        focal = np.exp(np.clip(parameters[:, 1], -2, 3)) * size[0]
+        return Cameras(*size, focal, axes_of(pitch, roll), np.ones(len(draws))), parameters
+
+    def at_height(self, height: Floats) -> Cameras:
+        """The same cameras at other heights [K] (m)."""
+        return Cameras(self.width, self.height_px, self.focal, self.axes, height)
+
+    def part(self, rows: slice) -> Cameras:
+        """The cameras of some draws."""
+        return Cameras(self.width, self.height_px, self.focal[rows], self.axes[rows], self.height[rows])
+
+    def repeated(self, count: int, draw: int = 0) -> Cameras:
+        """The camera of one draw so many times."""
+        one = slice(draw, draw + 1)
+        focal, axes, height = (np.repeat(values[one], count, axis=0) for values in (self.focal, self.axes, self.height))
+        return Cameras(self.width, self.height_px, focal, axes, height)
+
+    def rays(self, point: tuple[float, float] | Floats) -> Floats:
+        """Rays [K, 3] through an image point (px), or through one each [K, 2]: right, up and ahead, of depth 1."""
+        across = (np.asarray(point, np.float64) - np.array([self.width / 2, self.height_px / 2])) / self.focal[:, None]
+        rays = np.concatenate([across, np.ones((len(self.focal), 1))], axis=1)
+        return np.einsum("kij,kj->ki", self.axes, rays)
+
+    def project(self, coordinates: Floats) -> tuple[Floats, Floats]:
+        """Image points [K, ..., 2] (px) and depths [K, ...] (m) of coordinates [K, ..., 3]."""
+        steps = (slice(None),) + (None,) * (coordinates.ndim - 2)
+        from_camera = coordinates - np.array([0.0, 1.0, 0.0]) * self.height[(*steps, None)]
+        position = np.einsum("k...i,kij->k...j", from_camera, self.axes)
+        z = np.maximum(position[..., 2], 1e-3 * self.height[steps])
+        points = position[..., :2] * (self.focal[steps] / z)[..., None]
+        return points + np.array([self.width / 2, self.height_px / 2]), position[..., 2]
+
+    def depth(self, coordinates: Floats) -> Floats:
+        """Depths [K] (m) of coordinates [K, 3]."""
+        return self.project(coordinates)[1]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A body where the draws have it."""
+
+    shape: Shape
+    centre: Floats  # [K, 3]
+    half_width: Floats  # [K]
+    half_height: Floats  # [K]
+    stands: bool  # on the floor or on another body; else it is in the air
+    depth_share: float = 1.0  # how deep it is along the line of sight, of its width
+
+    def part(self, rows: slice) -> Placed:
+        """As some draws have it."""
+        centre, *halves = (values[rows] for values in (self.centre, self.half_width, self.half_height))
+        return replace(self, centre=centre, half_width=halves[0], half_height=halves[1])
+
+    def repeated(self, count: int) -> Placed:
+        """As the first draw has it, so many times."""
+        centre, *halves = (np.repeat(v[:1], count, axis=0) for v in (self.centre, self.half_width, self.half_height))
+        return replace(self, centre=centre, half_width=halves[0], half_height=halves[1])
+
+    @property
+    def top(self) -> Floats:
+        """Height [K] of its upper end above the floor."""
+        return self.centre[:, 1] + self.half_height
+
+
+def above(
+    cameras: Cameras, bbox: BBox, shape: Shape, draws: Floats, plane: Floats, depth_share: float = 1.0
+) -> Placed | None:
+    """A body that stands on a horizontal plane at a height [K] (m); None where its foot lies at or above the horizon.
+
+    The foot is the middle of the box's lower edge; the body's middle lies half its depth further away. A sphere's depth
+    follows from its radius and its middle.
+    """
+    height = cameras.height - plane
+    stretch = np.exp(SIZE_SIGMA * draws[:, COLUMN["size"]])
+    x0, y0, x1, y1 = bbox
+    if shape == "sphere":
+        rays, radius = cameras.rays(((x0 + x1) / 2, (y0 + y1) / 2)), (x1 - x0 + y1 - y0) / 4
+        sink = radius / cameras.focal - rays[:, 1]
+        if not _all_meet(sink, height):
+            return None
+        z = height / _safe(sink)
+        half = z * radius / cameras.focal
+        return Placed(shape, rays * z[:, None] + _raised(cameras.height), half, half, True)
+    foot = y1 + FOOT_SIGMA * (y1 - y0) * draws[:, COLUMN["foot"]]
+    rays = cameras.rays(np.stack([np.full(len(foot), (x0 + x1) / 2), foot], axis=1))
+    if not _all_meet(-rays[:, 1], height):
+        return None
+    near = rays[:, [0, 2]] * (height / _safe(-rays[:, 1]))[:, None]
+    distance = np.linalg.norm(near, axis=1)
+    way = near / distance[:, None]
+    half = np.zeros(len(foot))
+    for _ in range(4):
+        middle = near + way * (half * depth_share)[:, None]
+        centre = np.stack([middle[:, 0], plane, middle[:, 1]], axis=1)
+        half = (x1 - x0) * np.maximum(cameras.depth(centre), 1e-3 * height) / (2 * cameras.focal)
+    deep = half * depth_share
+    tall = _half_height(cameras, bbox, shape, distance + deep, deep, plane)
+    centre[:, 1] = plane + tall
+    return Placed(shape, centre, half * stretch, tall, True, depth_share)
+
+
+def in_the_air(cameras: Cameras, bbox: BBox, shape: Shape, depth: Floats) -> Placed:
+    """A body at depths [K] (m), as wide and high as its box."""
+    x0, y0, x1, y1 = bbox
+    rays = cameras.rays(((x0 + x1) / 2, (y0 + y1) / 2))
+    half, tall = ((x1 - x0) * depth / cameras.focal / 2, (y1 - y0) * depth / cameras.focal / 2)
+    if shape == "sphere":
+        half = tall = (half + tall) / 2
+    return Placed(shape, rays * depth[:, None] + _raised(cameras.height), half, tall, False)
+
+
+def _half_height(cameras: Cameras, bbox: BBox, shape: Shape, distance: Floats, half: Floats, plane: Floats) -> Floats:
+    """Half heights [K] by the upper edge of the box: the far rim of a top seen from above, else the near one."""
+    rays = cameras.rays(((bbox[0] + bbox[2]) / 2, bbox[1]))
+    slope = rays[:, 1] / np.maximum(np.linalg.norm(rays[:, [0, 2]], axis=1), 1e-6)
+    rim = np.zeros(len(half)) if shape == "cone" else np.where(slope < 0, half, -half)
+    top = cameras.height + slope * np.maximum(distance + rim, 1e-3)
+    return np.clip((top - plane) / 2, SLIMMEST * half, TALLEST * half)
+
+
+def _all_meet(sink: Floats, height: Floats) -> bool:
+    """Whether the likeliest ray falls on the plane at a sane distance."""
+    return bool(sink[0] > HORIZON and height[0] > 0)
+
+
+def _safe(sink: Floats) -> Floats:
+    return np.maximum(sink, HORIZON)
+
+
+def _raised(height: Floats) -> Floats:
+    """[K, 3]: what takes positions seen from the camera to coordinates above the floor."""
+    return np.stack([np.zeros(len(height)), height, np.zeros(len(height))], axis=1)

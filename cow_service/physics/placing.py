@@ -1,0 +1,256 @@
+"""Places all bodies of a scene on its floor, or in the air, and sets the mover going, for many draws at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+
+import numpy as np
+
+from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.physics.camera_fit import CameraFit
+from cow_service.physics.draws import COLUMN
+from cow_service.physics.lift import FARTHEST, NEAREST, Cameras, Placed, above, in_the_air
+from cow_service.records import FALLING_KINDS, Cue, Motion
+from cow_service.vision.types import Floats
+
+# Degrees, one standard deviation of a direction in the image, by where it was read.
+TURN_SIGMA: dict[Cue, float] = {
+    "arrow": 1.5, "trail": 3.0, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
+}  # fmt: skip
+DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
+RISE, RISE_SIGMA = math.radians(22), math.radians(12)  # above the horizontal: how things are thrown
+TURNS = np.linspace(-5, 5, 81)  # in deviations: turns out of the plane of the image that are weighed
+TURN_WIDTHS = ((0.6, 0.55), (3.0, 0.45))  # deviations and shares: most throws go nearly along the image, some do not
+LOW = 0.08  # sine of the angle between a ray and a horizontal plane below which the plane through the foot is taken
+APART = 0.98  # of the distance of two bodies: together they are so wide at most
+VEHICLE_WIDTH = 0.5  # of a vehicle's length
+LEAST_SHRUNK = 0.5  # of its width: bodies that overlap more are left to the engine
+
+
+@dataclass(frozen=True)
+class PlacedScene:
+    """The bodies of a scene, the mover first, for draws [K]."""
+
+    cameras: Cameras
+    bodies: tuple[Placed, ...]
+    supports: tuple[int | None, ...]  # index of the body that each stands on; None: the floor, or nothing
+    velocity: Floats  # [K, 3] m/s, of the mover
+    light: Floats  # [K, 2]: metres that a shadow lies to the right and ahead, per metre of height
+
+    def part(self, rows: slice) -> PlacedScene:
+        """The scene of some draws."""
+        bodies = tuple(body.part(rows) for body in self.bodies)
+        return PlacedScene(self.cameras.part(rows), bodies, self.supports, self.velocity[rows], self.light[rows])
+
+
+def place(
+    bodies: Sequence[SeenBody], motion: Motion, fit: CameraFit, size: tuple[int, int], draws: Floats
+) -> PlacedScene:
+    """Places bodies seen in an image of a size (width, height), px."""
+    cameras, parameters = Cameras.drawn(fit, size, draws)
+    supports = supports_of(bodies)
+    mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
+    if not flies(mover, motion):
+        share = _depth_share(bodies, supports, motion, cameras, draws)
+        unit = _stand(bodies, supports, 0, cameras, draws, share)
+        if unit is not None:
+            cameras = cameras.at_height(depth / np.maximum(cameras.depth(unit.centre), 1e-6))
+            return _with_others(bodies, supports, motion, cameras, parameters, draws, None, share)
+    ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
+    height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
+    cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
+    placed = in_the_air(cameras, mover.bbox, mover.shape, depth)
+    return _with_others(bodies, supports, motion, cameras, parameters, draws, placed)
+
+
+def flies(mover: SeenBody, motion: Motion) -> bool:
+    """Whether the mover is in the air at the first frame, as far as is said."""
+    if mover.prior is not None and mover.prior.stands_on is not None:
+        return mover.prior.stands_on == "air"
+    return motion.kind in FALLING_KINDS or rises(motion)
+
+
+def rises(motion: Motion) -> bool:
+    """Whether words, not a drawn cue, say that something moves up: not along the floor, then."""
+    return (
+        motion.kind == "linear"
+        and motion.cue == "text"
+        and motion.depth == 0
+        and motion.direction is not None
+        and motion.direction[1] < -0.5
+    )
+
+
+def _with_others(
+    bodies: Sequence[SeenBody],
+    supports: list[int | None],
+    motion: Motion,
+    cameras: Cameras,
+    parameters: Floats,
+    draws: Floats,
+    flying: Placed | None,
+    depth_share: float = 1.0,
+) -> PlacedScene:
+    """The other bodies beside a mover that stands, or flies as given; and its velocity."""
+    depth = cameras.focal * motion.metres_per_pixel.value
+    placed: list[Placed] = []
+    for i, body in enumerate(bodies):
+        if i == 0 and flying is not None:
+            placed.append(flying)
+            continue
+        share = depth_share if i == 0 else 1.0
+        standing = None if body.is_flying else _stand(bodies, supports, i, cameras, draws, share)
+        if standing is None or not NEAREST < cameras.depth(standing.centre)[0] / depth[0] < FARTHEST:
+            guess = depth if i == 0 else depth * np.exp(DEPTH_SIGMA * draws[:, COLUMN["foot"]])
+            standing = in_the_air(cameras, body.bbox, body.shape, guess)
+        placed.append(standing)
+    velocity = _velocity(placed[0], motion, cameras, draws)
+    placed = _apart(placed)
+    resting = tuple(on if body.stands else None for on, body in zip(supports, placed, strict=True))
+    return PlacedScene(cameras, tuple(placed), resting, velocity, parameters[:, 3:5])
+
+
+def _stand(
+    bodies: Sequence[SeenBody],
+    supports: list[int | None],
+    index: int,
+    cameras: Cameras,
+    draws: Floats,
+    depth_share: float = 1.0,
+) -> Placed | None:
+    """A body on the floor, or on the body that carries it, which stands on the floor."""
+    body, on = bodies[index], supports[index]
+    plane = np.zeros(len(draws))
+    if on is not None:
+        support = above(cameras, bodies[on].bbox, bodies[on].shape, draws, plane)
+        if support is not None:
+            plane = np.minimum(support.top, 0.95 * cameras.height)
+    return above(cameras, body.bbox, body.shape, draws, plane, depth_share)
+
+
+def _depth_share(
+    bodies: Sequence[SeenBody], supports: list[int | None], motion: Motion, cameras: Cameras, draws: Floats
+) -> float:
+    """How deep the mover is along the line of sight, of its width: a vehicle is longer along its heading."""
+    first = cameras.repeated(1)
+    unit = _stand(bodies, supports, 0, first, draws[:1]) if bodies[0].elongated else None
+    if unit is None or motion.direction is None or motion.kind != "linear":
+        return 1.0
+    way = _along_floor(unit, motion, first, np.array([motion.direction]))[0]
+    sight = unit.centre[0, [0, 2]] / np.linalg.norm(unit.centre[0, [0, 2]])
+    along = abs(float(way[[0, 2]] @ sight))
+    across = math.sqrt(max(0.0, 1 - along**2))
+    return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
+
+
+def _velocity(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats) -> Floats:
+    """[K, 3] m/s right, up and ahead."""
+    if motion.direction is None or motion.speed == 0:
+        return np.zeros((len(draws), 3))
+    speed = motion.speed * motion.metres_per_pixel.value * np.exp(motion.speed_deviation * draws[:, COLUMN["speed"]])
+    turn = np.radians(TURN_SIGMA[motion.cue]) * draws[:, COLUMN["turn"]]
+    cosine, sine = np.cos(turn), np.sin(turn)
+    dx, dy = motion.direction
+    direction = np.stack([cosine * dx - sine * dy, sine * dx + cosine * dy], axis=1)
+    if motion.kind == "projectile":
+        way = _thrown(mover, motion, cameras, draws, direction)
+    elif mover.stands:
+        way = _along_floor(mover, motion, cameras, direction)
+    else:
+        way = np.einsum("kij,kj->ki", cameras.axes, _with_depth(direction, motion.depth))
+    return way * speed[:, None]
+
+
+def _with_depth(direction: Floats, depth: float) -> Floats:
+    """Unit vectors [K, 3] in the frame of the camera, of directions [K, 2] in the image and the sine of the depth."""
+    return np.concatenate([direction * math.sqrt(1 - depth**2), np.full((len(direction), 1), depth)], axis=1)
+
+
+def _along_floor(mover: Placed, motion: Motion, cameras: Cameras, direction: Floats) -> Floats:
+    """Unit vectors [K, 3] over the floor whose image at the mover has the directions [K, 2]."""
+    if motion.depth:
+        way = np.einsum("kij,kj->ki", cameras.axes, _with_depth(direction, motion.depth))
+    else:
+        points, depth = cameras.project(mover.centre)
+        step = cameras.focal / depth * mover.half_width * 0.05
+        ends = [cameras.rays(points + side * step[:, None] * direction) for side in (-1.0, 1.0)]
+        sink = -ends[0][:, 1] / np.linalg.norm(ends[0], axis=1)
+        below = np.where(sink < LOW, mover.half_height, 0.0)
+        drop = cameras.height - mover.centre[:, 1] + below
+        hit = [ray * (drop / np.maximum(-ray[:, 1], 1e-3))[:, None] for ray in ends]
+        way = hit[1] - hit[0]
+    way[:, 1] = 0.0
+    return way / np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
+
+
+def _thrown(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, direction: Floats) -> Floats:
+    """Unit vectors [K, 3] seen in directions [K, 2]: in a vertical plane, turned from that of the image by the depth.
+
+    A drawn direction leaves the depth open. Small turns are likelier, as are throws that rise at the angle at which
+    things are thrown: both together give the turn and its deviation.
+    """
+    mean, sigma = math.asin(motion.depth), math.radians(motion.depth_deviation)
+    turn = np.full(len(draws), mean)
+    if sigma > 0:
+        turns, count = mean + sigma * TURNS, len(TURNS)
+        one, facing = mover.repeated(count), np.repeat(direction[:1], count, axis=0)
+        rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
+        weight = sum(share / width * np.exp(-0.5 * (TURNS / width) ** 2) for width, share in TURN_WIDTHS)
+        weight = weight * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
+        below = (np.cumsum(weight) - weight / 2) / weight.sum()
+        shares = np.array([NormalDist().cdf(z) for z in draws[:, COLUMN["depth"]]])
+        turn = np.interp(shares, below, turns)
+    return _in_plane(mover, cameras, direction, np.clip(turn, -1.5, 1.5))
+
+
+def _in_plane(mover: Placed, cameras: Cameras, direction: Floats, turn: Floats) -> Floats:
+    """Unit vectors [K, 3], seen in directions [K, 2], in vertical planes turned from that of the image (radians)."""
+    sense = np.where(direction[:, 0] < 0, -1.0, 1.0)
+    level = np.stack([sense * np.cos(turn), np.zeros(len(turn)), np.sin(turn)], axis=1)
+    up = np.tile(np.array([0.0, 1.0, 0.0]), (len(turn), 1))
+    seen = np.stack([_image_velocity(mover, cameras, way) for way in (level, up)], axis=2)
+    shares = np.linalg.solve(seen + 1e-9 * np.eye(2), direction[:, :, None])[:, :, 0]
+    way = shares[:, :1] * level + shares[:, 1:] * up
+    return way / np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
+
+
+def _image_velocity(mover: Placed, cameras: Cameras, way: Floats) -> Floats:
+    """Image velocities [K, 2], to a common factor, of the mover with velocities [K, 3]."""
+    step = 1e-4 * mover.half_width[:, None]
+    ends = [cameras.project(mover.centre + side * step * way)[0] for side in (-1.0, 1.0)]
+    return (ends[1] - ends[0]) / (2 * step) * (cameras.depth(mover.centre) / cameras.focal)[:, None]
+
+
+def _apart(placed: list[Placed]) -> list[Placed]:
+    """Makes bodies slimmer that would overlap: boxes are wider than the things in them."""
+    bodies = list(placed)
+    for i, a in enumerate(placed):
+        for j in range(i + 1, len(placed)):
+            b = placed[j]
+            between = a.centre[:, [0, 2]] - b.centre[:, [0, 2]]
+            gap = np.linalg.norm(between, axis=1)
+            level = np.abs(a.centre[:, 1] - b.centre[:, 1]) < APART * (a.half_height + b.half_height)
+            share = np.where(level, APART * gap / np.maximum(_reach(a, between) + _reach(b, between), 1e-9), 1.0)
+            if (share < 1).any():
+                share = np.clip(share, LEAST_SHRUNK, 1.0)
+                bodies[i], bodies[j] = _slimmer(bodies[i], a, share), _slimmer(bodies[j], b, share)
+    return bodies
+
+
+def _reach(body: Placed, way: Floats) -> Floats:
+    """Half the extent [K] of a body over the floor in the directions [K, 2]."""
+    sight = body.centre[:, [0, 2]] / np.maximum(np.linalg.norm(body.centre[:, [0, 2]], axis=1), 1e-9)[:, None]
+    along = np.einsum("ki,ki->k", way, sight) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)
+    return body.half_width * np.sqrt(1 + (body.depth_share**2 - 1) * along**2)
+
+
+def _slimmer(body: Placed, first: Placed, share: Floats) -> Placed:
+    """A body of at most a share of its first width; a sphere that stands keeps its foot."""
+    half = np.minimum(body.half_width, share * first.half_width)
+    if first.shape != "sphere":
+        return replace(body, half_width=half)
+    centre = first.centre - np.array([0.0, 1.0, 0.0]) * (first.half_width - half)[:, None] * first.stands
+    return replace(body, centre=centre, half_width=half, half_height=half)

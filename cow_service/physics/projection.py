@@ -1,0 +1,76 @@
+"""From worlds that were run back to the image: points, apparent size, turns, and how far they spread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cow_service.physics.world import Worlds
+from cow_service.vision.types import Floats, Mask
+
+PASSED = 0.08  # of its first depth: closer than this, a body has passed the camera
+
+
+@dataclass(frozen=True)
+class SeenPaths:
+    """What one body does in the image, for draws [K] and recorded frames [F]."""
+
+    points: Floats  # [K, F, 2] px
+    depth: Floats  # [K, F] m
+    scale: Floats  # [K, F]: apparent size, 1 at the first frame
+    passed: Mask  # [K, F]: it is at or behind the camera
+
+
+def seen_paths(worlds: Worlds, body: int) -> SeenPaths:
+    """A body's path in the image of every draw."""
+    positions = np.stack([run.positions[body] for run in worlds.runs])
+    points, depth = worlds.scene.cameras.project(positions)
+    first = np.maximum(depth[:, :1], 1e-9)
+    return SeenPaths(points, depth, first / np.maximum(depth, PASSED * first), depth <= PASSED * first)
+
+
+def states(worlds: Worlds, body: int) -> Floats:
+    """[F, 6] metres and m/s in the frame of the camera, of the first draw."""
+    cameras, run = worlds.scene.cameras, worlds.runs[0]
+    position = run.positions[body] - np.array([0.0, cameras.height[0], 0.0])
+    return np.hstack([position @ cameras.axes[0], run.velocities[body] @ cameras.axes[0]])
+
+
+def rotation(worlds: Worlds, body: int) -> Floats:
+    """Degrees [F] that a body of the first draw has turned in the image, clockwise, since the first frame.
+
+    A sphere turns by its spin about the line of sight. Of anything else the upright axis is followed: what turns about
+    it looks the same.
+    """
+    run, cameras = worlds.runs[0], worlds.scene.cameras
+    turns = run.turns[body]
+    if worlds.shapes[0][body].shape == "sphere":
+        sight = run.positions[body] - np.array([0.0, cameras.height[0], 0.0])
+        sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
+        # Right, up and ahead are a left-handed frame: there a positive turn about the line of sight is anticlockwise.
+        about = -np.einsum("fi,fi->f", _steps(turns), sight[1:])
+        return np.concatenate([[0.0], np.degrees(np.cumsum(about))])
+    upper = _turned(turns, np.array([0.0, 1.0, 0.0])) * worlds.shapes[0][body].half_height
+    ends = np.stack([run.positions[body] + upper, run.positions[body] - upper])
+    points, _ = cameras.project(ends[None])
+    way = points[0, 0] - points[0, 1]
+    angle = np.unwrap(np.arctan2(way[:, 0], -way[:, 1]))
+    return np.degrees(angle - angle[0])
+
+
+def _steps(turns: Floats) -> Floats:
+    """Rotation vectors [F - 1, 3] that lead from each quaternion of [F, 4] (x, y, z, w) to the next."""
+    before, after = turns[:-1], turns[1:]
+    axis = before[:, 3:] * after[:, :3] - after[:, 3:] * before[:, :3] + np.cross(before[:, :3], after[:, :3])
+    half = np.einsum("fi,fi->f", before, after)
+    axis = axis * np.where(half < 0, -1.0, 1.0)[:, None]
+    length = np.linalg.norm(axis, axis=1)
+    return axis * (2 * np.arctan2(length, np.abs(half)) / np.maximum(length, 1e-12))[:, None]
+
+
+def _turned(turns: Floats, vector: Floats) -> Floats:
+    """A vector [3] turned by quaternions [F, 4]."""
+    axis, w = turns[:, :3], turns[:, 3:]
+    across = np.cross(axis, vector)
+    return vector + 2 * (w * across + np.cross(axis, across))

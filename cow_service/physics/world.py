@@ -1,0 +1,137 @@
+"""A world: bodies placed on a floor, set going, and run under one of the two laws, for many draws at once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from cow_service.physics.bodies import SeenBody
+from cow_service.physics.camera_fit import CameraFit
+from cow_service.physics.draws import COLUMN
+from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
+from cow_service.physics.lift import BOX_SIDE, FARTHEST
+from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place
+from cow_service.records import FALLING_KINDS, Motion
+from cow_service.vision.types import Floats
+
+FRICTION, FRICTION_SIGMA = 0.5, 0.4  # of a body; one standard deviation of the logarithm
+RESTITUTION, RESTITUTION_SIGMA = 0.5, 0.15
+YAW_SIGMA = 0.4  # radians: how a box is turned about the vertical
+LEAST_HALF, MOST_HALF = 0.02, 60.0  # half widths and heights of bodies, in those of the mover
+
+
+@dataclass(frozen=True)
+class Led:
+    """A path that is given, per frame of the clip: of what stands by its foot in the image, else by its positions."""
+
+    positions: Floats  # [F, 3] m in the frame of the camera
+    feet: Floats  # [F, 2] px
+
+
+@dataclass(frozen=True)
+class WorldInput:
+    """What a world is made of. `bodies[0]` moves."""
+
+    bodies: tuple[SeenBody, ...]
+    motion: Motion
+    fit: CameraFit
+    size: tuple[int, int]  # px, of the image: width and height
+    num_frames: int
+    fps: float
+    led: Led | None = None  # the mover is led along a path, through everything
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """Worlds that were run: where bodies were placed, and what they did."""
+
+    scene: PlacedScene
+    shapes: tuple[tuple[RigidShape, ...], ...]  # per draw
+    runs: tuple[WorldRun, ...]  # per draw
+    every: int  # frames between recorded ones
+    fps: float  # of the clip
+
+    def part(self, rows: slice) -> Worlds:
+        """The worlds of some draws."""
+        return Worlds(self.scene.part(rows), self.shapes[rows], self.runs[rows], self.every, self.fps)
+
+
+def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
+    """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""
+    scene = place(given.bodies, given.motion, given.fit, given.size, draws)
+    shapes = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
+    return Worlds(scene, shapes, tuple(run_worlds(shapes, given.num_frames, given.fps, every)), every, given.fps)
+
+
+def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) -> tuple[RigidShape, ...]:
+    row = draws[k]
+    friction = FRICTION * math.exp(FRICTION_SIGMA * row[COLUMN["friction"]])
+    restitution = min(1.0, max(0.0, RESTITUTION + RESTITUTION_SIGMA * row[COLUMN["restitution"]]))
+    yaw = YAW_SIGMA * float(row[COLUMN["yaw"]])
+    unit = float(scene.bodies[0].half_width[k])
+    low, high = LEAST_HALF * unit, MOST_HALF * unit
+    bodies: list[RigidShape] = []
+    for seen, placed in zip(given.bodies, scene.bodies, strict=True):
+        half = float(np.clip(placed.half_width[k], low, high))
+        side = half if placed.shape != "box" else BOX_SIDE * half
+        position = placed.centre[k].tolist()
+        bodies.append(
+            RigidShape(
+                shape=placed.shape,
+                half_width=side,
+                half_depth=side,
+                half_height=half if placed.shape == "sphere" else float(np.clip(placed.half_height[k], low, high)),
+                position=(position[0], position[1], position[2]),
+                yaw=yaw if placed.shape == "box" and not seen.elongated else 0.0,
+                friction=friction,
+                restitution=restitution,
+                falls=placed.stands,
+            )
+        )
+    bodies[0] = _set_going(given, scene, k, bodies[0])
+    return tuple(bodies)
+
+
+def _set_going(given: WorldInput, scene: PlacedScene, k: int, body: RigidShape) -> RigidShape:
+    """The mover: thrown, let go, moving by itself, or led along a path."""
+    motion, mover = given.motion, given.bodies[0]
+    velocity = scene.velocity[k]
+    changes: dict[str, Any] = {"velocity": tuple(velocity.tolist()), "starts": motion.kind != "static"}
+    if given.led is not None:
+        changes |= {"follows": _led_along(given.led, scene, k), "falls": False}
+    else:
+        falls = motion.kind in FALLING_KINDS or not flies(mover, motion)
+        changes |= {"falls": falls, "glides": motion.kind == "linear"}
+    if mover.elongated and float(np.hypot(velocity[0], velocity[2])) > 0:
+        changes |= _as_vehicle(scene, k, body, velocity)
+    return replace(body, **changes)
+
+
+def _led_along(led: Led, scene: PlacedScene, k: int) -> Floats:
+    """Positions [F, 3] along a given path: on the floor for what stands there, as far as its foot is below the horizon."""
+    mover, cameras = scene.bodies[0], scene.cameras
+    height = float(cameras.height[k])
+    if not mover.stands:
+        return led.positions @ cameras.axes[k].T + np.array([0.0, height, 0.0])
+    count = len(led.feet)
+    rays = cameras.repeated(count, k).rays(led.feet)
+    drop = height - mover.centre[k, 1] + mover.half_height[k]
+    nearest = drop / (FARTHEST * float(np.linalg.norm(mover.centre[k, [0, 2]])))
+    near = rays[:, [0, 2]] * (drop / np.maximum(-rays[:, 1], nearest))[:, None]
+    way = near / np.maximum(np.linalg.norm(near, axis=1), 1e-9)[:, None]
+    middle = near + way * float(mover.half_width[k]) * mover.depth_share
+    return np.stack([middle[:, 0], np.full(count, mover.centre[k, 1]), middle[:, 1]], axis=1)
+
+
+def _as_vehicle(scene: PlacedScene, k: int, body: RigidShape, velocity: Floats) -> dict[str, Any]:
+    """A box, longer along its heading than across, as wide as it is seen."""
+    placed = scene.bodies[0]
+    sight = placed.centre[k, [0, 2]] / np.linalg.norm(placed.centre[k, [0, 2]])
+    along = abs(float(velocity[[0, 2]] @ sight)) / float(np.hypot(velocity[0], velocity[2]))
+    across = math.sqrt(max(0.0, 1 - along**2))
+    length = float(placed.half_width[k]) / (across + VEHICLE_WIDTH * along)
+    yaw = -math.atan2(velocity[2], velocity[0])
+    return {"shape": "box", "half_width": length, "half_depth": VEHICLE_WIDTH * length, "yaw": yaw}

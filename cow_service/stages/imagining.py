@@ -1,0 +1,67 @@
+"""Runs the world of a scene: the ensemble, what the question comes to in it, and the world that is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cow_service.physics.draws import ensemble, likeliest, one_at_a_time
+from cow_service.physics.events import Events, find_events
+from cow_service.physics.outcome import Decided, agrees, decide
+from cow_service.physics.world import WorldInput, Worlds, run_world
+from cow_service.records import Asked
+from cow_service.vision.types import Floats
+
+EVERY = 2  # frames between those that are recorded of the ensemble
+TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does
+
+
+@dataclass(frozen=True)
+class Imagined:
+    """The world that is shown, and what an ensemble around it says."""
+
+    shown: Worlds
+    events: Events  # of the shown world
+    around: Worlds | None  # the ensemble's
+    around_events: Events | None
+    decided: Decided | None  # null where nothing is asked, or there is no ensemble
+
+
+def imagine(world: WorldInput, asked: Asked | None, target: int | None, size: int) -> Imagined:
+    """Runs the likeliest world and an ensemble of `size` worlds around it.
+
+    What is shown must not contradict what is answered: where the answer is sure and the likeliest world differs from
+    it, the likeliest world of those that agree is shown.
+    """
+    shown = run_world(world, likeliest())
+    events = find_events(shown, world.bodies, world.fps)
+    if size == 0:
+        return Imagined(shown, events, None, None, None)
+    rows = ensemble(size)
+    varied = one_at_a_time()
+    all_worlds = run_world(world, np.concatenate([rows, varied]), EVERY)
+    all_events = find_events(all_worlds, world.bodies, world.fps)
+    around, around_events = all_worlds.part(slice(0, size)), all_events.part(slice(0, size))
+    if asked is None:
+        return Imagined(shown, events, around, around_events, None)
+    decided = decide(asked, target, around_events, rows, all_events.part(slice(size, None)))
+    if decided.sure:
+        shown, events = _agreeing(world, asked, target, rows, around_events, shown, events)
+    return Imagined(shown, events, around, around_events, decided)
+
+
+def _agreeing(
+    world: WorldInput, asked: Asked, target: int | None, rows: Floats, around: Events, shown: Worlds, events: Events
+) -> tuple[Worlds, Events]:
+    """The likeliest world that shows what most of the ensemble does."""
+    same = agrees(asked, target, events, around)
+    if same[-1]:
+        return shown, events
+    nearest = np.argsort(np.linalg.norm(rows, axis=1))
+    for row in [int(k) for k in nearest if same[k]][:TRIES]:
+        tried = run_world(world, rows[row : row + 1])
+        tried_events = find_events(tried, world.bodies, world.fps)
+        if agrees(asked, target, tried_events, around)[-1]:
+            return tried, tried_events
+    return shown, events

@@ -1,0 +1,170 @@
+"""Records of a world that was run: its camera, its bodies, their paths and contacts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from cow_service.physics.anchors import points_inside
+from cow_service.physics.bodies import SeenBody
+from cow_service.physics.camera_fit import CameraFit
+from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.projection import SeenPaths, rotation, seen_paths, states
+from cow_service.physics.world import Worlds
+from cow_service.records import Body, CameraDeviations, CameraEstimate, Contact, Path, Point
+from cow_service.vision.types import Floats
+
+MOVED = 0.5  # px: what moves less in the image stays where it is
+SETTLED = 0.25  # px per frame: what moves less is at rest
+LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
+LOW, HIGH = 10, 90  # percentiles of the band
+
+
+def camera_record(fit: CameraFit, worlds: Worlds, around: Worlds | None) -> CameraEstimate:
+    """The camera of the first draw; how far its height varies is seen in an ensemble around it."""
+    cameras, deviation = worlds.scene.cameras, np.sqrt(np.diag(fit.covariance))
+    right, up, _ = cameras.axes[0]
+    focal = float(cameras.focal[0])
+    return CameraEstimate(
+        focal=focal,
+        pitch=math.degrees(math.asin(float(np.clip(-up[2], -1, 1)))),
+        roll=math.degrees(math.atan2(-float(right[1]), float(right[0]))),
+        height=float(cameras.height[0]),
+        source=fit.source,
+        deviations=CameraDeviations(
+            focal=focal * float(deviation[1]),
+            pitch=math.degrees(float(deviation[0])),
+            roll=math.degrees(fit.roll_sigma),
+            height=0.0 if around is None else float(np.std(around.scene.cameras.height)),
+        ),
+    )
+
+
+def body_records(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[Body, ...]:
+    """Where the first draw has each body."""
+    cameras, records = worlds.scene.cameras, []
+    for seen, shape, placed, on in zip(
+        bodies, worlds.shapes[0], worlds.scene.bodies, worlds.scene.supports, strict=True
+    ):
+        centre = np.array(shape.position) - np.array([0.0, cameras.height[0], 0.0])
+        x, y, z = (float(v) for v in centre @ cameras.axes[0])
+        support = bodies[on].name if on is not None else "floor" if placed.stands else "air"
+        records.append(
+            Body(
+                object=seen.name,
+                bbox=seen.bbox,
+                shape=shape.shape,
+                size=(2 * shape.half_width, 2 * shape.half_height, 2 * shape.half_depth),
+                position=(x, y, z),
+                support=support,
+                source=seen.source,
+                confidence=seen.confidence,
+            )
+        )
+    return tuple(records)
+
+
+def path_records(
+    bodies: Sequence[SeenBody], start: Point, worlds: Worlds, size: tuple[int, int], around: Worlds | None
+) -> tuple[Path, ...]:
+    """Paths of the mover, from its grounded point, and of what it set in motion; `around` are the ensemble's worlds."""
+    records: list[Path] = []
+    for body in sorted({0} | worlds.runs[0].moved):
+        seen = seen_paths(worlds, body)
+        if body == 0 or float(np.linalg.norm(seen.points[0] - seen.points[0, :1], axis=1).max()) > MOVED:
+            at = start_of(bodies, body, start)
+            records.append(_path(bodies[body], body, np.array(at), worlds, seen, size, around))
+    return tuple(records)
+
+
+def _path(
+    seen: SeenBody,
+    body: int,
+    start: Floats,
+    worlds: Worlds,
+    path: SeenPaths,
+    size: tuple[int, int],
+    around: Worlds | None,
+) -> Path:
+    # The body's centre as placed and where its silhouette is differ a little: what is drawn starts where it is.
+    points, scale, turned = path.points[0], path.scale[0], rotation(worlds, body)
+    points = points + scale[:, None] * (start - points[0])
+    visible = np.all((points >= 0) & (points < np.array(size)), axis=1) & ~path.passed[0]
+    return Path(
+        body=body,
+        states=tuple(tuple(state) for state in states(worlds, body).tolist()),
+        points=pairs(points),
+        visible=tuple(visible.tolist()),
+        scale=tuple(scale.tolist()),
+        rotation=tuple(turned.tolist()) if np.abs(turned).max() > 0.05 else (),
+        band=() if around is None else _band(around, body, points - path.points[0], len(points)),
+        tracks=tuple(pairs(track) for track in tracks(seen, start, points, scale, turned)),
+    )
+
+
+def tracks(seen: SeenBody, start: Floats, points: Floats, scale: Floats, turned: Floats) -> list[Floats]:
+    """Several points inside a body's mask, each [F, 2] px, moved, scaled and turned as the body is."""
+    angle = np.radians(turned)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    found: list[Floats] = []
+    for x, y in points_inside(seen.mask, (float(start[0]), float(start[1]))):
+        dx, dy = x - start[0], y - start[1]
+        offset = np.stack([cosine * dx - sine * dy, sine * dx + cosine * dy], axis=1)
+        found.append(points + scale[:, None] * offset)
+    return found
+
+
+def _band(around: Worlds, body: int, shift: Floats, num_frames: int) -> tuple[tuple[float, float, float, float], ...]:
+    """Per frame the 10th and 90th percentile over the worlds of the ensemble."""
+    points = seen_paths(around, body).points
+    low, high = np.percentile(points, [LOW, HIGH], axis=0)
+    frames = np.arange(num_frames) / around.every
+    stamps = np.arange(points.shape[1])
+    columns = [np.interp(frames, stamps, edge[:, axis]) + shift[:, axis] for edge in (low, high) for axis in (0, 1)]
+    return tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in np.stack(columns, axis=1).tolist())
+
+
+def contact_records(worlds: Worlds, camera: FloorCamera) -> tuple[Contact, ...]:
+    """Contacts of the first draw, in the order of their times; without those of bodies that stand where they are."""
+    run, shapes = worlds.runs[0], worlds.shapes[0]
+    records: list[Contact] = []
+    for meeting in run.meetings:
+        a, on_floor = meeting.a, meeting.b is None
+        if a not in run.moved or (on_floor and (meeting.time == 0 or meeting.impulse < LEAST_BOUNCE)):
+            continue
+        frame = min(round(meeting.time * worlds.fps), run.positions.shape[1] - 1)
+        where = run.positions[a, frame].copy()
+        if meeting.b is None:
+            where[1] = 0.0
+        else:
+            share = shapes[a].half_width / (shapes[a].half_width + shapes[meeting.b].half_width)
+            where += share * (run.positions[meeting.b, frame] - where)
+        x, y = camera.project(camera.from_floor(where[None]))[0].tolist()
+        records.append(Contact(a=a, b=meeting.b, time=meeting.time, point=(x, y), impulse=meeting.impulse))
+    return tuple(sorted(records, key=lambda contact: contact.time))
+
+
+def moving_until(paths: Sequence[Path], fps: float) -> float:
+    """Seconds from which nothing moves any more in the image, or the mover has left it."""
+    seen = np.nonzero(paths[0].visible)[0]
+    left = int(seen[-1]) + 1 if len(seen) else 0
+    still = 0
+    for path in paths:
+        points = np.array(path.points)
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        moving = np.nonzero((steps > SETTLED) | (np.abs(np.diff(np.array(path.scale))) > SETTLED / 100))[0]
+        still = max(still, int(moving[-1]) + 1 if len(moving) else 0)
+    return min(left, still) / fps
+
+
+def start_of(bodies: Sequence[SeenBody], index: int, grounded: Point) -> Point:
+    """Where the path of a body starts: the mover's at its grounded point, others' in the middle of their boxes."""
+    body = bodies[index]
+    return grounded if index == 0 else ((body.bbox[0] + body.bbox[2]) / 2, (body.bbox[1] + body.bbox[3]) / 2)
+
+
+def pairs(points: Floats) -> tuple[tuple[float, float], ...]:
+    """Rows [F, 2] as tuples."""
+    return tuple((x, y) for x, y in points.tolist())
