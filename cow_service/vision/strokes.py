@@ -170,7 +170,7 @@ def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
         h, w = stroke.patch.shape
         inside = cv2.erode((whole & ~stroke.patch).astype(np.uint8), _SQUARE, borderValue=0) > 0
         pixels = image[stroke.y : stroke.y + h, stroke.x : stroke.x + w][inside].astype(np.int16)
-        if len(pixels) and np.median(np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)) <= FLAT:
+        if len(pixels) and np.median(np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)) <= TOLERANCES[1]:
             yield Stroke(stroke.x, stroke.y, whole, stroke.colour, hollow=True)
     elif cv2.erode(stroke.patch.astype(np.uint8), _SQUARE, borderValue=0).sum() > LEAST_INSIDE * stroke.patch.sum():
         yield from _with_rim(image, stroke)
