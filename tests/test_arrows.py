@@ -60,8 +60,8 @@ def test_an_arrow_at_its_object_is_measured(style: str, start: str) -> None:
 @settings(max_examples=12 * SCALE, deadline=None, derandomize=True)
 @given(
     angle=st.floats(0, 2 * np.pi),
-    width=st.floats(7, 20),
-    head=st.floats(1.4, 2.2),
+    width=st.floats(9, 20),
+    head=st.floats(1.5, 2.2),
     colours=st.sampled_from([("white", "red"), ("white", "black"), ("black", "white"), ("cyan", "black")]),
     quality=st.sampled_from([75, 90]),
 )
