@@ -57,6 +57,34 @@ def test_an_arrow_at_its_object_is_measured(style: str, start: str) -> None:
     assert angle_between(found[0].direction, arrow.direction) < 1.5
 
 
+@settings(max_examples=12 * SCALE, deadline=None, derandomize=True)
+@given(
+    angle=st.floats(0, 2 * np.pi),
+    width=st.floats(9, 20),
+    head=st.floats(1.5, 2.2),
+    colours=st.sampled_from([("white", "red"), ("white", "black"), ("black", "white"), ("cyan", "black")]),
+    quality=st.sampled_from([75, 90]),
+)
+def test_a_hollow_arrow_is_measured(
+    angle: float, width: float, head: float, colours: tuple[str, str], quality: int
+) -> None:
+    along = np.array([np.cos(angle), np.sin(angle)])
+    across = np.array([-along[1], along[0]])
+    length, broad = 60 + 5 * width, head * width + 3
+    tail = np.array([320, 200]) - along * length / 2
+    neck, tip = tail + along * (length - 0.8 * broad), tail + along * length
+    sides = [(tail, width / 2), (neck, width / 2), (neck, broad / 2), (tip, 0), (neck, -broad / 2), (neck, -width / 2)]
+    corners = [point + across * side for point, side in [*sides, (tail, -width / 2)]]
+    shape = np.round(16 * np.array(corners)).astype(np.int32)
+    image = floor()
+    cv2.fillPoly(image, [shape], COLOURS[colours[0]], cv2.LINE_AA, 4)
+    cv2.polylines(image, [shape], True, COLOURS[colours[1]], 3, cv2.LINE_AA, 4)
+    scene = Scene(jpeg(image, quality))
+    assert len(scene.arrows) == 1
+    assert angle_between(scene.arrows[0].direction, (along[0], along[1])) < 2.5
+    assert np.abs(scene.clean.astype(int) - floor())[scene.cues].mean() < 12
+
+
 def test_head_style_is_told() -> None:
     arrows = [DrawnArrow((200, 200), 0.3, 120, 5, COLOURS["red"], style) for style in ("filled", "open")]
     assert [Scene(jpeg(arrow.on(floor()))).arrows[0].filled for arrow in arrows] == [True, False]

@@ -18,6 +18,8 @@ from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing
 from cow_service.vision.types import Floats, Mask
 
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
+HEAD, HOLLOW_HEAD = 1.8, 1.3  # of the shaft's width: the least width of a head, and of a hollow drawing's
+MIN_HOLLOW_FIT = 0.82  # the same for a hollow drawing, whose head may be small
 CERTAIN_FIT = 0.88  # from here on, later strokes at the same place are skipped
 
 
@@ -70,7 +72,7 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int,
     for stroke in strokes:
         if any(shape.fit > CERTAIN_FIT and _same_place(stroke, other) for shape, other in found):
             continue
-        shape = fit_arrow(stroke.patch)
+        shape = fit_arrow(stroke.patch, stroke.hollow)
         if shape is not None:
             found.append((shape, stroke))
     found.sort(key=lambda item: -item[0].fit * np.linalg.norm(item[0].tip - item[0].tail) ** 0.25)
@@ -103,8 +105,13 @@ def _same_place(a: Stroke, b: Stroke) -> bool:
     return all(abs(p - q) <= 3 for p, q in corners)
 
 
-def fit_arrow(patch: Mask) -> _Shape | None:
-    """The arrow that a patch [h, w] is, or None. Coordinates are those of the patch."""
+def fit_arrow(patch: Mask, hollow: bool = False) -> _Shape | None:
+    """The arrow that a patch [h, w] is, or None. Coordinates are those of the patch.
+
+    A `hollow` drawing has two flat colours, which no object of a scene has: its head need not be much wider than its
+    shaft.
+    """
+    least_head = HOLLOW_HEAD if hollow else HEAD
     ys, xs = np.nonzero(patch)
     points = np.stack([xs, ys], axis=1).astype(np.float64)
     centre = points.mean(axis=0)
@@ -116,18 +123,18 @@ def fit_arrow(patch: Mask) -> _Shape | None:
     diameter = (hull[i] - hull[j]).astype(np.float64)
     for axis in (vectors[:, 1], diameter / np.linalg.norm(diameter)):
         for sign in (1.0, -1.0):
-            shape = _measure(points, centre, sign * axis, patch)
+            shape = _measure(points, centre, sign * axis, patch, least_head)
             if shape is not None and (best is None or shape.fit > best.fit):
                 best = shape
-    return best if best is not None and best.fit >= MIN_FIT else None
+    return best if best is not None and best.fit >= (MIN_HOLLOW_FIT if hollow else MIN_FIT) else None
 
 
-def _measure(points: Floats, centre: Floats, axis: Floats, patch: Mask) -> _Shape | None:
+def _measure(points: Floats, centre: Floats, axis: Floats, patch: Mask, least_head: float) -> _Shape | None:
     """Reads shaft and head off the width profile along `axis` (tail to tip); the axis is refined on the shaft."""
-    profile = _profile(points, centre, axis)
+    profile = _profile(points, centre, axis, least_head)
     for _ in range(2):
         if profile is not None:
-            profile = _profile(points, profile.centre, profile.axis)
+            profile = _profile(points, profile.centre, profile.axis, least_head)
     if profile is None or not _is_arrow_like(profile):
         return None
     tail, tip = profile.centre + profile.axis * profile.start, profile.centre + profile.axis * profile.end
@@ -138,7 +145,7 @@ def _measure(points: Floats, centre: Floats, axis: Floats, patch: Mask) -> _Shap
     return _Shape(tail, tip, filled, fits[filled])
 
 
-def _profile(points: Floats, centre: Floats, axis: Floats) -> _Profile | None:
+def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) -> _Profile | None:
     """The widths of a patch's points [N, 2] along an axis, or None where they are no shaft followed by a wider head."""
     normal = np.array([-axis[1], axis[0]])
     along, across = (points - centre) @ axis, (points - centre) @ normal
@@ -159,7 +166,7 @@ def _profile(points: Floats, centre: Floats, axis: Floats) -> _Profile | None:
     thickness = float(np.nanmedian(extent[max(1, n // 12) : shaft_end]))
     peak = int(np.nanargmax(extent))
     head_width = float(extent[peak])
-    if peak < 0.4 * n or head_width < max(1.8 * thickness, thickness + 4):
+    if peak < 0.4 * n or head_width < max(least_head * thickness, thickness + 4):
         return None
     wide = np.nonzero(extent[:peak] > thickness + max(2.0, 0.35 * thickness))[0]
     wide = wide[wide > 0.3 * n]

@@ -30,6 +30,8 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, 
     """Drawn boxes among the strokes of an image whose full size is [height, width], largest first."""
     boxes: list[DrawnBox] = []
     for stroke in strokes:
+        if stroke.hollow:  # a box is drawn around something: its inside is not drawn
+            continue
         line = _line_width(stroke.patch)
         if line is None:
             continue

@@ -1,6 +1,7 @@
 """Finds strokes drawn over an image: patches of one flat colour with sharp edges and a narrow part.
 
-`arrows.py` and `boxes.py` classify them by their shape.
+A closed rim counts twice: as it is, and together with what it encloses. `arrows.py` and `boxes.py` classify strokes by
+their shape.
 """
 
 from __future__ import annotations
@@ -22,14 +23,17 @@ TOLERANCES = (26, 52)  # grey levels around a flat colour: strict first, then wi
 FLAT = 14  # grey levels: median distance of a drawing's pixels from its colour
 SHARP = 56  # grey levels between a drawing and what lies beside it
 SHARP_SHARE = 0.85  # of what lies beside it
+GAP_SHARE = 0.25  # of the surroundings that have the colour of a patch which is a part of them
 FRINGE = 4  # px around a drawing that compression has mixed with it
 OUTLINE_MOST = 5  # px: maximum width of an outline
 MIN_LENGTH = 18.0  # px at the working size
 ALIKE = 0.04  # of the area: patches that differ less are the same, found with another tolerance
+LEAST_INSIDE = 0.12  # of a hollow drawing's area that its rim encloses
 BIN = 16  # grey levels: colours this close are tried as one
 MAX_COLOURS = 36  # flat colours tried per thin structure
 
 _SQUARE = np.ones((3, 3), np.uint8)
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,8 @@ class Stroke:
     x: int
     y: int
     patch: Mask  # [h, w], its top left corner at (x, y)
-    colour: tuple[int, int, int]  # RGB
+    colour: tuple[int, int, int]  # RGB; of a rim where the stroke has one
+    hollow: bool = False  # a rim and the one flat colour that it encloses, both in the patch
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,7 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
                     stroke = Stroke(bx + box[0], by + box[1], patch, (int(colour[0]), int(colour[1]), int(colour[2])))
                     if _is_drawn(image, stroke):
                         yield stroke
+                        yield from _hollow(image, stroke)
 
 
 def _is_known(known: dict[tuple[int, int, int, int], int], box: tuple[int, int, int, int], area: int) -> bool:
@@ -144,7 +150,62 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
     ring = cv2.dilate(near, _SQUARE) > near
     beyond = image[y0:y1, x0:x1][ring].astype(np.int16)
     sharp = (np.abs(beyond - np.array(stroke.colour, np.int16)) > SHARP).any(axis=1)
-    return bool(np.count_nonzero(sharp) > SHARP_SHARE * len(beyond))
+    return bool(np.count_nonzero(sharp) > SHARP_SHARE * len(beyond)) and not _is_gap(image, stroke)
+
+
+def _is_gap(image: Image, stroke: Stroke) -> bool:
+    """Whether the patch has the colour of what surrounds it: floor seen between two objects."""
+    x, y, (h, w) = stroke.x, stroke.y, stroke.patch.shape
+    reach = max(h, w)
+    near = image[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
+    low, high = (np.clip(np.array(stroke.colour) + step, 0, 255) for step in (-FLAT, FLAT))
+    alike = np.count_nonzero(cv2.inRange(near, low, high)) - np.count_nonzero(stroke.patch)
+    return alike > GAP_SHARE * near.shape[0] * near.shape[1]
+
+
+def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
+    """The hollow drawing of which a stroke may be the rim, and that of which it may be the inside."""
+    whole = _outlined(stroke.patch)
+    if np.count_nonzero(whole & ~stroke.patch) > LEAST_INSIDE * np.count_nonzero(whole):
+        h, w = stroke.patch.shape
+        inside = cv2.erode((whole & ~stroke.patch).astype(np.uint8), _SQUARE, borderValue=0) > 0
+        pixels = image[stroke.y : stroke.y + h, stroke.x : stroke.x + w][inside].astype(np.int16)
+        if len(pixels) and np.median(np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)) <= TOLERANCES[1]:
+            yield Stroke(stroke.x, stroke.y, whole, stroke.colour, hollow=True)
+    elif cv2.erode(stroke.patch.astype(np.uint8), _SQUARE, borderValue=0).sum() > LEAST_INSIDE * stroke.patch.sum():
+        yield from _with_rim(image, stroke)
+
+
+def _with_rim(image: Image, inside: Stroke) -> Iterator[Stroke]:
+    """A flat patch with the rim around it, where that has a colour of its own, unlike the patch and what lies beyond.
+
+    Compression may have broken such a rim: as a stroke of its own it is then not found.
+    """
+    pad = OUTLINE_MOST + FRINGE + 1
+    h, w = inside.patch.shape
+    y0, x0 = max(0, inside.y - pad), max(0, inside.x - pad)
+    near = image[y0 : inside.y + h + pad, x0 : inside.x + w + pad].astype(np.int16)
+    patch = np.zeros(near.shape[:2], np.uint8)
+    patch[inside.y - y0 : inside.y - y0 + h, inside.x - x0 : inside.x - x0 + w] = inside.patch
+    grown = [patch, *(cv2.dilate(patch, _CROSS, iterations=i) for i in (1, 3, OUTLINE_MOST + 1, pad - 2, pad))]
+    rim, beyond = (
+        np.median(near[(grown[outer] > 0) & (grown[inner] == 0)], axis=0) for inner, outer in ((1, 2), (4, 5))
+    )
+    unlike = min(np.abs(rim - beyond).max(), np.abs(rim - np.array(inside.colour)).max())
+    if unlike <= SHARP:
+        return
+    is_rim = (grown[3] > 0) & (2 * np.abs(near - rim).sum(axis=2) < np.abs(near - beyond).sum(axis=2))
+    count, labels, _, _ = cv2.connectedComponentsWithStats(((patch > 0) | is_rim).astype(np.uint8), connectivity=4)
+    kept = labels == np.bincount(labels[patch > 0], minlength=count).argmax()
+    yield Stroke(x0, y0, _outlined(kept), (int(rim[0]), int(rim[1]), int(rim[2])), hollow=True)
+
+
+def _outlined(patch: Mask) -> Mask:
+    """The area [h, w] within the outer outline of a patch."""
+    contours, _ = cv2.findContours(patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    whole = np.zeros(patch.shape, np.uint8)
+    cv2.drawContours(whole, [max(contours, key=cv2.contourArea)], -1, 1, -1)
+    return whole > 0
 
 
 def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
