@@ -26,7 +26,8 @@ SLANT = (0.0, 0.1)  # of the light: right and ahead, per unit of height
 SLANT_SIGMA = (0.5, 0.45)
 # Of the measurements: centre in radii of the ball, log of width and height, correlation.
 MEASUREMENT_SIGMA = (0.05, 0.05, 0.06, 0.08, 0.05)
-MAX_COST = 5.0  # squared deviations of the measurements in all: a patch that fits worse is not the ball's shadow
+MAX_COST = 12.0  # squared deviations of the measurements in all: a patch that fits worse is not the ball's shadow
+GOOD_COST = 5.0  # a worse fit than this widens the deviations
 LOWEST, HIGHEST = np.array([0.05, -0.7, 0.0, -1.5, -1.5]), np.array([1.4, 0.7, 3.7, 1.5, 1.5])
 MAX_ITERATIONS = 20
 
@@ -73,9 +74,10 @@ def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, in
         parameters = np.clip(parameters + move, LOWEST, HIGHEST)
         if float(np.abs(move).max()) < 1e-4:
             break
-    if float((residuals(parameters)[:5] ** 2).sum()) > MAX_COST:
+    cost = float((residuals(parameters)[:5] ** 2).sum())
+    if cost > MAX_COST:
         return None
-    covariance = np.asarray(np.linalg.inv(slopes.T @ slopes), np.float64)
+    covariance = np.asarray(np.linalg.inv(slopes.T @ slopes), np.float64) * max(1.0, cost / GOOD_COST)
     return CameraFit(parameters, covariance, start.roll, start.roll_sigma, "shadow")
 
 

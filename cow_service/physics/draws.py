@@ -22,6 +22,7 @@ PARAMETERS: dict[str, Doubt] = {
     "turn": "heading",
     "size": "size",
     "yaw": "size",
+    "outline": "size",
     "friction": "friction",
     "restitution": "friction",
 }  # what is uncertain in a world, and the kind of doubt that it belongs to

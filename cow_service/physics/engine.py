@@ -8,7 +8,7 @@ that bodies have the size for which its tolerances are made; gravity is scaled a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,13 +27,13 @@ from rapier3d import (
 
 from cow_service.physics.dynamics import GRAVITY
 from cow_service.records import Shape
-from cow_service.vision.types import Floats
+from cow_service.vision.types import Floats, Mask
 
 ENGINE_SIZE = 0.15  # m inside the engine: half the width of the first body of the first world
 SPACING = 24.0  # m inside the engine, between worlds
 COLOURS = 5  # worlds so many places apart, along and across, share a collision group
 REACH = 0.9 * COLOURS * SPACING / 2  # m inside the engine: what gets further away is taken out
-LEAST_STEPS = 60.0  # steps per second, at least
+LEAST_STEPS, LEAST_STEPS_OF_MANY = 60.0, 30.0  # steps per second, at least, of a world alone and of many
 FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.3
 GAP = 1e-3  # m inside the engine: how far above what it stands on a body starts
 
@@ -79,26 +79,41 @@ class WorldRun:
     moved: set[int]  # bodies that did not stay where they were
 
 
+Finished = Callable[[Floats, Floats], Mask]
+"""Of which worlds [K] the rest does not matter, by positions and velocities [K, 3] (m, m/s) of their first bodies."""
+
+
 def run_worlds(
     worlds: Sequence[Sequence[RigidShape]],
     num_frames: int,
     fps: float,
     every: int = 1,
+    finished: Finished | None = None,
 ) -> list[WorldRun]:
     """Runs worlds for the time of a clip, recording every `every`-th frame. They have equally many bodies each.
 
+    With more than one world, turns and impulses are not recorded, and those that are finished go on in a straight line.
+
     The same input gives the same output, bit by bit.
     """
-    return _Engine(worlds, num_frames, fps, every).run()
+    return _Engine(worlds, num_frames, fps, every, finished).run()
 
 
 class _Engine:
     """One run. Bodies are named by their world and their place in it."""
 
-    def __init__(self, worlds: Sequence[Sequence[RigidShape]], num_frames: int, fps: float, every: int) -> None:
-        self.worlds, self.fps, self.every = worlds, fps, every
+    def __init__(
+        self,
+        worlds: Sequence[Sequence[RigidShape]],
+        num_frames: int,
+        fps: float,
+        every: int,
+        finished: Finished | None,
+    ) -> None:
+        self.worlds, self.fps, self.every, self.finished = worlds, fps, every, finished
+        self.is_alone = len(worlds) == 1
         self.frames = range(0, num_frames, every)
-        self.substeps = max(1, math.ceil(LEAST_STEPS / fps))
+        self.substeps = max(1, math.ceil((LEAST_STEPS if self.is_alone else LEAST_STEPS_OF_MANY) / fps))
         self.scale = ENGINE_SIZE / worlds[0][0].half_width
         self.world = _empty_world(1 / (fps * self.substeps), GRAVITY * self.scale)
         self.collector = ChannelEventCollector()
@@ -115,8 +130,7 @@ class _Engine:
         self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
         self.meetings: list[list[Meeting]] = [[] for _ in worlds]
         self.awake = [{i for i, body in enumerate(bodies) if _acts(body)} for bodies in worlds]
-        self.gone: set[tuple[int, int]] = set()
-        self.measures_impulses = len(worlds) == 1
+        self.drift = np.zeros(shape[:2], bool)  # taken out: they go on in a straight line
 
     def run(self) -> list[WorldRun]:
         for k, bodies in enumerate(self.worlds):
@@ -126,9 +140,13 @@ class _Engine:
             self._advance(self.frames[row - 1])
             for moving in (self.positions, self.velocities, self.turns):
                 moving[:, :, row] = moving[:, :, row - 1]
+            self.positions[:, :, row] += self.drift[..., None] * self.velocities[:, :, row] * (self.every / self.fps)
             for k, awake in enumerate(self.awake):
                 for i in awake:
                     self._record(k, i, row)
+            if self.finished is not None:
+                for k in np.nonzero(self.finished(self.positions[:, 0, row], self.velocities[:, 0, row]))[0].tolist():
+                    self._take_out(k, 0)
         return [
             WorldRun(self.positions[k], self.velocities[k], self.turns[k], self.meetings[k], set(self.awake[k]))
             for k in range(len(self.worlds))
@@ -164,7 +182,7 @@ class _Engine:
         for step in range(self.every * self.substeps):
             time = frame / self.fps + step / (self.fps * self.substeps)
             self._lead(time + 1 / (self.fps * self.substeps))
-            before = self._velocities() if self.measures_impulses else {}
+            before = self._velocities() if self.is_alone else {}
             self.world.step()
             for event in self.collector.drain_collision_events():
                 if event.started:
@@ -210,19 +228,26 @@ class _Engine:
                     self.world.colliders[collider].friction = body.friction
 
     def _record(self, k: int, i: int, row: int) -> None:
-        body = self._body(self.handles[k][i])
-        if (k, i) in self.gone:
-            drift = self.velocities[k, i, row] * (self.every / self.fps)
-            self.positions[k, i, row] += drift
+        if self.drift[k, i]:
             return
-        position = np.array(body.translation.to_tuple()) - self.origin[k]
-        self.positions[k, i, row] = position / self.scale
-        self.velocities[k, i, row] = np.array(body.linvel.to_tuple()) / self.scale
-        turn = body.rotation
-        self.turns[k, i, row] = turn.i, turn.j, turn.k, turn.w
-        if max(abs(position[0]), abs(position[2])) > REACH:
-            body.is_enabled = False
-            self.gone.add((k, i))
+        body = self._body(self.handles[k][i])
+        x, y, z = body.translation.to_tuple()
+        ox, oy, oz = self.origin[k]
+        self.positions[k, i, row] = ((x - ox) / self.scale, (y - oy) / self.scale, (z - oz) / self.scale)
+        if i == 0 or self.is_alone:
+            vx, vy, vz = body.linvel.to_tuple()
+            self.velocities[k, i, row] = (vx / self.scale, vy / self.scale, vz / self.scale)
+        if self.is_alone:
+            turn = body.rotation
+            self.turns[k, i, row] = (turn.i, turn.j, turn.k, turn.w)
+        if max(abs(x - ox), abs(z - oz)) > REACH:
+            self._take_out(k, i)
+
+    def _take_out(self, k: int, i: int) -> None:
+        """Leaves a body out of what is computed from now on: it keeps its last velocity."""
+        if not self.drift[k, i]:
+            self._body(self.handles[k][i]).is_enabled = False
+            self.drift[k, i] = True
 
 
 def _empty_world(dt: float, gravity: float) -> PhysicsWorld:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody
+from cow_service.physics.draws import COLUMN
 from cow_service.physics.occlusion import shares
 from cow_service.physics.projection import seen_paths
 from cow_service.physics.world import Worlds
@@ -16,6 +17,7 @@ from cow_service.records import Encounter, EncounterKind
 from cow_service.vision.types import Floats, Mask
 
 COVERED = 0.3  # share of a silhouette from which it counts as covered
+COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
 NEVER = math.inf
 
@@ -38,13 +40,14 @@ class Events:
         return Events(times, {kind: values[rows] for kind, values in self.shares.items()}, self.eligible)
 
 
-def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float) -> Events:
-    """The events of every draw. What the mover stands on at the start is no encounter."""
-    count, draws = len(bodies), len(worlds.runs)
+def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats) -> Events:
+    """The events of every draw [K, P]. What the mover stands on at the start is no encounter."""
+    enough = COVERED * np.exp(COVERED_SIGMA * draws[:, COLUMN["outline"]])[:, None]
+    count = len(bodies)
     eligible = np.ones(count, bool)
     eligible[[0, *(on for on in worlds.scene.supports[:1] if on is not None)]] = False
-    times = {kind: np.full((draws, count), NEVER) for kind in KINDS}
-    most = {kind: np.zeros((draws, count)) for kind in KINDS}
+    times = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
+    most = {kind: np.zeros((len(draws), count)) for kind in KINDS}
     for k, run in enumerate(worlds.runs):
         for meeting in run.meetings:
             if meeting.a == 0 and meeting.b is not None and eligible[meeting.b]:
@@ -58,7 +61,7 @@ def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float) -> Event
         for kind, values in (("occludes", found.covers), ("occluded-by", found.covered)):
             seen = np.where(before, values, 0.0)
             most[kind][:, other] = seen.max(axis=1)
-            times[kind][:, other] = np.where(seen >= COVERED, clock[None], NEVER).min(axis=1)
+            times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)
     return Events(times, most, eligible)
 
 

@@ -10,7 +10,7 @@ from cow_service.physics.projection import SeenPaths
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats, Mask
 
-SAMPLES = 64  # points of a silhouette that are looked up in the other
+SAMPLES = 96  # points of a silhouette that are looked up in the other
 CHUNK = 2048  # draws and frames at a time, to bound the memory
 
 

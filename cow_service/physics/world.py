@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,16 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera_fit import CameraFit
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
-from cow_service.physics.lift import BOX_SIDE, FARTHEST
+from cow_service.physics.lift import BOX_SIDE, FARTHEST, Cameras
 from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place
 from cow_service.records import FALLING_KINDS, Motion
-from cow_service.vision.types import Floats
+from cow_service.vision.types import Floats, Mask
 
 FRICTION, FRICTION_SIGMA = 0.5, 0.4  # of a body; one standard deviation of the logarithm
 RESTITUTION, RESTITUTION_SIGMA = 0.5, 0.15
 YAW_SIGMA = 0.4  # radians: how a box is turned about the vertical
+LEFT_BY = 0.2  # of the image's width: so far outside, what goes on outwards does not come back
+LOOK_AHEAD = 0.01  # s
 LEAST_HALF, MOST_HALF = 0.02, 60.0  # half widths and heights of bodies, in those of the mover
 
 
@@ -63,7 +66,16 @@ def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""
     scene = place(given.bodies, given.motion, given.fit, given.size, draws)
     shapes = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
-    return Worlds(scene, shapes, tuple(run_worlds(shapes, given.num_frames, given.fps, every)), every, given.fps)
+    finished = None if len(draws) == 1 else partial(_has_left, scene.cameras, given.size[0])
+    runs = run_worlds(shapes, given.num_frames, given.fps, every, finished)
+    return Worlds(scene, shapes, tuple(runs), every, given.fps)
+
+
+def _has_left(cameras: Cameras, width: int, positions: Floats, velocities: Floats) -> Mask:
+    """Which movers [K] have left the image to the left or the right, and go on that way."""
+    x = cameras.project(positions)[0][:, 0]
+    step = cameras.project(positions + velocities * LOOK_AHEAD)[0][:, 0] - x
+    return ((x < -LEFT_BY * width) & (step < 0)) | ((x > (1 + LEFT_BY) * width) & (step > 0))
 
 
 def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) -> tuple[RigidShape, ...]:
@@ -111,7 +123,7 @@ def _set_going(given: WorldInput, scene: PlacedScene, k: int, body: RigidShape) 
 
 
 def _led_along(led: Led, scene: PlacedScene, k: int) -> Floats:
-    """Positions [F, 3] along a given path: on the floor for what stands there, as far as its foot is below the horizon."""
+    """Positions [F, 3] along a given path: on the floor for what stands there, if its foot is below the horizon."""
     mover, cameras = scene.bodies[0], scene.cameras
     height = float(cameras.height[k])
     if not mover.stands:

@@ -34,14 +34,12 @@ def imagine(world: WorldInput, asked: Asked | None, target: int | None, size: in
     What is shown must not contradict what is answered: where the answer is sure and the likeliest world differs from
     it, the likeliest world of those that agree is shown.
     """
-    shown = run_world(world, likeliest())
-    events = find_events(shown, world.bodies, world.fps)
+    shown, events = _run(world, likeliest())
     if size == 0:
         return Imagined(shown, events, None, None, None)
     rows = ensemble(size)
     varied = one_at_a_time()
-    all_worlds = run_world(world, np.concatenate([rows, varied]), EVERY)
-    all_events = find_events(all_worlds, world.bodies, world.fps)
+    all_worlds, all_events = _run(world, np.concatenate([rows, varied]), EVERY)
     around, around_events = all_worlds.part(slice(0, size)), all_events.part(slice(0, size))
     if asked is None:
         return Imagined(shown, events, around, around_events, None)
@@ -60,8 +58,12 @@ def _agreeing(
         return shown, events
     nearest = np.argsort(np.linalg.norm(rows, axis=1))
     for row in [int(k) for k in nearest if same[k]][:TRIES]:
-        tried = run_world(world, rows[row : row + 1])
-        tried_events = find_events(tried, world.bodies, world.fps)
+        tried, tried_events = _run(world, rows[row : row + 1])
         if agrees(asked, target, tried_events, around)[-1]:
             return tried, tried_events
     return shown, events
+
+
+def _run(world: WorldInput, draws: Floats, every: int = 1) -> tuple[Worlds, Events]:
+    worlds = run_world(world, draws, every)
+    return worlds, find_events(worlds, world.bodies, world.fps, draws)
