@@ -51,7 +51,7 @@ def _event(outcome: Outcome, mover: str) -> str:
     """What `Outcome.probability` is that of."""
     asked = outcome.asked
     does, do = EVENTS[asked.relation]
-    thing = _one_line(outcome.object or asked.target or "anything")
+    thing = _one_line(outcome.object or asked.target or ("anything" if asked.negated else "something"))
     if asked.form == "which-first":
         return f"the first thing that the {_bare(mover)} {does} is {_one_line(outcome.first or 'nothing')}"
     if asked.form == "how-many":
