@@ -16,7 +16,7 @@ from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
 
 MAX_OBSTACLES = 8
-MAX_LABEL = 120  # characters
+MAX_LABEL = 80  # characters
 
 
 @dataclass(frozen=True)
