@@ -53,8 +53,10 @@ from cow_service.readers.local.decoding import BatchRow, Sampling
 from cow_service.readers.local.loading import device_map, load_local
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny
+from cow_service.readers.mllm import locate
+from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.settings import Settings
-from cow_service.weights.manifests import Manifest, Source, load_manifests
+from cow_service.weights.manifests import Coordinates, Manifest, Source, load_manifests
 
 BOX = {
     "type": "object",
@@ -269,6 +271,36 @@ def test_an_agent_asks_again_with_the_reason(toy: LocalModel) -> None:
     assert found.output == seen[1]
     assert found.usage.requests == 2
     assert [message.kind for message in found.all_messages()] == ["request", "response"] * 2
+
+
+SAID = {"reasoning": "", "label": "ball", "bbox_2d": [1, 2, 30, 40]}
+HOW = {"cue": "text", "along_arrow": None, "camera": None, "direction": [1, 2, 3, 4]}
+CUBE = {"label": "cube", "bbox_2d": [50, 2, 90, 40]}
+
+
+@pytest.mark.parametrize(
+    ("reply", "allowed"),
+    [
+        (SAID | {"others": []} | HOW, True),
+        (SAID | {"size": 0.25, "others": [CUBE, CUBE | {"stands_on": "floor", "shape": "box"}]} | HOW, True),
+        (SAID | {"height_above": 1.5, "others": []} | HOW | {"depth_degrees": -30, "speed": "slow"}, True),
+        (SAID | {"size": 0.25, "bbox_2d": None, "others": []} | HOW, True),
+        (SAID | {"size": -1, "others": []} | HOW, False),
+        (SAID | {"others": [CUBE | {"shape": "blob"}]} | HOW, False),
+        (SAID | {"others": []} | HOW | {"speed": "slow", "depth_degrees": 120}, False),
+        (SAID | {"others": []}, False),
+    ],
+)
+def test_a_reply_may_leave_out_what_is_optional_and_nothing_else(toy: LocalModel, reply: Any, allowed: bool) -> None:
+    coordinates = Coordinates(units="thousandths", box="bbox_2d")
+    schema = locate.schema(CoordinateFrame(640, 480, (640, 480), coordinates), True, True, 100)
+    grammars = toy._generator.grammars
+    matcher = grammars.matcher(grammars.grammar(schema))
+    tokens = grammars._tokens.tokenize_str(json.dumps(reply))
+    assert (matcher.validate_tokens(tokens) == len(tokens)) == allowed
+    if allowed:
+        assert matcher.consume_tokens(tokens)
+        assert matcher.is_accepting()
 
 
 # How tokens are chosen.

@@ -431,7 +431,7 @@ def test_a_simulation_takes_two_calls_and_says_with_what(mllm: MllmServer, make)
         "name": "mllm",
         "model": "Qwen/Qwen3-VL-8B-Instruct",
         "revision": None,
-        "prompts": {"identify": 1, "locate": 1, "looking": 1},
+        "prompts": {"identify": 1, "locate": 2, "looking": 1},
         "stages": ["grounding", "motion"],
     }
     assert (told["grounding"]["source"], told["motion"]["source"], told["motion"]["cue"]) == (
@@ -671,7 +671,7 @@ def test_the_frames_follow_the_image_and_encounters_are_a_hypothesis(mllm: MllmS
     words = mllm.text(2)
     assert "hypothesis" in words
     assert "touches the blue object" in words or "passes" in words
-    assert told["reader"]["prompts"] == {"answer-with-frames": 1, "identify": 1, "locate": 1, "looking": 1}
+    assert told["reader"]["prompts"] == {"answer-with-frames": 2, "identify": 1, "locate": 2, "looking": 1}
     assert told["usage"]["calls"] == 3
 
 

@@ -49,9 +49,12 @@ SAMPLES: dict[str, object] = {
     "line_order": "[x0, y0, x1, y1]",
     "wants_box": True,
     "wants_direction": True,
+    "max_obstacles": 8,
     "options": read_choices("", ["Yes", "No"]),
     "sentence": "The ball moves.",
     "times": "0.06 s",
+    "law": "contact",
+    "facts": ("The ball touches the vase after 0.5 s.",),
     "encounters_known": True,
     "encounters": ("touches the vase, 0.5 s in",),
 }
@@ -78,7 +81,7 @@ def test_every_shipped_prompt_renders_its_inputs_and_no_others(name: str) -> Non
 FRAME = CoordinateFrame(640, 480, (640, 480), Coordinates(units="thousandths"))
 SCHEMAS = {
     "identify": identify.schema(100),
-    "locate": locate.schema(FRAME, True, True, True, 100),
+    "locate": locate.schema(FRAME, True, True, 100),
     "scale": scale.schema(FRAME, 100),
     "answer-from-image": answer.schema(read_choices("", ["Yes", "No"]), 100),
     "answer-with-frames": answer.schema(read_choices("", ["Yes", "No"]), 100),

@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from cow_service.records import (
     AnswerOption,
@@ -18,6 +19,7 @@ from cow_service.records import (
     LocatedObject,
     MetresPerPixel,
     MotionKind,
+    ObjectPrior,
     Point,
     ReaderInfo,
     Record,
@@ -27,6 +29,8 @@ from cow_service.records import (
     Vector,
 )
 from cow_service.vision.scene import Scene
+
+SpeedWord = Literal["slow", "normal", "fast"]
 
 
 @dataclass
@@ -65,6 +69,8 @@ class MotionHints(Record):
     sentence: str | None = None
     ends: tuple[Point, Point] | None = None  # of a line along the motion, px of the upright image
     camera: Literal["towards", "away"] | None = None  # the motion leads straight to the camera, or from it
+    depth_degrees: float | None = Field(default=None, ge=-90, le=90)  # out of the image plane, positive away
+    speed: SpeedWord | None = None
     cue: Cue | None = None
     along_arrow: bool | None = None
     metres_per_pixel: MetresPerPixel | None = None
@@ -82,6 +88,7 @@ class GroundingReading:
     others: tuple[LocatedObject, ...] = ()
     warnings: tuple[str, ...] = ()
     hints: MotionHints | None = None
+    prior: ObjectPrior | None = None  # of the mover
 
 
 @dataclass(frozen=True)
@@ -93,6 +100,9 @@ class MotionReading:
     cue: Cue
     along_arrow: bool | None = None
     depth: float = 0.0  # see `Motion.depth`
+    depth_deviation: float | None = None  # degrees; null where the reader says nothing of the depth
+    speed: SpeedWord | None = None  # as for such a thing
+    speed_deviation: float | None = None  # of ln speed; null where the reader says nothing of the speed
     metres_per_pixel: MetresPerPixel | None = None  # null where the reader cannot tell
     down: Vector = (0.0, 1.0)  # unit vector: which way things fall in the image
     sentence: str | None = None

@@ -10,6 +10,7 @@ from typing import Any, cast
 from cow_service.readers.base import AnswerReading, Imagined
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.free_text import MARKS, announced, is_broken_json, lines_of
+from cow_service.readers.mllm.hypothesis import hypothesis
 from cow_service.readers.mllm.replies import (
     ReplyError,
     fields_of,
@@ -21,7 +22,7 @@ from cow_service.readers.mllm.replies import (
 )
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
 from cow_service.readers.question.choices import not_sure_option, option_saying, plain, question_without, says_not_sure
-from cow_service.records import MEETINGS, AnswerOption, Encounter
+from cow_service.records import AnswerOption
 
 MAX_ANSWER = 400  # characters of an open answer
 MAX_REASONING = 4000  # characters that are kept
@@ -42,12 +43,12 @@ def answer_calls(
     votes: int,
     reasoning_length: int,
 ) -> list[PromptCall[AnswerReading]]:
-    """One call per vote. `jpegs` are the image, then the frames; what the mover would encounter is told in words."""
+    """One call per vote. `jpegs` are the image, then the frames; what the simulation found is told in words."""
     inputs: dict[str, object] = {"question": question_without(question, options), "options": tuple(options)}
     return [
         PromptCall(
             "answer-from-image" if imagined is None else "answer-with-frames",
-            inputs if imagined is None else inputs | _hypothesis(imagined),
+            inputs if imagined is None else inputs | hypothesis(imagined),
             jpegs,
             schema(options, reasoning_length),
             lambda reply: read_answer(reply, options),
@@ -56,23 +57,6 @@ def answer_calls(
         )
         for vote in range(votes)
     ]
-
-
-def _hypothesis(imagined: Imagined) -> dict[str, object]:
-    """What the simulation found, as inputs of the prompt."""
-    simulation = imagined.simulation
-    trajectory = simulation.trajectory
-    return {
-        "sentence": simulation.motion.sentence,
-        "times": ", ".join(f"{frame.time:.2f} s" for frame in simulation.frames),
-        "encounters": tuple(_encounter_words(each, trajectory.fps) for each in trajectory.encounters),
-        "encounters_known": simulation.encounters_known,
-    }
-
-
-def _encounter_words(encounter: Encounter, fps: float) -> str:
-    name = " ".join(encounter.object.split())
-    return f"{MEETINGS[encounter.kind]} the {name.removeprefix('the ')}, {encounter.first_frame / fps:.2f} s in"
 
 
 def schema(options: Sequence[AnswerOption], reasoning_length: int) -> Schema:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, names_corners
@@ -34,11 +34,12 @@ _FOUR = re.compile(rf"[(\[]?\s*({NUMBER})\s*,\s*({NUMBER})\s*,\s*({NUMBER})\s*,\
 
 @dataclass(frozen=True)
 class Place:
-    """Box and point as they were written, and what the reply calls them."""
+    """Box and point as they were written, what the reply calls them, and the object in which they stand."""
 
     label: str
     box: Any
     point: Any
+    fields: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
 def places_in(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[Place]:
@@ -55,7 +56,7 @@ def places_in(value: object, frame: CoordinateFrame, name: str = "") -> Iterator
     named = any(key in fields for key in (*boxes, *points))
     if named or names_corners(fields):
         label = next((label for key in _LABEL_KEYS if (label := text_of(fields.get(key)))), name)
-        yield Place(label, first_of(fields, *boxes) if named else value, first_of(fields, *points))
+        yield Place(label, first_of(fields, *boxes) if named else value, first_of(fields, *points), fields)
         return
     for key, held in fields.items():
         if isinstance(held, dict | list) and key not in NO_PLACES:

@@ -24,7 +24,7 @@ def follow_arrow(scene: Scene, bbox: BBox, reading: MotionReading, sense: ArrowS
     nothing that rules can read; then the reading's own `along_arrow` counts, and without one only the axis does.
     """
     arrow = arrow_at(scene, bbox)
-    if arrow is None or reading.direction is None or reading.depth:
+    if arrow is None or reading.direction is None:
         return reading
     along = sense == "along" if sense is not None else reading.along_arrow
     if along is None:
@@ -53,11 +53,10 @@ def box_warnings(scene: Scene, bbox: BBox, colour: str | None, clipped: bool) ->
 
     `clipped`: the box reached over the image's edge.
     """
-    x0, y0, x1, y1 = bbox
     found: list[str] = []
     if clipped:
         found.append("The reader's box reaches over the image's edge; it was cut off there.")
-    if (x1 - x0) * (y1 - y0) > MAX_BOX_SHARE * scene.width * scene.height:
+    if covers_image(scene.width, scene.height, bbox):
         found.append("The reader's box covers nearly the whole image: it may not be that of one object.")
     here = None if colour is None else scene.region_of(bbox)
     if here is not None and colour not in {here.colour, *here.colours}:
@@ -69,6 +68,12 @@ def box_warnings(scene: Scene, bbox: BBox, colour: str | None, clipped: bool) ->
                 f"({x:.0f}, {y:.0f}): the box may be wrong."
             )
     return tuple(found)
+
+
+def covers_image(width: int, height: int, bbox: BBox) -> bool:
+    """Whether a box covers nearly the whole image of `width` x `height` px."""
+    x0, y0, x1, y1 = bbox
+    return (x1 - x0) * (y1 - y0) > MAX_BOX_SHARE * width * height
 
 
 def angle(a: Vector, b: Vector) -> float:

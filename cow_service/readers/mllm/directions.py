@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal, cast
+from dataclasses import dataclass, replace
+from typing import cast
 
 from cow_service.readers.mllm.boxes import BOX_KEYS, CORNER_PAIRS, POINT_KEYS
 from cow_service.readers.mllm.coordinates import LEAST_LENGTH, CoordinateFrame
+from cow_service.readers.mllm.priors import CameraSense, SpeedWord, read_depth_degrees, read_speed
 from cow_service.readers.mllm.replies import ReplyError, fields_of, first_of, is_none, is_number, text_of, truth_of
 from cow_service.records import Cue, Point
 
-CameraSense = Literal["towards", "away"]
 STRAIGHT = 60.0  # degrees from the image's vertical, within which a line can also lead towards or away
+STEEP = 60.0  # degrees out of the image plane, from which a motion leads straight towards or away
 _DIRECTION_KEYS = ("direction", "motion_direction", "line", "vector")
 _CUE_WORDS: tuple[tuple[str, Cue], ...] = (
     ("arrow", "arrow"),
@@ -42,6 +43,9 @@ class Line:
     cue: Cue | None = None
     along_arrow: bool | None = None
     camera: CameraSense | None = None
+    depth_degrees: float | None = None  # out of the image plane, positive away from the camera
+    speed: SpeedWord | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def line_in(values: Sequence[object], said: str, frame: CoordinateFrame) -> Line:
@@ -53,7 +57,7 @@ def line_in(values: Sequence[object], said: str, frame: CoordinateFrame) -> Line
         raise ReplyError("`direction` is missing; give two points on the line of the motion, or null")
     if any(not _same_way(line, lines[0]) for line in lines):
         raise ReplyError("several directions are given; give one")
-    line = max(lines, key=lambda line: (line.cue is not None, line.camera is not None))
+    line = _one_depth(max(lines, key=lambda line: (line.cue is not None, line.camera is not None)))
     if line.ends is not None and line.camera is not None and not _leads(line.ends, line.camera):
         raise ReplyError(
             "`direction` and `camera` disagree; `camera` is for what moves straight towards or away from it, else null"
@@ -78,12 +82,32 @@ def _lines(value: object, frame: CoordinateFrame) -> Iterator[Line]:
     written = first_of(fields, *_DIRECTION_KEYS) if any(key in fields for key in _DIRECTION_KEYS) else value
     named = text_of(fields.get("cue")).lower()
     cue: Cue | None = next((cue for word, cue in _CUE_WORDS if word in named), None)
+    camera = _CAMERA.get(text_of(fields.get("camera")).lower().strip(" ."))
+    depth_degrees, depth_warnings = read_depth_degrees(fields.get("depth_degrees"), camera)
+    speed, speed_warnings = read_speed(fields.get("speed"))
     yield Line(
         ends=None if named == "none" and _is_zero(written) else _ends(written, frame),
         cue=cue,
         along_arrow=truth_of(fields.get("along_arrow")),
-        camera=_CAMERA.get(text_of(fields.get("camera")).lower().strip(" .")),
+        camera=camera,
+        depth_degrees=depth_degrees,
+        speed=speed,
+        warnings=(*depth_warnings, *speed_warnings),
     )
+
+
+def _one_depth(line: Line) -> Line:
+    """The line either straight towards or away (`camera`), or at an angle (`ends` and `depth_degrees`)."""
+    if line.depth_degrees is None:
+        return line
+    sense: CameraSense = "away" if line.depth_degrees > 0 else "towards"
+    steep = abs(line.depth_degrees) >= STEEP
+    if line.camera is not None:
+        oblique = line.ends is not None and not steep
+        return replace(line, camera=None) if oblique else replace(line, depth_degrees=None)
+    if steep and (line.ends is None or _leads(line.ends, sense)):
+        return replace(line, camera=sense, depth_degrees=None)
+    return line
 
 
 def _ends(written: object, frame: CoordinateFrame) -> tuple[Point, Point] | None:

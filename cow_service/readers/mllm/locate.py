@@ -1,4 +1,4 @@
-"""Second prompt: where the object is, which way it moves, and what tells so."""
+"""Second prompt: where the object is and what is around it, which way it moves, and what tells so."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.directions import Line, line_in
 from cow_service.readers.mllm.identify import MAX_OTHERS
 from cow_service.readers.mllm.images import EncodedImage
-from cow_service.readers.mllm.replies import ReplyError, fields_of, is_none, name_words, values_in, without_thinking
+from cow_service.readers.mllm.others import MAX_LABEL, MAX_OBSTACLES, read_surroundings
+from cow_service.readers.mllm.priors import MOTION_FIELDS, OBJECT_FIELDS
+from cow_service.readers.mllm.replies import ReplyError, is_none, values_in, without_thinking
 from cow_service.readers.mllm.schemas import Schema, nullable, numbers, object_of, one_of, words
-from cow_service.records import BBox, LocatedObject, Point
+from cow_service.records import BBox, LocatedObject, ObjectPrior, Point
 
 CUES = ("arrow", "trail", "text", "orientation", "none")
-MAX_LABEL = 120  # characters
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,9 @@ class Located:
     label: str = ""
     clipped: bool = False  # the box reached over the image's edge
     others: tuple[LocatedObject, ...] = ()
+    prior: ObjectPrior | None = None
     line: Line | None = None
+    warnings: tuple[str, ...] = ()  # of optional fields and other boxes that were left out
 
 
 def locate_call(
@@ -56,8 +59,9 @@ def locate_call(
         "line_order": frame.line_order,
         "wants_box": wants_box,
         "wants_direction": wants_direction,
+        "max_obstacles": MAX_OBSTACLES,
     }
-    shape = schema(frame, bool(others), wants_box, wants_direction, reasoning_length)
+    shape = schema(frame, wants_box, wants_direction, reasoning_length)
     return PromptCall(
         "locate",
         inputs,
@@ -67,43 +71,52 @@ def locate_call(
     )
 
 
-def schema(
-    frame: CoordinateFrame, others: bool, wants_box: bool, wants_direction: bool, reasoning_length: int
-) -> Schema:
-    """JSON schema of the reply."""
+def schema(frame: CoordinateFrame, wants_box: bool, wants_direction: bool, reasoning_length: int) -> Schema:
+    """JSON schema of the reply. What only priors are made of may be left out."""
     box_key, box = frame.coordinates.box, numbers(frame, 4)
     fields: dict[str, Schema] = {"reasoning": words(reasoning_length)}
     if wants_box:
-        fields |= {"label": words(MAX_LABEL), box_key: nullable(box)}
-        if others:
-            item = object_of(**{"label": words(MAX_LABEL), box_key: box})
-            fields["others"] = {"type": "array", "items": item, "maxItems": MAX_OTHERS}
+        item = object_of(OBJECT_FIELDS, **{"label": words(MAX_LABEL), box_key: box}, **OBJECT_FIELDS)
+        fields |= {"label": words(MAX_LABEL), box_key: nullable(box)} | OBJECT_FIELDS
+        fields["others"] = {"type": "array", "items": item, "maxItems": MAX_OTHERS + MAX_OBSTACLES}
     if wants_direction:
         fields |= {
             "cue": one_of(*CUES),
             "along_arrow": nullable({"type": "boolean"}),
             "camera": nullable(one_of("towards", "away")),
             "direction": nullable(numbers(frame, 4)),
-        }
-    return object_of(**fields)
+        } | MOTION_FIELDS
+    return object_of(OBJECT_FIELDS | MOTION_FIELDS, **fields)
 
 
 def read_located(
     reply: str, frame: CoordinateFrame, wanted: str, others: Sequence[str], wants_box: bool, wants_direction: bool
 ) -> Located | None:
-    """What a reply says of the object `wanted`; None where it says that it does not see it. Raises `ReplyError`."""
+    """What a reply says of the object `wanted`; None where it says that it does not see it. Raises `ReplyError`.
+
+    `others` are the things that the question names besides.
+    """
     said = without_thinking(reply)
     values = values_in(said)
     place = _place(values, said, frame, wanted) if wants_box else None
     if wants_box and place is None:
         return None
     line = line_in(values, said, frame) if wants_direction else None
+    told = () if line is None else line.warnings
     if place is None:
-        return Located(line=line)
-    found = _others(values, frame, others)
-    if not is_none(place.box):
-        return Located(frame.bbox(place.box), None, place.label, frame.overshoots(place.box), found, line)
-    return Located(None, frame.point(place.point), place.label, False, found, line)
+        return Located(line=line, warnings=told)
+    bbox = None if is_none(place.box) else frame.bbox(place.box)
+    around = read_surroundings(values, frame, wanted, place.fields, others)
+    return Located(
+        bbox=bbox,
+        point=frame.point(place.point) if bbox is None else None,
+        label=place.label,
+        clipped=bbox is not None and frame.overshoots(place.box),
+        others=around.others,
+        prior=around.prior,
+        line=line,
+        warnings=(*around.warnings, *told),
+    )
 
 
 def _place(values: Sequence[object], said: str, frame: CoordinateFrame, wanted: str) -> Place | None:
@@ -117,17 +130,3 @@ def _place(values: Sequence[object], said: str, frame: CoordinateFrame, wanted: 
         )
     place = chosen(places, wanted)
     return None if is_none(place.box) and is_none(place.point) else place
-
-
-def _others(values: Sequence[object], frame: CoordinateFrame, wanted: Sequence[str]) -> tuple[LocatedObject, ...]:
-    """Boxes of the other objects that were asked for; one that cannot be read is left out."""
-    found: dict[str, LocatedObject] = {}
-    for value in values:
-        for place in places_in(fields_of(value).get("others"), frame):
-            name = next((name for name in wanted if name_words(name) == name_words(place.label)), None)
-            if name is not None and place.box is not None:
-                try:
-                    found.setdefault(name, LocatedObject(object=name, bbox=frame.bbox(place.box)))
-                except ReplyError:
-                    continue  # the mover matters more than asking for this again
-    return tuple(found.values())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -20,6 +21,8 @@ from cow_service.readers.mllm.identify import Identified, identify_call
 from cow_service.readers.mllm.images import EncodedImage, encode
 from cow_service.readers.mllm.locate import Located, locate_call
 from cow_service.readers.mllm.models import UNKNOWN, configure
+from cow_service.readers.mllm.others import separate_objects
+from cow_service.readers.mllm.priors import HEADING_DEVIATION, SPEED_DEVIATION
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.mllm.scale import Scaled, scale_call
 from cow_service.readers.question.sentences import parse, parse_noun_phrase
@@ -87,6 +90,7 @@ class MllmReader:
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
             phrase = parse_noun_phrase(identified.object)
             warnings = box_warnings(given.scene, bbox, phrase.colour if phrase else None, located.clipped)
+        others, doubles = separate_objects(bbox, located.others)
         if located.label and set(name_words(located.label)).isdisjoint(name_words(identified.object)):
             mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
             warnings = (*warnings, mismatch)
@@ -94,9 +98,10 @@ class MllmReader:
             object=identified.object,
             bbox=bbox,
             point=located.point,
-            others=located.others,
-            warnings=(*warnings, *self._family_warnings()),
+            others=others,
+            warnings=(*warnings, *located.warnings, *doubles, *self._family_warnings()),
             hints=hints if given.motion_wanted else None,
+            prior=located.prior,
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
@@ -104,18 +109,20 @@ class MllmReader:
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
         """
+        warnings: tuple[str, ...] = ()
         if hints is None:
             image, identified = self._encode(given), None
             if grounding.source != "request":
                 identified = self._client.complete(identify_call(given.question, image, self._reasoning), given)
-            _, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
+            located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
+            warnings = () if located is None else located.warnings
         kind = hints.kind or _kind(given, None)
-        reading = MotionReading(kind, None, "text", sentence=hints.sentence)
+        reading = MotionReading(kind, None, "text", sentence=hints.sentence, warnings=warnings)
         if kind in FALLING_KINDS:
             reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
             if hints.scale_error:
                 warning = f"The scale of the scene could not be read ({hints.scale_error}): the default one was taken."
-                reading = replace(reading, warnings=(warning,))
+                reading = replace(reading, warnings=(*warnings, warning))
         return self._directed(given, grounding, reading, hints) if kind in DIRECTED_KINDS else reading
 
     def answer(
@@ -170,6 +177,8 @@ class MllmReader:
             sentence=identified.sentence if identified else None,
             ends=line.ends,
             camera=line.camera,
+            depth_degrees=line.depth_degrees,
+            speed=line.speed,
             cue=line.cue,
             along_arrow=line.along_arrow,
             metres_per_pixel=scale.metres_per_pixel,
@@ -186,13 +195,18 @@ class MllmReader:
                 f"{self._subject} found nothing in the image or the question that tells which way the "
                 f"{grounding.object} moves. {GIVE_DIRECTION}"
             )
+        if hints.speed is not None:
+            reading = replace(reading, speed=hints.speed, speed_deviation=SPEED_DEVIATION)
         question = parse(given.question)
         words = question.motion
         guess: Cue = "arrow" if question.mentions_arrow else "text" if words.direction is not None else "orientation"
         cue = hints.cue or guess
         if hints.camera is not None:
             direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
-            return replace(reading, direction=direction, depth=depth, cue=cue)
+            return replace(reading, direction=direction, depth=depth, depth_deviation=HEADING_DEVIATION, cue=cue)
+        if hints.depth_degrees is not None:
+            depth = math.sin(math.radians(hints.depth_degrees))
+            reading = replace(reading, depth=depth, depth_deviation=HEADING_DEVIATION)
         (x0, y0), (x1, y1) = hints.ends or ((0.0, 0.0), (1.0, 0.0))
         along = hints.along_arrow if cue == "arrow" else None
         reading = replace(reading, direction=(x1 - x0, y1 - y0), cue=cue, along_arrow=along)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 from cow_service.readers.mllm.coordinates import CoordinateFrame
@@ -9,9 +10,10 @@ from cow_service.readers.mllm.coordinates import CoordinateFrame
 Schema = dict[str, Any]
 
 
-def object_of(**properties: Schema) -> Schema:
-    """An object with exactly these fields, in this order: reasoning comes first."""
-    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
+def object_of(optional: Collection[str] = (), /, **properties: Schema) -> Schema:
+    """An object with these fields and no others, in this order: reasoning comes first. `optional` may be left out."""
+    required = [name for name in properties if name not in optional]
+    return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
 
 
 def words(longest: int) -> Schema:

@@ -1,0 +1,102 @@
+"""What a multimodal LLM is told of a simulation before it answers: the embedded reader's facts, as a hypothesis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cow_service.readers.base import Imagined
+from cow_service.readers.mllm.answer import answer_calls
+from cow_service.readers.prompts import load_prompt
+from cow_service.readers.question.choices import read_choices
+from cow_service.records import Simulation
+
+SHA = "0" * 64
+OPTIONS = read_choices("", ["Yes", "No", "Not sure"])
+FACTS = "The ball bounces once and meets\nthe white cube after 1.1 s."
+MUG = {"object": "the blue mug", "bbox": (60, 20, 80, 40), "first_frame": 8}
+
+
+def prompt(**trajectory: Any) -> str:
+    """The text of the answer's prompt for a simulation with this trajectory."""
+    image = {"sha256": SHA, "url": f"/artifacts/{SHA}", "media_type": "image/png", "size": 1}
+    path = {"states": [(0,) * 6] * 2, "points": [(1, 1)] * 2, "visible": [True] * 2, "scale": [1, 1], "tracks": []}
+    simulation = Simulation.model_validate(
+        {
+            "id": "x", "created_at": "", "question": "q", "frames": (), "video": None, "overlay": image,
+            "image": {"sha256": SHA, "width": 96, "height": 64},
+            "grounding": {"object": "the ball", "point": (1, 1), "bbox": (0, 0, 9, 9), "source": "mllm"},
+            "motion": {
+                "kind": "linear", "direction": (1, 0), "cue": "text", "speed": 10, "sentence": "The ball rolls.",
+                "metres_per_pixel": {"value": 0.01, "source": "default"}, "source": "mllm",
+            },
+            "trajectory": {"law": "contact", "fps": 16, "paths": [path], "anchors": [], "ensemble": 200} | trajectory,
+            "generator": {"name": "cutout", "seed": 0}, "reader": {"name": "mllm"}, "timings": {},
+        }
+    )  # fmt: skip
+    imagined = Imagined(simulation, (np.zeros((4, 4, 3), np.uint8),))
+    (call,) = answer_calls("Will it hit the cube?", OPTIONS, (b"", b""), imagined, 1, 100)
+    return load_prompt(call.prompt).render(**call.inputs)
+
+
+def outcome(**fields: Any) -> dict[str, Any]:
+    asked = {"relation": "touches", "target": "the white cube"} | fields.pop("asked", {})
+    return {"asked": asked, "object": "the white cube", "sure": True, "robust": True, "facts": FACTS} | fields
+
+
+def test_the_outcome_is_told_as_a_hypothesis() -> None:
+    text = prompt(
+        outcome=outcome(probability=0.93, robust=False, depends_on=["speed", "heading"]),
+        encounters=[MUG | {"kind": "touches"}],
+    )
+    lines = text.splitlines()
+    assert "> The ball bounces once and meets the white cube after 1.1 s." in lines
+    assert "> In 93% of 200 computed worlds: the ball touches the white cube." in lines
+    (doubts,) = [line for line in lines if "standard deviation" in line]
+    assert "a single estimate behind it changes this" in doubts
+    assert "depends most on the speed, the heading in depth" in doubts
+    assert "blue mug" not in text
+    assert "a computed hypothesis about the first image" in text
+    assert "It can be wrong" in text
+    told = text[text.index("The simulation came to") : text.index("- `answer`")]
+    assert not any(f"({option.letter})" in told or option.text in told.split() for option in OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"asked": {"negated": True}}, "the ball does not touch the white cube."),
+        ({"asked": {"relation": "covers", "negated": True}}, "the ball does not hide the white cube."),
+        ({"asked": {"relation": "covered"}}, "the ball is hidden by the white cube."),
+        ({"asked": {"target": None}, "object": None}, "the ball touches something."),
+        ({"asked": {"target": None, "negated": True}, "object": None}, "the ball does not touch anything."),
+        ({"asked": {"form": "which-first"}, "first": "red\nbox"}, "the first thing that the ball touches is red box."),
+        ({"asked": {"form": "which-first"}}, "the first thing that the ball touches is nothing."),
+        ({"asked": {"form": "how-many"}, "count": 2}, "the number of things that the ball touches is 2."),
+        ({"asked": {"form": "when"}, "time": 1.1, "time_band": (0.9, 1.4)}, "first after 1.10 s (0.90 to 1.40 s"),
+    ],
+)
+def test_every_form_of_question_is_put_in_words(fields: dict[str, Any], told: str) -> None:
+    text = prompt(outcome=outcome(probability=0.5, **fields))
+    (line,) = [line for line in text.splitlines() if line.startswith("> In 50% of 200 computed worlds: ")]
+    assert told in line
+    assert "no single estimate behind it changes this" in text
+
+
+def test_encounters_are_told_where_there_is_no_outcome() -> None:
+    hidden = MUG | {"kind": "occludes", "share": 0.4, "probability": 0.9}
+    text = prompt(encounters=[MUG | {"kind": "touches"}, hidden])
+    assert "> touches the blue mug, 0.50 s in" in text.splitlines()
+    line = "> passes in front of the blue mug, 0.50 s in, at most 40% covered; in 90% of 200 computed worlds"
+    assert line in text.splitlines()
+    assert "a computed hypothesis" in text
+    assert "The simulation found nothing" in prompt()
+    assert "The simulation found nothing" not in prompt(encounters_known=False)
+    assert "The simulation found nothing" in prompt(outcome=outcome(facts=""))  # an outcome that tells nothing
+
+
+def test_a_law_without_contacts_is_told() -> None:
+    assert "move on through whatever they meet" in prompt(law="ballistic")
+    assert "move on through whatever they meet" not in prompt()
