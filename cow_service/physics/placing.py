@@ -21,9 +21,10 @@ TURN_SIGMA: dict[Cue, float] = {
     "arrow": 1.5, "trail": 3.0, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
 }  # fmt: skip
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
-RISE, RISE_SIGMA = math.radians(22), math.radians(12)  # above the horizontal: how things are thrown
+RISE, RISE_SIGMA = math.radians(20), math.radians(10)  # above the horizontal: how things are thrown
 TURNS = np.linspace(-5, 5, 81)  # in deviations: turns out of the plane of the image that are weighed
 TURN_WIDTHS = ((0.6, 0.55), (3.0, 0.45))  # deviations and shares: most throws go nearly along the image, some do not
+AIMED, AIM_SIGMA = 1.5, math.radians(12)  # how much likelier a heading to what is asked about is, and how exact
 LOW = 0.08  # sine of the angle between a ray and a horizontal plane below which the plane through the foot is taken
 APART = 0.98  # of the distance of two bodies: together they are so wide at most
 VEHICLE_WIDTH = 0.5  # of a vehicle's length
@@ -47,9 +48,14 @@ class PlacedScene:
 
 
 def place(
-    bodies: Sequence[SeenBody], motion: Motion, fit: CameraFit, size: tuple[int, int], draws: Floats
+    bodies: Sequence[SeenBody],
+    motion: Motion,
+    fit: CameraFit,
+    size: tuple[int, int],
+    draws: Floats,
+    asked: int | None = None,
 ) -> PlacedScene:
-    """Places bodies seen in an image of a size (width, height), px."""
+    """Places bodies seen in an image of a size (width, height), px. `asked` is the body that the question is about."""
     cameras, parameters = Cameras.drawn(fit, size, draws)
     supports = supports_of(bodies)
     mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
@@ -58,12 +64,14 @@ def place(
         unit = _stand(bodies, supports, 0, cameras, draws, share)
         if unit is not None:
             cameras = cameras.at_height(depth / np.maximum(cameras.depth(unit.centre), 1e-6))
-            return _with_others(bodies, supports, motion, cameras, parameters, draws, None, share)
+            placed = _with_others(bodies, supports, motion, cameras, draws, None, share)
+            return _going(placed, supports, motion, cameras, parameters, draws, asked)
     ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
     height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
     cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
     placed = in_the_air(cameras, mover.bbox, mover.shape, depth)
-    return _with_others(bodies, supports, motion, cameras, parameters, draws, placed)
+    others = _with_others(bodies, supports, motion, cameras, draws, placed)
+    return _going(others, supports, motion, cameras, parameters, draws, asked)
 
 
 def flies(mover: SeenBody, motion: Motion) -> bool:
@@ -89,12 +97,11 @@ def _with_others(
     supports: list[int | None],
     motion: Motion,
     cameras: Cameras,
-    parameters: Floats,
     draws: Floats,
     flying: Placed | None,
     depth_share: float = 1.0,
-) -> PlacedScene:
-    """The other bodies beside a mover that stands, or flies as given; and its velocity."""
+) -> list[Placed]:
+    """The mover, which stands, or flies as given, and the other bodies."""
     depth = cameras.focal * motion.metres_per_pixel.value
     placed: list[Placed] = []
     for i, body in enumerate(bodies):
@@ -107,7 +114,20 @@ def _with_others(
             guess = depth if i == 0 else depth * np.exp(DEPTH_SIGMA * draws[:, COLUMN["foot"]])
             standing = in_the_air(cameras, body.bbox, body.shape, guess)
         placed.append(standing)
-    velocity = _velocity(placed[0], motion, cameras, draws)
+    return placed
+
+
+def _going(
+    placed: list[Placed],
+    supports: list[int | None],
+    motion: Motion,
+    cameras: Cameras,
+    parameters: Floats,
+    draws: Floats,
+    asked: int | None,
+) -> PlacedScene:
+    """The bodies apart from each other, and the velocity of the mover."""
+    velocity = _velocity(placed[0], motion, cameras, draws, None if asked is None else placed[asked])
     placed = _apart(placed)
     resting = tuple(on if body.stands else None for on, body in zip(supports, placed, strict=True))
     return PlacedScene(cameras, tuple(placed), resting, velocity, parameters[:, 3:5])
@@ -146,7 +166,7 @@ def _depth_share(
     return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
 
 
-def _velocity(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats) -> Floats:
+def _velocity(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, asked: Placed | None) -> Floats:
     """[K, 3] m/s right, up and ahead."""
     if motion.direction is None or motion.speed == 0:
         return np.zeros((len(draws), 3))
@@ -156,7 +176,7 @@ def _velocity(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats) ->
     dx, dy = motion.direction
     direction = np.stack([cosine * dx - sine * dy, sine * dx + cosine * dy], axis=1)
     if motion.kind == "projectile":
-        way = _thrown(mover, motion, cameras, draws, direction)
+        way = _thrown(mover, motion, cameras, draws, direction, asked)
     elif mover.stands:
         way = _along_floor(mover, motion, cameras, direction)
     else:
@@ -171,7 +191,7 @@ def _with_depth(direction: Floats, depth: float) -> Floats:
 
 def _along_floor(mover: Placed, motion: Motion, cameras: Cameras, direction: Floats) -> Floats:
     """Unit vectors [K, 3] over the floor whose image at the mover has the directions [K, 2]."""
-    if motion.depth:
+    if motion.depth and motion.source == "request":  # readers' depth is that of the direction, which the floor tells
         way = np.einsum("kij,kj->ki", cameras.axes, _with_depth(direction, motion.depth))
     else:
         points, depth = cameras.project(mover.centre)
@@ -186,11 +206,13 @@ def _along_floor(mover: Placed, motion: Motion, cameras: Cameras, direction: Flo
     return way / np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
 
 
-def _thrown(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, direction: Floats) -> Floats:
+def _thrown(
+    mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, direction: Floats, asked: Placed | None
+) -> Floats:
     """Unit vectors [K, 3] seen in directions [K, 2]: in a vertical plane, turned from that of the image by the depth.
 
-    A drawn direction leaves the depth open. Small turns are likelier, as are throws that rise at the angle at which
-    things are thrown: both together give the turn and its deviation.
+    A drawn direction leaves the depth open. Small turns are likelier; so are throws that rise at the angle at which
+    things are thrown, and throws that lead about to what the question asks about: people ask of what might happen.
     """
     mean, sigma = math.asin(motion.depth), math.radians(motion.depth_deviation)
     turn = np.full(len(draws), mean)
@@ -200,6 +222,10 @@ def _thrown(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, dire
         rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
         weight = sum(share / width * np.exp(-0.5 * (TURNS / width) ** 2) for width, share in TURN_WIDTHS)
         weight = weight * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
+        if asked is not None:
+            away = asked.centre[0] - mover.centre[0]
+            bearing = math.atan2(float(away[2]), float(np.sign(direction[0, 0]) * away[0]))
+            weight = weight * (1 + AIMED * np.exp(-0.5 * ((turns - bearing) / AIM_SIGMA) ** 2))
         below = (np.cumsum(weight) - weight / 2) / weight.sum()
         shares = np.array([NormalDist().cdf(z) for z in draws[:, COLUMN["depth"]]])
         turn = np.interp(shares, below, turns)

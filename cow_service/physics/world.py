@@ -44,6 +44,7 @@ class WorldInput:
     size: tuple[int, int]  # px, of the image: width and height
     num_frames: int
     fps: float
+    asked: int | None = None  # the body that the question is about
     led: Led | None = None  # the mover is led along a path, through everything
 
 
@@ -64,7 +65,7 @@ class Worlds:
 
 def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""
-    scene = place(given.bodies, given.motion, given.fit, given.size, draws)
+    scene = place(given.bodies, given.motion, given.fit, given.size, draws, given.asked)
     shapes = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
     finished = None if len(draws) == 1 else partial(_has_left, scene.cameras, given.size[0])
     runs = run_worlds(shapes, given.num_frames, given.fps, every, finished)
