@@ -20,6 +20,7 @@ _NOT_MET: dict[str, str] = {
     "covers": "does not hide {}",
     "covered": "is not hidden by {}",
 }
+_NOTHING_MET: dict[str, str] = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
 
 
 def facts_of(mover: str, trajectory: Trajectory) -> str:
@@ -48,7 +49,7 @@ def _named(name: str, article: str) -> str:
         words = words[1:]
     short = " ".join(words).rstrip(".?!;:") or "object"
     if len(short) > MAX_NAME:
-        short = short[:MAX_NAME].rstrip() + "..."
+        short = short[:MAX_NAME].rstrip() + "\u2026"
     return f"{article} {short}"
 
 
@@ -171,12 +172,13 @@ def _missed(trajectory: Trajectory, met: Sequence[Encounter]) -> str:
     outcome = trajectory.outcome
     if not trajectory.encounters_known:
         return ""
-    if outcome is not None and outcome.object is not None:
+    if outcome is not None and (outcome.asked.target is None or outcome.object is not None):
         if _asked_about(outcome, trajectory.encounters) is not None:
             return ""
+        if outcome.asked.target is None or outcome.object is None:
+            return _NOTHING_MET[outcome.asked.relation]
         return _NOT_MET[outcome.asked.relation].format(_named(outcome.object, "the"))
-    touches = any(each.kind == "touches" for each in (*met, *trajectory.encounters))
-    return "" if touches else "touches nothing"
+    return "" if any(each.kind == "touches" for each in met) else _NOTHING_MET["touches"]
 
 
 def _end(trajectory: Trajectory) -> list[str]:
@@ -201,6 +203,8 @@ def _agreement(trajectory: Trajectory, met: Sequence[Encounter]) -> float | None
         kind = _KINDS[asked.relation]
         count = len({each.object for each in trajectory.encounters if each.kind == kind and _happened(each)})
         return outcome.probability if count == outcome.count else None
-    if asked.form == "which-first" and (None if first is None else first.object) == outcome.first:
-        return outcome.probability
-    return None if first is None else first.probability
+    if asked.form == "which-first":
+        return outcome.probability if outcome.first == (None if first is None else first.object) else None
+    if first is None:
+        return outcome.probability if outcome.time is None else None
+    return first.probability

@@ -24,7 +24,7 @@ _STARTS = lex.words(
 )
 _OPENERS = lex.words(", and then so but now please")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
-_RELATED = lex.words("it they the a an be this its")  # behind the "which" of a relative clause
+_SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
 _CONDITIONS = lex.words("if when once after as while upon assuming given provided suppose supposing")
 _SUBJECT = r"(?:it|M|T\d+|they|there)(?: .*)?"
 _INVERTED = re.compile(rf"(?:.* )?(?:will|would|do|does|did|can|could) {_SUBJECT}|be {_SUBJECT}")
@@ -139,13 +139,17 @@ def _opens(before: Sequence[str]) -> bool:
     if not rest:
         return True
     last = rest[max((at for at, token in enumerate(rest) if token == ","), default=-1) + 1 :]
-    closed = len(rest) < len(before) or any(token in lex.CONDITIONALS for token in rest)
-    relative = all(last[at + 1][0] in "MT" or last[at + 1] in _RELATED for at in _places(last[:-1], "which"))
-    return closed and relative and _ASKING.isdisjoint(last) and last[-1] not in {"not", "when", "where", "which"}
+    closed = len(rest) < len(before) or any(token in lex.CONDITIONALS for token in last)
+    clause = closed or any(token in lex.VERBS for token in last)
+    follows = zip(last, [*last[1:], ""], strict=True)
+    related = all(_relates(token, after) for token, after in follows if token in {"which", "when", "where"})
+    return clause and related and _ASKING.isdisjoint(last) and last[-1] != "not"
 
 
-def _places(tokens: Sequence[str], token: str) -> list[int]:
-    return [at for at, each in enumerate(tokens) if each == token]
+def _relates(token: str, after: str) -> bool:
+    """Whether a clause follows on "which", "when" or "where": then nothing is asked with them."""
+    subject = after[:1] in {"M", "T", "X"} or after in _SUBJECTS or after.startswith("OBJ")
+    return subject or (token == "when" and after.removesuffix("-ing") in lex.VERBS)
 
 
 def _leaves_world(sentence: Sentence, covered: frozenset[int]) -> bool:
@@ -156,16 +160,19 @@ def _leaves_world(sentence: Sentence, covered: frozenset[int]) -> bool:
         return True
     if not _INTERVENTIONS.isdisjoint(words) or _NOT_THERE.fullmatch(" ".join(words)):
         return False
-    return not any(_moves_another(tokens, at) or _hits(tokens, at) for at in rest)
+    return not any(_moves_another(sentence, at) or _hits(tokens, at) for at in rest)
 
 
-def _moves_another(words: Sequence[str], at: int) -> bool:
-    """Whether another thing than the mover is the subject of a verb of motion at a place."""
-    verb = lex.VERBS.get(words[at])
-    subject = at - 2 if at > 1 and words[at - 1] == "be" else at - 1
-    if verb is None or verb.kind in {None, "static"} or subject < 0 or not re.fullmatch(r"T\d+", words[subject]):
+def _moves_another(sentence: Sentence, at: int) -> bool:
+    """Whether another thing than the mover, or a hand that moves it, is the subject of a verb of motion at a place."""
+    tokens = sentence.tokens
+    verb = lex.VERBS.get(tokens[at])
+    subject = at - 2 if at > 1 and tokens[at - 1] == "be" else at - 1
+    if verb is None or verb.kind in {None, "static"} or subject < 0 or tokens[subject] not in sentence.phrases:
         return False
-    return subject == 0 or words[subject - 1] not in _BEFORE_PLACES
+    if sentence.phrases[tokens[subject]].head in lex.AGENTS and tokens[at + 1 : at + 2] == ["M"]:
+        return False
+    return subject == 0 or tokens[subject - 1] not in _BEFORE_PLACES
 
 
 def _hits(words: Sequence[str], at: int) -> bool:
