@@ -1,156 +1,144 @@
-"""What can be said of a what-if question without a model: by encounters, by where a throw comes down, or by an axis."""
+"""The answer of the embedded reader: what the world tells of the question, in the words of its options.
+
+One rule for every form: `Outcome.sure` decides whether an answer is given, and half the probability is the line.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
-import numpy as np
-
-from cow_service.physics.dynamics import DEFAULT_SPEED
-from cow_service.physics.encounters import Sweep, find_encounters
-from cow_service.physics.landing import rolls_into
 from cow_service.readers.base import AnswerReading
-from cow_service.readers.question.choices import not_sure_option, plain, says_not_sure
-from cow_service.readers.question.relations import AskedRelation, Relation, read_relation
-from cow_service.readers.question.sentences import Question
-from cow_service.records import AnswerOption, EncounterKind, Grounding, LocatedObject, Simulation, Vector
-from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.scene import Scene
+from cow_service.readers.question.choices import not_sure_option, says_not_sure
+from cow_service.readers.question.numbers_said import count_of, seconds_of, spans
+from cow_service.readers.question.options_said import may_name, names_none, names_several, says_it_happens
+from cow_service.readers.question.phrases import ObjectPhrase
+from cow_service.readers.question.sentences import parse_noun_phrase
+from cow_service.records import AnswerOption, Asked, Doubt, Outcome
 
-# Encounters that make the answer yes. What touches a thing in the picture stands before a part of it.
-YES_BY: dict[Relation, frozenset[EncounterKind]] = {
-    "touches": frozenset(("touches",)),
-    "covers": frozenset(("occludes", "touches")),
-    "covered": frozenset(("occluded-by",)),
-}
-VEHICLES = frozenset(
-    {"car", "truck", "bus", "train", "van", "lorry", "jeep", "taxi", "tram", "tractor", "wagon", "locomotive", "boat"}
-)
-MIN_ELONGATION = 1.3  # length of a silhouette over its breadth, from which its axis is that of the vehicle
-AXIS_ERROR = 12.0  # degrees that the axis may be off, either way
-HEADING_STEP = 4.0  # degrees between the headings that are tried
-CLIP_SECONDS, CLIP_FPS = 5.0, 16.0  # of a clip of the default length
+HAPPENS = 0.5  # probability from which what is asked happens
+
 NOT_ASKED = (
-    "Not sure, because the embedded reader decides only plain yes/no questions: whether the mover hits, lands on, "
-    "hides or is hidden by one thing. Set COW_MLLM to ask a multimodal LLM."
+    "Not sure, because the embedded reader understands only plain questions: whether the mover hits, lands on, hides, "
+    "misses or is hidden by one thing or any, which thing it hits first, when, and how many. Set COW_MLLM to ask a "
+    "multimodal LLM."
 )
-NO_SIMULATION = "Not sure, because without a simulation there are no encounters for the embedded reader to judge by."
+NO_SIMULATION = "Not sure, because without a simulation there is nothing for the embedded reader to judge by."
+NO_OUTCOME = "Not sure, because the simulation does not tell what the question asks."
 NOT_FOUND = "Not sure, because what the question asks about was not found in the image under that name."
-LANDING = "Decided by where the mover's shadow shows that it comes down and rolls on: its trajectory here has no floor."
-NO_LANDING = (
-    "Not sure, because a throw is decided by where its shadow shows that it comes down, and none was found, or it is "
-    "too close to call."
-)
-AXIS = "Decided by the mover's own axis: along it nothing of what is asked happens, whichever end is its front."
+NOT_TOLD = "Not sure, because nothing in the image tells what was asked: its objects could not be told apart."
+NO_OPTION = "The world's answer is '{said}', but not exactly one of the options says so."
+NOT_AMONG = "Not sure, because what is met first, '{said}', is not one of what the question asks about."
+TOO_CLOSE = "Not sure: the probability of {what} is {probability:.2f}{depends}."
+
+_DOUBTS: dict[Doubt, str] = {
+    "speed": "how fast it moves",
+    "heading": "which way it heads in depth",
+    "camera": "how the camera stands",
+    "size": "how large things are",
+    "place": "where things are in depth",
+    "friction": "how much the floor brakes",
+}
 
 
-@dataclass(frozen=True)
-class Decision:
-    """Whether what the question asks happens, null where nothing tells; and why, where that is not plain to see."""
-
-    happens: bool | None
-    why: str = ""
-
-
-def decide(
-    scene: Scene, question: Question, own_grounding: Grounding | None, simulation: Simulation | None
-) -> Decision:
-    """What can be said of the question. `own_grounding` is null where another reader grounded the mover."""
-    asked = read_relation(question)
-    if asked is None:
-        return Decision(None, NOT_ASKED)
-    if simulation is None:
-        stays_clear = own_grounding is not None and _stays_clear(scene, question, asked, own_grounding)
-        return Decision(False, AXIS) if stays_clear else Decision(None, NO_SIMULATION)
-    motion = simulation.motion
-    if motion.kind == "projectile" and motion.source != "request":  # its speed is assumed, and there is no floor
-        return _by_landing(scene, asked, simulation)
-    happens = _by_encounters(simulation, asked)
-    return Decision(happens, NOT_FOUND if happens is None else "")
+def answer_from(
+    options: Sequence[AnswerOption],
+    asked: Asked | None,
+    outcome: Outcome | None,
+    simulated: bool,
+    alternatives: Sequence[ObjectPhrase] = (),
+) -> AnswerReading:
+    """The answer, and why it is not sure. `asked` and `alternatives` are read in the question."""
+    if asked is None or not simulated or outcome is None:
+        why = NOT_ASKED if asked is None else NO_OUTCOME if simulated else NO_SIMULATION
+        return _unsure(options, why)
+    first = outcome.first
+    if outcome.sure and first is not None and alternatives and not any(may_name(each, first) for each in alternatives):
+        return replace(_unsure(options, NOT_AMONG.format(said=first)), reasoning=outcome.facts)
+    return choose_option(options, outcome)
 
 
-def choose_option(options: Sequence[AnswerOption], happens: bool | None) -> AnswerReading:
-    """Yes or no as the options word it; not sure where nothing was decided, or the options are not yes and no."""
-    if happens is not None and not options:
-        return AnswerReading("Yes" if happens else "No", False)
-    unsure = not_sure_option(options)
-    notes: tuple[str, ...] = ()
-    if happens is not None:
-        sure = [option for option in options if not says_not_sure(option.text)]
-        yes, no = ([o for o in sure if plain(o.text).split()[:1] == [word]] for word in ("yes", "no"))
-        if len(yes) == len(no) == 1:
-            return AnswerReading((yes if happens else no)[0].letter, False)
-        notes = (f"What is asked {'happens' if happens else 'does not happen'}, but the options are not yes and no.",)
-    return AnswerReading(None if unsure is None else unsure.letter, True, notes=notes)
+def choose_option(options: Sequence[AnswerOption], outcome: Outcome) -> AnswerReading:
+    """The option that says what the world says, or its words where there are none; else not sure, and why."""
+    why = why_not_sure(outcome)
+    if why:
+        reading = _unsure(options, why)
+    elif not options:
+        reading = AnswerReading(_in_words(outcome), False)
+    else:
+        offered = [option for option in options if not says_not_sure(option.text)]
+        fitting = _fitting(offered, outcome)
+        if len(fitting) == 1:
+            reading = AnswerReading(fitting[0].letter, False)
+        else:
+            reading = _unsure(options, NO_OPTION.format(said=_in_words(outcome)))
+    return replace(reading, reasoning=outcome.facts)
 
 
-def _located(asked: AskedRelation, others: Sequence[LocatedObject]) -> LocatedObject | None:
-    """The thing that is asked about, where it was found by that name."""
-    name = None if asked.target is None else plain(asked.target.text)
-    return next((other for other in others if plain(other.object) == name), None)
+def why_not_sure(outcome: Outcome) -> str:
+    """What keeps the world from an answer, in one sentence; empty where it gives one."""
+    if outcome.asked.target is not None and outcome.object is None:
+        return NOT_FOUND
+    if outcome.probability is None or (outcome.asked.form == "how-many" and outcome.count is None):
+        return NOT_TOLD
+    if outcome.sure:
+        return ""
+    what = "what is asked" if outcome.asked.form == "whether" else f"the likeliest answer, '{_in_words(outcome)}',"
+    depends = f"; it depends most on {_DOUBTS[outcome.depends_on[0]]}" if outcome.depends_on else ""
+    return TOO_CLOSE.format(what=what, probability=outcome.probability, depends=depends)
 
 
-def _by_encounters(simulation: Simulation, asked: AskedRelation) -> bool | None:
-    """Whether what is asked happens, by the encounters of a simulation; None where they cannot tell."""
-    if not simulation.encounters_known:
-        return None
-    met = [encounter for encounter in simulation.trajectory.encounters if encounter.kind in YES_BY[asked.relation]]
-    if asked.target is None:
-        return True if met else None
-    target = _located(asked, simulation.grounding.others)
-    return None if target is None else any(encounter.object == target.object for encounter in met)
+def _unsure(options: Sequence[AnswerOption], why: str) -> AnswerReading:
+    option = not_sure_option(options)
+    return AnswerReading(None if option is None else option.letter, True, notes=(why,))
 
 
-def _by_landing(scene: Scene, asked: AskedRelation, simulation: Simulation) -> Decision:
-    """What is thrown comes down and rolls on: what it then runs into does not depend on its speed."""
-    grounding, direction = simulation.grounding, simulation.motion.direction
-    target = _located(asked, grounding.others)
-    if asked.relation != "touches" or target is None or direction is None:
-        return Decision(None, NOT_FOUND if target is None else NO_LANDING)
-    obstacles = scene.obstacles(grounding.bbox, grounding.others)
-    happens = rolls_into(scene, grounding.bbox, direction, target.bbox, obstacles)
-    return Decision(happens, NO_LANDING if happens is None else LANDING)
+def _happens(outcome: Outcome) -> bool:
+    return outcome.probability is not None and outcome.probability >= HAPPENS
 
 
-def _stays_clear(scene: Scene, question: Question, asked: AskedRelation, grounding: Grounding) -> bool:
-    """Whether a vehicle meets the target neither forward nor backward along its own axis.
-
-    Which end is its front is not known, so that this never decides for yes.
-    """
-    target, mover = _located(asked, grounding.others), question.mover
-    if target is None or mover is None or mover.head not in VEHICLES or question.motion.forward is None:
-        return False
-    axis = _axis(scene, grounding)
-    obstacles = [o for o in scene.obstacles(grounding.bbox, grounding.others) if o.name == target.object]
-    if axis is None or not obstacles:
-        return False
-    offsets = np.arange(-AXIS_ERROR, AXIS_ERROR + HEADING_STEP / 2, HEADING_STEP)
-    headings = [math.radians(axis + offset + turn) for turn in (0.0, 180.0) for offset in offsets]
-    directions = ((math.cos(heading), math.sin(heading)) for heading in headings)
-    return not any(_meets(scene, grounding, direction, obstacles, asked) for direction in directions)
+def _in_words(outcome: Outcome) -> str:
+    """The answer to an open question."""
+    match outcome.asked.form:
+        case "whether":
+            return "Yes" if _happens(outcome) else "No"
+        case "which-first":
+            return outcome.first or "Nothing"
+        case "when":
+            return "Never" if outcome.time is None else f"After about {outcome.time:.1f} s"
+        case "how-many":
+            return str(outcome.count)
 
 
-def _axis(scene: Scene, grounding: Grounding) -> float | None:
-    """Degrees of the long axis of the mover's silhouette in the image; None where it has none to speak of."""
-    ys, xs = np.nonzero(scene.silhouette(grounding.bbox))
-    if len(xs) < 16:
-        return None
-    spread, axes = np.linalg.eigh(np.cov(np.stack([xs, ys])))
-    if spread[1] < MIN_ELONGATION**2 * spread[0]:
-        return None
-    return math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
+def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
+    """The options that say what the world says."""
+    match outcome.asked.form:
+        case "whether":
+            happens = _happens(outcome)
+            return [option for option in options if says_it_happens(option.text, outcome.asked) is happens]
+        case "which-first":
+            return _naming(options, outcome.first)
+        case "when":
+            return _at_time(options, outcome)
+        case "how-many":
+            return [option for option in options if outcome.count in (count_of(option.text) or range(0))]
 
 
-def _meets(
-    scene: Scene, grounding: Grounding, direction: Vector, obstacles: Sequence[Obstacle], asked: AskedRelation
-) -> bool:
-    x0, y0, x1, y1 = grounding.bbox
-    start = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
-    times = np.arange(0, CLIP_SECONDS, 1 / CLIP_FPS)
-    points = start + np.outer(times, DEFAULT_SPEED * scene.width * np.array(direction))
-    inside = np.all((points >= 0) & (points < [scene.width, scene.height]), axis=1)
-    mask = scene.silhouette(grounding.bbox)
-    sweep = Sweep(mask, grounding.bbox, start, points, np.ones(len(times)), inside, airborne=False)
-    return any(encounter.kind in YES_BY[asked.relation] for encounter in find_encounters(sweep, obstacles))
+def _naming(options: Sequence[AnswerOption], first: str | None) -> list[AnswerOption]:
+    if first is None:
+        return [option for option in options if names_none(option.text)]
+    if any(names_several(option.text) for option in options):
+        return []
+    said = [(option, parse_noun_phrase(option.text)) for option in options if not names_none(option.text)]
+    return [option for option, phrase in said if phrase is not None and may_name(phrase, first)]
+
+
+def _at_time(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
+    """The one option in whose span the time lies, where no other option's meets the band of times."""
+    if outcome.time is None:
+        return [option for option in options if names_none(option.text)]
+    said = [(option, span) for option in options if (span := seconds_of(option.text)) is not None]
+    low, high = outcome.time_band or (outcome.time, outcome.time)
+    placed = list(zip([option for option, _ in said], spans([span for _, span in said]), strict=True))
+    met = [(option, span) for option, span in placed if span[0] <= high and span[1] >= low]
+    return [option for option, (start, end) in met if len(met) == 1 and start <= outcome.time <= end]

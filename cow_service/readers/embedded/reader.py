@@ -9,10 +9,11 @@ from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
-from cow_service.readers.embedded.answers import choose_option, decide
+from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
+from cow_service.readers.question.relations import read_alternatives, read_asked
 from cow_service.readers.question.sentences import Question, parse
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, AnswerOption, BBox, Grounding, LocatedObject, ReaderInfo, Source, Vector
@@ -61,15 +62,15 @@ class EmbeddedReader:
         imagined: Imagined | None,
         votes: int,
     ) -> tuple[AnswerReading, ...]:
-        """What geometry decides, the same for every vote; not sure where it does not. It gives no reasoning."""
-        simulation = None if imagined is None else imagined.simulation
-        own_grounding = grounding if grounding is not None and grounding.source == self.source else None
-        with given.cpu():
-            decision = decide(given.scene, parse(given.question), own_grounding, simulation)
-        reading = choose_option(options, decision.happens)
-        again = ("The embedded reader gives the same answer every time: more votes say no more.",) if votes > 1 else ()
-        notes = tuple(note for note in (decision.why, *reading.notes, *again) if note)
-        return (replace(reading, notes=notes),) * votes
+        """What the world tells of the question, the same for every vote; not sure where it does not."""
+        question = parse(given.question)
+        outcome = None if imagined is None else imagined.simulation.trajectory.outcome
+        alternatives = read_alternatives(question)
+        reading = answer_from(options, read_asked(question), outcome, imagined is not None, alternatives)
+        if votes > 1:
+            again = "The embedded reader gives the same answer every time: more votes say no more."
+            reading = replace(reading, notes=(*reading.notes, again))
+        return (reading,) * votes
 
 
 def create(settings: Settings) -> EmbeddedReader:

@@ -92,7 +92,7 @@ def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: b
         return determined and not has_noun
     if key in PUNCTUATION or key in _CLOSED or _is_measure(found, at, has_noun):
         return False
-    if lex.is_adverb(key):
+    if lex.is_adverb(key) or key == "first":  # "will it hit the mug first?"
         return determined and not has_noun
     return key not in lex.VERBS or _verb_belongs(found, at, has_noun, asked, determined or inside)
 

@@ -134,7 +134,7 @@ ABSTRACT = (
         "horizon collision contact impact turn push kick shove nudge throw chance possibility order bit state",
         "part area region space height angle air air's depth reverse motionless stationary number label influence",
         "choice choices yes no forth freefall place front manner fashion pace future scenario situation half",
-        "border force fall toss possible likely true sure going visible rest unison parabola arc",
+        "border force fall toss possible likely true sure going visible untouched rest unison parabola arc",
     )
 )
 NO_THINGS = ABSTRACT | SCENERY
@@ -159,9 +159,9 @@ _KINDS: dict[MotionKind, frozenset[str]] = {
     "static": words("stay remain rest stand sit"),
 }
 TOUCH = words("hit touch collide bump strike reach knock crash contact smash meet impact ram graze intersect scrape")
-OCCLUDE = words("occlude hide block cover obscure conceal overlap eclipse disappear vanish")
+OCCLUDE = words("occlude hide block cover obscure conceal overlap eclipse obstruct disappear vanish")
 LAND = words("land settle")
-_OTHER = words("happen become end stop appear look fit affect break point show indicate lie hang face")
+_OTHER = words("happen become end stop appear look fit affect break point show indicate lie hang face miss avoid fail")
 # Acting on something else with these makes that thing the mover ("someone pushes the cube").
 TRANSITIVE = words(
     "move roll slide push pull drag blow shove kick nudge flick tap knock shift propel carry bring transport lift",

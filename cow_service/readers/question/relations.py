@@ -1,153 +1,213 @@
-"""Reads which relation a yes/no question asks about: whether the mover hits, lands on, hides or is hidden by one thing.
+"""Reads which event a question asks about: that the mover hits, lands on, hides or is hidden by something.
 
-The question is taken at its word: an auxiliary, a subject, a verb, an object. Anything beside that (a negation, an
-order of events, a number) leaves it unread: a wrong yes is worse than "not sure".
+The question is taken at its word, by the grammar of `asked_grammar`. Anything beside it (an order of events, a number,
+a thing that is taken away, another thing that moves) leaves it unread: a wrong yes is worse than "not sure".
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise, takewhile
-from typing import Literal
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.choices import plain
-from cow_service.readers.question.clauses import SENTENCE_END, is_vague
-from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten
+from cow_service.readers.question.asked_grammar import PATTERNS, Pattern
+from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
+from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
+from cow_service.records import Asked
 
-Relation = Literal["touches", "covers", "covered"]  # the mover does it to the other thing, or has it done to it
-
-_AUXILIARIES = lex.words("will would does do did is are could can shall might may")
-_OPENERS = lex.words(", . ? ; : then and ) ( — –")
-_BE = lex.words("be been being get gets getting become becomes is are")
-_CONTACT = lex.words("contact collision")
-# Nothing but these may stand beside subject, verb and object: any other word may turn the question round.
-_HARMLESS = lex.words(
-    "into onto on upon in with against to at of by behind front it its they the a an any some ever eventually then",
-    "actually directly , while moving during along",
+_STARTS = lex.words(
+    "will would do does did can could shall might may be tell say predict know when at in after how what which with",
+    "into on onto",
 )
-_TIMES = lex.words("moment point time times way path motion movement course trajectory future end clip video")
-_COUNTING = lex.words(
-    "two three four five both all every each another other several many twice once exactly least most"
+_OPENERS = lex.words(", and then so but now please")
+_ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
+_SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
+_CONDITIONS = lex.words("if when once after as while upon assuming given provided suppose supposing")
+_SUBJECT = r"(?:it|M|T\d+|they|there)(?: .*)?"
+_INVERTED = re.compile(rf"(?:.* )?(?:will|would|do|does|did|can|could) {_SUBJECT}|be {_SUBJECT}")
+# They set something else in motion, take it away, put it in, or turn the condition round.
+_INTERVENTIONS = lex.words(
+    "remove removes removed removing delete deleted erase erased taken without absent gone missing put puts putting",
+    "insert inserted add added replace replaced swap swapped exchange exchanged trail unless instead otherwise except",
+    "rather no",
 )
-# Toppling, stopping and wrapping are more than touching or hiding.
-_MORE = lex.words("knock block cover crash smash overlap meet reach")
-_MAKING = lex.words("make makes come comes be get gets")  # contact; it can also be lost
-_VANISH = lex.words("disappear vanish")
-_ANYTHING = lex.words("anything something object objects thing things obstacle obstacles")
-_COMES_DOWN = lex.words("fall drop tumble come end stop rest")
-_ONTO = lex.words("by with against into onto on upon behind")
-_KNOWN = lex.VERBS.keys() | _BE | _HARMLESS | _ANYTHING | _TIMES | _CONTACT | {"make", "makes"}
+_NOT_THERE = re.compile(r".*\b(?:not|n't|never) (?:there|here|present|exist|existed)\b.*")
+_SHORT_ANSWER = lex.words(
+    "please answer reply respond say just only with by in a single word yes no or not sure either"
+)
+_LIST = re.compile(r"(?P<list>T\d+(?: , T\d+)*(?: ,)? or T\d+)")
+_LIST_AT_END = re.compile(r".*?, " + _LIST.pattern)
+_BEFORE_PLACES = lex.words("to of by near behind beside in on at from under above below with toward towards into")
+_HOLLOW = lex.words("bowl basket hole pocket goal bin bucket pit hoop net drawer gap garage tunnel cave tray pan pot")
 
 
 @dataclass(frozen=True)
-class AskedRelation:
-    """The relation of the mover to another thing that a question asks about."""
+class _Reading:
+    """What a pattern covers: its things, and which tokens of the sentence."""
 
-    relation: Relation
-    target: ObjectPhrase | None  # None: any thing at all
+    pattern: Pattern
+    named: tuple[ObjectPhrase, ...]
+    covered: frozenset[int]
 
 
-def read_relation(question: Question) -> AskedRelation | None:
-    """The relation that the question asks for; None where it is not one of ours, or not put plainly."""
-    found = question.items
-    starts = [at for at in range(len(found) - 1) if found[at].key in _AUXILIARIES and _is_subject(found[at + 1])]
-    if len(starts) != 1 or (starts[0] and found[starts[0] - 1].key not in _OPENERS):
+def read_asked(question: Question) -> Asked | None:
+    """What the question asks for; None where it is not one of ours, or not put plainly.
+
+    `target` is worded as in `Question.others`, where the question names it there. Of `which-first` it is None: see
+    `read_alternatives`.
+    """
+    reading = _read(question)
+    if reading is None:
         return None
-    _, subject, *rest = takewhile(lambda item: item.key not in SENTENCE_END, found[starts[0] :])
-    if not _is_plain(rest):
+    pattern, several = reading.pattern, reading.pattern.form == "which-first"
+    if len(reading.named) > 1 and not several:
         return None
-    is_mover = subject.key in lex.MOVER_PRONOUNS or _means(subject.phrase, question.mover)
-    if not is_mover and not _done_by_mover(rest, question):
+    target = None if several or not reading.named else _as_named(reading.named[0], question)
+    return Asked(form=pattern.form, relation=pattern.relation, target=target, negated=pattern.negated)
+
+
+def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
+    """The things, or the one kind, among which a question asks for the first; empty where it asks for any."""
+    reading = _read(question)
+    return () if reading is None or reading.pattern.form != "which-first" else reading.named
+
+
+@lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
+def _read(question: Question) -> _Reading | None:
+    """The one clause of the question that asks; None where none is understood, or several ask."""
+    found = sentences(question)
+    if any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
         return None
-    rest = [item for item in rest if not _has_head(item, _TIMES)]
-    if any(_has_head(item, _CONTACT) or item.key == "contact" for item in rest):
-        return _contact(rest) if is_mover else None
-    return _by_verb(rest, subject.phrase, is_mover)
+    readings = [(at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence))]
+    if len(readings) != 1:
+        return None
+    at, reading = readings[0]
+    for place, sentence in enumerate(found):
+        covered = reading.covered if place == at else frozenset[int]()
+        if place != at and _INVERTED.fullmatch(" ".join(sentence.tokens)):
+            return None
+        if not _leaves_world(sentence, covered):
+            return None
+    listed = _listed(found[at], reading.covered, found[at + 1 :])
+    if listed and reading.pattern.form != "which-first":
+        return None
+    return replace(reading, named=(*reading.named, *listed))
 
 
-def _is_subject(item: Item) -> bool:
-    return item.phrase is not None or item.key in lex.MOVER_PRONOUNS
+def _read_sentence(sentence: Sentence) -> _Reading | None:
+    """The longest part of a sentence, up to its end or to a condition, that a pattern covers."""
+    tokens = sentence.tokens
+    ends = [len(tokens), *(at for at, token in enumerate(tokens) if token in _CONDITIONS)]
+    for start in (at for at, token in enumerate(tokens) if token in _STARTS and _opens(tokens[:at])):
+        for end in (end for end in ends if end > start):
+            reading = _match(sentence, _without_insertion(tokens, start, end))
+            if reading is not None:
+                return reading
+    return None
 
 
-def _has_head(item: Item, heads: frozenset[str]) -> bool:
-    return item.phrase is not None and item.phrase.head in heads
+def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]:
+    """The places of a clause without what stands between commas behind its subject: "the car, moving left,"."""
+    places = list(range(start, end))
+    commas = [at for at in places if tokens[at] == ","]
+    if len(commas) > 1 and commas[0] == start + 2 and tokens[start + 1] in {"M", "it"}:
+        first = tokens[commas[0] + 1]
+        if first in _CONDITIONS or first.endswith("-ing") or first in lex.VERBS:
+            return [at for at in places if not commas[0] <= at <= commas[1]]
+    return places[:-1] if commas and commas[-1] == end - 1 else places
 
 
-def _is_plain(rest: Sequence[Item]) -> bool:
-    """Whether a clause holds one verb, one thing at the most, and beside them only words that change nothing."""
-    verbs = [item for item in rest if item.key in lex.VERBS and item.key not in _BE | _TIMES | _CONTACT]
-    things = [item.phrase for item in rest if item.phrase is not None and not _has_head(item, _TIMES | _CONTACT)]
-    counted = not _COUNTING.isdisjoint(flatten(rest)) or any(thing.text.split()[0].isdecimal() for thing in things)
-    known = all(item.key in _KNOWN for item in rest if item.phrase is None)
-    return len(verbs) <= 1 and len(things) <= 1 and not counted and known
+def _match(sentence: Sentence, places: Sequence[int]) -> _Reading | None:
+    clause = " ".join(sentence.tokens[at] for at in places)
+    for pattern in PATTERNS:
+        match = pattern.regex.fullmatch(clause)
+        if match is not None:
+            names = dict.fromkeys(group for group in match.groups() if group is not None)
+            named = tuple(sentence.phrases[name] for name in names)
+            return None if _is_into_hollow(clause, named) else _Reading(pattern, named, frozenset(places))
+    return None
 
 
-def _done_by_mover(rest: Sequence[Item], question: Question) -> bool:
-    """Whether something else is said to be hit or hidden by nobody in particular, or by the mover."""
-    agents = [item.phrase for before, item in pairwise(rest) if item.phrase and before.key == "by"]
-    return all(_means(agent, question.mover) for agent in agents)
+def _opens(before: Sequence[str]) -> bool:
+    """Whether a question may begin behind these tokens: at the start, or where its condition ends."""
+    rest = list(before)
+    while rest and rest[-1] in _OPENERS:
+        rest.pop()
+    if not rest:
+        return True
+    last = rest[max((at for at, token in enumerate(rest) if token == ","), default=-1) + 1 :]
+    closed = len(rest) < len(before) or any(token in lex.CONDITIONALS for token in last)
+    clause = closed or any(token in lex.VERBS for token in last)
+    follows = zip(last, [*last[1:], ""], strict=True)
+    related = all(_relates(token, after) for token, after in follows if token in {"which", "when", "where"})
+    return clause and related and _ASKING.isdisjoint(last) and last[-1] != "not"
 
 
-def _means(phrase: ObjectPhrase | None, mover: ObjectPhrase | None) -> bool:
-    """Whether a phrase speaks of the mover again: no word in it that the mover's own lacks."""
-    if phrase is None or mover is None:
+def _relates(token: str, after: str) -> bool:
+    """Whether a clause follows on "which", "when" or "where": then nothing is asked with them."""
+    subject = after[:1] in {"M", "T", "X"} or after in _SUBJECTS or after.startswith("OBJ")
+    return subject or (token == "when" and after.removesuffix("-ing") in lex.VERBS)
+
+
+def _leaves_world(sentence: Sentence, covered: frozenset[int]) -> bool:
+    """Whether the words around a question leave its world as it is: one thing moves, and hits nothing yet."""
+    tokens, rest = sentence.tokens, [at for at in range(len(sentence.tokens)) if at not in covered]
+    words = [word for at in rest for word in sentence.words[at]]
+    if set(words) <= _SHORT_ANSWER:
+        return True
+    if not _INTERVENTIONS.isdisjoint(words) or _NOT_THERE.fullmatch(" ".join(words)):
         return False
-    return set(plain(phrase.text).split()) <= set(plain(mover.text).split())
+    return not any(_moves_another(sentence, at) or _hits(tokens, at) for at in rest)
 
 
-def _by_verb(rest: Sequence[Item], subject: ObjectPhrase | None, is_mover: bool) -> AskedRelation | None:
-    at = next((at for at, item in enumerate(rest) if item.key in lex.VERBS and item.key not in _BE), None)
-    if at is None:
-        return None
-    verb, behind = lex.VERBS[rest[at].key], rest[at:]
-    passive = verb.form != "ing" and any(item.key in _BE for item in rest[:at])
-    if verb.lemma in _MORE or (not passive and not is_mover):
-        return None
-    if passive and is_mover:
-        return _any_or_named("covered", behind, optional=True) if verb.lemma in lex.OCCLUDE else None
-    if passive:
-        relation = "covers" if verb.lemma in lex.OCCLUDE else "touches" if verb.lemma in lex.TOUCH else None
-        return None if relation is None else AskedRelation(relation, subject)
-    relation = _active(verb.lemma, {item.key for item in behind})
-    return None if relation is None else _any_or_named(relation, behind, optional=verb.lemma in _VANISH)
+def _moves_another(sentence: Sentence, at: int) -> bool:
+    """Whether another thing than the mover, or a hand that moves it, is the subject of a verb of motion at a place."""
+    tokens = sentence.tokens
+    verb = lex.VERBS.get(tokens[at])
+    subject = at - 2 if at > 1 and tokens[at - 1] == "be" else at - 1
+    if verb is None or verb.kind in {None, "static"} or subject < 0 or tokens[subject] not in sentence.phrases:
+        return False
+    if sentence.phrases[tokens[subject]].head in lex.AGENTS and tokens[at + 1 : at + 2] == ["M"]:
+        return False
+    return subject == 0 or tokens[subject - 1] not in _BEFORE_PLACES
 
 
-def _active(lemma: str, words: set[str]) -> Relation | None:
-    """What the mover does, by its verb and the words behind it."""
-    if lemma in _VANISH or "behind" in words:
-        return "covered"
-    if lemma in lex.OCCLUDE or "front" in words:
-        return "covers"
-    comes_down = lemma in _COMES_DOWN and not _ONTO.isdisjoint(words)
-    return "touches" if lemma in lex.TOUCH | lex.LAND or comes_down else None
+def _hits(words: Sequence[str], at: int) -> bool:
+    """Whether something is said to hit, hide or reach another thing than the mover."""
+    lemma = words[at].removesuffix("-ing")
+    if lemma not in lex.TOUCH | lex.OCCLUDE or lemma in {"contact", "impact"}:
+        return False
+    after = [word for word in words[at + 1 : at + 3] if word not in {"into", "against", "with"}]
+    return words[at - 1 : at] != ["be"] and after[:1] not in (["M"], ["it"])
 
 
-def _any_or_named(relation: Relation, rest: Sequence[Item], *, optional: bool) -> AskedRelation | None:
-    """The relation to the first thing that is named, or to any; `optional` where none need be named."""
-    target = next((item for item in rest if item.phrase is not None), None)
-    if target is None:
-        return AskedRelation(relation, None) if optional or any(item.key in _ANYTHING for item in rest) else None
-    return _named(relation, target)
+def _is_into_hollow(clause: str, named: Sequence[ObjectPhrase]) -> bool:
+    """ "roll into the bowl": it would be in it, not only touch it."""
+    inside = re.search(r"\b(?:run|roll|slide|drive|skid)(?:-ing)? into", clause) is not None
+    return inside and any(phrase.head in _HOLLOW for phrase in named)
 
 
-def _contact(rest: Sequence[Item]) -> AskedRelation | None:
-    """ "make contact with the vase", "be in collision with it"."""
-    if _MAKING.isdisjoint(item.key for item in rest):
-        return None
-    objects = [item for item in rest if item.phrase is not None and not _has_head(item, _CONTACT)]
-    return _named("touches", objects[-1]) if objects else None
+def _as_named(target: ObjectPhrase, question: Question) -> str:
+    """The target in the words of the first mention of it: "a blue cup" that is "the cup" later."""
+    texts = [other.text for other in question.others]
+    if target.text in texts:
+        return target.text
+    words = set(target.text.lower().split())
+    fuller = [text for text in texts if words <= set(text.lower().split())]
+    return fuller[0] if len(fuller) == 1 else target.text
 
 
-def _named(relation: Relation, target: Item) -> AskedRelation | None:
-    """The relation to one named thing, or to any; None where what is named is no thing, such as the floor."""
-    phrase = target.phrase
-    if phrase is None:
-        return None
-    if set(target.words) & _ANYTHING and phrase.colour is None and phrase.number is None:
-        return AskedRelation(relation, None)
-    if is_vague(target) or phrase.head in lex.NO_THINGS:
-        return None
-    return AskedRelation(relation, phrase)
+def _listed(asking: Sentence, covered: frozenset[int], following: Sequence[Sentence]) -> tuple[ObjectPhrase, ...]:
+    """The things of a list behind the question: "What will it hit first if it falls? The red cube or the blue mug?"."""
+    behind = " ".join(asking.tokens[max(covered) + 1 :])
+    next_one = " ".join(following[0].tokens) if following else ""
+    for sentence, text in (
+        (asking, _LIST_AT_END.fullmatch(behind)),
+        (following[0] if following else asking, _LIST.fullmatch(next_one)),
+    ):
+        if text is not None:
+            return tuple(sentence.phrases[name] for name in text["list"].split() if name in sentence.phrases)
+    return ()

@@ -1,0 +1,121 @@
+"""The sentence that says what happens in a world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from cow_service.readers.question.facts import facts_of
+from cow_service.records import Asked, Body, Contact, Encounter, Outcome, Path, Trajectory
+
+FRAMES, FPS = 21, 10.0
+BOX = (0.0, 0.0, 10.0, 10.0)
+HIT = Asked(relation="touches", target="white cube")
+
+
+def path(
+    body: int = 0, *, to: tuple[float, float, float] = (1.0, 0.0, 0.0), turned: float = 0.0, leaves: bool = False
+) -> Path:
+    steps = [frame / (FRAMES - 1) for frame in range(FRAMES)]
+    points = tuple((100 * step * to[0], 0.0) for step in steps)
+    return Path(
+        body=body,
+        states=tuple((to[0] * s, to[1] * s, 3 + to[2] * s, 0.0, 0.0, 0.0) for s in steps),
+        points=points,
+        visible=(*([True] * (FRAMES - 5)), *([not leaves] * 5)),
+        scale=(1.0,) * FRAMES,
+        rotation=tuple(turned * s for s in steps),
+        tracks=(points,),
+    )
+
+
+def body(name: str, shape: Any = "box", support: str = "floor") -> Body:
+    return Body(
+        object=name, bbox=BOX, shape=shape, size=(0.1, 0.1, 0.1), position=(0.0, 0.0, 3.0), support=support,
+        source="embedded", confidence=1.0,
+    )  # fmt: skip
+
+
+def touch(name: str = "white cube", number: int = 1, frame: int = 11, probability: float | None = 0.93) -> Encounter:
+    return Encounter(object=name, bbox=BOX, body=number, kind="touches", first_frame=frame, probability=probability)
+
+
+def occlusion(kind: Any, share: float, name: str = "vase") -> Encounter:
+    return Encounter(object=name, bbox=BOX, body=1, kind=kind, first_frame=8, share=share, probability=0.9)
+
+
+def world(**values: Any) -> Trajectory:
+    given: dict[str, Any] = {"bodies": (body("ball", "sphere"),), "paths": (path(),)}
+    return Trajectory(fps=FPS, anchors=(), **(given | values))
+
+
+def outcome(asked: Asked, probability: float, name: str | None = "white cube", **values: Any) -> Outcome:
+    return Outcome(asked=asked, object=name, probability=probability, sure=True, robust=True, **values)
+
+
+BALL, CUBE = body("ball", "sphere"), body("white cube")
+THROWN = world(
+    bodies=(body("ball", "sphere", "air"), CUBE),
+    contacts=(
+        Contact(a=0, b=None, time=0.4, point=(1.0, 1.0), impulse=1.5),
+        Contact(a=0, b=None, time=0.7, point=(1.0, 1.0), impulse=0.01),
+        Contact(a=0, b=1, time=1.14, point=(1.0, 1.0), impulse=0.5),
+    ),
+    encounters=(touch(),),
+    ensemble=100,
+)
+
+
+@pytest.mark.parametrize(
+    ("mover", "told", "sentence"),
+    [
+        ("ball", THROWN,
+         "The ball bounces once, rolls on and meets the white cube after 1.1 s; 93 of 100 worlds agree."),
+        ("the ball", THROWN.model_copy(update={"ensemble": 0}),
+         "The ball bounces once, rolls on and meets the white cube after 1.1 s."),
+        ("A ball", THROWN.model_copy(update={"outcome": outcome(HIT, 0.9)}),
+         "The ball bounces once, rolls on and meets the white cube after 1.1 s; 90 of 100 worlds agree."),
+        ("ball", world(), "The ball rolls to the right and touches nothing."),
+        ("ball", world(encounters_known=False), "The ball rolls to the right."),
+        ("red mug", world(bodies=(body("red mug"), body("pink vase")), paths=(path(to=(-1.0, 0.0, 0.2), leaves=True),),
+                          moving_until=1.8, ensemble=200,
+                          outcome=outcome(Asked(relation="touches", target="pink vase"), 0.03, "pink vase")),
+         "The red mug slides to the left, does not touch the pink vase and leaves the image; 194 of 200 worlds agree."),
+        ("red mug", world(bodies=(body("red mug"),), ensemble=200,
+                          outcome=outcome(Asked(relation="touches", target="vase", negated=True), 0.97, "vase")),
+         "The red mug slides to the right and does not touch the vase; 194 of 200 worlds agree."),
+        ("toy car", world(bodies=(body("toy car"), body("vase")), encounters=(occlusion("occludes", 0.45),),
+                          ensemble=100, outcome=outcome(Asked(relation="covers", target="vase"), 0.9, "vase")),
+         "The toy car slides to the right and passes in front of the vase (hiding 45% of it) from 0.8 s on; "
+         "90 of 100 worlds agree."),
+        ("ball", world(encounters=(occlusion("occluded-by", 0.6),)),
+         "The ball rolls to the right, passes behind the vase (which hides 60% of it) from 0.8 s on and touches "
+         "nothing."),
+        ("ball", world(ensemble=100, outcome=outcome(Asked(relation="covers"), 0.05, None)),
+         "The ball rolls to the right and hides nothing; 95 of 100 worlds agree."),
+        ("ball", world(bodies=(BALL, CUBE), paths=(path(), path(1)), encounters=(touch(probability=None),)),
+         "The ball rolls to the right and meets and pushes the white cube after 1.1 s."),
+        ("ball", world(bodies=(BALL, CUBE), paths=(path(), path(1, turned=90.0)), encounters=(touch(),),
+                       moving_until=1.4),
+         "The ball rolls to the right, meets and tips over the white cube after 1.1 s and comes to rest after 1.4 s."),
+        ("ball", world(paths=(path(to=(0.0, 0.0, 0.0)),)), "The ball stays where it is and touches nothing."),
+        ("ball", world(bodies=(body("ball", "sphere", "air"),), paths=(path(to=(0.0, 1.0, 0.0)),)),
+         "The ball falls and touches nothing."),
+        ("ball", world(bodies=(BALL, CUBE, body("mug")), encounters=(touch(), touch("mug", 2, 15)), ensemble=100,
+                       outcome=outcome(Asked(form="how-many", relation="touches"), 0.8, None, count=2)),
+         "The ball rolls to the right, meets the white cube after 1.1 s and meets the mug after 1.5 s; "
+         "80 of 100 worlds agree."),
+    ],
+)  # fmt: skip
+def test_what_happens(mover: str, told: Trajectory, sentence: str) -> None:
+    assert facts_of(mover, told) == sentence
+
+
+def test_the_sentence_stays_short() -> None:
+    name = "the very long name of a thing that nobody would ever want to read again in full. " * 5
+    told = world(bodies=(body(name), body(name)), encounters=tuple(touch(name, 1, frame) for frame in range(9)))
+    said = facts_of(name, told)
+    assert len(said) <= 300
+    assert said.count(". ") == 0
+    assert said.endswith(".")
