@@ -254,12 +254,15 @@ def _is_wall(view: _View, part: Mask, border: Mask) -> bool:
 
 def _balls(view: _View, component: Mask) -> Iterator[Mask]:
     """Discs among the pale patches between the edges of a component: white balls before or on something white."""
-    smooth = component & (view.edges < view.edge_threshold) & (view.chroma_gap < CHROMA_STEP) & (view.bright > -12)
-    for patch in _blobs(smooth, 0.5 * OWN_AREA):
-        body = cv2.dilate(patch.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2) > 0
-        disc = as_disc(body, view.edges, view.edge_threshold, grow=EDGE_BAND)
-        if disc is not None:
-            yield disc
+    pale = component & (view.chroma_gap < CHROMA_STEP) & (view.bright > -12)
+    taken = np.zeros(component.shape, bool)
+    for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
+        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
+            body = cv2.dilate(patch.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2) > 0
+            disc = as_disc(body, view.edges, view.edge_threshold, grow=EDGE_BAND)
+            if disc is not None and not (disc & taken).any():
+                taken |= disc
+                yield disc
 
 
 def _parts(view: _View, component: Mask) -> list[Mask]:
