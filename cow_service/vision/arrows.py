@@ -19,7 +19,7 @@ from cow_service.vision.types import Floats, Mask
 
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
 HEAD, HOLLOW_HEAD = 1.8, 1.3  # of the shaft's width: the least width of a head, and of a hollow drawing's
-MIN_HOLLOW_FIT = 0.82  # the same for a hollow drawing, whose head may be small
+MIN_HOLLOW_FIT = 0.88  # the same for a hollow drawing, whose head may be small
 CERTAIN_FIT = 0.88  # from here on, later strokes at the same place are skipped
 
 

@@ -23,6 +23,7 @@ class Obstacle:
     name: str
     bbox: BBox
     mask: CroppedMask
+    confidence: float = 1.0  # 0..1: how sure it is that it is there as one thing with this mask; 1 for what is given
 
 
 def find_obstacles(
@@ -40,7 +41,9 @@ def find_obstacles(
         if iou(other.bbox, mover) < SAME_OBJECT_IOU:
             region = region_of(regions, other.bbox)
             mask = CroppedMask.of(silhouette(other.bbox)) if region is None else region.mask
-            obstacles.append(Obstacle(other.object, other.bbox, mask))
+            found = region is not None and region.bbox == other.bbox  # here, not by the request or another reader
+            confidence = region.confidence if region is not None and found else 1.0
+            obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
     for region in regions:
         area = region.mask.area
         if iou(region.bbox, mover) >= SAME_OBJECT_IOU or region.mask.shared_with(body) > 0.5 * area:
@@ -49,5 +52,5 @@ def find_obstacles(
             continue
         if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU for other in obstacles):
             continue
-        obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask))
+        obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
     return tuple(obstacles)

@@ -7,7 +7,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -22,17 +22,27 @@ from cow_service.vision.types import Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
 CHROMA_STEP = 9.0  # Lab units from the surroundings
+STRONG_CHROMA_STEP = 18.0  # Lab units from the surroundings: no wall or floor
 BRIGHT_STEP, BRIGHT_REACH = 5.0, 1.6  # Lab lightness above the surroundings: a top, and another lit face
 EDGE_THRESHOLDS = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median gradient; the larger counts
 SHARP_SHARE = 0.65  # of an outline that must lie on edges
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
 MIN_AREA = 0.0004  # of the image
 MAX_AREA = 0.25
+MAX_SIDE = 0.1  # of the image: one shaded side of something white
+ALONG_BORDER = 0.5  # of the height or width of something bright and pale that runs along the image's border: a wall
 SAME_OBJECT_IOU = 0.5  # intersection over union from which a region is the object of a box
 MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
 CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
 SPLIT_HUE = 36.0  # degrees: another colour, hence another object
+OWN_AREA = 380  # px at the working size: a patch of another colour this large is no part of a thing
+EDGE_BAND = 4.0  # px: half the width of an edge as it is measured
+MIN_REST = 0.05  # of a component: less is no part of its own
+OWN_WIDTH = 0.55  # of the broadest colour: black narrower than this is a neck or a wheel
 MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
+
+SURE_CONTRAST = 12.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
+SURE_AREA = 300.0  # px at the working size, from which the size takes nothing
 
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
 
@@ -45,6 +55,7 @@ class Region:
     colour: str
     colours: frozenset[str]  # all names that people may use for its colour
     roundness: float  # 0..1: how much of the smallest circle around it the region fills
+    confidence: float  # 0..1: how sure it is that this is one separable thing with this outline; see `_confidence`
     is_disc: bool  # its outline was fitted by a circle: the mask is exact, segmenting it again would not improve it
 
     @property
@@ -87,6 +98,9 @@ def find_regions(image: Image) -> tuple[Region, ...]:
         return ()
     solid = (core | _white_sides(view, core)).astype(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    border = np.pad(np.zeros((solid.shape[0] - 2, solid.shape[1] - 2), bool), 1, constant_values=True)
+    walls = border.copy()
+    walls[-1, 1:-1] = False  # what the lower border cuts stands in front
     regions: list[Region] = []
     count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
     for i in range(1, count):
@@ -95,11 +109,14 @@ def find_regions(image: Image) -> tuple[Region, ...]:
         window = _window(stats[i], solid.shape)
         near = view.crop(window)
         for part in _parts(near, labels[window] == i):
+            if _is_wall(near, part, walls[window]):
+                continue
             disc = as_disc(part, near.edges, view.edge_threshold)
             if disc is not None or _is_sharp(near, part, view.edge_threshold):
                 whole = np.zeros(solid.shape, np.float32)
                 whole[window] = part if disc is None else disc
-                regions.append(_region(near.lab[part], whole, (height, width), disc is not None))
+                confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
+                regions.append(_region(near.lab[part], whole, (height, width), confidence, disc is not None))
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
@@ -114,11 +131,8 @@ def _view(small: Image) -> _View:
     smooth = cv2.bilateralFilter(small, 5, 25, 5)
     lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
     coarse = scaled(np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.uint8), 0.25)
-    side = int(0.5 * min(coarse.shape[:2])) | 1
-    pad = side // 2
-    padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)
-    median = cv2.medianBlur(padded, side)[pad : pad + coarse.shape[0], pad : pad + coarse.shape[1]]
-    around = cv2.resize(median, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    size = small.shape[1], small.shape[0]
+    around = cv2.resize(_surroundings(coarse), size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
     around_l: Floats32 = np.divide(around[..., 0], 2.55, dtype=np.float32)
     gap = np.hypot(lab[..., 1] - (around[..., 1] - 128), lab[..., 2] - (around[..., 2] - 128))
     blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
@@ -126,6 +140,30 @@ def _view(small: Image) -> _View:
     edges = np.sqrt((dx * dx + dy * dy).sum(axis=2))
     edge_threshold = max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * float(np.median(edges)))
     return _View(lab, gap, lab[..., 0] - around_l, around_l, edges, edge_threshold)
+
+
+def _surroundings(coarse: Image) -> Image:
+    """The median over half the image around every pixel of an 8-bit Lab image [h, w, 3], strong colours left out.
+
+    What is left out is seen in a first pass; without this a large object would count as its own surroundings.
+    """
+    first = _wide_median(coarse)
+    off = np.hypot(*np.moveaxis(coarse[..., 1:].astype(np.float32) - first[..., 1:], 2, 0))
+    plain = (cv2.dilate((off > STRONG_CHROMA_STEP).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0).astype(np.float32)
+    if plain.all() or plain.mean() < 0.5:
+        return first
+    reach = (0.25 * min(coarse.shape[:2]),) * 2
+    weight = cv2.GaussianBlur(plain, (0, 0), *reach)[..., None]
+    filled = cv2.GaussianBlur(coarse * plain[..., None], (0, 0), *reach) / np.maximum(weight, 1e-3)
+    return _wide_median(np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8))
+
+
+def _wide_median(coarse: Image) -> Image:
+    side = int(0.5 * min(coarse.shape[:2])) | 1
+    pad = side // 2
+    padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)
+    median = cv2.medianBlur(padded, side)[pad : pad + coarse.shape[0], pad : pad + coarse.shape[1]]
+    return np.asarray(median, np.uint8)
 
 
 def _window(stats: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[slice, slice]:
@@ -156,7 +194,7 @@ def _white_sides(view: _View, core: Mask) -> Mask:
         count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
         for i in range(1, count):
             x, y, w, h, area = (int(v) for v in stats[i])
-            if area < 12 or area > 0.03 * core.size or x == 0 or y == 0 or x + w == width or y + h == height:
+            if area < 12 or area > MAX_SIDE * core.size or x == 0 or y == 0 or x + w == width or y + h == height:
                 continue
             near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
             patch = (labels[near] == i).astype(np.uint8)
@@ -202,33 +240,73 @@ def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
     return spans or sliver or (on_side and (on_top or on_bottom))
 
 
+def _is_wall(view: _View, part: Mask, border: Mask) -> bool:
+    """Whether a pale part runs along the image's border for much of its own length, as a strip of wall does."""
+    along = part & border
+    chroma = float(np.median(np.hypot(view.lab[..., 1], view.lab[..., 2])[part]))
+    pale = chroma < 2 * CHROMA_STEP and float(np.median(view.bright[part])) > 0
+    if not pale or not along.any():
+        return False
+    (rows, columns), (edge_rows, edge_columns) = np.nonzero(part), np.nonzero(along)
+    wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
+    return bool(np.ptp(edge_columns) > ALONG_BORDER * wide or np.ptp(edge_rows) > ALONG_BORDER * high)
+
+
+def _balls(view: _View, component: Mask) -> Iterator[Mask]:
+    """Discs among the pale patches between the edges of a component: white balls before or on something white."""
+    pale = component & (view.chroma_gap < CHROMA_STEP) & (view.bright > -12)
+    taken = np.zeros(component.shape, bool)
+    for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
+        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
+            body = cv2.dilate(patch.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2) > 0
+            disc = as_disc(body, view.edges, view.edge_threshold, grow=EDGE_BAND)
+            if disc is not None and not (disc & taken).any():
+                taken |= disc
+                yield disc
+
+
 def _parts(view: _View, component: Mask) -> list[Mask]:
-    """Splits a component where two colours meet; wheels, necks and lights stay with what they sit on."""
+    """Splits a component into white balls and by colour; wheels, necks and lights stay with what they sit on."""
+    balls = list(_balls(view, component))
+    rest = component & ~np.any(balls, axis=0) if balls else component
+    return balls + [part for blob in _blobs(rest, MIN_REST * component.sum()) for part in _coloured_parts(view, blob)]
+
+
+def _coloured_parts(view: _View, component: Mask) -> list[Mask]:
     area = int(component.sum())
     lab = view.lab
     chroma = np.hypot(lab[..., 1], lab[..., 2])
     hue = np.degrees(np.arctan2(lab[..., 2], lab[..., 1]))
     coloured = component & (view.chroma_gap > CHROMA_STEP) & (chroma > CHROMA_STEP)
+    least = min(0.12 * area, OWN_AREA)
     seeds: list[Mask] = []
     rest = coloured.copy()
-    while rest.sum() > 0.12 * area and len(seeds) < 6:
+    while rest.sum() > least and len(seeds) < 6:
         values = hue[rest]
         histogram, _ = np.histogram(values % 360, bins=36, range=(0, 360), weights=chroma[rest])
         wrapped = histogram + np.roll(histogram, 1) + np.roll(histogram, -1)
         middle = 10 * int(wrapped.argmax()) + 5
         alike = rest & (np.abs((hue - middle + 180) % 360 - 180) < SPLIT_HUE)
-        seeds.extend(_blobs(alike, 0.12 * area))
+        seeds.extend(_blobs(alike, least))
         rest &= ~alike
     neutral = component & ~coloured
     bright = neutral & (view.bright > -12) & (lab[..., 0] > 40)
     black = neutral & (lab[..., 0] < BLACK_SHARE * view.around)
-    seeds.extend(_blobs(bright, 0.30 * area))
-    seeds.extend(_blobs(black, 0.35 * area))
+    broad = max((_half_width(seed) for seed in seeds), default=0.0)
+    seeds.extend(_blobs(bright, min(0.3 * area, OWN_AREA)))
+    for seed in _blobs(black, min(0.35 * area, OWN_AREA)):
+        if _half_width(seed) > OWN_WIDTH * broad or seed.sum() > 0.35 * area:
+            seeds.append(seed)
     if len(seeds) <= 1:
         return [component]
     distances = np.stack([cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds])
     owner = distances.argmin(axis=0)
     return [component & (owner == i) for i in range(len(seeds))]
+
+
+def _half_width(mask: Mask) -> float:
+    """Radius (px) of the largest circle inside a mask [h, w]."""
+    return float(cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
 
 
 def _blobs(mask: Mask, least: float) -> list[Mask]:
@@ -237,13 +315,31 @@ def _blobs(mask: Mask, least: float) -> list[Mask]:
     return [labels == i for i in range(1, count) if stats[i][4] >= max(least, 12)]
 
 
-def _region(lab: Floats32, part: Floats32, size: tuple[int, int], is_disc: bool) -> Region:
+def _confidence(view: _View, part: Mask, border: Mask, is_disc: bool) -> float:
+    """How sure it is that a part is one separable thing with this outline: a product of four shares, each 0..1.
+
+    Edges: the share of its outline, image border aside, that lies on edges; a disc was fitted to them. Contrast: its
+    median distance from the surroundings in Lab over `SURE_CONTRAST`. Size: its area over `SURE_AREA` (square roots of
+    both). Border: 1 less half the share of its outline along the image's border, beyond which it may go on.
+    """
+    outline = outline_of(part)
+    inner = outline & ~border
+    nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
+    sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
+    contrast = float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / SURE_CONTRAST
+    size = float(np.count_nonzero(part)) / SURE_AREA
+    cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
+    edges = max(sharp, 0.9) if is_disc else sharp
+    return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
+
+
+def _region(lab: Floats32, part: Floats32, size: tuple[int, int], confidence: float, is_disc: bool) -> Region:
     """A part [h, w] at the working size, with the Lab colours [N, 3] of its pixels, as a region of the image."""
     mask = enlarged(np.asarray(cv2.GaussianBlur(part, (0, 0), MASK_SIGMA), np.float32), size)
     chroma = np.hypot(lab[:, 1], lab[:, 2])
     sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
     seen = [float(v) for v in np.median(sample, axis=0)]
-    return Region(mask, colour_name(*seen), colour_names(*seen), _roundness(mask.patch), is_disc)
+    return Region(mask, colour_name(*seen), colour_names(*seen), _roundness(mask.patch), confidence, is_disc)
 
 
 def _roundness(mask: Mask) -> float:
