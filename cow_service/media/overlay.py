@@ -1,87 +1,151 @@
-"""Draws the results over the input image: box, point, direction, path and encounters."""
+"""Draws the results over the input image: outline, direction, paths with their bands, contacts and encounters."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.records import BBox, Grounding, Motion, Trajectory
+from cow_service.media.labels import Label, draw_labels
+from cow_service.records import BBox, Encounter, Grounding, Motion, Path, Trajectory
+from cow_service.records.world import MEETINGS
 
-BOX, PATH, ARROW, LIGHT, DARK = (255, 196, 0), (0, 229, 255), (255, 64, 129), (255, 255, 255), (20, 20, 20)
+OUTLINE, PATH, ARROW, LIGHT, DARK = (255, 196, 0), (0, 229, 255), (255, 64, 129), (255, 255, 255), (20, 20, 20)
+PUSHED = (255, 150, 60)  # the paths of other bodies
 ENCOUNTERS = {"touches": (255, 82, 82), "occludes": (190, 120, 255), "occluded-by": (120, 200, 255)}  # RGB
+BAND_OPACITY = 0.3
 SUBPIXEL = 4  # binary places of the coordinates handed to OpenCV
+FARTHEST = 20_000  # px: OpenCV draws no farther
 
 Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Colour = tuple[int, int, int]
 
 
-def draw_overlay(image: Image, grounding: Grounding, motion: Motion, trajectory: Trajectory) -> Image:
-    """A copy of the RGB image [H, W, 3] with the records drawn on it; sizes follow the image's."""
+def draw_overlay(
+    image: Image, grounding: Grounding, motion: Motion, trajectory: Trajectory, mask: Mask | None = None
+) -> Image:
+    """A copy of the RGB image [H, W, 3] with the records drawn on it; sizes follow the image's.
+
+    `mask` [H, W] is the mover's: its outline is drawn, and its box where there is none.
+    """
     canvas = np.ascontiguousarray(image).copy()
     unit = max(1.0, max(canvas.shape[:2]) / 640)
     thin = max(1, round(unit))
+    for number, path in reversed(list(enumerate(trajectory.paths))):
+        _draw_band(canvas, path, PUSHED if number else PATH)
     for encounter in trajectory.encounters:
         _rectangle(canvas, encounter.bbox, ENCOUNTERS[encounter.kind], thin)
-    _draw_path(canvas, trajectory, thin)
-    _rectangle(canvas, grounding.bbox, BOX, 2 * thin)
-    for encounter in trajectory.encounters:
-        text = f"{encounter.kind} {encounter.object} {encounter.first_frame / trajectory.fps:.1f} s"
-        _label(canvas, text, encounter.bbox, ENCOUNTERS[encounter.kind], unit, below=True)
-    _label(canvas, grounding.object, grounding.bbox, BOX, unit, below=False)
+    for number, path in reversed(list(enumerate(trajectory.paths))):
+        _draw_path(canvas, path, trajectory.fps, PUSHED if number else PATH, thin)
+    if mask is not None and mask.any():
+        _draw_outline(canvas, mask, OUTLINE, thin)
+    else:
+        _rectangle(canvas, grounding.bbox, OUTLINE, 2 * thin)
+    for contact in trajectory.contacts:
+        _draw_contact(canvas, contact.point, thin, of_floor=contact.b is None)
     if motion.direction is not None:
         start = np.array(grounding.point)
         reach = 0.14 * max(canvas.shape[:2])
         tip = start + np.array(motion.direction) * reach
         for colour, width in ((DARK, 4 * thin), (ARROW, 2 * thin)):
             cv2.arrowedLine(canvas, _fixed(start), _fixed(tip), colour, width, cv2.LINE_AA, SUBPIXEL, 0.28)
-    cv2.circle(canvas, _fixed(grounding.point), round(4 * unit * 2**SUBPIXEL), DARK, -1, cv2.LINE_AA, SUBPIXEL)
-    cv2.circle(canvas, _fixed(grounding.point), round(3 * unit * 2**SUBPIXEL), LIGHT, -1, cv2.LINE_AA, SUBPIXEL)
+    _dot(canvas, grounding.point, unit, LIGHT)
+    labels = [Label(grounding.object, grounding.bbox, OUTLINE, below=False)]
+    labels += [
+        Label(_words(encounter, trajectory.fps), encounter.bbox, ENCOUNTERS[encounter.kind], below=True)
+        for encounter in trajectory.encounters
+    ]
+    points = [grounding.point, *(contact.point for contact in trajectory.contacts)]
+    for path in trajectory.paths:
+        points += [point for point, visible in zip(path.points, path.visible, strict=True) if visible]
+    draw_labels(canvas, labels, unit, DARK, points)
     return canvas
 
 
-def _draw_path(canvas: Image, trajectory: Trajectory, thin: int) -> None:
+def _words(encounter: Encounter, fps: float) -> str:
+    """As in: hits white cube 1.1 s, 93%."""
+    kind = "hits" if encounter.kind == "touches" else MEETINGS[encounter.kind]
+    sure = "" if encounter.probability is None else f", {round(100 * encounter.probability)}%"
+    return f"{kind} {encounter.object} {encounter.first_frame / fps:.1f} s{sure}"
+
+
+def _draw_band(canvas: Image, path: Path, colour: Colour) -> None:
+    """The boxes between the 10th and 90th percentile, joined along the path; translucent."""
+    if not path.band:
+        return
+    height, width = canvas.shape[:2]
+    boxes = np.clip(np.array(path.band, np.float64), -FARTHEST, FARTHEST)
+    corners = boxes[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 4, 2)
+    covered = np.zeros((height, width), np.uint8)
+    for before, after, seen in zip(corners, corners[1:], path.visible[1:], strict=False):
+        if seen:
+            hull = cv2.convexHull(np.concatenate([before, after]).astype(np.float32))
+            cv2.fillConvexPoly(covered, np.rint(hull).astype(np.int32), 1)
+    rows, columns = (np.nonzero(covered.any(axis=axis))[0] for axis in (1, 0))
+    if len(rows):
+        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        part = canvas[window]
+        mixed = part + BAND_OPACITY * (np.array(colour, np.float32) - part)
+        part[:] = np.where(covered[window][..., None] > 0, mixed, part).astype(np.uint8)
+
+
+def _draw_path(canvas: Image, path: Path, fps: float, colour: Colour, thin: int) -> None:
     """The path as far as it is visible, with a dot every half second."""
-    seen = [point for point, visible in zip(trajectory.points, trajectory.visible, strict=True) if visible]
-    line = np.array([_fixed(point) for point in seen], np.int32).reshape(-1, 1, 2)
-    for colour, width in ((DARK, 3 * thin), (PATH, thin)):
-        cv2.polylines(canvas, [line], False, colour, width, cv2.LINE_AA, SUBPIXEL)
-    step = max(1, round(trajectory.fps / 2))
-    for index in range(step, len(trajectory.points), step):
-        if trajectory.visible[index]:
-            centre = _fixed(trajectory.points[index])
-            cv2.circle(canvas, centre, round(3.5 * thin * 2**SUBPIXEL), DARK, -1, cv2.LINE_AA, SUBPIXEL)
-            cv2.circle(canvas, centre, round(2.5 * thin * 2**SUBPIXEL), PATH, -1, cv2.LINE_AA, SUBPIXEL)
+    runs: list[list[tuple[int, int]]] = [[]]
+    for point, visible in zip(path.points, path.visible, strict=True):
+        if visible:
+            runs[-1].append(_fixed(point))
+        elif runs[-1]:
+            runs.append([])
+    lines = [np.array(run, np.int32).reshape(-1, 1, 2) for run in runs if run]
+    for shade, width in ((DARK, 3 * thin), (colour, thin)):
+        cv2.polylines(canvas, lines, False, shade, width, cv2.LINE_AA, SUBPIXEL)
+    step = max(1, round(fps / 2))
+    for index in range(step, len(path.points), step):
+        if path.visible[index]:
+            _dot(canvas, path.points[index], 0.85 * thin, colour)
 
 
-def _rectangle(canvas: Image, bbox: BBox, colour: tuple[int, int, int], width: int) -> None:
+def _draw_outline(canvas: Image, mask: Mask, colour: Colour, thin: int) -> None:
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    for shade, width in ((DARK, 3 * thin), (colour, thin + (thin + 1) // 2)):
+        cv2.drawContours(canvas, outlines, -1, shade, width, cv2.LINE_AA)
+
+
+def _draw_contact(canvas: Image, point: Sequence[float], thin: int, *, of_floor: bool) -> None:
+    """A triangle that stands on the floor for a bounce, a ring with a cross for a meeting."""
+    size = 5.5 * thin
+    x, y = point
+    if of_floor:
+        corners = [_fixed((x, y)), _fixed((x - 0.8 * size, y + 1.4 * size)), _fixed((x + 0.8 * size, y + 1.4 * size))]
+        line = np.array(corners, np.int32).reshape(-1, 1, 2)
+        cv2.fillPoly(canvas, [line], LIGHT, cv2.LINE_AA, SUBPIXEL)
+        cv2.polylines(canvas, [line], True, DARK, thin, cv2.LINE_AA, SUBPIXEL)
+        return
+    colour = ENCOUNTERS["touches"]
+    for shade, width in ((DARK, 4 * thin), (colour, 2 * thin)):
+        cv2.circle(canvas, _fixed(point), round(size * 2**SUBPIXEL), shade, width, cv2.LINE_AA, SUBPIXEL)
+    for sign in (-1, 1):
+        reach = 0.5 * size
+        ends = _fixed((x - reach, y - sign * reach)), _fixed((x + reach, y + sign * reach))
+        cv2.line(canvas, *ends, LIGHT, thin, cv2.LINE_AA, SUBPIXEL)
+
+
+def _dot(canvas: Image, point: Sequence[float], unit: float, colour: Colour) -> None:
+    for radius, shade in ((4.0, DARK), (3.0, colour)):
+        cv2.circle(canvas, _fixed(point), round(radius * unit * 2**SUBPIXEL), shade, -1, cv2.LINE_AA, SUBPIXEL)
+
+
+def _rectangle(canvas: Image, bbox: BBox, colour: Colour, width: int) -> None:
     corners = _fixed(bbox[:2]), _fixed(bbox[2:])
     cv2.rectangle(canvas, *corners, DARK, width + 2, cv2.LINE_AA, SUBPIXEL)
     cv2.rectangle(canvas, *corners, colour, width, cv2.LINE_AA, SUBPIXEL)
 
 
-def _label(
-    canvas: Image,
-    text: str,
-    bbox: BBox,
-    colour: tuple[int, int, int],
-    unit: float,
-    *,
-    below: bool,
-) -> None:
-    """Text on a dark plate above or below a box, kept inside the image. Letters that OpenCV lacks become '?'."""
-    shown = text.encode("ascii", "replace").decode()[:60]
-    size, weight = 0.42 * unit, max(1, round(unit))
-    (width, height), base = cv2.getTextSize(shown, cv2.FONT_HERSHEY_SIMPLEX, size, weight)
-    pad = round(3 * unit)
-    plate = height + base + 2 * pad
-    y = bbox[3] + pad if below else bbox[1] - plate - pad
-    y = int(min(max(0, y), canvas.shape[0] - plate))
-    x = int(min(max(0, bbox[0]), max(0, canvas.shape[1] - width - 2 * pad)))
-    cv2.rectangle(canvas, (x, y), (x + width + 2 * pad, y + plate), DARK, -1)
-    cv2.putText(canvas, shown, (x + pad, y + pad + height), cv2.FONT_HERSHEY_SIMPLEX, size, colour, weight, cv2.LINE_AA)
-
-
-def _fixed(point: tuple[float, ...] | NDArray[np.float64]) -> tuple[int, int]:
+def _fixed(point: Sequence[float] | NDArray[np.float64]) -> tuple[int, int]:
     """Fixed-point pixel centres, bounded so that far points stay drawable."""
-    x, y = (float(np.clip(v, -20_000, 20_000)) for v in point[:2])
+    x, y = (float(np.clip(v, -FARTHEST, FARTHEST)) for v in point[:2])
     return round((x - 0.5) * 2**SUBPIXEL), round((y - 0.5) * 2**SUBPIXEL)

@@ -66,7 +66,8 @@ def generate(
     with run.device():
         frames, video = _render(given, run.generator, request, artifacts, run.report_share)
     with run.cpu():
-        overlay = artifacts.put(encode_png(draw_overlay(scene.image, grounding, motion, trajectory)), "image/png")
+        drawn = draw_overlay(scene.image, grounding, motion, trajectory, scene.silhouette(grounding.bbox))
+        overlay = artifacts.put(encode_png(drawn), "image/png")
     clip = Clip(frames=frames, video=video, overlay=overlay, generator=run.generator.describe(given))
     stored = (*(frame.sha256 for frame in frames), *([] if video is None else [video.sha256]), overlay.sha256)
     return StageResult(value=clip, artifacts=stored)

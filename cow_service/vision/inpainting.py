@@ -10,9 +10,12 @@ from cow_service.vision.types import Floats32, Image, Mask
 
 INPAINT_RADIUS = 4  # px
 MARGIN = 8  # px around a drawing that inpainting may use
-TEXTURE_SIGMA = 3.0  # px: finer detail than this is texture, coarser is shading
-VARIED = 18.0  # grey levels: standard deviation around a hole from which exemplars are used
+TEXTURE_SIGMA, TEXTURE_LEAST = 0.12, 3.0  # of the hole's size, px: finer detail is texture, coarser is shading
+VARIED, STRUCTURED = 18.0, 4.0  # grey levels: deviation around a hole, there from a smooth surface: then exemplars
+MOST_UNREST = 1.5  # of the detail around the hole: with more, a place shows the edge of something
 RIM, RIM_LEAST = 0.04, 3.0  # of the hole's size, px: next to it the fill fades out, and nothing is learnt
+BESIDE, BESIDE_LEAST = 0.15, 6.0  # of the hole's size, px: so far around it shading is taken from
+MOST_SAMPLES = 1500  # pixels of a ring
 SHADOW_STEP = 14.0  # grey levels
 LEAST_WEIGHT = 1e-3  # of a pyramid cell known: with less, the coarser level says more
 FADE = 0.14  # of the hole's size: how far out its shadow is taken away
@@ -57,11 +60,16 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
     trusted = known & ~shadow & (away > rim)
     if not trusted.any():
         trusted = known
-    shading = push_pull(source, trusted)
+    # What lies further off may be another surface: it counts only where nothing nearer is known.
+    beside = trusted & (away < rim + max(BESIDE_LEAST, BESIDE * size))
+    shading = push_pull(source, beside if beside.any() else trusted)
     if _is_varied(source, inside, trusted):
         filled = exemplar_inpaint(source, inside | (away <= rim), ~trusted, shading)
     else:
-        filled = shading + _texture(image, hole, avoid, crop)
+        sigma = max(TEXTURE_LEAST, TEXTURE_SIGMA * size)
+        detail = np.abs(shading - cv2.GaussianBlur(shading, (0, 0), sigma))[beside if beside.any() else trusted]
+        most = MOST_UNREST * float(np.percentile(detail, 99))
+        filled = shading + _texture(image, hole, avoid, crop, sigma, most)
     fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
     reach = np.where(cv2.dilate(shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, max(fade, rim), rim)
     share = np.where(inside, 1.0, np.where(known, np.clip(1 - away / reach, 0, 1), 0.0))[..., None].astype(np.float32)
@@ -71,10 +79,24 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
 
 
 def _is_varied(source: Floats32, inside: Mask, known: Mask) -> bool:
-    """Whether what lies around the hole is no plain surface: it has texture, or several colours."""
+    """Whether what lies around the hole is no plain surface: it has texture, or several colours, or an edge runs in."""
     reach = 2 * max(4, int(0.25 * np.sqrt(inside.sum()))) + 1
     ring = (cv2.dilate(inside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & known
-    return bool(ring.any()) and float(source[ring].std(axis=0).max()) > VARIED
+    if not ring.any():
+        return False
+    return float(source[ring].std(axis=0).max()) > VARIED or _roughness(source, ring) > STRUCTURED
+
+
+def _roughness(source: Floats32, ring: Mask) -> float:
+    """Standard deviation (grey levels) of what is coarser than texture in a ring from a quadratic surface."""
+    ys, xs = np.nonzero(ring)
+    every = max(1, len(ys) // MOST_SAMPLES)
+    ys, xs = ys[::every], xs[::every]
+    values = np.asarray(cv2.GaussianBlur(source, (0, 0), 2.0), np.float64)[ys, xs]
+    u, v = (xs - xs.mean()) / max(1.0, float(xs.std())), (ys - ys.mean()) / max(1.0, float(ys.std()))
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    rest = values - terms @ np.linalg.lstsq(terms, values, rcond=None)[0]
+    return float(rest.std(axis=0).max())
 
 
 def _contact_shadow(source: Floats32, inside: Mask, known: Mask) -> Mask:
@@ -108,8 +130,13 @@ def push_pull(source: Floats32, known: Mask) -> Floats32:
     return np.asarray(value, np.float32)
 
 
-def _texture(image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, slice]) -> Floats32:
-    """Fine detail for the crop, from the calmest neighbouring place of the hole's shape; zero where there is none."""
+def _texture(
+    image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, slice], sigma: float, most: float
+) -> Floats32:
+    """Detail finer than sigma (px) for the crop, from the calmest neighbouring place of the hole's shape.
+
+    Zero where each has detail of more than `most` grey levels: an edge of something else.
+    """
     rows, columns = crop
     height, width = hole.shape
     inner = window_of(hole, 2) or crop
@@ -125,9 +152,9 @@ def _texture(image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, sl
         if (unusable[place] & shape).any():
             continue
         patch = image[place].astype(np.float32)
-        detail = patch - cv2.GaussianBlur(patch, (0, 0), TEXTURE_SIGMA)
+        detail = patch - cv2.GaussianBlur(patch, (0, 0), sigma)
         unrest = float(np.percentile(np.abs(detail[shape]), 99))
-        if best is None or unrest < best[0]:
+        if unrest < (most if best is None else best[0]):
             best = unrest, detail
     texture = np.zeros((rows.stop - rows.start, columns.stop - columns.start, 3), np.float32)
     if best is not None:

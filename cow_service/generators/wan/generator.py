@@ -138,7 +138,7 @@ class WanGenerator:
 
         `progress` is called after every denoising step; once it has raised, nothing more is computed.
         """
-        model, num_frames = self._model, len(given.trajectory.points)
+        model, num_frames = self._model, given.trajectory.num_frames
         width, height = self.size(given.scene.width, given.scene.height)
         with (
             exclusive_use(model.device, lambda: progress(0.0)),
@@ -152,7 +152,7 @@ class WanGenerator:
 
     def _video(self, given: GeneratorInput, width: int, height: int, progress: Callable[[float], None]) -> Image:
         """All frames [F, height, width, 3]."""
-        pipeline, num_frames = self._model.pipeline, len(given.trajectory.points)
+        pipeline, num_frames = self._model.pipeline, given.trajectory.num_frames
         # Drawn on the CPU: a seed gives the same noise whatever the device.
         random = torch.Generator().manual_seed(given.seed)
         noise = torch.randn(latent_shape(width, height, num_frames), generator=random)
@@ -172,7 +172,7 @@ class WanGenerator:
     def _conditioning(self, given: GeneratorInput, width: int, height: int, *, guided: bool) -> Conditioning:
         scene, options = given.scene, _options(given)
         first_frame = scene.clean if options.clean_cues else scene.image
-        image = self._embeddings.image(first_frame, width, height, len(given.trajectory.points))
+        image = self._embeddings.image(first_frame, width, height, given.trajectory.num_frames)
         tracks = tracks_of(given.trajectory, scene.width, scene.height)
         # In pixels of the clip: its sides are rounded, so that its aspect ratio is not quite the image's.
         tracks = tracks.scaled(width / scene.width, height / scene.height)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.records import Trajectory
+from cow_service.records import Path, Trajectory
 from cow_service.vision.types import Floats, Floats32
 
 MAX_FRAMES = 81  # of a Wan2.1 clip
@@ -22,6 +22,7 @@ STRIDE = 4  # clip frames per latent frame, after the first
 FILE_SAMPLES = 121
 FILE_UNITS_PER_PIXEL = 8
 SAMPLES_PER_FRAME = 1.5
+MAX_OTHER_TRACKS = 40  # of the bodies that the mover sets moving: memory and time of a clip grow with their number
 
 Bools = NDArray[np.bool_]
 
@@ -66,20 +67,32 @@ def nearest_lengths(num_frames: int) -> tuple[int, ...]:
 
 
 def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
-    """The mover's tracks, then the anchors, on an image of this size (px). Points outside the image are not visible."""
-    frames = len(trajectory.points)
-    moving = np.array(trajectory.tracks, np.float64).reshape(-1, frames, 2)
-    still = np.repeat(np.array(trajectory.anchors, np.float64).reshape(-1, 1, 2), frames, axis=1)
-    points = np.concatenate([moving, still]).transpose(1, 0, 2)
-    inside = _inside(points, width, height)
-    centre = np.array(trajectory.points, np.float64)
-    # Inside the image and yet not visible: behind the camera or hidden, and so are the mover's other points. Outside
+    """The tracks of every body that moves, the mover's first, then the anchors, on an image of this size (px).
+
+    Points outside the image are not visible. The bodies after the mover share `MAX_OTHER_TRACKS`.
+    """
+    frames = trajectory.num_frames
+    parts = [_tracks_of_path(path, width, height) for path in trajectory.paths]
+    least = max(1, MAX_OTHER_TRACKS // max(1, len(parts) - 1))
+    parts[1:] = [Tracks(part.points[:, :least], part.visible[:, :least]) for part in parts[1 : MAX_OTHER_TRACKS + 1]]
+    anchors = np.array(trajectory.anchors, np.float32).reshape(1, -1, 2).repeat(frames, axis=0)
+    parts.append(Tracks(anchors, _inside(anchors.astype(np.float64), width, height)))
+    return Tracks(
+        np.concatenate([part.points for part in parts], axis=1),
+        np.concatenate([part.visible for part in parts], axis=1),
+    )
+
+
+def _tracks_of_path(path: Path, width: int, height: int) -> Tracks:
+    """Several points of one body."""
+    frames = len(path.points)
+    points = np.array(path.tracks, np.float64).reshape(-1, frames, 2).transpose(1, 0, 2)
+    # Inside the image and yet not visible: behind the camera or hidden, and so are the body's other points. Outside
     # it the centre says nothing of them.
-    hidden = _inside(centre, width, height) & ~np.array(trajectory.visible, bool)
-    visible = inside.copy()
-    visible[:, : len(moving)] &= ~hidden[:, None]
-    if trajectory.tracks_visible is not None:
-        visible[:, : len(moving)] &= np.array(trajectory.tracks_visible, bool).reshape(len(moving), frames).T
+    hidden = _inside(np.array(path.points, np.float64), width, height) & ~np.array(path.visible, bool)
+    visible = _inside(points, width, height) & ~hidden[:, None]
+    if path.tracks_visible is not None:
+        visible &= np.array(path.tracks_visible, bool).reshape(-1, frames).T
     return Tracks(points.astype(np.float32), visible)
 
 

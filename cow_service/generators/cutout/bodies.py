@@ -1,0 +1,88 @@
+"""The bodies of a scene as the compositor sees them: masks at the clip's size, and where each is at a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cow_service.generators.base import GeneratorInput
+from cow_service.generators.cutout.ground import Ground, Placed
+from cow_service.generators.cutout.sprites import MARGIN, Window, soft
+from cow_service.records import FALLING_KINDS, BBox, Path
+from cow_service.vision.masks import resized_mask, window_of
+from cow_service.vision.types import Floats, Floats32, Mask
+
+
+@dataclass(frozen=True)
+class StillBody:
+    """Something that stays where it is, and hides what is farther away."""
+
+    index: int  # of `Trajectory.bodies`
+    mask: Mask  # [h, w]
+    placed: Placed
+
+    @cached_property
+    def alpha(self) -> tuple[Window, Floats32]:
+        """Window of the frame and alpha 0..1 in it."""
+        window = window_of(self.mask, MARGIN) or (slice(0, 1), slice(0, 1))
+        return window, soft(self.mask[window])
+
+
+@dataclass(frozen=True)
+class MovingBody:
+    """Something that moves, with its path."""
+
+    path: Path
+    bbox: BBox  # px of the image, at the first frame
+    start: Floats  # [2] px of the image: the point that `path.points` follows
+    mask: Mask  # [h, w]
+    airborne: bool
+    ground: Ground | None
+    support: int | None  # the still body that it stands on at the first frame, of `Trajectory.bodies`
+
+    def placed(self, frame: int) -> Placed:
+        """At a frame of the clip."""
+        point, scale = np.array(self.path.points[frame]), self.path.scale[frame]
+        corners = point + (np.array(self.bbox).reshape(2, 2) - self.start) * scale
+        x0, y0, x1, y1 = (float(v) for v in corners.ravel())
+        bbox = (x0, y0, x1, y1)
+        if self.ground is None:
+            return Placed(bbox, self.airborne)
+        there = np.array(self.path.states[frame][:3])
+        middle, half = self.ground.height(there), self.ground.bodies[self.path.body].size[1] / 2
+        return Placed(bbox, self.airborne, float(there[2]), middle - half, middle + half)
+
+
+def moving_body(given: GeneratorInput, path: Path, size: tuple[int, int], ground: Ground | None) -> MovingBody:
+    """The body of a path, at a clip size (width, height)."""
+    airborne = ground is None and given.motion.kind in FALLING_KINDS
+    if path.body == 0:
+        bbox, mask = given.grounding.bbox, given.scene.silhouette(given.grounding.bbox)
+    else:
+        obstacle = given.obstacles[path.body - 1]
+        bbox, mask = obstacle.bbox, obstacle.mask.full()
+    # Without a camera, points follow the grounded point, wherever a given path begins.
+    start = given.grounding.point if ground is None and path.body == 0 else path.points[0]
+    support = None if ground is None else ground.support_of(path.body)
+    return MovingBody(path, bbox, np.array(start), resized_mask(mask, size), airborne, ground, support)
+
+
+def still_bodies(
+    given: GeneratorInput, moving: tuple[MovingBody, ...], size: tuple[int, int], ground: Ground | None
+) -> tuple[StillBody, ...]:
+    """The obstacles that have no path."""
+    taken = np.logical_or.reduce([body.mask for body in moving])
+    found: list[StillBody] = []
+    for index, obstacle in enumerate(given.obstacles, start=1):
+        if any(body.path.body == index for body in moving):
+            continue
+        placed = Placed(obstacle.bbox, airborne=False)
+        if ground is not None:
+            body = ground.bodies[index]
+            middle = ground.height(np.array(body.position))
+            half = body.size[1] / 2
+            placed = Placed(obstacle.bbox, False, body.position[2], middle - half, middle + half)
+        found.append(StillBody(index, obstacle.mask.at(size) & ~taken, placed))
+    return tuple(found)

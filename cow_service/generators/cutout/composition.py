@@ -1,0 +1,97 @@
+"""Puts a frame together: background, then shadows on it, then sprites from far to near behind what stands nearer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cmp_to_key
+
+import numpy as np
+
+from cow_service.generators.base import GeneratorInput
+from cow_service.generators.cutout.bodies import MovingBody, StillBody
+from cow_service.generators.cutout.layers import Layers, take_apart
+from cow_service.generators.cutout.sprites import Sprite, Window, moved, soft
+from cow_service.physics.camera import has_passed
+from cow_service.vision.types import Floats, Floats32, Image
+
+
+@dataclass(frozen=True)
+class Compositor:
+    """The layers of a scene, and what several frames need of them."""
+
+    layers: Layers
+    _open: dict[int | None, Floats32] = field(default_factory=dict, repr=False)
+
+    @staticmethod
+    def of(given: GeneratorInput) -> Compositor:
+        """For the frames of one clip."""
+        return Compositor(take_apart(given))
+
+    def frame(self, index: int) -> Image:
+        """The clip frame [h, w, 3] of an index."""
+        layers = self.layers
+        frame = layers.background.copy()
+        size = frame.shape[1], frame.shape[0]
+        for shadow in layers.shadows:
+            for drawn in shadow.at(index, size):
+                window = frame[drawn.window]
+                dark = drawn.dark * self._surface(drawn.surface)[drawn.window][..., None]
+                window[:] = np.clip(window * (1 - dark) + 0.5, 0, 255).astype(np.uint8)
+        for body, sprite in self._far_to_near(index):
+            self._draw(frame, body, sprite, index)
+        return frame
+
+    def _surface(self, body: int | None) -> Floats32:
+        """Where a surface is seen, 0..1 [h, w]: the floor between the bodies that stand still, or one of these."""
+        if body not in self._open:
+            masks = [other.mask for other in self.layers.still if body in (None, other.index)]
+            covered = np.zeros(self.layers.background.shape[:2], bool)
+            for mask in masks:
+                covered |= mask
+            alpha = soft(covered)
+            self._open[body] = 1 - alpha if body is None else alpha
+        return self._open[body]
+
+    def _far_to_near(self, index: int) -> list[tuple[MovingBody, Sprite]]:
+        """The bodies before the camera at a frame, in the order in which they are drawn."""
+        there: list[tuple[MovingBody, Sprite]] = []
+        for body, sprite in zip(self.layers.moving, self.layers.sprites, strict=True):
+            depths: Floats = np.array([body.path.states[0][2], body.path.states[index][2]])
+            if not has_passed(depths, depths[0])[1]:
+                there.append((body, sprite))
+        eye = self.layers.eye
+
+        def order(a: tuple[MovingBody, Sprite], b: tuple[MovingBody, Sprite]) -> int:
+            return 1 if a[0].placed(index).in_front_of(b[0].placed(index), eye) else -1
+
+        return sorted(there, key=cmp_to_key(order)) if len(there) > 1 else there
+
+    def _draw(self, frame: Image, body: MovingBody, sprite: Sprite, index: int) -> None:
+        path = body.path
+        point = self.layers.factor * np.array(path.points[index])
+        rotation = path.rotation[index] if path.rotation else 0.0
+        found = moved(sprite, point, path.scale[index], rotation, (frame.shape[1], frame.shape[0]))
+        if found is None:
+            return
+        window, pixels = found
+        placed = body.placed(index)
+        for other in self.layers.still:
+            if _overlap(window, other) and not placed.in_front_of(other.placed, self.layers.eye):
+                _hide(pixels, window, other)
+        shown = frame[window]
+        mixed = shown * (1 - pixels[..., 3:]) + pixels[..., :3]
+        shown[:] = np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
+
+
+def _overlap(window: Window, other: StillBody) -> bool:
+    there = other.alpha[0]
+    return all(a.start < b.stop and b.start < a.stop for a, b in zip(window, there, strict=True))
+
+
+def _hide(pixels: Floats32, window: Window, other: StillBody) -> None:
+    """Takes away the part of a window's pixels [a, b, 4] that another body covers."""
+    there, alpha = other.alpha
+    both = [slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(window, there, strict=True)]
+    inner = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, window, strict=True))
+    covered = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, there, strict=True))
+    pixels[inner] *= 1 - alpha[covered][..., None]
