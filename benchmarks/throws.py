@@ -113,10 +113,18 @@ def _box(camera: FloorCamera, body: RigidShape) -> BBox | None:
         rise = np.linspace(-np.pi / 2, np.pi / 2, 21)
         rims = [(np.sin(r) * body.half_width, np.cos(r) * body.half_width) for r in rise]
     else:
-        rims = [(-body.half_height, body.half_width), (body.half_height, 0.0 if body.shape == "cone" else body.half_width)]
+        rims = [
+            (-body.half_height, body.half_width),
+            (body.half_height, 0.0 if body.shape == "cone" else body.half_width),
+        ]
     if body.shape == "box":
-        turns, rims = turns[:4] * 0 + np.array([0.25, 0.75, 1.25, 1.75]) * np.pi, [(y, r * math.sqrt(2)) for y, r in rims]
-    rim = np.concatenate([np.stack([r * np.cos(turns), np.full(len(turns), y), r * np.sin(turns)], axis=1) for y, r in rims])
+        turns, rims = (
+            turns[:4] * 0 + np.array([0.25, 0.75, 1.25, 1.75]) * np.pi,
+            [(y, r * math.sqrt(2)) for y, r in rims],
+        )
+    rim = np.concatenate(
+        [np.stack([r * np.cos(turns), np.full(len(turns), y), r * np.sin(turns)], axis=1) for y, r in rims]
+    )
     points = camera.project(camera.from_floor(np.array(body.position) + rim))
     (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
     inside = x0 > 0 and y0 > 0 and x1 < WIDTH and y1 < HEIGHT
