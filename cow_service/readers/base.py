@@ -18,6 +18,7 @@ from cow_service.records import (
     LocatedObject,
     MetresPerPixel,
     MotionKind,
+    ObjectPrior,
     Point,
     ReaderInfo,
     Record,
@@ -82,6 +83,7 @@ class GroundingReading:
     others: tuple[LocatedObject, ...] = ()
     warnings: tuple[str, ...] = ()
     hints: MotionHints | None = None
+    prior: ObjectPrior | None = None  # of the mover
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,9 @@ class MotionReading:
     cue: Cue
     along_arrow: bool | None = None
     depth: float = 0.0  # see `Motion.depth`
+    depth_deviation: float | None = None  # degrees; null where the reader does not say
+    speed: Literal["slow", "normal", "fast"] | None = None  # in a word; null where none is said
+    speed_deviation: float | None = None  # see `Motion.speed_deviation`; null where the reader does not say
     metres_per_pixel: MetresPerPixel | None = None  # null where the reader cannot tell
     down: Vector = (0.0, 1.0)  # unit vector: which way things fall in the image
     sentence: str | None = None
