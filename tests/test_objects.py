@@ -137,6 +137,8 @@ def test_a_tuft_of_fur_is_refused_with_what_to_give(seed: int) -> None:
     with pytest.raises(CannotGround, match=r"`objects\.0\.bbox`") as caught:
         ground(run_of(image, grounding={"bbox": MOVER}, objects=[{"object": "tuft", "point": (320, 200)}]))
     assert caught.value.errors[0].pointer == "/objects/0/point"
+    begun = ground(run_of(image, trajectory={"points": [(320, 200), (400, 200)]}))  # a path says where it begins
+    assert any("was guessed to be" in warning for warning in begun.warnings)
     seen = ball(image, (320, 200), 45, (220, 40, 40))
     found = ground(run_of(seen, grounding={"point": (320, 200)})).value
     assert found.bbox == pytest.approx((275, 155, 365, 245), abs=6)

@@ -29,7 +29,7 @@ def export_tracks(
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="tracks.pth or .npz for ATI, tracks.npy for Wan-Move.")],
 ) -> None:
-    """Write a simulation's tracks, in pixels of its input image: the mover's, then the anchors."""
+    """Write a simulation's tracks, in pixels of its input image: of what moves, then the anchors."""
     from pydantic import ValidationError  # noqa: PLC0415
 
     from cow_service.generators.wan.track_files import write_tracks  # noqa: PLC0415
@@ -42,7 +42,7 @@ def export_tracks(
         raise _invalid(f"{simulation.name} is not a simulation", error, "the file") from error
     tracks = tracks_of(record.trajectory, record.image.width, record.image.height)
     written = _written(out, lambda: write_tracks(tracks, out))
-    moving, still = len(record.trajectory.tracks), len(record.trajectory.anchors)
+    moving, still = sum(len(path.tracks) for path in record.trajectory.paths), len(record.trajectory.anchors)
     names = " and ".join(str(path) for path in written)
     typer.echo(f"{moving} moving and {still} static tracks over {tracks.num_frames} frames: {names}")
 

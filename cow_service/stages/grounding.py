@@ -72,8 +72,9 @@ def _store_mask(run: Run[SimulateRequest], bbox: BBox) -> Artifact:
 
 
 def _given(run: Run[SimulateRequest], given: GroundingRequest) -> GroundingReading:
-    """What a request says of the mover."""
-    place = place_of(run.scene, given, run.backends.artifacts, "/grounding")
+    """What a request says of the mover. The first point of a path says less of it than a point that is given for it."""
+    derived = run.request.grounding is None
+    place = place_of(run.scene, given, run.backends.artifacts, "/grounding", may_guess=derived)
     return GroundingReading(given.object or DEFAULT_NAME, place.bbox, prior=prior_of(given), warnings=place.warnings)
 
 

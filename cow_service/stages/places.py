@@ -41,11 +41,13 @@ class Place:
     warnings: tuple[str, ...] = ()
 
 
-def place_of(scene: Scene, given: PlaceRequest, artifacts: ArtifactStore, pointer: str) -> Place:
+def place_of(
+    scene: Scene, given: PlaceRequest, artifacts: ArtifactStore, pointer: str, *, may_guess: bool = False
+) -> Place:
     """The place of an object; the scene knows its silhouette afterwards. `pointer` is the JSON Pointer to `given`.
 
     Raises `InvalidRequest` for a place outside the image and for a mask that is none of this image, and `CannotGround`
-    where no object can be cut out around a point.
+    where what can be cut out around a point is no object, unless `may_guess`.
     """
     if given.mask is not None:
         mask = _read_mask(scene, given.mask, artifacts, f"{pointer}/mask")
@@ -53,7 +55,7 @@ def place_of(scene: Scene, given: PlaceRequest, artifacts: ArtifactStore, pointe
         scene.preset_mask(bbox, cropped.full)
         return Place(bbox, has_mask=True)
     if given.point is not None:
-        return _around(scene, given.point, pointer)
+        return _around(scene, given.point, pointer, may_guess=may_guess)
     x0, y0, x1, y1 = given.bbox or (0.0, 0.0, 0.0, 0.0)
     clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
     if clipped[2] - clipped[0] < 2 or clipped[3] - clipped[1] < 2:
@@ -69,7 +71,7 @@ def prior_of(given: PlaceRequest) -> ObjectPrior | None:
     return ObjectPrior(shape=given.shape, size=size, stands_on=given.stands_on)
 
 
-def _around(scene: Scene, point: Point, pointer: str) -> Place:
+def _around(scene: Scene, point: Point, pointer: str, *, may_guess: bool) -> Place:
     """The object at a point, with a warning where its outline had to be guessed. Raises as `place_of` does."""
     x, y = point
     if not (0 <= x < scene.width and 0 <= y < scene.height):
@@ -78,7 +80,7 @@ def _around(scene: Scene, point: Point, pointer: str) -> Place:
     if scene.region_of(bbox) is not None:
         return Place(bbox, has_mask=False)
     field = field_of(pointer)
-    fault = _fault_of_cut(scene, bbox)
+    fault = None if may_guess else _fault_of_cut(scene, bbox)
     if fault is not None:
         detail = f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {fault}"
         raise CannotGround(
