@@ -28,7 +28,9 @@ class MotionRequest(Record):
     )
     depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
     speed: Annotated[Finite, Field(ge=0, le=100_000)] | None = Field(
-        default=None, description="px/s; by default 0.26 image widths per second."
+        default=None,
+        description="px/s; by default 0.26 image widths per second, and of a throw under the contact law that of a "
+        "toy thrown at 1.8 m/s.",
     )
     metres_per_pixel: Annotated[Finite, Field(ge=1e-6, le=1000)] | None = Field(
         default=None, description="By default the image is taken to be 3 m wide at the object."
