@@ -33,7 +33,7 @@ from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.outcome import SURE
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
-from cow_service.stages.motion import DEPTH_DEVIATION, THROW_SPEED_DEVIATION, throw_speed
+from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, throw_speed
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.shadows import Shadow
 from cow_service.vision.types import Floats
@@ -46,8 +46,12 @@ SHADOW_NOISE = 0.03  # of the ball's radius and of the shadow's width
 DIRECTION_NOISE = 1.0  # degrees
 TURN_SIGMA = 15.0  # degrees out of the plane of the image
 SHAPES: tuple[tuple[Shape, float, float], ...] = (
-    ("box", 0.15, 0.15), ("cylinder", 0.12, 0.15), ("cylinder", 0.1, 0.25), ("cone", 0.17, 0.22), ("sphere", 0.15, 0.15),
-)  # fmt: skip
+    ("box", 0.15, 0.15),
+    ("cylinder", 0.12, 0.15),
+    ("cylinder", 0.1, 0.25),
+    ("cone", 0.17, 0.22),
+    ("sphere", 0.15, 0.15),
+)  # half widths and heights, m
 
 
 @dataclass(frozen=True)
@@ -164,10 +168,10 @@ def probability(throw: Throw, size: int) -> tuple[float, bool]:
         kind="projectile",
         law="contact",
         direction=throw.direction,
-        depth_deviation=DEPTH_DEVIATION,
+        depth_deviation=THROW_DEPTH_DEVIATION,
         cue="arrow",
         speed=throw_speed(box, scale),
-        speed_deviation=THROW_SPEED_DEVIATION,
+        speed_deviation=SPEED_DEVIATIONS["projectile"],
         metres_per_pixel=scale,
         sentence="",
         source="embedded",

@@ -10,6 +10,7 @@ from cow_service.readers.question.wording import motion_sentence
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
+    BBox,
     Grounding,
     Law,
     MetresPerPixel,
@@ -24,7 +25,7 @@ from cow_service.stages.run import Run
 
 THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
 THROW_DEPTH_DEVIATION = 15.0  # degrees: words and arrows tell a throw's heading in the image alone
-SPEED_DEVIATIONS: dict[MotionKind, float] = {"linear": 0.25, "projectile": 0.35}  # of the logarithm of a default speed
+SPEED_DEVIATIONS: dict[MotionKind, float] = {"linear": 0.25, "projectile": 0.28}  # of the logarithm of a default speed
 SPEED_FACTORS = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
 
 
@@ -94,18 +95,20 @@ def _complete(
 def _default_speed(
     image_width: int, grounding: Grounding, reading: MotionReading, scale: MetresPerPixel, law: Law
 ) -> float:
-    """px/s of a motion whose speed nobody gave as a number.
-
-    A throw under the contact law has the v^2 / (g R) of a toy of radius 0.15 m thrown at 1.8 m/s: how far it gets in
-    the image, in its own radii, does then not depend on the scale, which is uncertain.
-    """
-    if reading.kind == "projectile" and law == "contact":
-        x0, y0, x1, y1 = grounding.bbox
-        radius = (x1 - x0 + y1 - y0) / 4  # px
-        speed = math.sqrt(THROW_SPEED**2 / (GRAVITY * THROW_RADIUS) * (GRAVITY / scale.value) * radius)
-    else:
-        speed = DEFAULT_SPEED * image_width
+    """px/s of a motion whose speed nobody gave as a number."""
+    thrown = reading.kind == "projectile" and law == "contact"
+    speed = throw_speed(grounding.bbox, scale) if thrown else DEFAULT_SPEED * image_width
     return speed if reading.speed is None else SPEED_FACTORS[reading.speed] * speed
+
+
+def throw_speed(bbox: BBox, scale: MetresPerPixel) -> float:
+    """px/s of a throw whose speed nobody gave: v^2 / (g R) as of a toy of radius 0.15 m thrown at 1.8 m/s.
+
+    How far it gets in the image, in its own radii, does then not depend on the scale, which is uncertain.
+    """
+    x0, y0, x1, y1 = bbox
+    radius = (x1 - x0 + y1 - y0) / 4  # px
+    return math.sqrt(THROW_SPEED**2 / (GRAVITY * THROW_RADIUS) * (GRAVITY / scale.value) * radius)
 
 
 def _depth_deviation(reading: MotionReading) -> float:
