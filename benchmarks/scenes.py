@@ -148,7 +148,7 @@ def _frame_errors(
     backgrounds: list[float] = []
     arrows: list[float] = []
     for frame, pixels in zip(simulation.frames, frames, strict=True):
-        shift = np.array(simulation.trajectory.points[frame.index]) - start
+        shift = np.array(simulation.trajectory.path.points[frame.index]) - start
         move = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float64)
         here = np.asarray(cv2.warpAffine(truth.astype(np.uint8), move, (truth.shape[1], truth.shape[0])), np.uint8)
         changed = np.asarray(cv2.dilate(here, kernel), np.uint8) | still
@@ -158,7 +158,7 @@ def _frame_errors(
         if free.sum() > 0.5 * drawn.sum() > 0:
             arrows.append(float(np.abs(pixels.astype(int) - clean)[free].mean()))
         beside = _shifted(simulation.grounding.bbox, shift)
-        if simulation.trajectory.visible[frame.index] and not any(_meet(beside, other) for other in others):
+        if simulation.trajectory.path.visible[frame.index] and not any(_meet(beside, other) for other in others):
             found = _locate(scene, truth, pixels, shift)
             if found is not None:
                 centres.append(found)
@@ -199,7 +199,7 @@ def _locate(scene: Scene, mover: Mask, pixels: NDArray[np.uint8], shift: NDArray
 def _path_error(simulation: Simulation, meta: dict[str, Any]) -> float:
     last = min(meta["hits"].values(), default=len(meta["track"]) - 1)
     true = np.array(meta["track"][: last + 1])
-    path = np.array(simulation.trajectory.points)
+    path = np.array(simulation.trajectory.path.points)
     fine = np.stack(
         [np.interp(np.linspace(0, len(path) - 1, 4000), np.arange(len(path)), path[:, i]) for i in (0, 1)], 1
     )

@@ -33,7 +33,7 @@ from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.outcome import SURE
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
-from cow_service.stages.motion import DEPTH_DEVIATION, THROW_SPEED_DEVIATION, throw_speed
+from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, throw_speed
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.shadows import Shadow
 from cow_service.vision.types import Floats
@@ -46,8 +46,12 @@ SHADOW_NOISE = 0.03  # of the ball's radius and of the shadow's width
 DIRECTION_NOISE = 1.0  # degrees
 TURN_SIGMA = 15.0  # degrees out of the plane of the image
 SHAPES: tuple[tuple[Shape, float, float], ...] = (
-    ("box", 0.15, 0.15), ("cylinder", 0.12, 0.15), ("cylinder", 0.1, 0.25), ("cone", 0.17, 0.22), ("sphere", 0.15, 0.15),
-)  # fmt: skip
+    ("box", 0.15, 0.15),
+    ("cylinder", 0.12, 0.15),
+    ("cylinder", 0.1, 0.25),
+    ("cone", 0.17, 0.22),
+    ("sphere", 0.15, 0.15),
+)  # half widths and heights, m
 
 
 @dataclass(frozen=True)
@@ -113,10 +117,18 @@ def _box(camera: FloorCamera, body: RigidShape) -> BBox | None:
         rise = np.linspace(-np.pi / 2, np.pi / 2, 21)
         rims = [(np.sin(r) * body.half_width, np.cos(r) * body.half_width) for r in rise]
     else:
-        rims = [(-body.half_height, body.half_width), (body.half_height, 0.0 if body.shape == "cone" else body.half_width)]
+        rims = [
+            (-body.half_height, body.half_width),
+            (body.half_height, 0.0 if body.shape == "cone" else body.half_width),
+        ]
     if body.shape == "box":
-        turns, rims = turns[:4] * 0 + np.array([0.25, 0.75, 1.25, 1.75]) * np.pi, [(y, r * math.sqrt(2)) for y, r in rims]
-    rim = np.concatenate([np.stack([r * np.cos(turns), np.full(len(turns), y), r * np.sin(turns)], axis=1) for y, r in rims])
+        turns, rims = (
+            turns[:4] * 0 + np.array([0.25, 0.75, 1.25, 1.75]) * np.pi,
+            [(y, r * math.sqrt(2)) for y, r in rims],
+        )
+    rim = np.concatenate(
+        [np.stack([r * np.cos(turns), np.full(len(turns), y), r * np.sin(turns)], axis=1) for y, r in rims]
+    )
     points = camera.project(camera.from_floor(np.array(body.position) + rim))
     (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
     inside = x0 > 0 and y0 > 0 and x1 < WIDTH and y1 < HEIGHT
@@ -156,10 +168,10 @@ def probability(throw: Throw, size: int) -> tuple[float, bool]:
         kind="projectile",
         law="contact",
         direction=throw.direction,
-        depth_deviation=DEPTH_DEVIATION,
+        depth_deviation=THROW_DEPTH_DEVIATION,
         cue="arrow",
         speed=throw_speed(box, scale),
-        speed_deviation=THROW_SPEED_DEVIATION,
+        speed_deviation=SPEED_DEVIATIONS["projectile"],
         metres_per_pixel=scale,
         sentence="",
         source="embedded",

@@ -67,6 +67,11 @@ def pointer_part(part: int | str) -> str:
     return shortened(str(part), MAX_KEY).replace("~", "~0").replace("/", "~1")
 
 
+def field_of(pointer: str) -> str:
+    """A JSON Pointer as messages name a field: `objects.0.mask` for /objects/0/mask."""
+    return pointer[1:].replace("/", ".")
+
+
 def shortened(text: str, most: int) -> str:
     """The text, or its first `most` characters and how many there are: what callers send may be megabytes long."""
     return text if len(text) <= most else f"{text[:most]}... ({len(text)} characters)"

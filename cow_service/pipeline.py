@@ -8,7 +8,7 @@ from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.stages.answering import answer_question
 from cow_service.stages.generation import generate
-from cow_service.stages.grounding import ground, use_stored_mask
+from cow_service.stages.grounding import ground, use_stored_masks
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
@@ -22,7 +22,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
     """
     run.check_request()
     grounding = run.stage("grounding", ground)
-    use_stored_mask(run, grounding)
+    use_stored_masks(run, grounding)
     motion = run.stage("motion", read_motion, grounding, run.hints)
     trajectory = run.stage("trajectory", compute_trajectory, grounding, motion)
     clip = run.stage("generation", generate, grounding, motion, trajectory)

@@ -6,7 +6,7 @@ import re
 import uuid
 from functools import partial
 from threading import Lock
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import (
@@ -15,9 +15,10 @@ from cow_service.errors import (
     GeneratorUnavailable,
     InvalidRequest,
     ReaderUnavailable,
+    field_of,
 )
 from cow_service.generators.base import Generator
-from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.artifacts import ArtifactStore, media_type_of
 from cow_service.media.data_urls import decode_data_url
 from cow_service.media.images import DecodedImage, decode
 from cow_service.net.images import ImageUrls
@@ -26,7 +27,7 @@ from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader
 from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulation
 from cow_service.registry import Registry
-from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, SimulateRequest
+from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, PlaceRequest, SimulateRequest
 from cow_service.settings import Settings, SettingsError
 from cow_service.stages.checks import check_request
 from cow_service.stages.run import Backends, Progress, Run, Step, compute_directly, ignore_progress, now
@@ -35,6 +36,7 @@ from cow_service.weights.manifests import find_manifest, load_manifests
 
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
 Request = TypeVar("Request", bound=SimulateRequest)
+Place = TypeVar("Place", bound=PlaceRequest)
 _OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)
 
 
@@ -98,11 +100,24 @@ class Service:
         of backends that nobody has, the errors of `image_of`, and whatever `progress` raises.
         """
         backends = self._backends(request)
+        request = self.keep_masks(request)
         created_at = created_at or now()
         # Also with an image at hand: a run begins in its turn, and its job counts as queued until then.
         with self.cpu.held(created_at, partial(progress, None, 0.0)):
             image = image or self.image_of(request.image)[1]
         return Run(request, image, backends, progress, step, run_id or str(uuid.uuid4()), created_at)
+
+    def keep_masks(self, request: Request) -> Request:
+        """The request with its masks as artifacts: those that are data URLs are kept, and not decoded before they are
+        needed. Raises `InvalidRequest` and `ImageTypeUnsupported`."""
+        changed: dict[str, Any] = {}
+        if request.grounding is not None and isinstance(request.grounding.mask, str):
+            changed["grounding"] = self._with_mask_kept(request.grounding, "/grounding/mask")
+        if any(isinstance(given.mask, str) for given in request.objects):
+            changed["objects"] = tuple(
+                self._with_mask_kept(given, f"/objects/{index}/mask") for index, given in enumerate(request.objects)
+            )
+        return request.model_copy(update=changed) if changed else request
 
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
         """Says at once what is wrong with a request as far as that costs nothing; returns its reader and generator.
@@ -186,6 +201,16 @@ class Service:
             return ref.artifact, decode(data, max_megapixels=self.settings.max_image_megapixels)
         artifact, image = self.keep_image(decode_data_url(ref))
         return artifact.sha256, image
+
+    def _with_mask_kept(self, place: Place, pointer: str) -> Place:
+        if not isinstance(place.mask, str):
+            return place
+        data = decode_data_url(place.mask, pointer)
+        if media_type_of(data) != "image/png":
+            detail = "is no PNG"
+            raise InvalidRequest(f"`{field_of(pointer)}` {detail}.", errors=(FieldError(pointer, detail),))
+        kept = ImageArtifact(artifact=self.artifacts.put(data, "image/png").sha256)
+        return place.model_copy(update={"mask": kept})
 
     def _known(self, role: str, name: str, registry: Registry[Reader] | Registry[Generator]) -> str:
         if name not in registry.names():

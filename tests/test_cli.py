@@ -72,6 +72,19 @@ def test_json_and_overrides(tmp_path: Path, picture: Path) -> None:
     assert (tmp_path / "toys-cow" / "frame_001.png").is_file()
 
 
+def test_other_objects_a_law_and_no_ensemble(tmp_path: Path, picture: Path) -> None:
+    other = ["--other", "blue cube=430,160,510,250", "--other", "spot=470,200"]
+    told = cow(tmp_path, "simulate", str(picture), QUESTION, *other[:2], "--law", "ballistic", "--ensemble", "0",
+               "--no-video", "--num-frames", "5", "--json")  # fmt: skip
+    simulation = Simulation.model_validate_json(told.stdout)
+    assert simulation.motion.law == "ballistic"
+    assert [(one.object, one.bbox) for one in simulation.grounding.others] == [("blue cube", (430, 160, 510, 250))]
+    twice = cow(tmp_path, "simulate", str(picture), QUESTION, *other)
+    assert "`objects.1` has the same box as `objects.0`" in twice.stderr
+    wrong = cow(tmp_path, "simulate", str(picture), QUESTION, "--other", "430,160")
+    assert "--other takes NAME=X0,Y0,X1,Y1" in wrong.stderr
+
+
 def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
     result = cow(
         tmp_path, "simulate", str(picture), "?", "--box", "105,155,195,245", "--kind", "fall", "--json", "--no-video"

@@ -44,7 +44,7 @@ from cow_service.client.inputs import Upload, image_input
 from cow_service.client.options import AnswerOptions, SimulateOptions
 from cow_service.client.progress import reporting
 from cow_service.records import Job
-from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, SimulateRequest
+from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, ObjectRequest, SimulateRequest
 
 __all__ = ["connect"]  # a fixture
 
@@ -119,8 +119,9 @@ def _digest(data: bytes) -> str:
 def test_images_of_every_kind(address: str, tmp_path: Path) -> None:
     with Client(address) as client:
         client.simulate(IMAGE, QUESTION, **SMALL)
+        boxed = SMALL | {"grounding": {"bbox": [42, 62, 78, 98]}}  # in black and white no object is told from the rest
         for name, image in _kinds_of_images(tmp_path).items():
-            simulation = client.simulate(image, QUESTION, **SMALL)
+            simulation = client.simulate(image, QUESTION, **boxed)
             assert (simulation.image.width, simulation.image.height) == (240, 160), name
             if "file" in name or "PIL" in name or "array" in name:
                 assert client.artifact(simulation.image.sha256).startswith(b"\x89PNG"), name
@@ -221,12 +222,42 @@ def test_bytes_that_are_no_image(client: Any) -> None:
 
 def test_options_are_the_fields_of_the_requests() -> None:
     for options, request in ((SimulateOptions, SimulateRequest), (AnswerOptions, AnswerRequest)):
-        assert set(options.__annotations__) | set(SimulateOptions.__annotations__) == set(request.model_fields) - {
-            "image",
-            "question",
-        }
+        assert set(options.__annotations__) | set(SimulateOptions.__annotations__) == {"law"} | set(
+            request.model_fields
+        ) - {"image", "question"}
         assert not options.__required_keys__
         assert get_type_hints(Event)
+
+
+def test_objects_law_ensemble_and_camera_are_sent_right(client: Any) -> None:
+    mask = np.zeros((160, 240), bool)
+    mask[60:98, 170:205] = True
+    boxed = {"object": "blue cube", "bbox": (170, 60, 205, 98), "role": "obstacle"}
+    for law, motion in (("ballistic", None), ("contact", {"direction": (1, 0)}), (None, {"kind": "fall"})):
+        given = SMALL | {"motion": motion, "law": law, "ensemble": 0, "camera": {"pitch": 25}, "seed": 7}
+        for objects in ([boxed], [ObjectRequest.model_validate(boxed)], [{"object": "blue cube", "mask": mask}]):
+            simulation = client.submit(IMAGE, QUESTION, objects=objects, **given).wait()
+            assert simulation.motion.law == law or (law is None and simulation.motion.law == "contact")
+            (cube,) = simulation.grounding.others
+            assert (cube.object, cube.bbox, cube.source) == ("blue cube", (170, 60, 205, 98), "request")
+            assert (cube.mask is None) == (objects[0] is boxed or isinstance(objects[0], ObjectRequest))
+    with pytest.raises(errors.InvalidRequest, match=r"motion\.law"):
+        client.simulate(IMAGE, QUESTION, law="contact", motion={"law": "ballistic"})
+    with pytest.raises(errors.InvalidRequest) as caught:
+        client.simulate(
+            IMAGE, QUESTION, **SMALL | {"objects": [{"object": "cube", "mask": np.zeros((160, 240), bool)}]}
+        )
+    assert [field.pointer for field in caught.value.errors] == ["/objects/0/mask"]
+
+
+def test_batches_take_the_same_arguments(client: Any) -> None:
+    mask = np.zeros((160, 240), np.uint8)
+    mask[60:98, 170:205] = 255
+    item = {"image": IMAGE, "question": QUESTION, "objects": [{"object": "cube", "mask": mask}], "law": "ballistic"}
+    (outcome,) = list(client.map([item], kind="simulate", ensemble=0, **SMALL))
+    assert outcome.error is None
+    assert outcome.result.motion.law == "ballistic"
+    assert [other.object for other in outcome.result.grounding.others] == ["cube"]
 
 
 def test_options_of_every_kind_are_sent_right(client: Any, tmp_path: Path) -> None:
@@ -252,13 +283,13 @@ def test_options_of_every_kind_are_sent_right(client: Any, tmp_path: Path) -> No
         assert simulation.grounding.bbox == (42, 62, 78.5, 98)
         assert simulation.motion.direction == pytest.approx((0.894, 0.447), abs=1e-3)
         assert (simulation.motion.speed, simulation.trajectory.fps) == (40, 8)
-        assert len(simulation.trajectory.points) == 5
+        assert len(simulation.trajectory.path.points) == 5
         assert (simulation.generator.seed, len(simulation.frames), simulation.video) == (9, 2, None)
         points = np.stack([np.linspace(60, 90, 4), np.full(4, 80.0)], axis=1)
         again = client.simulate(
             image, QUESTION, **SMALL | {"grounding": GroundingRequest(point=(60, 80)), "trajectory": {"points": points}}
         )
-        assert again.trajectory.points[0] == (60, 80)
+        assert again.trajectory.path.points[0] == (60, 80)
 
 
 def test_questions_arrive_as_they_are(client: Any, tmp_path: Path) -> None:

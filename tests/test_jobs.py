@@ -14,8 +14,11 @@ from datetime import datetime, timedelta
 from typing import Any
 from uuid import uuid4
 
+import cv2
 import httpx
+import numpy as np
 import pytest
+from drawn import png_bytes
 from hypothesis import HealthCheck, given
 from hypothesis import settings as trying
 from hypothesis import strategies as st
@@ -735,7 +738,7 @@ def test_the_same_request_again_is_not_worked_on(served: Served) -> None:
 
 
 def test_another_seed_is_another_clip_only(served: Served) -> None:
-    body = slow(0, seed=60, image=data_url(picture(31)))
+    body = slow(0, seed=60, image=data_url(picture(31)), grounding={"point": [91, 80]})
     assert served.http.post("/simulate", json=body).json()["reused"] == []
     other = served.http.post("/simulate", json={**body, "seed": 61}).json()
     assert other["reused"] == STAGES[:3]
@@ -743,7 +746,9 @@ def test_another_seed_is_another_clip_only(served: Served) -> None:
 
 
 def test_a_clip_is_the_same_whether_its_object_was_found_before_or_not(served: Served) -> None:
-    body = {**BODY, "image": data_url(picture(33))}  # a point: what is cut around it is not what is cut from its box
+    mask = data_url(png_bytes(cv2.circle(np.zeros((160, 240, 3), np.uint8), (93, 80), 12, (255, 255, 255), -1)))
+    # What a mask says is not what is cut from its box.
+    body = {**BODY, "image": data_url(picture(33)), "grounding": {"mask": mask}}
     first = served.http.post("/simulate", json=body).json()
     other = served.http.post("/simulate", json={**body, "seed": 1}).json()  # which this generator does not heed
     assert other["reused"] == STAGES[:3]
@@ -754,7 +759,7 @@ def test_a_clip_is_the_same_whether_its_object_was_found_before_or_not(served: S
 
 
 def test_an_answer_takes_what_a_simulation_came_to(served: Served) -> None:
-    body = {**BODY, "image": data_url(picture(32))}
+    body = {**BODY, "image": data_url(picture(32)), "grounding": {"point": [92, 80]}}
     simulation = served.http.post("/simulate", json=body).json()
     answer = served.http.post("/answer", json=body).json()
     assert answer["reused"] == STAGES

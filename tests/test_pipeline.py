@@ -111,7 +111,7 @@ def test_the_video_plays(service: Service) -> None:
         assert stream.average_rate == 12
     assert len(frames) == simulation.video.num_frames == 24
     assert frames[0].shape == (400, 640, 3)
-    x, y = simulation.trajectory.points[20]
+    x, y = simulation.trajectory.path.points[20]
     assert frames[20][int(y), int(x), 0] > 120 > frames[20][int(y), int(x), 2]
 
 
@@ -140,7 +140,7 @@ def test_overrides_skip_their_readers(service: Service) -> None:
     simulation = run(service, question="?", trajectory=path, video=False)
     assert simulation.reader.stages == ()
     assert iou(simulation.grounding.bbox, (110, 160, 190, 240)) > 0.8
-    assert simulation.trajectory.points[16] == pytest.approx((150, 100))
+    assert simulation.trajectory.path.points[16] == pytest.approx((150, 100))
 
 
 def test_doubts_are_told(service: Service) -> None:

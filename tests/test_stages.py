@@ -13,7 +13,7 @@ from runs import run_of
 
 from cow_service.errors import InvalidRequest
 from cow_service.readers.base import MotionReading
-from cow_service.records import Encounter, Grounding, Motion, Trajectory
+from cow_service.records import Contact, Encounter, Grounding, Motion, Path, Trajectory
 from cow_service.requests import FramesRequest, SimulateRequest, TrajectoryRequest
 from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
@@ -89,34 +89,34 @@ def test_defaults_of_speed_scale_and_gravity(scene: Scene) -> None:
 
 def test_static_stays(scene: Scene) -> None:
     trajectory = rolled(scene, moved(scene, kind="static"))
-    assert len(set(trajectory.points)) == 1
+    assert len(set(trajectory.path.points)) == 1
 
 
 def test_linear_points_move_by_speed_over_fps(scene: Scene) -> None:
     trajectory = rolled(scene, moved(scene, direction=(1, 0), speed=160))
-    points = np.array(trajectory.points)
+    points = np.array(trajectory.path.points)
     assert np.allclose(np.diff(points, axis=0), [10, 0])
-    assert len(trajectory.states) == len(trajectory.visible) == len(trajectory.scale) == 81
+    assert len(trajectory.path.states) == len(trajectory.path.visible) == len(trajectory.path.scale) == 81
     outside = points[:, 0] >= 640
-    assert (np.array(trajectory.visible) == ~outside).all()
+    assert (np.array(trajectory.path.visible) == ~outside).all()
     metres = 3 / 640
-    assert trajectory.states[0][3:] == pytest.approx((160 * metres, 0, 0))
-    assert trajectory.states[0][2] == pytest.approx(640 * metres)
+    assert trajectory.path.states[0][3:] == pytest.approx((160 * metres, 0, 0))
+    assert trajectory.path.states[0][2] == pytest.approx(640 * metres)
 
 
 def test_a_fall_follows_gravity(scene: Scene) -> None:
     trajectory = rolled(scene, moved(scene, kind="fall"), fps=16)
-    start, later = trajectory.points[0], trajectory.points[8]
+    start, later = trajectory.path.points[0], trajectory.path.points[8]
     assert later[0] == pytest.approx(start[0])
     assert later[1] - start[1] == pytest.approx(0.5 * 9.81 * (640 / 3) * 0.25)
 
 
 def test_tracks_follow_the_object_and_grow_with_it(scene: Scene) -> None:
     trajectory = rolled(scene, moved(scene, direction=(0, 1), depth=-0.8, speed=60), frames=33)
-    assert trajectory.scale[-1] > trajectory.scale[0] == 1
-    centre, track = np.array(trajectory.points), np.array(trajectory.tracks[1])
+    assert trajectory.path.scale[-1] > trajectory.path.scale[0] == 1
+    centre, track = np.array(trajectory.path.points), np.array(trajectory.path.tracks[1])
     spread = np.linalg.norm(track - centre, axis=1)
-    assert np.allclose(spread / spread[0], trajectory.scale)
+    assert np.allclose(spread / spread[0], trajectory.path.scale)
 
 
 def test_anchors_keep_off_object_and_path(scene: Scene) -> None:
@@ -151,13 +151,13 @@ def test_a_given_path_is_followed_and_held(scene: Scene) -> None:
     assert motion.direction == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
     assert motion.speed == pytest.approx(200)
     trajectory = rolled(scene, motion, path, frames=33, fps=16)
-    assert trajectory.points[0] == pytest.approx((200, 200))
-    assert trajectory.points[4] == pytest.approx((250, 200))
-    assert trajectory.points[8] == pytest.approx((300, 200))
-    assert trajectory.points[16] == pytest.approx((300, 300))
-    assert trajectory.points[32] == pytest.approx((300, 300))
-    assert trajectory.states[32][3:] == (0, 0, 0)
-    assert trajectory.states[12][4] > 0
+    assert trajectory.path.points[0] == pytest.approx((200, 200))
+    assert trajectory.path.points[4] == pytest.approx((250, 200))
+    assert trajectory.path.points[8] == pytest.approx((300, 200))
+    assert trajectory.path.points[16] == pytest.approx((300, 300))
+    assert trajectory.path.points[32] == pytest.approx((300, 300))
+    assert trajectory.path.states[32][3:] == (0, 0, 0)
+    assert trajectory.path.states[12][4] > 0
 
 
 def test_a_path_that_returns_has_a_first_direction_and_one_that_stays_is_static(scene: Scene) -> None:
@@ -165,14 +165,12 @@ def test_a_path_that_returns_has_a_first_direction_and_one_that_stays_is_static(
     assert moved(scene, path=TrajectoryRequest(points=((5, 5), (5, 5)))).kind == "static"
 
 
-def plain(frames: int, encounters: tuple[int, ...] = (), seen: int | None = None) -> Trajectory:
+def plain(frames: int, encounters: tuple[int, ...] = (), seen: int | None = None, **more) -> Trajectory:
     visible = tuple(i < (frames if seen is None else seen) for i in range(frames))
     met = tuple(Encounter(object="o", bbox=(0, 0, 1, 1), first_frame=i, kind="touches") for i in encounters)
     zero = ((0.0, 0.0),) * frames
-    return Trajectory(
-        fps=16, states=((0.0,) * 6,) * frames, points=zero, visible=visible, scale=(1.0,) * frames, tracks=(zero,),
-        anchors=(), encounters=met,
-    )  # fmt: skip
+    path = Path(states=((0.0,) * 6,) * frames, points=zero, visible=visible, scale=(1.0,) * frames, tracks=(zero,))
+    return Trajectory(fps=16, paths=(path,), anchors=(), encounters=met, **more)
 
 
 def test_frame_policies() -> None:
@@ -183,6 +181,17 @@ def test_frame_policies() -> None:
     assert 12 in choose_frames(FramesRequest(policy="events"), plain(81, (12,), seen=40))
     assert max(choose_frames(FramesRequest(policy="events"), plain(81, seen=40))) == 39
     assert choose_frames(FramesRequest(indices=(7, 3, 3)), plain(81)) == (3, 7)
+
+
+def test_event_frames_show_contacts_that_no_other_frame_shows() -> None:
+    def at(time: float, b: int | None) -> Contact:
+        return Contact(a=0, b=b, time=time, point=(0, 0), impulse=1)
+
+    contacts = (at(0.0, None), at(0.5, None), at(1.0, 1), at(1.05, 2))
+    events = FramesRequest(policy="events")
+    assert choose_frames(events, plain(81, (40,), contacts=contacts)) == (8, 16, 40)  # 1.05 s shows what 1 s does
+    assert choose_frames(events, plain(81, (16,), contacts=contacts))[:2] == (8, 16)
+    assert max(choose_frames(events, plain(81, contacts=contacts, moving_until=2.0))) == 32
 
 
 @given(
@@ -206,6 +215,16 @@ def test_any_policy_gives_as_many_frames_as_there_are(policy, count, frames, eve
     [
         ({"grounding": {"object": "ball"}}, "either `bbox` or `point`"),
         ({"grounding": {"bbox": [0, 0, 9, 9], "point": [1, 1]}}, "either `bbox` or `point`"),
+        ({"grounding": {"mask": "https://example.org/mask.png"}}, "must be a data URL"),
+        ({"objects": [{"object": "mug"}]}, "either `bbox` or `point`"),
+        ({"objects": [{"bbox": [0, 0, 9, 9]}]}, "Field required"),
+        ({"objects": [{"object": "mug", "bbox": [0, 0, 9, 9], "size": 0}]}, "greater than or equal to 0.0001"),
+        ({"objects": [{"object": "mug", "bbox": [0, 0, 9, 9]}] * 1000}, "at most 64 items"),
+        ({"ensemble": 501}, "less than or equal to 500"),
+        ({"camera": {}}, "give `focal`, `pitch` or `roll`"),
+        ({"camera": {"pitch": 91}}, "less than or equal to 90"),
+        ({"motion": {"law": "ballistic", "speed": 9}}, "only `law` can be given"),
+        ({"motion": {"kind": "fall", "depth_deviation": 9}}, "takes no `direction`"),
         ({"grounding": {"bbox": [10, 10, 10, 90]}}, "span at least 2 px"),
         ({"motion": {"direction": [0, 0]}}, "must have a length"),
         ({"motion": {"kind": "projectile"}}, "needs a `direction`"),
@@ -220,6 +239,48 @@ def test_any_policy_gives_as_many_frames_as_there_are(policy, count, frames, eve
 def test_requests_that_cannot_be_meant(body, told) -> None:
     with pytest.raises(ValueError, match=told):
         SimulateRequest.model_validate({"image": "data:,", "question": "?", **body})
+
+
+def test_the_law_alone_leaves_the_motion_to_the_reader() -> None:
+    asked = SimulateRequest.model_validate({"image": "data:,", "question": "?", "motion": {"law": "ballistic"}})
+    assert (asked.law, asked.stated_motion, asked.left_to_reader) == ("ballistic", None, {"grounding", "motion"})
+    kept = SimulateRequest.model_validate(asked.model_dump(mode="json", exclude_defaults=True))
+    assert kept == asked
+    default = SimulateRequest(image="data:,", question="?")
+    assert (default.law, default.ensemble) == ("contact", 200)
+
+
+def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Scene) -> None:
+    thrown = moved(scene, direction=(1, 0), kind="projectile")
+    x0, y0, x1, y1 = grounded(scene, **POINT).bbox
+    radius, gravity = (x1 - x0 + y1 - y0) / 4, thrown.gravity[1]
+    assert thrown.speed**2 / (gravity * radius) == pytest.approx(1.8**2 / (9.81 * 0.15))
+    assert (thrown.law, thrown.speed_deviation, thrown.depth_deviation) == ("contact", 0.35, 0)
+    ballistic = moved(scene, direction=(1, 0), kind="projectile", law="ballistic")
+    assert (ballistic.law, ballistic.speed) == ("ballistic", pytest.approx(0.26 * 640))
+    given = moved(scene, direction=(1, 0), kind="projectile", speed=50, depth_deviation=4)
+    assert (given.speed, given.speed_deviation, given.depth_deviation) == (50, 0, 4)
+
+
+def read_as(scene: Scene, reading: MotionReading, **request) -> Motion:
+    class OneReader:
+        source = "mllm"
+
+        def read_motion(self, given, grounding, hints):
+            return reading
+
+    return read_motion(run(scene, reader=OneReader, **request), grounded(scene, **POINT), None).value
+
+
+def test_what_a_reader_leaves_open_of_a_motion(scene: Scene) -> None:
+    slow = read_as(scene, MotionReading("linear", (1, 0), "text", speed="slow"))
+    assert (slow.speed, slow.speed_deviation) == (pytest.approx(0.13 * 640), 0.25)
+    thrown = read_as(scene, MotionReading("projectile", (1, 0), "text", down=(0.6, 0.8)))
+    assert (thrown.down, thrown.depth_deviation) == ((0.6, 0.8), 15)
+    fast = read_as(scene, MotionReading("projectile", (1, 0), "text", speed="fast", depth_deviation=30.0))
+    assert (fast.speed / thrown.speed, fast.depth_deviation) == (pytest.approx(2), 30)
+    assert read_as(scene, fall := MotionReading("fall", None, "gravity")).speed_deviation == 0
+    assert read_as(scene, fall, motion={"law": "ballistic"}).law == "ballistic"
 
 
 def test_a_reader_is_asked_where_the_request_is_silent(scene: Scene) -> None:
@@ -260,6 +321,21 @@ class TestKeys:
         path = {"trajectory": {"points": [(200, 200), (300, 200)]}}
         assert self.key(scene, "grounding", grounding=POINT, **path) == self.key(scene, "grounding", **path)
         assert self.key(scene, "trajectory", grounding=POINT, **path) != self.key(scene, "trajectory", **path)
+
+    def test_objects_law_ensemble_and_camera_decide_their_stages(self, scene: Scene) -> None:
+        mug = {"objects": [{"object": "mug", "bbox": [0, 0, 90, 90]}]}
+        for place in ({}, {"grounding": POINT}):
+            assert self.key(scene, "grounding", **place, **mug) != self.key(scene, "grounding", **place)
+        law, path = {"law": "ballistic"}, {"trajectory": {"points": [(200, 200), (300, 200)]}}
+        for motion in ({}, {"kind": "fall"}):
+            given = self.key(scene, "motion", motion=motion | law, question="a")
+            assert given != self.key(scene, "motion", motion=motion, question="a")
+            asks_reader = given != self.key(scene, "motion", motion=motion | law, question="b")
+            assert asks_reader is (not motion)
+        assert self.key(scene, "motion", motion=law, **path) != self.key(scene, "motion", **path)
+        for decides in ({"ensemble": 0}, {"camera": {"pitch": 20}}):
+            assert self.key(scene, "trajectory", **decides) != self.key(scene, "trajectory")
+            assert self.key(scene, "grounding", **decides) == self.key(scene, "grounding")
 
     def test_a_backend_that_does_not_say_what_decides_it_shares_nothing(self, scene: Scene) -> None:
         one, other = (self.key(scene, identity=lambda role: None, seed=seed) for seed in (1, 2))

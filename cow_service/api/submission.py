@@ -165,6 +165,9 @@ class Submitter:
         service = self.engine.service
         if isinstance(body.image, ImageArtifact):
             self.engine.may_read(body.image.artifact, submission.owner if image is None else None)
+        for mask in body.masks:
+            if isinstance(mask, ImageArtifact):
+                self.engine.may_read(mask.artifact, submission.owner)
         reader, generator = service.precheck(body)
         if body.webhook is not None:
             self.engine.webhooks.check(body.webhook)
@@ -172,7 +175,7 @@ class Submitter:
         if image is None:
             sha256, image = service.image_of(body.image)
         kept = ImageArtifact(artifact=sha256 or image.info.sha256)
-        asks = body.model_copy(update={"image": kept, "webhook": None})
+        asks = service.keep_masks(body).model_copy(update={"image": kept, "webhook": None})
         spec = JobSpec(
             kind=submission.kind,
             request=asks.model_dump(mode="json", exclude_defaults=True),

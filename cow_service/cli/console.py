@@ -15,6 +15,7 @@ from rich.table import Table
 
 from cow_service.cli.errors import HINTS
 from cow_service.cli.options import read_file
+from cow_service.client.wording import contacts_words, encounters_words, outcome_words
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.images import DecodedImage
 from cow_service.records import Answer, BackendInfo, Models, Simulation, Verdict
@@ -100,9 +101,14 @@ def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], 
 
 
 def print_stages(console: Console, simulation: Simulation) -> None:
-    """Prints a line for each stage: its time and its result."""
+    """Prints a line for each stage: its time and its result; and what touches what, and what comes of it."""
     for stage, line in _stage_lines(simulation).items():
         console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {escape(line)}")
+    trajectory = simulation.trajectory
+    if contacts := contacts_words(trajectory):
+        console.print(f"[dim]contacts[/]: {escape(contacts)}")
+    if trajectory.outcome is not None and (outcome := outcome_words(trajectory.outcome)):
+        console.print(f"[dim]outcome[/]: {escape(outcome)}")
 
 
 def print_warnings(console: Console, warnings: Iterable[str]) -> None:
@@ -170,12 +176,11 @@ def _stage_lines(simulation: Simulation) -> dict[Stage, str]:
     way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"
     if motion.depth:
         way += " and towards the camera" if motion.depth < 0 else " and away from the camera"
-    met = ", ".join(f"{e.kind} {e.object} at {e.first_frame / trajectory.fps:.1f} s" for e in trajectory.encounters)
     video = f", {simulation.video.num_frames}-frame video" if simulation.video else ""
     return {
         "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
         "motion": f"{motion.kind}{way}, {motion.speed:.0f} px/s, from {motion.cue}",
-        "trajectory": met or ("meets nothing" if simulation.encounters_known else "encounters were not computed"),
+        "trajectory": f"{encounters_words(trajectory)}, law {trajectory.law}",
         "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
     }
 

@@ -15,6 +15,7 @@ from cow_service.errors import CowError, InvalidRequest
 
 Policy = Literal["initial", "uniform", "events"]
 Kind = Literal["linear", "projectile", "fall", "static"]
+Law = Literal["contact", "ballistic"]
 Image = Annotated[
     Path, typer.Argument(metavar="IMAGE", help="PNG, JPEG or WebP.", exists=True, dir_okay=False, readable=True)
 ]
@@ -35,6 +36,19 @@ def request_body(
         Kind, typer.Option(help="Kind of motion, with --direction (or alone for fall and static).")
     ] = "linear",
     speed: Annotated[float | None, typer.Option(help="px/s, with --direction.", show_default="0.26 widths/s")] = None,
+    law: Annotated[
+        Law | None,
+        typer.Option(help="contact: floor, bounces, pushes; ballistic: through everything.", show_default="contact"),
+    ] = None,
+    other: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=X0,Y0,X1,Y1",
+            help='Another object and its box (or X,Y of a point on it), such as "red mug=10,20,90,140"; '
+            "may be repeated.",
+        ),
+    ] = None,
+    ensemble: Annotated[int, typer.Option(help="How many worlds the probabilities are counted in; 0: none.")] = 100,
     trajectory: Annotated[
         Path | None,
         typer.Option(
@@ -67,6 +81,8 @@ def request_body(
         "num_frames": num_frames,
         "fps": fps,
         "seed": seed,
+        "ensemble": ensemble,
+        "objects": [_other(text) for text in other or []],
         "frames": {"policy": frames, "count": count, "max_side": max_side or None},
     }
     if point is not None or box is not None:
@@ -85,6 +101,8 @@ def request_body(
         }
     elif kind != "linear" or speed is not None:
         raise InvalidRequest("--kind and --speed go with --direction; without it the motion is read from the question.")
+    if law is not None:
+        body["motion"] = {**body.get("motion", {}), "law": law}
     if trajectory is not None:
         body["trajectory"] = path = _json(trajectory)
         if name is not None and "grounding" not in body and isinstance(path, dict):
@@ -125,6 +143,16 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
             f"{option} takes {count} numbers with commas between, such as {','.join(['10'] * count)}; got '{text}'."
         )
     return values
+
+
+def _other(text: str) -> dict[str, object]:
+    """Another object of the image, by its box or by a point on it."""
+    name, _, place = text.rpartition("=")
+    if not name.strip():
+        raise InvalidRequest(f"--other takes NAME=X0,Y0,X1,Y1 or NAME=X,Y; got '{text}'.")
+    is_point = place.count(",") == 1
+    field, count = ("point", 2) if is_point else ("bbox", 4)
+    return {"object": name.strip(), field: _numbers("--other NAME=", place, count)}
 
 
 def _name_and_value(given: str) -> tuple[str, object]:

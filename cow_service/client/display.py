@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from cow_service.records import MEETINGS, Answer, Frame, Simulation, Verdict
+from cow_service.client.wording import contacts_words, encounters_words, outcome_words
+from cow_service.records import Answer, Frame, Simulation, Verdict
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,13 +45,6 @@ def one_line(text: str, most: int = 120) -> str:
     """The text on one line, cut where it is long."""
     line = " ".join(text.split())
     return line if len(line) <= most else f"{line[: most - 1]}…"
-
-
-def describe_encounters(simulation: Simulation) -> str:
-    """What the mover encounters, in words."""
-    fps = simulation.trajectory.fps
-    met = [f"{MEETINGS[e.kind]} {e.object} at {e.first_frame / fps:.1f} s" for e in simulation.trajectory.encounters]
-    return ", ".join(met) or ("meets nothing" if simulation.encounters_known else "encounters were not computed")
 
 
 def describe_answer(answer: Verdict) -> str:
@@ -114,10 +108,18 @@ def _body(simulation: Simulation, get: GetBytes) -> str:
     pictures = [_figure(get(simulation.overlay.sha256), image.width / image.height, "what was found")]
     pictures += [_figure(get(frame.sha256), frame.width / frame.height, _caption(frame)) for frame in simulation.frames]
     strip = f'<div style="display:flex;flex-wrap:wrap;gap:10px {GAP_PX}px;margin:8px 0">{"".join(pictures)}</div>'
+    trajectory = simulation.trajectory
     said = simulation.motion.sentence
     if simulation.encounters_known:
-        said += f" It {describe_encounters(simulation)}."
-    return strip + f"<div>{escape(said)}</div>" + _warnings(simulation.warnings)
+        said += f" It {encounters_words(trajectory)}."
+    told = [said]
+    if contacts := contacts_words(trajectory):
+        told.append(f"Contacts: {contacts}.")
+    if trajectory.outcome is not None and (outcome := outcome_words(trajectory.outcome)):
+        told.append(f"Outcome: {outcome}.")
+    if trajectory.moving_until is not None:
+        told.append(f"Nothing moves in the image from {trajectory.moving_until:.1f} s on.")
+    return strip + "".join(f"<div>{escape(text)}</div>" for text in told) + _warnings(simulation.warnings)
 
 
 def _caption(frame: Frame) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import httpx
 
 from cow_service.client.inputs import ImageLike, Reference, Upload, image_input
+from cow_service.client.request_fields import request_fields
 from cow_service.client.serialization import to_json
 from cow_service.client.steps import Send
 from cow_service.errors import FieldError, InvalidRequest
@@ -43,13 +44,14 @@ def job_request(
 ) -> JobRequest:
     """A request for work; without a key it gets a random one.
 
-    Raises what `image_input` does, and `InvalidRequest` for a key that no header can hold and for text that is none.
+    Raises what `image_input` and `request_fields` do, and `InvalidRequest` for a key that no header can hold and for
+    text that is none.
     """
     if key is not None and not _KEY.fullmatch(key):
         detail = "takes 1 to 255 printable ASCII characters without spaces"
         raise InvalidRequest(f"`idempotency_key` {detail}, got {key[:80]!r}.", errors=(FieldError("", detail),))
     sent = image_input(image)
-    rest = {name: value for name, value in options.items() if value is not None}
+    rest = request_fields(options)
     try:
         content, media_type = _body_of(sent, question, rest)
     except UnicodeEncodeError as error:

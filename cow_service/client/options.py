@@ -6,7 +6,15 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
-    from cow_service.requests import FramesRequest, GroundingRequest, MotionRequest, TrajectoryRequest
+    from cow_service.records import Law
+    from cow_service.requests import (
+        CameraRequest,
+        FramesRequest,
+        GroundingRequest,
+        MotionRequest,
+        ObjectRequest,
+        TrajectoryRequest,
+    )
 
 DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
 RETRIES = 5
@@ -16,12 +24,19 @@ Given = Mapping[str, Any]  # a record as a plain mapping, checked by the server
 
 
 class SimulateOptions(TypedDict, total=False):
-    """All of `SimulateRequest` but image and question; README.md and `cow_service.requests` say what each means."""
+    """All of `SimulateRequest` but image and question; docs/http.md and `cow_service.requests` say what each means.
+
+    `law` stands for `motion.law`. The `mask` of an object may be whatever an image may be, and an array of booleans.
+    """
 
     options: Sequence[str] | None
     grounding: GroundingRequest | Given | None
     motion: MotionRequest | Given | None
     trajectory: TrajectoryRequest | Given | None
+    objects: Sequence[ObjectRequest | Given] | None
+    camera: CameraRequest | Given | None
+    law: Law | None
+    ensemble: int | None
     reader: str | None
     generator: str | None
     num_frames: int

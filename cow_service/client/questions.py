@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cow_service.client.inputs import ImageLike, Reference, image_input, is_url
+from cow_service.client.request_fields import request_fields
 from cow_service.client.serialization import to_json
-from cow_service.errors import FieldError, InvalidRequest
+from cow_service.errors import CowError, FieldError, InvalidRequest
 
 # A mapping has `image` and `question`, maybe `id` and `meta`, and else fields of the request; a pair has the first two.
 QuestionLike: TypeAlias = "Question | Mapping[str, Any] | tuple[ImageLike, str]"
 MAX_ID_CHARACTERS = 200
 _OWN_FIELDS = {"id", "image", "meta", "question"}  # of each question: no defaults are taken for them
+_CONVERTED = {"law", "grounding", "objects"}  # fields that are not sent as they are given
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -66,6 +68,7 @@ def questions(
     same: dict[str, int] = {}
     for place, item in enumerate(items, 1):
         question = _read(item, place, defaults, folder)
+        question = replace(question, options=_fields(question.options, place))
         if question.id == "":
             made = _checked(question, place).fingerprint[:16]
             times = same[made] = same.get(made, 0) + 1
@@ -96,6 +99,14 @@ def _read(item: Any, place: int, defaults: Mapping[str, Any], folder: Path | Non
     if folder is not None and isinstance(image, str) and not is_url(image):
         image, named = folder / image, image  # the same question, from wherever the folder is looked at
     return Question("" if own is None else str(own), image, question, {**defaults, **given}, meta, named)
+
+
+def _fields(options: Mapping[str, Any], place: int) -> Mapping[str, Any]:
+    """The fields of the request, with masks that JSON can hold. Raises `InvalidRequest` naming the question."""
+    try:
+        return request_fields(options) if _CONVERTED & options.keys() else options
+    except CowError as error:
+        raise InvalidRequest(f"Question {place}: {error.detail}", errors=error.errors) from error
 
 
 def _checked(question: Question, place: int) -> Question:

@@ -18,7 +18,6 @@ from cow_service import records
 from cow_service.client.display import (
     answer_html,
     describe_answer,
-    describe_encounters,
     filmstrip_png,
     one_line,
     picture_of,
@@ -26,6 +25,7 @@ from cow_service.client.display import (
     stacked,
 )
 from cow_service.client.steps import Steps, finished
+from cow_service.client.wording import encounters_words
 from cow_service.errors import CowError
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class _Simulation(records.Simulation):
     _files: Files = PrivateAttr(default_factory=Files)
 
     def __repr__(self) -> str:
-        said = one_line(f"{self.grounding.object} {describe_encounters(self)}")
+        said = one_line(f"{self.grounding.object} {encounters_words(self.trajectory)}")
         return f"<{type(self).__name__} {self.id}: {said}; {len(self.frames)} frames>"
 
     __str__ = __repr__

@@ -187,8 +187,8 @@ class JobEngine:
             starts_now = self.open_jobs.count(spec.generator) < self.max_running_jobs_per_generator
             self.open_jobs.record(job_id, spec.generator)
         try:
-            # Before the job exists: its image must not be removed before work on it starts.
-            self.database.add_references(job_id, [image.info.sha256])
+            # Before the job exists: its image and masks must not be removed before work on it starts.
+            self.database.add_references(job_id, [image.info.sha256, *spec.masks])
             if starts_now:
                 self.active.put_image(job_id, image)
                 self._start(job_id, spec, owner)

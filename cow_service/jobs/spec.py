@@ -12,7 +12,7 @@ from cow_service.stages.results import digest_of
 
 
 class JobSpec(Record):
-    """One accepted request. Its image is an artifact: a spec has no bytes. Databases store the field names."""
+    """One accepted request. Its image and masks are artifacts: a spec has no bytes. Databases store the field names."""
 
     kind: JobKind
     request: dict[str, Any]
@@ -28,6 +28,12 @@ class JobSpec(Record):
     def digest(self) -> str:
         """Equal for requests that ask for the same."""
         return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
+
+    @property
+    def masks(self) -> list[str]:
+        """The digests of the masks that the request gives."""
+        places = [self.request.get("grounding") or {}, *self.request.get("objects", ())]
+        return [place["mask"]["artifact"] for place in places if place.get("mask")]
 
     def parsed(self) -> SimulateRequest | AnswerRequest:
         """The request, as it was validated when it came."""

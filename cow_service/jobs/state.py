@@ -15,7 +15,7 @@ from cow_service.errors import CowError, FieldError, InternalError, InvalidReque
 from cow_service.jobs.active import ActiveJobs, share_done
 from cow_service.jobs.database import database_errors
 from cow_service.observability.timestamps import rfc3339
-from cow_service.records import Job, JobKind, JobPage, JobStatus, Problem
+from cow_service.records import Answer, Job, JobKind, JobPage, JobStatus, Problem, Simulation
 
 KINDS: tuple[JobKind, ...] = get_args(JobKind)
 ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT = "generator", "created_at"  # what DBOS keeps beside a workflow
@@ -167,7 +167,19 @@ def _state(status: WorkflowStatus, active: ActiveJobs) -> JobState:
         problem=None if error is None else Problem(**error.as_problem()),
     )
     ended = None if status.completed_at is None else status.completed_at / 1000
-    return JobState(job, status.authenticated_user, status.output if shown == "succeeded" else None, error, ended)
+    result = status.output if shown == "succeeded" else None
+    return JobState(job, status.authenticated_user, result and _current(kind, result), error, ended)
+
+
+def _current(kind: JobKind, result: str) -> str:
+    """A stored result as it is written today: that of an older version had its only path in the trajectory itself.
+
+    Others are not parsed: that takes long. Inside a text, quotes would stand behind backslashes.
+    """
+    if '"trajectory":{' not in result or '"trajectory":{"law":' in result:
+        return result
+    model = Answer if kind == "answer" else Simulation
+    return model.model_validate_json(result).model_dump_json()
 
 
 def _error(status: WorkflowStatus) -> CowError | None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from cow_service.errors import FieldError, InvalidRequest, pointer_part
-from cow_service.records import FramePolicy, MotionKind
+from cow_service.records import FramePolicy, Law, MotionKind
 
 
 def _list_from_json(value: Any) -> Any:
@@ -25,6 +25,15 @@ FromJson = BeforeValidator(_list_from_json)
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Box = Annotated[list[Number], Field(min_length=4, max_length=4)]
+
+
+class NamedBox(BaseModel):
+    """A thing and where it is."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    object: str = Field(description="In words ('blue mug').")
+    bbox: Box = Field(description="[x0, y0, x1, y1], pixels.")
 
 
 class ToolInput(BaseModel):
@@ -61,6 +70,15 @@ class ToolInput(BaseModel):
     speed: Number | None = Field(
         default=None, description="Pixels per second, with `direction`. By default 0.26 image widths per second."
     )
+    law: Law | None = Field(
+        default=None,
+        description="contact (the default): it bounces, pushes, rolls, comes to rest; ballistic: through everything.",
+    )
+    objects: Annotated[list[NamedBox] | None, FromJson] = Field(
+        default=None,
+        description="Other things that matter and where they are, as far as they are known: they are hard to find in a "
+        "photograph.",
+    )
     num_frames: int | None = Field(
         default=None, description="Frames of the clip, 16 a second. By default 81: five seconds."
     )
@@ -77,12 +95,13 @@ class ToolInput(BaseModel):
     def request_fields(self) -> dict[str, Any]:
         """The fields of the service's request beside image and question."""
         grounding = _given(object=self.object, bbox=self.bbox, point=self.point)
-        motion = _given(direction=self.direction, kind=self.motion_kind, speed=self.speed)
+        motion = _given(direction=self.direction, kind=self.motion_kind, speed=self.speed, law=self.law)
         frames = _given(policy=self.frames_policy, count=self.frames_count)
         return _given(
             grounding=grounding or None,
             motion=motion or None,
             frames=frames or None,
+            objects=None if self.objects is None else [thing.model_dump() for thing in self.objects],
             num_frames=self.num_frames,
             seed=self.seed,
             generator=self.generator,

@@ -7,9 +7,10 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service import records
+from cow_service.client.wording import body_name, first_contacts, outcome_words
 from cow_service.mcp.images import ARTIFACTS
 from cow_service.mcp.inputs import lean
-from cow_service.records import EncounterKind, MotionKind
+from cow_service.records import Doubt, EncounterKind, Law, MotionKind
 
 
 class Result(BaseModel):
@@ -19,7 +20,7 @@ class Result(BaseModel):
 
 
 class Encounter(Result):
-    """The mover's silhouette meets another thing: a hypothesis, computed from the image alone."""
+    """The mover meets another thing: a hypothesis, computed from the image alone."""
 
     object: str
     kind: EncounterKind = Field(
@@ -27,6 +28,31 @@ class Encounter(Result):
     )
     time_s: float = Field(description="When it begins, seconds from now.")
     frame: int = Field(description="When it begins, frame of the clip.")
+    probability: float | None = Field(
+        description="Share of the simulated worlds in which it happens; null where they were not counted."
+    )
+    share: float | None = Field(description="Of an occlusion: the largest share that is covered.")
+
+
+class Contact(Result):
+    """Two things begin to touch in the likeliest world."""
+
+    a: str
+    b: str = Field(description="The other thing, or `the floor`.")
+    time_s: float
+
+
+class Outcome(Result):
+    """What the question asks, as the simulated world answers it: a hypothesis with a probability."""
+
+    summary: str = Field(description="In words.")
+    probability: float | None = Field(description="That what is asked happens, or of the value below.")
+    first: str | None = Field(description="What is met first, where that is asked.")
+    count: int | None = Field(description="How many, where that is asked.")
+    time_s: float | None = Field(description="Seconds until it happens.")
+    sure: bool = Field(description="Whether the world is certain enough for an answer.")
+    robust: bool = Field(description="Whether no single doubt changes the answer.")
+    depends_on: list[Doubt] = Field(description="What the answer depends on, most first.")
 
 
 class Frame(Result):
@@ -63,9 +89,15 @@ class SimulateResult(Result):
         description="Unit vector [dx, dy], x right, y down; null for a fall or a thing that stays."
     )
     speed: float = Field(description="Pixels per second at first.")
+    law: Law = Field(description="contact: floor, bounces, pushes; ballistic: straight through everything.")
     leaves_at_s: float | None = Field(description="When its centre leaves the image; null where it stays inside.")
     encounters: list[Encounter] = Field(description="What it meets on its way, in order of time.")
     encounters_known: bool = Field(description="Whether an empty list of encounters means that it meets nothing.")
+    contacts: list[Contact] = Field(description="The first contacts, in order of time.")
+    moving_until_s: float | None = Field(
+        description="From when nothing moves in the image any more; null where it is not known or something still does."
+    )
+    outcome: Outcome | None = Field(description="Null where the question asks for nothing that the world can tell.")
     frames: list[Frame]
     video: Video | None
     overlay_sha256: str = Field(description="The image with box, direction and path drawn: the first picture.")
@@ -116,7 +148,7 @@ class AnswerResult(Result):
 def simulate_result(simulation: records.Simulation, base_url: str | None) -> SimulateResult:
     """A simulation as a tool returns it; `base_url` is the address of its server, where that has one."""
     motion, trajectory, video = simulation.motion, simulation.trajectory, simulation.video
-    hidden = [not visible for visible in trajectory.visible]
+    hidden = [not visible for visible in trajectory.path.visible]
     return SimulateResult(
         id=simulation.id,
         object=simulation.grounding.object,
@@ -125,14 +157,13 @@ def simulate_result(simulation: records.Simulation, base_url: str | None) -> Sim
         kind=motion.kind,
         direction=None if motion.direction is None else _rounded(motion.direction, 3),
         speed=round(motion.speed, 1),
+        law=trajectory.law,
         leaves_at_s=round(hidden.index(True) / trajectory.fps, 2) if any(hidden) else None,
-        encounters=[
-            Encounter(
-                object=e.object, kind=e.kind, time_s=round(e.first_frame / trajectory.fps, 2), frame=e.first_frame
-            )
-            for e in sorted(trajectory.encounters, key=lambda e: e.first_frame)
-        ],
+        encounters=[_encounter(e, trajectory.fps) for e in sorted(trajectory.encounters, key=lambda e: e.first_frame)],
         encounters_known=simulation.encounters_known,
+        contacts=[_contact(contact, trajectory) for contact in first_contacts(trajectory)],
+        moving_until_s=None if trajectory.moving_until is None else round(trajectory.moving_until, 2),
+        outcome=None if trajectory.outcome is None else _outcome(trajectory.outcome),
         frames=[Frame(time_s=round(frame.time, 2), **frame.model_dump()) for frame in simulation.frames],
         video=None if video is None else _video(video, base_url),
         overlay_sha256=simulation.overlay.sha256,
@@ -160,9 +191,43 @@ def output_schema(model: type[Result]) -> dict[str, Any]:
     return lean(model.model_json_schema(mode="serialization"))
 
 
+def _encounter(encounter: records.Encounter, fps: float) -> Encounter:
+    return Encounter(
+        object=encounter.object,
+        kind=encounter.kind,
+        time_s=round(encounter.first_frame / fps, 2),
+        frame=encounter.first_frame,
+        probability=_maybe(encounter.probability),
+        share=_maybe(encounter.share),
+    )
+
+
+def _contact(contact: records.Contact, trajectory: records.Trajectory) -> Contact:
+    return Contact(
+        a=body_name(contact.a, trajectory), b=body_name(contact.b, trajectory), time_s=round(contact.time, 2)
+    )
+
+
+def _outcome(outcome: records.Outcome) -> Outcome:
+    return Outcome(
+        summary=outcome_words(outcome),
+        probability=_maybe(outcome.probability),
+        first=outcome.first,
+        count=outcome.count,
+        time_s=_maybe(outcome.time),
+        sure=outcome.sure,
+        robust=outcome.robust,
+        depends_on=list(outcome.depends_on),
+    )
+
+
 def _video(video: records.Video, base_url: str | None) -> Video:
     url = None if base_url is None else base_url + video.url
     return Video(uri=ARTIFACTS + video.sha256, url=url, **video.model_dump(exclude={"url"}))
+
+
+def _maybe(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)
 
 
 def _rounded(values: tuple[float, ...], digits: int) -> list[float]:

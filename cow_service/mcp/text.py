@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from cow_service.client.wording import worlds
 from cow_service.mcp.results import AnswerResult, Encounter, SimulateResult, Verdict
 from cow_service.records import MEETINGS
 
@@ -37,6 +38,12 @@ def _simulation(simulation: SimulateResult) -> Iterable[str]:
     yield simulation.motion
     yield f"It is the {simulation.object} at [{box}] in the image of {size}; {_motion(simulation)}."
     yield _encounters(simulation)
+    if simulation.contacts:
+        yield f"Contacts: {'; '.join(f'{one.a} and {one.b} at {one.time_s:g} s' for one in simulation.contacts)}."
+    if simulation.outcome is not None and simulation.outcome.summary:
+        yield f"Outcome (a hypothesis of the simulated world): {simulation.outcome.summary}."
+    if simulation.moving_until_s is not None:
+        yield f"Nothing moves in the image from {simulation.moving_until_s:g} s on."
     if simulation.leaves_at_s is not None:
         yield f"Its centre leaves the image at {simulation.leaves_at_s:g} s."
     frames = [f"frame {frame.index} ({frame.time_s:g} s)" for frame in simulation.frames]
@@ -48,22 +55,23 @@ def _simulation(simulation: SimulateResult) -> Iterable[str]:
 
 def _motion(simulation: SimulateResult) -> str:
     if simulation.direction is None:
-        return simulation.kind
+        return f"{simulation.kind}, law {simulation.law}"
     along = ", ".join(f"{part:g}" for part in simulation.direction)
-    return f"{simulation.kind}, direction [{along}] (x right, y down), {simulation.speed:g} px/s"
+    return f"{simulation.kind}, direction [{along}] (x right, y down), {simulation.speed:g} px/s, law {simulation.law}"
 
 
 def _encounters(simulation: SimulateResult) -> str:
     encounters = "; ".join(_encounter(encounter) for encounter in simulation.encounters)
     if encounters:
-        return f"On its way (from silhouettes, hypotheses) it {encounters}."
+        return f"On its way (hypotheses) it {encounters}."
     if simulation.encounters_known:
-        return "It meets nothing on its way, as far as silhouettes tell."
+        return "It meets nothing on its way, as far as the image tells."
     return "What it meets was not computed."
 
 
 def _encounter(encounter: Encounter) -> str:
-    return f"{MEETINGS[encounter.kind]} {encounter.object} from {encounter.time_s:g} s (frame {encounter.frame})"
+    sure = "" if encounter.probability is None else f", {worlds(encounter.probability)}"
+    return f"{MEETINGS[encounter.kind]} {encounter.object} from {encounter.time_s:g} s (frame {encounter.frame}{sure})"
 
 
 def _verdict(answer: str | None, option: str | None) -> str:

@@ -125,6 +125,12 @@ class _Engine:
         self.origin = np.array([[(k % side) * SPACING, 0.0, (k // side) * SPACING] for k in range(len(worlds))])
         self.origin -= np.array([1.0, 0.0, 1.0]) * (side - 1) / 2 * SPACING
         self.groups = [Group(1 << (k % side % COLOURS * COLOURS + k // side % COLOURS)) for k in range(len(worlds))]
+        self.led = {
+            (k, i): body.follows
+            for k, bodies in enumerate(worlds)
+            for i, body in enumerate(bodies)
+            if body.follows is not None
+        }
         self.handles = [[self._add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
         shape = len(worlds), len(worlds[0]), len(self.frames)
         self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
@@ -133,17 +139,13 @@ class _Engine:
         self.drift = np.zeros(shape[:2], bool)  # taken out: they go on in a straight line
 
     def run(self) -> list[WorldRun]:
-        for k, bodies in enumerate(self.worlds):
-            for i in range(len(bodies)):
-                self._record(k, i, 0)
+        self._record([(k, i) for k, bodies in enumerate(self.worlds) for i in range(len(bodies))], 0)
         for row in range(1, len(self.frames)):
             self._advance(self.frames[row - 1])
             for moving in (self.positions, self.velocities, self.turns):
                 moving[:, :, row] = moving[:, :, row - 1]
             self.positions[:, :, row] += self.drift[..., None] * self.velocities[:, :, row] * (self.every / self.fps)
-            for k, awake in enumerate(self.awake):
-                for i in awake:
-                    self._record(k, i, row)
+            self._record([(k, i) for k, awake in enumerate(self.awake) for i in awake if not self.drift[k, i]], row)
             if self.finished is not None:
                 for k in np.nonzero(self.finished(self.positions[:, 0, row], self.velocities[:, 0, row]))[0].tolist():
                     self._take_out(k, 0)
@@ -190,14 +192,11 @@ class _Engine:
 
     def _lead(self, time: float) -> None:
         """Sets where bodies that follow a path are to be at a time."""
-        for k, bodies in enumerate(self.worlds):
-            for i, body in enumerate(bodies):
-                if body.follows is not None:
-                    at = min(time * self.fps, len(body.follows) - 1.0)
-                    low = min(int(at), len(body.follows) - 2)
-                    there = body.follows[low] + (at - low) * (body.follows[low + 1] - body.follows[low])
-                    there = there * self.scale + self.origin[k]
-                    self._body(self.handles[k][i]).set_next_kinematic_translation(tuple(there.tolist()))
+        for (k, i), path in self.led.items():
+            at = min(time * self.fps, len(path) - 1.0)
+            low = min(int(at), len(path) - 2)
+            there = (path[low] + (at - low) * (path[low + 1] - path[low])) * self.scale + self.origin[k]
+            self._body(self.handles[k][i]).set_next_kinematic_translation(tuple(there.tolist()))
 
     def _velocities(self) -> dict[tuple[int, int], Floats]:
         return {
@@ -217,7 +216,7 @@ class _Engine:
             after = np.array(self._body(self.handles[k][a]).linvel.to_tuple())
             impulse = float(np.linalg.norm(after - before[k, a])) / self.scale
         self.meetings[k].append(Meeting(time, a, b, impulse))
-        if b is None:
+        if b is None or not {a, b} & self.awake[k]:  # bodies that stand close together touch when nothing moves
             return
         for i in (a, b):
             body = self.worlds[k][i]
@@ -227,21 +226,20 @@ class _Engine:
                     collider = self._body(self.handles[k][i]).colliders[0]
                     self.world.colliders[collider].friction = body.friction
 
-    def _record(self, k: int, i: int, row: int) -> None:
-        if self.drift[k, i]:
+    def _record(self, which: Sequence[tuple[int, int]], row: int) -> None:
+        """Writes down where some bodies of worlds are."""
+        if not which:
             return
-        body = self._body(self.handles[k][i])
-        x, y, z = body.translation.to_tuple()
-        ox, oy, oz = self.origin[k]
-        self.positions[k, i, row] = ((x - ox) / self.scale, (y - oy) / self.scale, (z - oz) / self.scale)
-        if i == 0 or self.is_alone:
-            vx, vy, vz = body.linvel.to_tuple()
-            self.velocities[k, i, row] = (vx / self.scale, vy / self.scale, vz / self.scale)
+        bodies = [self._body(self.handles[k][i]) for k, i in which]
+        k, i = (np.array(column) for column in zip(*which, strict=True))
+        positions = np.array([body.translation.to_tuple() for body in bodies]) - self.origin[k]
+        self.positions[k, i, row] = positions / self.scale
+        self.velocities[k, i, row] = np.array([body.linvel.to_tuple() for body in bodies]) / self.scale
         if self.is_alone:
-            turn = body.rotation
-            self.turns[k, i, row] = (turn.i, turn.j, turn.k, turn.w)
-        if max(abs(x - ox), abs(z - oz)) > REACH:
-            self._take_out(k, i)
+            turns = [body.rotation for body in bodies]
+            self.turns[k, i, row] = np.array([(turn.i, turn.j, turn.k, turn.w) for turn in turns])
+        for far in np.nonzero(np.abs(positions[:, [0, 2]]).max(axis=1) > REACH)[0].tolist():
+            self._take_out(*which[far])
 
     def _take_out(self, k: int, i: int) -> None:
         """Leaves a body out of what is computed from now on: it keeps its last velocity."""

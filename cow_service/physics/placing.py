@@ -21,10 +21,10 @@ TURN_SIGMA: dict[Cue, float] = {
     "arrow": 1.5, "trail": 3.0, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
 }  # fmt: skip
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
-RISE, RISE_SIGMA = math.radians(20), math.radians(10)  # above the horizontal: how things are thrown
+RISE, RISE_SIGMA = math.radians(20), math.radians(8)  # above the horizontal: how things are thrown
 TURNS = np.linspace(-5, 5, 81)  # in deviations: turns out of the plane of the image that are weighed
 TURN_WIDTHS = ((0.6, 0.55), (3.0, 0.45))  # deviations and shares: most throws go nearly along the image, some do not
-AIMED, AIM_SIGMA = 1.5, math.radians(12)  # how much likelier a heading to what is asked about is, and how exact
+AIMED, AIM_SIGMA = 1.0, math.radians(9)  # how much likelier a heading to what is asked about is, and how exact
 LOW = 0.08  # sine of the angle between a ray and a horizontal plane below which the plane through the foot is taken
 APART = 0.98  # of the distance of two bodies: together they are so wide at most
 VEHICLE_WIDTH = 0.5  # of a vehicle's length

@@ -18,7 +18,7 @@ from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place
 from cow_service.records import FALLING_KINDS, Motion
 from cow_service.vision.types import Floats, Mask
 
-FRICTION, FRICTION_SIGMA = 0.5, 0.4  # of a body; one standard deviation of the logarithm
+FRICTION, FRICTION_SIGMA = 0.5, 0.3  # of a body; one standard deviation of the logarithm
 RESTITUTION, RESTITUTION_SIGMA = 0.5, 0.15
 YAW_SIGMA = 0.4  # radians: how a box is turned about the vertical
 LEFT_BY = 0.2  # of the image's width: so far outside, what goes on outwards does not come back

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -17,6 +18,8 @@ from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 
+MIN_GAP = 0.2  # s between a contact and another chosen frame: closer ones show the same
+
 Image = NDArray[np.uint8]
 
 
@@ -24,10 +27,11 @@ def choose_frames(wanted: FramesRequest, trajectory: Trajectory) -> tuple[int, .
     """Ascending clip indices of the frames to return, by the policy or as listed in the request.
 
     `initial` is every second frame after the first (1, 3, 5, ...), as in the paper's evaluation code; `uniform` spreads
-    over the whole clip, both ends included; `events` takes the first frame of each encounter, then the frames that lie
-    farthest from those already taken while the object is visible.
+    over the whole clip, both ends included; `events` takes the first frame of each encounter, then contacts, in the
+    order of their times, then the frames that lie farthest from those already taken while the object is visible and
+    something moves.
     """
-    last = len(trajectory.points) - 1
+    last = trajectory.num_frames - 1
     if wanted.indices is not None:
         return tuple(sorted(set(wanted.indices)))
     count = min(wanted.count, last + 1)
@@ -40,16 +44,26 @@ def choose_frames(wanted: FramesRequest, trajectory: Trajectory) -> tuple[int, .
 
 
 def _at_events(trajectory: Trajectory, count: int) -> tuple[int, ...]:
-    last = len(trajectory.points) - 1
+    last, visible = trajectory.num_frames - 1, trajectory.path.visible
     chosen = list(dict.fromkeys(encounter.first_frame for encounter in trajectory.encounters))[:count]
-    seen = [i for i in range(1, last + 1) if trajectory.visible[i]] or list(range(1, last + 1))
-    end = seen[-1]
+    for frame in _contact_frames(trajectory):
+        if len(chosen) < count and all(abs(frame - other) >= MIN_GAP * trajectory.fps for other in (0, *chosen)):
+            chosen.append(frame)
+    moving = last if trajectory.moving_until is None else max(1, math.ceil(trajectory.moving_until * trajectory.fps))
+    seen = [i for i in range(1, min(last, moving) + 1) if visible[i]] or list(range(1, last + 1))
     if not chosen:
-        chosen = [end]
+        chosen = [seen[-1]]
     for pool in (seen, list(range(last + 1))):
         while len(chosen) < count and (left := [i for i in pool if i not in chosen]):
             chosen.append(max(left, key=lambda i: min(abs(i - j) for j in (*chosen, 0))))
     return tuple(sorted(chosen))
+
+
+def _contact_frames(trajectory: Trajectory) -> list[int]:
+    """The first frame after each contact of the clip, those between bodies before those with the floor."""
+    contacts = sorted(trajectory.contacts, key=lambda contact: (contact.b is None, contact.time))
+    frames = [math.ceil(contact.time * trajectory.fps - 1e-6) for contact in contacts]
+    return [frame for frame in frames if frame < trajectory.num_frames]
 
 
 def generate(
@@ -84,7 +98,7 @@ def _render(
     trajectory, wanted = given.trajectory, request.frames
     chosen = choose_frames(wanted, trajectory)
     size = generator.size(given.scene.width, given.scene.height)
-    indices = tuple(range(len(trajectory.points))) if request.video else chosen
+    indices = tuple(range(trajectory.num_frames)) if request.video else chosen
     frames: list[Frame] = []
 
     def rendered() -> Iterator[Image]:

@@ -1,23 +1,31 @@
-"""Stage 1: which object moves, and where it is."""
+"""Stage 1: which object moves and where it is, and where the others are that matter."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
 
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import GroundingReading
-from cow_service.records import BBox, Grounding, Point, Source
+from cow_service.records import Artifact, BBox, Grounding, LocatedObject, Point, Source
 from cow_service.requests import GroundingRequest, SimulateRequest
+from cow_service.stages.places import place_of, prior_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
-from cow_service.vision.scene import Scene
+from cow_service.vision.masks import iou
+from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.types import Mask
 
 DEFAULT_NAME = "object"
+SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 
 
 def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     """The mover, from the request where it says so, else from the reader; its mask [H, W] is stored as PNG.
 
-    Raises `InvalidRequest` for a place outside the image, and what the reader raises.
+    The others are those of the request, then those of the reader that are not among them. Raises `InvalidRequest` and
+    `CannotGround` for what the request says of places (`place_of`), and what the reader raises.
     """
     place = run.request.place
     source: Source = "request"
@@ -25,57 +33,93 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         reading, source = run.reader.ground(run.reader_input("grounding")), run.reader.source
     else:
         with run.cpu():
-            reading = _given(run.scene, place)
+            reading = _given(run, place)
     with run.cpu():
-        mask = run.backends.artifacts.put(encode_png(run.scene.silhouette(reading.bbox)), "image/png")
+        mask = _store_mask(run, reading.bbox)
+        given, warnings = _given_objects(run, reading.bbox)
+    read = (other.model_copy(update={"source": other.source or source}) for other in reading.others)
+    others = (*given, *(other for other in read if not any(_same(other.bbox, one.bbox) for one in given)))
     grounding = Grounding(
         object=reading.object,
         point=reading.point or _centre(reading.bbox),
         bbox=reading.bbox,
         mask=mask,
-        others=reading.others,
+        others=others,
+        prior=reading.prior,
         source=source,
     )
-    return StageResult(value=grounding, warnings=reading.warnings, artifacts=(mask.sha256,), hints=reading.hints)
+    masks = (mask.sha256, *(one.mask.sha256 for one in given if one.mask is not None))
+    told = (*reading.warnings, *warnings)
+    return StageResult(value=grounding, warnings=told, artifacts=masks, hints=reading.hints)
 
 
-def use_stored_mask(run: Run[SimulateRequest], grounding: Grounding) -> None:
-    """Has the scene use the stored mask of a grounding that was found again.
+def use_stored_masks(run: Run[SimulateRequest], grounding: Grounding) -> None:
+    """Has the scene use the stored masks of a grounding that was found again.
 
-    A mask cut again from its box may differ from one that was cut around a point.
+    A mask cut again from its box may differ from one that was cut around a point, or given.
     """
-    mask = grounding.mask
-    if mask is not None:
-        read = run.backends.artifacts.read
-        run.scene.preset_mask(grounding.bbox, lambda: decode_own(read(mask.sha256))[..., 0] > 0)
+    for placed in (grounding, *grounding.others):
+        if placed.mask is not None:
+            run.scene.preset_mask(placed.bbox, partial(_stored, run, placed.mask))
 
 
-def _given(scene: Scene, place: GroundingRequest) -> GroundingReading:
-    """What a request says of the object, and a warning where its outline had to be guessed around a point."""
-    bbox = _bbox_of(scene, place)
-    warnings: tuple[str, ...] = ()
-    if place.point is not None and scene.region_of(bbox) is None:
-        box = ", ".join(f"{value:.0f}" for value in bbox)
-        warnings = (f"The object around the point was guessed to be [{box}]; `grounding.bbox` says it for certain.",)
-    return GroundingReading(place.object or DEFAULT_NAME, bbox, warnings=warnings)
+def _stored(run: Run[SimulateRequest], mask: Artifact) -> Mask:
+    return decode_own(run.backends.artifacts.read(mask.sha256))[..., 0] > 0
 
 
-def _bbox_of(scene: Scene, place: GroundingRequest) -> BBox:
-    if place.point is not None:
-        x, y = place.point
-        if not (0 <= x < scene.width and 0 <= y < scene.height):
-            raise _outside("/grounding/point", list(place.point), scene)
-        return scene.bbox_at(place.point)
-    x0, y0, x1, y1 = place.bbox or (0.0, 0.0, 0.0, 0.0)
-    clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
-    if clipped[2] - clipped[0] < 2 or clipped[3] - clipped[1] < 2:
-        raise _outside("/grounding/bbox", [x0, y0, x1, y1], scene)
-    return clipped
+def _store_mask(run: Run[SimulateRequest], bbox: BBox) -> Artifact:
+    return run.backends.artifacts.put(encode_png(run.scene.silhouette(bbox)), "image/png")
 
 
-def _outside(pointer: str, value: list[float], scene: Scene) -> InvalidRequest:
-    detail = f"{value} lies outside the upright image of {scene.width} x {scene.height} px."
-    return InvalidRequest(f"{detail} Give pixels, x right and y down.", errors=(FieldError(pointer, detail),))
+def _given(run: Run[SimulateRequest], given: GroundingRequest) -> GroundingReading:
+    """What a request says of the mover. The first point of a path says less of it than a point that is given for it."""
+    derived = run.request.grounding is None
+    place = place_of(run.scene, given, run.backends.artifacts, "/grounding", may_guess=derived)
+    return GroundingReading(given.object or DEFAULT_NAME, place.bbox, prior=prior_of(given), warnings=place.warnings)
+
+
+def _given_objects(run: Run[SimulateRequest], mover: BBox) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
+    """The other objects of a request, and warnings. One at the place of the mover is taken for the mover.
+
+    Raises as `place_of` does, and `InvalidRequest` for an object that is given twice.
+    """
+    found: list[LocatedObject] = []
+    boxes: list[BBox] = []
+    warnings: list[str] = []
+    for index, given in enumerate(run.request.objects):
+        run.check_canceled()
+        place = place_of(run.scene, given, run.backends.artifacts, f"/objects/{index}")
+        warnings += place.warnings
+        _check_new(place.bbox, boxes, index)
+        boxes.append(place.bbox)
+        if _same(place.bbox, mover):
+            warnings.append(f"`objects.{index}` ('{given.object}') lies where the mover is, and was taken for it.")
+            continue
+        found.append(
+            LocatedObject(
+                object=given.object,
+                bbox=place.bbox,
+                role=given.role,
+                mask=_store_mask(run, place.bbox) if place.has_mask else None,
+                prior=prior_of(given),
+                source="request",
+            )
+        )
+    return tuple(found), tuple(warnings)
+
+
+def _check_new(bbox: BBox, boxes: Sequence[BBox], index: int) -> None:
+    """Raises `InvalidRequest` for an object that stands before in the request."""
+    twin = next((place for place, other in enumerate(boxes) if iou(bbox, other) >= SAME_BOX_IOU), None)
+    if twin is not None:
+        detail = f"has the same box as `objects.{twin}`"
+        raise InvalidRequest(
+            f"`objects.{index}` {detail}: give each object once.", errors=(FieldError(f"/objects/{index}", detail),)
+        )
+
+
+def _same(a: BBox, b: BBox) -> bool:
+    return iou(a, b) >= SAME_OBJECT_IOU
 
 
 def _centre(bbox: BBox) -> Point:

@@ -19,7 +19,7 @@ from cow_service.requests import SimulateRequest, Stage
 from cow_service.stages.results import digest_of
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 2  # of stored results; raised where what a stage means or stores changes
+FORMAT = 3  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,22 @@ class KeyFields:
 
     fields: tuple[str, ...]
     backend: BackendRole | None = None
-    set_by_request: tuple[str, ...] = ()  # where the request sets one of these, they decide alone: no reader is asked
+    set_by_request: tuple[str, ...] = ()  # where the request sets one of these, no reader is asked: they decide ...
+    always: tuple[str, ...] = ()  # ... together with these, which decide in either case
     prompt: str | None = None  # whose version decides, too
 
 
 READER_FIELDS = ("question", "seed", "left_to_reader")
-TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "question", "num_frames", "fps")
+TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "ensemble", "question", "num_frames", "fps")
 KEY_FIELDS: dict[Stage, KeyFields] = {
-    "grounding": KeyFields(READER_FIELDS, "reader", set_by_request=("place",)),
-    "motion": KeyFields(READER_FIELDS, "reader", set_by_request=("motion", "trajectory"), prompt="motion-sentence"),
+    "grounding": KeyFields(READER_FIELDS, "reader", set_by_request=("place",), always=("objects",)),
+    "motion": KeyFields(
+        READER_FIELDS,
+        "reader",
+        set_by_request=("stated_motion", "trajectory"),
+        always=("law",),
+        prompt="motion-sentence",
+    ),
     "trajectory": KeyFields(TRAJECTORY_FIELDS),
     "generation": KeyFields(("seed", "frames", "video"), "generator"),
     "answering": KeyFields(("question", "seed", "options", "votes", "baseline", "imagine"), "reader"),
@@ -73,6 +80,7 @@ def key_of(
         "image": image_sha256,
         "inputs": [_digest(value) for value in inputs],
         "prompt": None if decided.prompt is None else load_prompt(decided.prompt).version,
+        "always": {name: _plain(getattr(request, name)) for name in decided.always},
     }
     given = {name: _plain(value) for name in decided.set_by_request if (value := getattr(request, name)) is not None}
     if given:
@@ -91,6 +99,8 @@ def _digest(value: Record | None) -> str | None:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
     if isinstance(value, frozenset):
         return sorted(value)
     return value.model_dump(mode="json") if isinstance(value, BaseModel) else value

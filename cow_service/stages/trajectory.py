@@ -55,10 +55,10 @@ def trajectory_of(
     """What happens in the scene over the frames of a request's clip."""
     bodies = seen_bodies(scene, grounding, obstacles)
     free = _free_path(scene, grounding, motion, request)
-    world = _world(scene, bodies, motion, request, free, grounding)
     known = bool(scene.regions or obstacles)
     asked = read_asked(parse(request.question))
     target = None if asked is None else target_of(asked, grounding, bodies)
+    world = _world(scene, bodies, motion, request, free, grounding, target)
     tellable = asked is not None and known and (asked.target is None or target is not None)
     imagined = imagine(world, asked if tellable else None, target, request.ensemble)
     trajectory = _record(scene, grounding, motion, request, world, imagined, free, known)
@@ -82,6 +82,7 @@ def _world(
     request: SimulateRequest,
     free: FreePath | None,
     grounding: Grounding,
+    asked: int | None,
 ) -> WorldInput:
     led = None
     if free is not None:
@@ -91,7 +92,7 @@ def _world(
     in_air = flies(bodies[0], motion) and bodies[0].shape == "sphere"
     fit = camera_of(scene, motion, request.camera, bodies[0].bbox if in_air else None, fixed_focal=led is not None)
     size = scene.width, scene.height
-    return WorldInput(bodies, motion, fit, size, request.num_frames, request.fps, led)
+    return WorldInput(bodies, motion, fit, size, request.num_frames, request.fps, asked, led)
 
 
 def _record(

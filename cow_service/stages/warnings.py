@@ -47,7 +47,7 @@ def _cues_not_spoken_of(scene: Scene, request: SimulateRequest) -> str | None:
 
 
 def _motion_beside_path(request: SimulateRequest) -> str | None:
-    if request.motion is None or request.trajectory is None:
+    if request.stated_motion is None or request.trajectory is None:
         return None
     return "Both `motion` and `trajectory` were given: the object follows the trajectory, the motion only words it."
 

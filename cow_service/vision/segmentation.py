@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision.masks import bbox_of, outline_of, scaled
-from cow_service.vision.types import Floats, Image, Mask
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
 POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
@@ -21,6 +23,48 @@ GAMMA = 0.5  # brightens what is cut: dark hair on a dark wall differs by few gr
 MARGIN = 0.25  # of the box, kept around it as sure background
 STABILITY_WEIGHT = 0.6  # in the score: how much a mask stays the same when more of the image is used
 POINT_REACHES = (0.07, 0.11, 0.16, 0.24, 0.34)  # half sides tried around a point, of the image's shorter side
+
+LEAST_CONTRAST = 10.0  # in 8-bit Lab: what lies inside and outside a piece of outline differs by at least this
+
+
+@dataclass(frozen=True)
+class CutQuality:
+    """How much a cut looks like a whole object, and not like a tuft of fur or a patch of grass."""
+
+    area: float  # of the square of the image's shorter side
+    on_edge: float  # share of its outline along which inside and outside differ
+    solidity: float  # its area as a share of that of its convex hull
+
+
+def cut_quality(image: Image, mask: Mask) -> CutQuality:
+    """The quality of a mask [H, W], not empty, that was cut from an image [H, W, 3]."""
+    height, width = mask.shape
+    x0, y0, x1, y1 = bbox_of(mask)
+    pad = MARGIN * max(x1 - x0, y1 - y0) + 6
+    rows = slice(max(0, int(y0 - pad)), min(height, int(np.ceil(y1 + pad))))
+    columns = slice(max(0, int(x0 - pad)), min(width, int(np.ceil(x1 + pad))))
+    scale = min(1.0, WORKING_SIDE / max(rows.stop - rows.start, columns.stop - columns.start))
+    lab = cv2.cvtColor(scaled(image[rows, columns], scale), cv2.COLOR_RGB2LAB).astype(np.float32)
+    inside = scaled(mask[rows, columns].astype(np.uint8) * np.uint8(255), scale) >= 128
+    reach = max(1.5, 0.04 * float(np.sqrt(inside.sum())))  # px on either side of the outline that are compared
+    outline = outline_of(inside)
+    apart = np.linalg.norm(_local_mean(lab, inside, reach) - _local_mean(lab, ~inside, reach), axis=2)[outline]
+    contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    largest = max(contours, key=cv2.contourArea, default=None)
+    hull = 0.0 if largest is None else cv2.contourArea(cv2.convexHull(largest))
+    return CutQuality(
+        area=float(mask.sum()) / min(height, width) ** 2,
+        on_edge=float(np.mean(apart >= LEAST_CONTRAST)) if apart.size else 0.0,
+        solidity=cv2.contourArea(largest) / hull if largest is not None and hull > 0 else 0.0,
+    )
+
+
+def _local_mean(values: Floats32, where: Mask, reach: float) -> Floats32:
+    """Mean of the values [h, w, 3] near each pixel, of the pixels in a mask [h, w] alone."""
+    weights = where.astype(np.float32)
+    total = cv2.GaussianBlur(weights, (0, 0), reach)
+    summed = cv2.GaussianBlur(values * weights[..., None], (0, 0), reach)
+    return np.asarray(summed / (total[..., None] + 1e-4), np.float32)
 
 
 def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:

@@ -1,0 +1,26 @@
+"""What a caller may ask: the bodies of `POST /simulate` and `POST /answer`. Checked once, here, then trusted."""
+
+from cow_service.requests.motion import CameraRequest, MotionRequest, TrajectoryRequest
+from cow_service.requests.places import GroundingRequest, ObjectRequest, PlaceRequest
+from cow_service.requests.simulation import AnswerRequest, FramesRequest, SimulateRequest, Stage
+from cow_service.requests.values import Finite, Flag, ImageArtifact, ImageRef, ImageUrl, MaskRef, Whole
+
+__all__ = [
+    "AnswerRequest",
+    "CameraRequest",
+    "Finite",
+    "Flag",
+    "FramesRequest",
+    "GroundingRequest",
+    "ImageArtifact",
+    "ImageRef",
+    "ImageUrl",
+    "MaskRef",
+    "MotionRequest",
+    "ObjectRequest",
+    "PlaceRequest",
+    "SimulateRequest",
+    "Stage",
+    "TrajectoryRequest",
+    "Whole",
+]

@@ -1,0 +1,55 @@
+"""Where an object is, and what is said of it: the mover, and the others."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, field_validator, model_validator
+
+from cow_service.records import BBox, ObjectRole, Record, Shape
+from cow_service.requests.values import Finite, MaskRef, Words
+
+MAX_OBJECTS = 64
+
+ObjectWords = Annotated[Words, Field(min_length=1, max_length=200)]
+
+
+class PlaceRequest(Record):
+    """An object's place in the image, and what the caller knows of it beside. What is left out is read or assumed."""
+
+    bbox: tuple[Finite, Finite, Finite, Finite] | None = Field(default=None, description="[x0, y0, x1, y1], px.")
+    point: tuple[Finite, Finite] | None = Field(
+        default=None, description="[x, y], px, on the object: its outline is cut from the image around it."
+    )
+    mask: MaskRef | None = Field(
+        default=None, description="PNG of the upright image's size, white where the object is and black elsewhere."
+    )
+    shape: Shape | None = None
+    size: Annotated[Finite, Field(ge=1e-4, le=1000)] | None = Field(default=None, description="Its longest side, m.")
+    stands_on: ObjectWords | None = Field(default=None, description="`floor`, `air`, or an object in words.")
+
+    @model_validator(mode="after")
+    def _one_place(self) -> PlaceRequest:
+        if (self.bbox is not None) + (self.point is not None) + (self.mask is not None) != 1:
+            raise ValueError("give either `bbox` or `point`, or instead of both a `mask`")
+        return self
+
+    @field_validator("bbox")
+    @classmethod
+    def _has_area(cls, bbox: BBox | None) -> BBox | None:
+        if bbox is not None and (bbox[2] - bbox[0] < 2 or bbox[3] - bbox[1] < 2):
+            raise ValueError(f"[x0, y0, x1, y1] must span at least 2 px each way, got {list(bbox)}")
+        return bbox
+
+
+class GroundingRequest(PlaceRequest):
+    """Skips stage 1: the object that moves, by its box, its mask, or a point on it."""
+
+    object: ObjectWords | None = None
+
+
+class ObjectRequest(PlaceRequest):
+    """Another object of the image, by its box, its mask, or a point on it."""
+
+    object: ObjectWords
+    role: ObjectRole = Field(default="target", description="target: the question asks about it; obstacle: it is there.")

@@ -1,0 +1,145 @@
+"""The bodies of `POST /simulate` and `POST /answer`."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator
+
+from cow_service.records import FramePolicy, Law, Record
+from cow_service.requests.motion import CameraRequest, MotionRequest, TrajectoryRequest
+from cow_service.requests.places import MAX_OBJECTS, GroundingRequest, ObjectRequest
+from cow_service.requests.values import Finite, Flag, ImageRef, MaskRef, Name, Whole, Words, writable
+
+MAX_FRAMES = 481
+MAX_OPTION_LEVELS = 8
+
+
+class FramesRequest(Record):
+    """Which frames of the clip to return as pictures, and how large."""
+
+    policy: FramePolicy = Field(
+        default="initial",
+        description="initial: frames 1, 3, 5, ...; uniform: evenly over the clip; "
+        "events: at encounters and on the way.",
+    )
+    count: Whole = Field(default=3, ge=1, le=64)
+    indices: tuple[Annotated[Whole, Field(ge=0)], ...] | None = Field(
+        default=None, min_length=1, max_length=MAX_FRAMES, description="Exactly these frames; overrides the policy."
+    )
+    max_side: Annotated[Whole, Field(ge=16, le=8192)] | None = Field(
+        default=512, description="Longest side of the pictures, px; null for the clip's own size."
+    )
+
+
+class SimulateRequest(Record):
+    """One image and one what-if question; everything else has a default."""
+
+    image: ImageRef
+    question: Words = Field(min_length=1, max_length=4000)
+    options: tuple[Annotated[Words, Field(min_length=1, max_length=400)], ...] | None = Field(
+        default=None,
+        max_length=26,
+        description="Answers to choose from, lettered A, B, C...; by default those that the question lists. "
+        "Used by `/answer`.",
+    )
+    grounding: GroundingRequest | None = None
+    motion: MotionRequest | None = None
+    trajectory: TrajectoryRequest | None = None
+    objects: tuple[ObjectRequest, ...] = Field(
+        default=(),
+        max_length=MAX_OBJECTS,
+        description="Other objects of the image: they come before what the reader finds there.",
+    )
+    camera: CameraRequest | None = None
+    ensemble: Whole = Field(
+        default=100,
+        ge=0,
+        le=500,
+        description="How many worlds the probabilities are counted in; 0: none, and no probabilities.",
+    )
+    reader: Name | None = Field(default=None, description="By default the server's.")
+    generator: Name | None = Field(default=None, description="By default the server's.")
+    num_frames: Whole = Field(default=81, ge=2, le=MAX_FRAMES)
+    fps: Finite = Field(default=16, ge=1, le=60)
+    seed: Whole = Field(default=0, ge=0, le=2**32 - 1)
+    video: Flag = Field(default=True, description="Whether to make the mp4 of the whole clip.")
+    frames: FramesRequest = FramesRequest()
+    generator_options: dict[str, Any] = Field(default_factory=dict, description="As the generator defines them.")
+    webhook: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=2048,
+        description="URL to call when the job has ended, signed as Standard Webhooks says; off unless the server has a "
+        "secret for it.",
+    )
+
+    @property
+    def place(self) -> GroundingRequest | None:
+        """Where the object is, as far as the request says: a given trajectory begins on it, so it grounds it, too."""
+        if self.grounding is None and self.trajectory is not None:
+            return GroundingRequest(point=self.trajectory.points[0])
+        return self.grounding
+
+    @property
+    def left_to_reader(self) -> frozenset[str]:
+        """The stages of a simulation that the request leaves to the reader."""
+        needed = {"grounding"} if self.place is None else set[str]()
+        given = self.stated_motion is not None or self.trajectory is not None
+        return frozenset(needed if given else needed | {"motion"})
+
+    @property
+    def law(self) -> Law:
+        """The law of the motion, whoever reads it."""
+        return MotionRequest().law if self.motion is None else self.motion.law
+
+    @property
+    def stated_motion(self) -> MotionRequest | None:
+        """The motion, where the request says more of it than its law."""
+        return None if self.motion is None or self.motion.stated_kind is None else self.motion
+
+    @property
+    def masks(self) -> tuple[MaskRef, ...]:
+        """The masks that it gives, the mover's first."""
+        places = (*([] if self.grounding is None else [self.grounding]), *self.objects)
+        return tuple(place.mask for place in places if place.mask is not None)
+
+    @field_validator("options")
+    @classmethod
+    def _differ(cls, options: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        plain = [" ".join(option.lower().split()) for option in options or ()]
+        if len(plain) == 1 or len(set(plain)) < len(plain):
+            raise ValueError(f"options must be two or more different texts, got {list(options or ())}")
+        return options or None
+
+    @field_validator("generator_options")
+    @classmethod
+    def _plain_values(cls, options: dict[str, Any]) -> dict[str, Any]:
+        level: list[Any] = [*options, *options.values()]
+        for _ in range(MAX_OPTION_LEVELS):
+            if any(isinstance(value, float) and not math.isfinite(value) for value in level):
+                raise ValueError("holds a number that is not finite")
+            for text in (value for value in level if isinstance(value, str)):
+                writable(text)
+            below = [value for value in level if isinstance(value, dict | list)]
+            keys = [key for value in below if isinstance(value, dict) for key in value]
+            level = keys + [part for value in below for part in (value.values() if isinstance(value, dict) else value)]
+        if level:
+            raise ValueError(f"is nested deeper than {MAX_OPTION_LEVELS} levels")
+        return options
+
+
+class AnswerRequest(SimulateRequest):
+    """As a simulation, and how to answer from it."""
+
+    video: Flag = Field(default=False, description="Whether to make the mp4 of the whole clip, too.")
+
+    imagine: Literal["always", "never"] = Field(
+        default="always", description="never: answer from the image alone, without a simulation."
+    )
+    baseline: Flag = Field(default=False, description="Answer without frames, too, for comparison.")
+    votes: Whole = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer is taken.")
+
+
+Stage = Literal["grounding", "motion", "trajectory", "generation", "answering"]

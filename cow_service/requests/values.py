@@ -1,0 +1,70 @@
+"""What fields of a request are made of: strict numbers, text that can be kept, points, images."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from cow_service.records import Record, Sha256
+
+MAX_NAME = 100  # characters of a backend's name
+
+
+def _number(value: Any) -> Any:
+    """Numbers only: `true` is not 1 and "81" is not 81, but 81.0 is 81."""
+    if isinstance(value, bool | str):
+        raise ValueError(f"must be a number, without quotes, got {json.dumps(value)[:40]}")
+    return value
+
+
+def writable(text: str) -> str:
+    """Text that every database and file can hold."""
+    if "\0" in text:
+        raise ValueError(f"holds the character NUL (U+0000) at position {text.index(chr(0))}; leave it out")
+    return text
+
+
+def _says_something(text: str) -> str:
+    """Text with at least one character to be seen: zero-width and control characters are none."""
+    if not any(character.isprintable() and not character.isspace() for character in text):
+        raise ValueError(f"is empty: it holds only {len(text)} blank or invisible characters")
+    return text
+
+
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # strict: no strings, no booleans
+Whole = Annotated[int, BeforeValidator(_number)]
+Flag = Annotated[bool, Field(strict=True)]
+Words = Annotated[str, AfterValidator(writable), AfterValidator(_says_something)]
+Name = Annotated[str, Field(max_length=MAX_NAME)]
+# Of a long list the first wrong element is told: the others would fill the memory.
+Points = Annotated[tuple[tuple[Finite, Finite], ...], Field(fail_fast=True)]
+Flags = Annotated[tuple[Flag, ...], Field(fail_fast=True)]
+
+
+class ImageArtifact(Record):
+    """An image that the service already keeps."""
+
+    artifact: Sha256
+
+
+class ImageUrl(Record):
+    """An image to be fetched; off unless the server allows it."""
+
+    url: str = Field(max_length=4096)
+
+
+ImageRef = Annotated[str, Field(description="data:image/png;base64,... (PNG, JPEG or WebP)")] | ImageArtifact | ImageUrl
+
+
+def _no_address(mask: str | ImageArtifact) -> str | ImageArtifact:
+    """Masks are drawn by the caller: there is nothing to be fetched."""
+    if isinstance(mask, str) and not mask[:5].lower() == "data:":
+        raise ValueError('must be a data URL (data:image/png;base64,...) or {"artifact": "<sha256>"}')
+    return mask
+
+
+MaskRef = Annotated[
+    Annotated[str, Field(description="data:image/png;base64,...")] | ImageArtifact, AfterValidator(_no_address)
+]

@@ -1,0 +1,158 @@
+"""Objects that a request gives: by box, point or mask, before what the reader finds; and cuts that are refused."""
+
+from __future__ import annotations
+
+import base64
+
+import cv2
+import numpy as np
+import pytest
+from drawn import ball, block, floor, png_bytes
+from runs import run_of
+
+from cow_service.errors import CannotGround, InvalidRequest
+from cow_service.media.images import decode_own, encode_png
+from cow_service.readers.base import GroundingReading
+from cow_service.records import Grounding, LocatedObject
+from cow_service.requests import SimulateRequest
+from cow_service.service import Service
+from cow_service.stages.grounding import ground, use_stored_masks
+
+MOVER = (160, 160, 240, 240)
+CUBE = (400, 220, 480, 300)
+
+
+@pytest.fixture(scope="module")
+def pixels() -> np.ndarray:
+    return block(ball(floor(640, 400), (200, 200), 40, (200, 30, 30)), CUBE, (30, 60, 200))
+
+
+class OneReader:
+    source = "embedded"
+
+    def ground(self, given):
+        others = (LocatedObject(object="blue cube", bbox=CUBE), LocatedObject(object="vase", bbox=(20, 300, 60, 390)))
+        return GroundingReading("red ball", MOVER, others=others)
+
+
+def grounded(pixels: np.ndarray, *objects: dict, **request) -> tuple[Grounding, tuple[str, ...]]:
+    given = {"grounding": {"bbox": MOVER}} | request
+    result = ground(run_of(pixels, objects=objects, **given))
+    return result.value, result.warnings
+
+
+def kept(run, mask: np.ndarray) -> dict[str, str]:
+    return {"artifact": run.backends.artifacts.put(encode_png(mask), "image/png").sha256}
+
+
+def circle(centre: tuple[int, int], radius: int, size: tuple[int, int] = (640, 400)) -> np.ndarray:
+    return cv2.circle(np.zeros(size[::-1], np.uint8), centre, radius, 255, -1)
+
+
+def test_objects_stand_before_what_the_reader_finds_and_replace_it(pixels: np.ndarray) -> None:
+    objects = [{"object": "crate", "bbox": CUBE, "role": "obstacle", "shape": "box", "size": 0.3, "stands_on": "floor"}]
+    asked = ground(run_of(pixels, reader=OneReader, objects=objects)).value
+    assert [(other.object, other.source) for other in asked.others] == [("crate", "request"), ("vase", "embedded")]
+    crate = asked.others[0]
+    assert crate.role == "obstacle"
+    assert crate.prior is not None
+    assert crate.prior.size is not None
+    assert (crate.prior.shape, crate.prior.size.value, crate.prior.stands_on) == ("box", 0.3, "floor")
+
+
+def test_a_mask_gives_box_and_outline_and_is_found_again(pixels: np.ndarray) -> None:
+    run = run_of(pixels, grounding={"bbox": MOVER})
+    mask = circle((430, 260), 25)
+    again = run_of(pixels, grounding={"bbox": MOVER}, objects=[{"object": "disc", "mask": kept(run, mask)}])
+    result = ground(again)
+    disc = result.value.others[0]
+    assert disc.bbox == (405, 235, 456, 286)
+    assert disc.mask is not None
+    assert disc.mask.sha256 in result.artifacts
+    assert (decode_own(again.backends.artifacts.read(disc.mask.sha256))[..., 0] == mask).all()
+    use_stored_masks(run, result.value)  # a run that has found the grounding stored
+    assert (run.scene.silhouette(disc.bbox) == (mask > 0)).all()
+
+
+def test_the_mover_may_be_given_by_mask(pixels: np.ndarray) -> None:
+    mask = circle((200, 200), 30)
+    run = run_of(pixels, grounding={"mask": kept(run_of(pixels), mask), "object": "ball", "shape": "sphere"})
+    mover = ground(run).value
+    assert mover.bbox == (170, 170, 231, 231)
+    assert mover.prior is not None
+    assert mover.prior.shape == "sphere"
+    assert (run.scene.silhouette(mover.bbox) == (mask > 0)).all()
+
+
+@pytest.mark.parametrize(
+    ("mask", "told"),
+    [
+        (np.zeros((400, 640), np.uint8), "is empty"),
+        (np.full((400, 640), 255, np.uint8), "covers 100% of the image"),
+        (circle((100, 100), 30, (320, 200)), "has 320 x 200 px where the upright image has 640 x 400 px"),
+        (circle((100, 100), 30, (1280, 800)), "cannot be read"),
+    ],
+)
+def test_a_mask_that_is_none_of_the_image_is_refused(pixels: np.ndarray, mask: np.ndarray, told: str) -> None:
+    good = {"object": "cube", "bbox": CUBE}
+    with pytest.raises(InvalidRequest, match=told) as caught:
+        grounded(pixels, good, {"object": "disc", "mask": kept(run_of(pixels), mask)})
+    assert caught.value.errors[0].pointer == "/objects/1/mask"
+
+
+@pytest.mark.parametrize(("given", "field"), [({"bbox": (700, 10, 800, 90)}, "bbox"), ({"point": (10, 400)}, "point")])
+def test_an_object_outside_the_image_is_refused(pixels: np.ndarray, given: dict, field: str) -> None:
+    with pytest.raises(InvalidRequest, match="outside the upright image") as caught:
+        grounded(pixels, {"object": "cube", **given})
+    assert caught.value.errors[0].pointer == f"/objects/0/{field}"
+
+
+def test_an_object_given_twice_is_refused_and_the_mover_is_no_other(pixels: np.ndarray) -> None:
+    with pytest.raises(InvalidRequest, match=r"same box as `objects\.0`") as caught:
+        grounded(pixels, {"object": "cube", "bbox": CUBE}, {"object": "crate", "point": (440, 260)})
+    assert caught.value.errors[0].pointer == "/objects/1"
+    grounding, warnings = grounded(pixels, {"object": "ball", "bbox": MOVER}, {"object": "cube", "bbox": CUBE})
+    assert [other.object for other in grounding.others] == ["cube"]
+    assert any("`objects.0` ('ball') lies where the mover is" in warning for warning in warnings)
+
+
+def fur(seed: int) -> np.ndarray:
+    """A texture of many fine strokes, such as fur or grass."""
+    rng = np.random.default_rng(seed)
+    image = np.full((400, 640, 3), (110, 90, 60), np.uint8)
+    for x, y, dx, shade in zip(
+        rng.uniform(0, 640, 9000), rng.uniform(0, 400, 9000), rng.normal(0, 6, 9000), rng.normal(0, 30, 9000),
+        strict=True,
+    ):  # fmt: skip
+        colour = np.clip(np.array((110, 90, 60)) + shade, 0, 255).tolist()
+        cv2.line(image, (int(x), int(y)), (int(x + dx), int(y + 14)), colour, 1, cv2.LINE_AA)
+    return image
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_tuft_of_fur_is_refused_with_what_to_give(seed: int) -> None:
+    image = fur(seed)
+    with pytest.raises(CannotGround, match=r"Give its box as `grounding\.bbox`, or its outline as `grounding\.mask`"):
+        ground(run_of(image, grounding={"point": (320, 200)}))
+    with pytest.raises(CannotGround, match=r"`objects\.0\.bbox`") as caught:
+        ground(run_of(image, grounding={"bbox": MOVER}, objects=[{"object": "tuft", "point": (320, 200)}]))
+    assert caught.value.errors[0].pointer == "/objects/0/point"
+    begun = ground(run_of(image, trajectory={"points": [(320, 200), (400, 200)]}))  # a path says where it begins
+    assert any("was guessed to be" in warning for warning in begun.warnings)
+    seen = ball(image, (320, 200), 45, (220, 40, 40))
+    found = ground(run_of(seen, grounding={"point": (320, 200)})).value
+    assert found.bbox == pytest.approx((275, 155, 365, 245), abs=6)
+
+
+def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service, pixels: np.ndarray) -> None:
+    data = base64.b64encode(png_bytes(np.repeat(circle((430, 260), 25)[..., None], 3, axis=2))).decode()
+    objects = [{"object": "disc", "mask": f"data:image/png;base64,{data}"}]
+    asked = SimulateRequest.model_validate({"image": "data:,", "question": "?", "objects": objects})
+    kept_request = service.keep_masks(asked)
+    assert service.artifacts.read(kept_request.objects[0].mask.artifact)  # pyright: ignore[reportAttributeAccessIssue]
+    assert service.keep_masks(kept_request) is kept_request
+    for mask, told in (("data:image/png;base64,AAAA", "no PNG"), ("data:,x", "data URL with base64")):
+        wrong = asked.objects[0].model_copy(update={"mask": mask})
+        with pytest.raises(InvalidRequest, match=told) as caught:
+            service.keep_masks(asked.model_copy(update={"objects": (wrong,)}))
+        assert caught.value.errors[0].pointer == "/objects/0/mask"
