@@ -28,7 +28,6 @@ from rich.console import Console
 from rich.table import Table
 
 from cow_service.errors import CannotReadDirection, CowError
-from cow_service.physics.encounters import box_at
 from cow_service.records import BBox, Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
@@ -158,12 +157,17 @@ def _frame_errors(
         free = drawn & (cv2.dilate(hole, np.ones((11, 11), np.uint8)) == 0) if frame.index else drawn
         if free.sum() > 0.5 * drawn.sum() > 0:
             arrows.append(float(np.abs(pixels.astype(int) - clean)[free].mean()))
-        beside = box_at(simulation.grounding.bbox, start, start + shift, 1.0)
+        beside = _shifted(simulation.grounding.bbox, shift)
         if simulation.trajectory.path.visible[frame.index] and not any(_meet(beside, other) for other in others):
             found = _locate(scene, truth, pixels, shift)
             if found is not None:
                 centres.append(found)
     return max(centres, default=None), max(backgrounds), max(arrows, default=None)
+
+
+def _shifted(bbox: BBox, shift: NDArray[np.float64]) -> BBox:
+    dx, dy = float(shift[0]), float(shift[1])
+    return bbox[0] + dx, bbox[1] + dy, bbox[2] + dx, bbox[3] + dy
 
 
 def _meet(a: BBox, b: BBox) -> bool:

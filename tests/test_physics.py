@@ -1,6 +1,8 @@
-"""Dynamics, camera, anchors and encounters, against closed forms and drawn truth."""
+"""Dynamics, the frontal camera, the ballistic law, anchors and swept masks, against closed forms and drawn truth."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
@@ -8,11 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.physics.anchors import points_inside, spread_anchors
+from cow_service.physics.ballistic import FreePath, ballistic_path, given_path
 from cow_service.physics.camera import Camera, depth_motion
 from cow_service.physics.dynamics import GRAVITY, roll_out
-from cow_service.physics.encounters import Sweep, box_at, find_encounters, stands_nearer, swept_mask
+from cow_service.physics.sweeping import swept
+from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Path
+from cow_service.requests import TrajectoryRequest
 from cow_service.vision.masks import CroppedMask
-from cow_service.vision.obstacles import Obstacle
 
 number = st.floats(-50, 50)
 vector = st.tuples(number, number, number).map(np.array)
@@ -91,96 +95,82 @@ def test_anchors_spread_over_an_empty_image() -> None:
 def test_tracks_lie_inside_the_mask() -> None:
     ys, xs = np.mgrid[:200, :300]
     ring = (np.hypot(xs - 150, ys - 100) < 60) & (np.hypot(xs - 150, ys - 100) > 25)
-    points = points_inside(ring, (150, 100))
+    points = points_inside(CroppedMask.of(ring), (150, 100))
     assert len(points) == 5
     assert all(ring[int(y), int(x)] for x, y in points)
-    assert points_inside(np.zeros((10, 10), bool), (4.0, 5.0)) == ((4.0, 5.0),)
+    assert points_inside(CroppedMask.of(np.zeros((10, 10), bool)), (4.0, 5.0)) == ((4.0, 5.0),)
 
 
-def disc(centre, radius, shape=(400, 800)):
-    ys, xs = np.mgrid[: shape[0], : shape[1]] + 0.5
-    return np.hypot(xs - centre[0], ys - centre[1]) <= radius
+class TestBallisticLaw:
+    """The paths of before there was a floor, computed here once more in closed form."""
 
+    def path(self, width, height, point, kind, direction, depth, speed, metres, times) -> FreePath:
+        motion = Motion(
+            kind=kind, law="ballistic", direction=direction, depth=depth, cue="request", speed=speed,
+            gravity=(0.0, 9.81 / metres) if kind in FALLING_KINDS else (0.0, 0.0),
+            metres_per_pixel=MetresPerPixel(value=metres, source="request"), sentence="", source="request",
+        )  # fmt: skip
+        box = (point[0] - 5, point[1] - 5, point[0] + 5, point[1] + 5)
+        grounding = Grounding(object="ball", point=point, bbox=box, source="request")
+        return ballistic_path(Camera(width, height, metres), grounding, motion, times)
 
-def box(centre, radius):
-    return (centre[0] - radius, centre[1] - radius, centre[0] + radius, centre[1] + radius)
-
-
-def sweep(start, end, radius=30, frames=41, airborne=False, scale=None, visible=None) -> Sweep:
-    points = np.linspace(start, end, frames)
-    return Sweep(
-        mask=disc(start, radius),
-        bbox=box(start, radius),
-        start=np.array(start, float),
-        points=points,
-        scale=np.ones(frames) if scale is None else scale,
-        visible=np.ones(frames, bool) if visible is None else visible,
-        airborne=airborne,
+    @given(
+        st.tuples(st.floats(0, 639), st.floats(0, 399)),
+        st.sampled_from(["linear", "projectile", "fall", "static"]),
+        st.floats(-math.pi, math.pi),
+        st.floats(-1, 1),
+        st.floats(0, 2000),
+        st.floats(1e-4, 0.1),
+        st.integers(2, 81),
+        st.sampled_from([8.0, 16.0, 24.0, 60.0]),
     )
+    def test_it_is_velocity_and_gravity_before_a_frontal_camera(
+        self, point, kind, angle, depth, speed, metres, frames, fps
+    ) -> None:
+        directed = kind in DIRECTED_KINDS
+        dx, dy = (math.cos(angle), math.sin(angle)) if directed else (0.0, 0.0)
+        depth, speed = (depth, speed) if directed else (0.0, 0.0)
+        times = np.arange(frames) / fps
+        found = self.path(640, 400, point, kind, (dx, dy) if directed else None, depth, speed, metres, times)
+        first, pull = 640 * metres, 9.81 if kind in FALLING_KINDS else 0.0
+        for i, t in enumerate(times.tolist()):
+            across = speed * metres * math.sqrt(1 - depth**2)
+            x = (point[0] - 320) * metres + across * dx * t
+            y = (point[1] - 200) * metres + across * dy * t + pull * t * t / 2
+            z = first + speed * metres * depth * t
+            state = [x, y, z, across * dx, across * dy + pull * t, speed * metres * depth]
+            assert found.states[i].tolist() == pytest.approx(state, rel=1e-9, abs=1e-9)
+            passed = z <= 0.08 * first
+            seen = max(z, 0.08 * first)
+            u, v = 320 + 640 * x / seen, 200 + 640 * y / seen
+            assert found.points[i].tolist() == pytest.approx([u, v], rel=1e-9, abs=1e-9)
+            assert found.scale[i] == pytest.approx(first / seen, rel=1e-9)
+            if min(abs(u), abs(u - 640), abs(v), abs(v - 400), abs(z - 0.08 * first)) > 1e-6:
+                assert found.visible[i] == (0 <= u < 640 and 0 <= v < 400 and not passed)
+
+    def test_a_given_path_is_followed_and_held(self) -> None:
+        given = TrajectoryRequest(points=((200, 200), (300, 200), (300, 300)), fps=2)
+        found = given_path(Camera(640, 400, 0.005), given, np.arange(33) / 16)
+        expected = {0: (200, 200), 4: (250, 200), 8: (300, 200), 16: (300, 300), 32: (300, 300)}
+        for frame, point in expected.items():
+            assert found.points[frame].tolist() == pytest.approx(point)
+        assert found.states[4, 3:].tolist() == pytest.approx([200 * 0.005, 0, 0])
+        assert found.states[32, 3:].tolist() == [0, 0, 0]
+        assert found.visible.all()
 
 
-def obstacle(centre, radius=30, name="vase") -> Obstacle:
-    return Obstacle(name, box(centre, radius), CroppedMask.of(disc(centre, radius)))
-
-
-def kinds(moving: Sweep, *others: Obstacle):
-    return [(e.object, e.kind) for e in find_encounters(moving, others)]
-
-
-def test_at_the_same_depth_they_touch() -> None:
-    found = find_encounters(sweep((100, 200), (700, 200)), [obstacle((400, 200))])
-    assert [(e.object, e.kind) for e in found] == [("vase", "touches")]
-    # The rims meet when the centres are 60 px apart: frame 16 of 15 px each; the overlap must then be visible.
-    assert 16 <= found[0].first_frame <= 18
-
-
-def test_in_front_it_occludes_and_behind_it_is_occluded() -> None:
-    assert kinds(sweep((100, 200), (700, 200)), obstacle((400, 150), 40)) == [("vase", "occludes")]
-    assert kinds(sweep((100, 200), (700, 200)), obstacle((400, 265), 50)) == [("vase", "occluded-by")]
-
-
-def test_past_it_there_is_nothing() -> None:
-    assert kinds(sweep((100, 200), (700, 200)), obstacle((400, 320))) == []
-    assert kinds(sweep((100, 200), (300, 200)), obstacle((400, 200))) == []
-
-
-def test_a_graze_is_no_encounter() -> None:
-    assert kinds(sweep((100, 200), (700, 200)), obstacle((400, 257))) == []
-
-
-def test_outside_the_image_nothing_is_met() -> None:
-    visible = np.arange(41) < 10
-    assert kinds(sweep((100, 200), (700, 200), visible=visible), obstacle((400, 200))) == []
-
-
-def test_several_are_listed_in_order_of_time() -> None:
-    others = obstacle((600, 200), name="far"), obstacle((300, 200), name="near")
-    assert kinds(sweep((100, 200), (700, 200)), *others) == [("near", "touches"), ("far", "touches")]
-
-
-def test_a_falling_thing_lands_on_what_is_below_it() -> None:
-    assert kinds(sweep((400, 60), (400, 390), airborne=True), obstacle((410, 250))) == [("vase", "touches")]
-    assert kinds(sweep((400, 60), (400, 390), airborne=True), obstacle((520, 250))) == []
-
-
-def test_growing_it_reaches_further() -> None:
-    still = np.full((41, 2), 1.0)
-    growing = sweep((300, 200), (300, 200), scale=np.linspace(1, 4, 41) * still[:, 0])
-    assert kinds(sweep((300, 200), (300, 200)), obstacle((400, 200))) == []
-    assert kinds(growing, obstacle((400, 200)))
-
-
-def test_the_swept_mask_covers_the_whole_way() -> None:
-    swept = swept_mask(sweep((100, 200), (700, 200)))
-    assert swept[200, 80:720].all()
-    assert not swept[120].any()
-
-
-def test_nearer_stands_lower() -> None:
-    assert stands_nearer((0, 0, 10, 50), (0, 0, 10, 40), airborne=False)
-    assert not stands_nearer((0, 0, 10, 30), (0, 0, 10, 40), airborne=False)
-    assert stands_nearer((0, 0, 10, 30), (0, 0, 10, 40), airborne=True)
-
-
-def test_the_box_moves_and_grows_about_its_centre() -> None:
-    assert box_at((10, 20, 30, 60), np.array([20, 40]), np.array([100, 100]), 2.0) == (80, 60, 120, 140)
+def test_the_swept_mask_covers_the_whole_way_and_no_more() -> None:
+    ys, xs = np.mgrid[:400, :800] + 0.5
+    disc = CroppedMask.of(np.hypot(xs - 100, ys - 200) <= 30)
+    points = np.linspace((100, 200), (700, 200), 61)
+    scale = np.linspace(1, 0.5, 61)
+    path = Path(
+        states=((0.0,) * 6,) * 61, points=tuple(map(tuple, points.tolist())), visible=(True,) * 61,
+        scale=tuple(scale.tolist()), tracks=(),
+    )  # fmt: skip
+    mask = swept([disc], [np.array([100.0, 200.0])], [path])
+    assert mask[200, 75:710].all()
+    assert mask[175:225, 105].all()
+    assert not mask[:165].any()
+    assert not mask[:180, 690:].any(), "it has become half as large"
+    assert not mask[:, 725:].any()

@@ -124,6 +124,9 @@ class _Engine:
         side = math.ceil(math.sqrt(len(worlds)))
         self.origin = np.array([[(k % side) * SPACING, 0.0, (k // side) * SPACING] for k in range(len(worlds))])
         self.origin -= np.array([1.0, 0.0, 1.0]) * (side - 1) / 2 * SPACING
+        # Each first body stands in the middle of its cell: small ones are many of their sizes away from the camera.
+        self.middle = np.array([bodies[0].position for bodies in worlds]) * [self.scale, 0.0, self.scale]
+        self.origin -= self.middle
         self.groups = [Group(1 << (k % side % COLOURS * COLOURS + k // side % COLOURS)) for k in range(len(worlds))]
         self.led = {
             (k, i): body.follows
@@ -137,6 +140,7 @@ class _Engine:
         self.meetings: list[list[Meeting]] = [[] for _ in worlds]
         self.awake = [{i for i, body in enumerate(bodies) if _acts(body)} for bodies in worlds]
         self.drift = np.zeros(shape[:2], bool)  # taken out: they go on in a straight line
+        self.touching: list[dict[int, set[int]]] = [{} for _ in worlds]
 
     def run(self) -> list[WorldRun]:
         self._record([(k, i) for k, bodies in enumerate(self.worlds) for i in range(len(bodies))], 0)
@@ -148,7 +152,7 @@ class _Engine:
             self._record([(k, i) for k, awake in enumerate(self.awake) for i in awake if not self.drift[k, i]], row)
             if self.finished is not None:
                 for k in np.nonzero(self.finished(self.positions[:, 0, row], self.velocities[:, 0, row]))[0].tolist():
-                    self._take_out(k, 0)
+                    self._take_out(k, 0, row)
         return [
             WorldRun(self.positions[k], self.velocities[k], self.turns[k], self.meetings[k], set(self.awake[k]))
             for k in range(len(self.worlds))
@@ -170,7 +174,7 @@ class _Engine:
         else:
             builder = builder.sleeping(True)
         collider = _collider(body, self.scale).friction(0.0 if body.glides else body.friction)
-        collider = _combined(collider.restitution(body.restitution)).sensor(body.ghost or body.follows is not None)
+        collider = _combined(collider.restitution(body.restitution)).sensor(_passes(body))
         collider = collider.collision_groups(InteractionGroups(self.groups[k], self.groups[k]))
         handle = self.world.add_body(builder, colliders=[collider.active_events(ActiveEvents.COLLISION_EVENTS)])
         self.owner[self._body(handle).colliders[0].index] = k, i
@@ -216,15 +220,25 @@ class _Engine:
             after = np.array(self._body(self.handles[k][a]).linvel.to_tuple())
             impulse = float(np.linalg.norm(after - before[k, a])) / self.scale
         self.meetings[k].append(Meeting(time, a, b, impulse))
-        if b is None or not {a, b} & self.awake[k]:  # bodies that stand close together touch when nothing moves
+        if b is None or _passes(self.worlds[k][a]) or _passes(self.worlds[k][b]):
             return
+        self.touching[k].setdefault(a, set()).add(b)
+        self.touching[k].setdefault(b, set()).add(a)
+        if not {a, b} & self.awake[k]:  # bodies that stand close together touch when nothing moves
+            return
+        self._wake(k, {a, b})
         for i in (a, b):
-            body = self.worlds[k][i]
-            if not (self.worlds[k][a].ghost or self.worlds[k][b].ghost) and body.follows is None:
-                self.awake[k].add(i)
-                if body.glides:
-                    collider = self._body(self.handles[k][i]).colliders[0]
-                    self.world.colliders[collider].friction = body.friction
+            if self.worlds[k][i].glides:
+                collider = self._body(self.handles[k][i]).colliders[0]
+                self.world.colliders[collider].friction = self.worlds[k][i].friction
+
+    def _wake(self, k: int, bodies: set[int]) -> None:
+        """Has bodies recorded from now on, and what they have touched: it stands on them or leans against them."""
+        waiting = list(bodies)
+        while waiting:
+            i = waiting.pop()
+            self.awake[k].add(i)
+            waiting += self.touching[k].get(i, set()) - self.awake[k]
 
     def _record(self, which: Sequence[tuple[int, int]], row: int) -> None:
         """Writes down where some bodies of worlds are."""
@@ -238,14 +252,15 @@ class _Engine:
         if self.is_alone:
             turns = [body.rotation for body in bodies]
             self.turns[k, i, row] = np.array([(turn.i, turn.j, turn.k, turn.w) for turn in turns])
-        for far in np.nonzero(np.abs(positions[:, [0, 2]]).max(axis=1) > REACH)[0].tolist():
-            self._take_out(*which[far])
+        for far in np.nonzero(np.abs((positions - self.middle[k])[:, [0, 2]]).max(axis=1) > REACH)[0].tolist():
+            self._take_out(*which[far], row)
 
-    def _take_out(self, k: int, i: int) -> None:
-        """Leaves a body out of what is computed from now on: it keeps its last velocity."""
+    def _take_out(self, k: int, i: int, row: int) -> None:
+        """Leaves a body out of what is computed from now on: it keeps its last velocity over the floor."""
         if not self.drift[k, i]:
             self._body(self.handles[k][i]).is_enabled = False
             self.drift[k, i] = True
+            self.velocities[k, i, row, 1] = 0.0
 
 
 def _empty_world(dt: float, gravity: float) -> PhysicsWorld:
@@ -259,6 +274,11 @@ def _empty_world(dt: float, gravity: float) -> PhysicsWorld:
 
 def _acts(body: RigidShape) -> bool:
     return body.starts or body.follows is not None
+
+
+def _passes(body: RigidShape) -> bool:
+    """Whether it passes through everything."""
+    return body.ghost or body.follows is not None
 
 
 def _combined(collider: ColliderBuilder) -> ColliderBuilder:

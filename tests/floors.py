@@ -1,0 +1,73 @@
+"""A camera above a floor with known truth, written without the project's geometry: where things are seen, and boxes.
+
+Places are metres right of the camera, above the floor and ahead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class TrueCamera:
+    """Angles in degrees; a positive roll leans the vertical to the left in the image."""
+
+    pitch: float = 28.0
+    roll: float = 0.0
+    focal: float = 640.0  # px
+    height: float = 1.5  # m above the floor
+    size: tuple[int, int] = (640, 400)  # px
+
+    def positions(self, places: Floats) -> Floats:
+        """Places [N, 3] as x right, y down and z ahead of the camera."""
+        right, above, ahead = np.asarray(places, float).T
+        pitch, roll = np.radians(self.pitch), np.radians(self.roll)
+        drop = self.height - above
+        level = np.stack([right, drop * np.cos(pitch) - ahead * np.sin(pitch)], axis=1)
+        depth = ahead * np.cos(pitch) + drop * np.sin(pitch)
+        turn = np.array([[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]])
+        return np.column_stack([level @ turn.T, depth])
+
+    def seen(self, places: Floats) -> Floats:
+        """Image points [N, 2] (px)."""
+        position = self.positions(places)
+        return position[:, :2] * self.focal / position[:, 2:] + np.array(self.size) / 2
+
+    def box(self, places: Floats) -> Box:
+        """The box (px) around the image of places."""
+        points = self.seen(places)
+        return _box(points)
+
+    def sphere_box(self, centre: tuple[float, float, float], radius: float) -> Box:
+        """The box (px) of a sphere: planes through the camera that touch it."""
+        x, y, z = self.positions(np.array([centre]))[0]
+        edges = []
+        for across in (x, y):
+            root = radius * np.sqrt(across**2 + z**2 - radius**2)
+            edges.append((across * z + np.array([-root, root])) / (z**2 - radius**2))
+        points = np.stack(edges, axis=1) * self.focal + np.array(self.size) / 2
+        return _box(points)
+
+
+def _box(points: Floats) -> Box:
+    (x0, y0), (x1, y1) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    return x0, y0, x1, y1
+
+
+def outline(shape: str, foot: tuple[float, float], half_width: float, height: float, yaw: float = 0.0) -> Floats:
+    """Places [N, 3] on the rims of a cylinder, cone or box that stands with the middle of its base at a foot."""
+    if shape == "box":
+        turns = yaw + np.pi / 4 + np.arange(4) * np.pi / 2
+        reach = half_width * np.sqrt(2)
+    else:
+        turns, reach = np.linspace(0, 2 * np.pi, 64, endpoint=False), half_width
+    rim = np.array(foot) + reach * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    top = np.array([foot]) if shape == "cone" else rim
+    raised = [np.column_stack([ring[:, 0], np.full(len(ring), h), ring[:, 1]]) for ring, h in ((rim, 0), (top, height))]
+    return np.concatenate(raised)
