@@ -62,7 +62,7 @@ def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: F
         depth = worlds.scene.cameras.depth(worlds.scene.bodies[other].centre)
         found = shares(bodies[0].mask, path, bodies[other].mask, depth)
         before = clock[None] <= times["touches"][:, other : other + 1] + step
-        for kind, values in (("occludes", found.covers), ("occluded-by", found.covered)):
+        for kind, values in zip(KINDS[1:], (found.covers, found.covered), strict=True):
             seen = np.where(before, values, 0.0)
             most[kind][:, other] = seen.max(axis=1)
             times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)

@@ -162,7 +162,9 @@ def push_pull(source: Floats32, known: Mask) -> Floats32:
         coarse = cv2.resize(value, (weights.shape[1], weights.shape[0]), interpolation=cv2.INTER_LINEAR)
         trust = np.where(weights > LEAST_WEIGHT, np.minimum(weights, 1), 0)
         own = trust / np.maximum(weights, LEAST_WEIGHT)
-        value = colours * _three(np.asarray(own, np.float32)) + coarse * _three(np.asarray(1 - np.minimum(weights, 1), np.float32))
+        value = colours * _three(np.asarray(own, np.float32)) + coarse * _three(
+            np.asarray(1 - np.minimum(weights, 1), np.float32)
+        )
     for _ in range(2):
         value = np.asarray(cv2.GaussianBlur(value, (0, 0), 2.0), np.float32)
         value += (source - value) * kept
