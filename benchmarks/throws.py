@@ -6,8 +6,9 @@ Each throw is drawn at random: a camera, a ball in the air with its shadow, a ta
 speed, a rise and a heading out of the plane of the image (15 degrees, one standard deviation; with `--wide` any up to
 45 degrees, which nothing in the image tells). Half of the targets lie about on the ball's way, half anywhere. The
 engine says with the true values whether the ball meets the target. Stage 3 sees what an image shows: boxes, the
-shadow's ellipse and the direction in the image, each with a little noise; not camera, heights, depth or speed. Printed are the Brier score (mean
-squared difference of probability and truth), that of always saying the base rate, and how often answers are right.
+shadow's ellipse and the direction in the image, each with a little noise; not camera, heights, depth or speed.
+Printed are the Brier score (mean squared difference of probability and truth), that of always saying the base rate, and
+how often answers are right.
 """
 
 from __future__ import annotations
