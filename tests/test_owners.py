@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -9,10 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from servers import ASYNC, BODY, PATIENCE, TERMINAL, Served, data_url, events_of, eventually, picture, problem, slow
 
 from cow_service.api.middleware.keys import hash_of, new_key
+from cow_service.media.images import encode_png
 
 pytestmark = pytest.mark.slow
 
@@ -112,6 +115,20 @@ def test_pages_hold_ones_own_jobs(alice: Caller, bob: Caller) -> None:
     foreign = bob.http.get("/jobs", params={"limit": 500, "cursor": page["next"]})
     assert foreign.status_code == 200
     assert not {job["id"] for job in foreign.json()["jobs"]} & alice.ids()
+
+
+def test_masks_are_their_owners_alone_and_stay_while_the_job_does(alice: Caller, bob: Caller) -> None:
+    mask = np.zeros((160, 240), np.uint8)
+    mask[60:98, 170:205] = 255
+    sent = encode_png(mask, level=9)  # other bytes than those of the mask that the first stage stores
+    body = {**BODY, "objects": [{"object": "cube", "mask": data_url(sent)}]}
+    assert alice.ended(body)["result"]["grounding"]["others"][0]["bbox"] == [170, 60, 205, 98]
+    sha256 = hashlib.sha256(sent).hexdigest()
+    assert alice.sees(sha256)
+    kept = {**BODY, "objects": [{"object": "cube", "mask": {"artifact": sha256}}]}
+    assert alice.ended(kept)["status"] == "succeeded"
+    problem(bob.http.post("/simulate", json=kept), 404, "artifact-not-found")
+    problem(bob.http.post("/simulate", json={**BODY, "grounding": kept["objects"][0]}), 404, "artifact-not-found")
 
 
 def test_artifacts_are_their_owners_alone(alice: Caller, bob: Caller) -> None:

@@ -45,6 +45,43 @@ def test_touching_objects_of_two_colours_are_two() -> None:
     assert all(region.roundness < 0.76 for region in regions)
 
 
+@pytest.mark.parametrize("quality", [75, 90])
+def test_a_white_ball_on_a_white_table_is_one_of_two(quality: int) -> None:
+    table = block(floor(grey=120), (200, 160, 380, 300), (205, 205, 205))
+    regions = find_regions(jpeg(ball(table, (290, 135), 36, (235, 235, 235)), quality))
+    found = {region.is_disc: region.bbox for region in regions}
+    assert len(regions) == 2
+    assert iou(found[True], (254, 99, 326, 171)) > 0.85
+    assert iou(found[False], (200, 160, 380, 300)) > 0.8
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 0.8])
+def test_only_a_ball_is_a_disc(turn: float) -> None:
+    angles = turn + np.arange(6) * np.pi / 3
+    corners = np.stack([200 + 45 * np.cos(angles), 200 + 45 * np.sin(angles)], axis=1).round().astype(np.int32)
+    image = ball(floor(), (420, 200), 40, RGB["green"])
+    cv2.fillPoly(image, [corners], RGB["blue"], cv2.LINE_AA)  # the outline of a cube seen at a corner
+    for quality in (60, 90):
+        discs = {region.colour: region.is_disc for region in find_regions(jpeg(image, quality))}
+        assert discs == {"blue": False, "green": True}
+
+
+def test_a_large_object_does_not_count_as_its_own_surroundings() -> None:
+    regions = find_regions(jpeg(block(floor(), (250, 260, 400, 400), RGB["blue"])))
+    assert [region.colour for region in regions] == ["blue"]
+    assert iou(regions[0].bbox, (250, 260, 400, 400)) > 0.9
+
+
+def test_confidence_falls_with_contrast_and_at_the_border() -> None:
+    clear, faint, cut = (
+        find_regions(jpeg(ball(floor(), (x, 180), 40, rgb)))[0].confidence
+        for x, rgb in ((300, RGB["red"]), (300, (176, 146, 136)), (12, RGB["red"]))
+    )
+    assert clear > 0.9
+    assert clear > cut
+    assert clear > faint
+
+
 def test_a_shadow_is_no_object() -> None:
     image = floor().astype(np.float32)
     shade = cv2.GaussianBlur(

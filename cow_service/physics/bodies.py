@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cow_service.records import BBox, LocatedObject, ObjectPrior, Shape
+from cow_service.records import BBox, LocatedObject, ObjectPrior, Shape, Source
 from cow_service.vision.masks import CroppedMask
 
 ON_TOP = 0.72  # of a support's height in the image, from its upper edge: a foot below that stands before it
@@ -25,7 +25,7 @@ class SeenBody:
     bbox: BBox
     mask: CroppedMask
     shape: Shape
-    source: str = "embedded"
+    source: Source = "embedded"
     confidence: float = 1.0
     prior: ObjectPrior | None = None
     elongated: bool = False  # a vehicle: longer along its heading than across

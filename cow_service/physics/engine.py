@@ -119,7 +119,7 @@ class _Engine:
         self.scale = ENGINE_SIZE / worlds[0][0].half_width
         self.world = _empty_world(1 / (fps * self.substeps), min(GRAVITY * self.scale, MOST_GRAVITY))
         self.collector = ChannelEventCollector()
-        self.world.event_handler = self.collector
+        self.world.event_handler = self.collector  # pyright: ignore[reportAttributeAccessIssue]
         floor = Collider.halfspace((0.0, 1.0, 0.0)).friction(FLOOR_FRICTION).restitution(FLOOR_RESTITUTION)
         self.world.add_collider(_combined(floor))
         self.owner: dict[int, tuple[int, int]] = {}  # world and body by the collider's index
@@ -168,11 +168,11 @@ class _Engine:
         builder = builder.translation((x, y + lift, z)).rotation((0.0, body.yaw, 0.0))
         builder = builder.gravity_scale(1.0 if body.falls else 0.0)
         if _acts(body):
-            velocity = tuple(v * self.scale for v in body.velocity)
-            builder = builder.linvel(velocity).ccd_enabled(not body.ghost).soft_ccd_prediction(FORESEEN)
+            x, y, z = (v * self.scale for v in body.velocity)
+            builder = builder.linvel((x, y, z)).ccd_enabled(not body.ghost).soft_ccd_prediction(FORESEEN)
             if body.glides and body.shape == "sphere":  # it rolls
                 radius = body.half_width * self.scale
-                builder = builder.angvel((velocity[2] / radius, 0.0, -velocity[0] / radius))
+                builder = builder.angvel((z / radius, 0.0, -x / radius))
         else:
             builder = builder.sleeping(True)
         collider = _collider(body, self.scale).friction(0.0 if body.glides else body.friction)

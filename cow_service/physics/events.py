@@ -20,14 +20,15 @@ COVERED = 0.3  # share of a silhouette from which it counts as covered
 COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
 NEVER = math.inf
+PerKind = dict[EncounterKind, Floats]  # [K, B] each
 
 
 @dataclass(frozen=True)
 class Events:
     """Per kind of encounter, draw and body: the first time (s, infinity for never) and the largest share covered."""
 
-    times: dict[EncounterKind, Floats]  # [K, B] each
-    shares: dict[EncounterKind, Floats]  # [K, B] each; 0 for touches
+    times: PerKind
+    shares: PerKind  # 0 for touches
     eligible: Mask  # [B]: neither the mover nor what it stands on
 
     def happens(self, kind: EncounterKind) -> Mask:
@@ -36,8 +37,11 @@ class Events:
 
     def part(self, rows: slice) -> Events:
         """Those of some draws."""
-        times = {kind: values[rows] for kind, values in self.times.items()}
-        return Events(times, {kind: values[rows] for kind, values in self.shares.items()}, self.eligible)
+        return Events(_rows(self.times, rows), _rows(self.shares, rows), self.eligible)
+
+
+def _rows(table: PerKind, rows: slice) -> PerKind:
+    return {kind: values[rows] for kind, values in table.items()}
 
 
 def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats) -> Events:
@@ -46,8 +50,8 @@ def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: F
     count = len(bodies)
     eligible = np.ones(count, bool)
     eligible[[0, *(on for on in worlds.scene.supports[:1] if on is not None)]] = False
-    times = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
-    most = {kind: np.zeros((len(draws), count)) for kind in KINDS}
+    times: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
+    most: PerKind = {kind: np.zeros((len(draws), count)) for kind in KINDS}
     for k, run in enumerate(worlds.runs):
         for meeting in run.meetings:
             if meeting.a == 0 and meeting.b is not None and eligible[meeting.b]:

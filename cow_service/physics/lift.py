@@ -130,7 +130,7 @@ def above(
     near = rays[:, [0, 2]] * (height / _safe(-rays[:, 1]))[:, None]
     distance = np.linalg.norm(near, axis=1)
     way = near / distance[:, None]
-    half = np.zeros(len(foot))
+    half, centre = np.zeros(len(foot)), np.zeros((len(foot), 3))
     for _ in range(4):
         middle = near + way * (half * depth_share)[:, None]
         centre = np.stack([middle[:, 0], plane, middle[:, 1]], axis=1)

@@ -148,7 +148,7 @@ def contact_records(worlds: Worlds, camera: FloorCamera) -> tuple[Contact, ...]:
 
 def moving_until(paths: Sequence[Path], fps: float) -> float:
     """Seconds from which nothing moves any more in the image, or the mover has left it."""
-    seen = np.nonzero(paths[0].visible)[0]
+    seen = np.nonzero(np.array(paths[0].visible))[0]
     left = int(seen[-1]) + 1 if len(seen) else 0
     still = 0
     for path in paths:

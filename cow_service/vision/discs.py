@@ -14,6 +14,7 @@ TRIES = 120  # circles through three points of the outline
 NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
 ON_CIRCLE = 0.5  # share of the outline
 ON_BOTH = 1.17  # sum of that share and of the share of the rays from the middle whose strongest edge is the circle
+WHOLE, LEAST_ARC = 0.85, 0.25  # less of the outline than the first: so much of the circle must lie on edges in one run
 BEYOND_IMAGE = 0.85  # share of those rays for a circle that the image's border cuts
 RAY = (-0.3, 0.2)  # of the radius: how far inside and outside the circle a ray is searched
 RAY_ERROR = (1.0, 0.03)  # px, and of the radius: how near the circle its strongest edge must lie; the larger counts
@@ -45,7 +46,10 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
     strong = cv2.dilate((edges > edge_threshold).astype(np.uint8), np.ones((3, 3), np.uint8))
     if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < ON_EDGES:
         return None
-    sharpest = _strongest_on(edges, x, y, radius)[seen].mean()
+    rays = _strongest_on(edges, x, y, radius)
+    sharpest = rays[seen].mean()
+    if on_circle < WHOLE and _longest_arc(rays) < LEAST_ARC:
+        return None
     if on_circle + sharpest < ON_BOTH or (not seen.all() and sharpest < BEYOND_IMAGE):
         return None
     ys, xs = np.mgrid[:height, :width]
@@ -74,6 +78,17 @@ def _strongest_on(edges: Floats32, x: float, y: float, radius: float) -> Mask:
     values = cv2.remap(edges, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)
     strongest = np.abs(offsets[0][np.asarray(values).argmax(axis=1)])
     return strongest < max(RAY_ERROR[0], RAY_ERROR[1] * radius)
+
+
+def _longest_arc(rays: Mask) -> float:
+    """Share of the circle that the longest run of rays takes, gaps of one ray closed: a polygon has many short runs."""
+    twice = np.concatenate([rays, rays])
+    closed = twice | (np.roll(twice, 1) & np.roll(twice, -1))
+    longest = length = 0
+    for on in closed:
+        length = length + 1 if on else 0
+        longest = max(longest, length)
+    return min(1.0, longest / len(rays))
 
 
 def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:

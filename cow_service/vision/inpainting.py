@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -9,8 +11,9 @@ from cow_service.vision.masks import scaled_size, window_of
 from cow_service.vision.types import Floats32, Image, Mask
 
 INPAINT_RADIUS = 4  # px
+WIDE = 0.6  # of the hole's size: so far around it exemplars are looked for
 MARGIN = 8  # px around a drawing that inpainting may use
-TEXTURE_SIGMA, TEXTURE_LEAST = 0.12, 3.0  # of the hole's size, px: finer detail is texture, coarser is shading
+TEXTURE_WIDTH, TEXTURE_LEAST = 0.2, 5.0  # of the hole's size, px: half of what finer detail is texture, not shading
 VARIED, STRUCTURED = 18.0, 4.0  # grey levels: deviation around a hole, there from a smooth surface: then exemplars
 MOST_UNREST = 1.5  # of the detail around the hole: with more, a place shows the edge of something
 RIM, RIM_LEAST = 0.04, 3.0  # of the hole's size, px: next to it the fill fades out, and nothing is learnt
@@ -21,8 +24,8 @@ LEAST_WEIGHT = 1e-3  # of a pyramid cell known: with less, the coarser level say
 FADE = 0.14  # of the hole's size: how far out its shadow is taken away
 FADE_MOST = 0.011  # of the image's longer side: and no further
 SHIFTS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))  # in sizes of the hole
-COARSE_SIDE = 128  # px: the crop is searched at this size
-TILE = 9  # px at the coarse size: what one patch fills
+COARSE_SIDE = 96  # px: the crop is searched at this size
+TILE = 13  # px at the coarse size: what one patch fills
 CONTEXT = 5  # px around a tile that must fit
 FEATHER = 3  # px over which patches overlap
 
@@ -43,44 +46,79 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
     Pixels of `avoid` (other objects) give neither shading nor texture, unless nothing else is left. The object's own
     shadow around the hole gives none either; it fades out over the few pixels next to it.
     """
-    size = float(np.sqrt(hole.sum()))
-    crop = window_of(hole, max(24, int(0.6 * size)))
-    if crop is None:
+    size = float(np.sqrt(np.count_nonzero(hole)))
+    reach = RIM * size + RIM_LEAST + max(BESIDE_LEAST, BESIDE * size)
+    around = _surroundings(image, hole, avoid, max(round(reach), round(FADE * size)) + 2)
+    if around is None or not around.trusted.any():
+        around = _surroundings(image, hole, avoid, max(24, int(WIDE * size)))
+        reach = np.inf
+    if around is None:
         return image
+    beside = around.trusted & (around.away < reach)
+    varied = _is_varied(around.source, around.inside, around.trusted)
+    if varied and np.isfinite(reach):
+        around = _surroundings(image, hole, avoid, max(24, int(WIDE * size))) or around
+        beside = around.trusted & (around.away < reach)
+    shading = push_pull(around.source, beside)
+    if varied:
+        filled = exemplar_inpaint(around.source, around.inside | (around.away <= around.rim), ~around.trusted, shading)
+    else:
+        width = 2 * round(max(TEXTURE_LEAST, TEXTURE_WIDTH * size)) + 1
+        detail = np.abs(shading - cv2.blur(shading, (width, width)))[beside]
+        most = MOST_UNREST * float(np.percentile(detail, 99))
+        filled = shading + _texture(image, hole, avoid, around.crop, width, most)
+    return _faded_in(image, filled, around, size)
+
+
+@dataclass(frozen=True)
+class _Surroundings:
+    """What lies around a hole, in a crop of the image."""
+
+    crop: tuple[slice, slice]
+    source: Floats32  # [h, w, 3]
+    inside: Mask  # [h, w]: the hole
+    known: Mask  # [h, w]: neither the hole nor to be avoided
+    trusted: Mask  # [h, w]: of these, neither at the rim nor in the object's shadow
+    shadow: Mask  # [h, w]
+    away: Floats32  # [h, w] px from the hole
+    rim: float  # px: next to the hole nothing is learnt
+
+
+def _surroundings(image: Image, hole: Mask, avoid: Mask | None, margin: int) -> _Surroundings | None:
+    """Within a margin (px) of a hole; None where there is no hole, or nothing else."""
+    crop = window_of(hole, margin)
+    if crop is None:
+        return None
     inside = hole[crop]
     known = ~(inside | avoid[crop]) if avoid is not None else ~inside
     if not known.any():
         known = ~inside
     if not known.any():
-        return image
+        return None
     source = image[crop].astype(np.float32)
-    away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
-    rim = max(RIM_LEAST, RIM * size)
+    away = np.asarray(cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+    rim = max(RIM_LEAST, RIM * float(np.sqrt(np.count_nonzero(inside))))
     shadow = _contact_shadow(source, inside, known)
     trusted = known & ~shadow & (away > rim)
-    if not trusted.any():
-        trusted = known
-    # What lies further off may be another surface: it counts only where nothing nearer is known.
-    beside = trusted & (away < rim + max(BESIDE_LEAST, BESIDE * size))
-    shading = push_pull(source, beside if beside.any() else trusted)
-    if _is_varied(source, inside, trusted):
-        filled = exemplar_inpaint(source, inside | (away <= rim), ~trusted, shading)
-    else:
-        sigma = max(TEXTURE_LEAST, TEXTURE_SIGMA * size)
-        detail = np.abs(shading - cv2.GaussianBlur(shading, (0, 0), sigma))[beside if beside.any() else trusted]
-        most = MOST_UNREST * float(np.percentile(detail, 99))
-        filled = shading + _texture(image, hole, avoid, crop, sigma, most)
+    return _Surroundings(crop, source, inside, known, trusted if trusted.any() else known, shadow, away, rim)
+
+
+def _faded_in(image: Image, filled: Floats32, around: _Surroundings, size: float) -> Image:
+    """The image with a filled crop in the hole, fading out next to it, and over a longer way in the object's shadow."""
     fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
-    reach = np.where(cv2.dilate(shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, max(fade, rim), rim)
-    share = np.where(inside, 1.0, np.where(known, np.clip(1 - away / reach, 0, 1), 0.0))[..., None].astype(np.float32)
+    wide = cv2.dilate(around.shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    reach = np.where(wide, np.float32(max(fade, around.rim)), np.float32(around.rim))
+    share = np.asarray(np.clip(1 - around.away / reach, 0, 1) * around.known, np.float32)
+    share[around.inside] = 1
+    share = _three(share)
     result = image.copy()
-    result[crop] = np.clip(filled * share + source * (1 - share) + 0.5, 0, 255).astype(np.uint8)
+    result[around.crop] = cv2.convertScaleAbs(np.maximum(around.source + (filled - around.source) * share, 0))
     return result
 
 
 def _is_varied(source: Floats32, inside: Mask, known: Mask) -> bool:
     """Whether what lies around the hole is no plain surface: it has texture, or several colours, or an edge runs in."""
-    reach = 2 * max(4, int(0.25 * np.sqrt(inside.sum()))) + 1
+    reach = 2 * max(4, int(0.25 * np.sqrt(np.count_nonzero(inside)))) + 1
     ring = (cv2.dilate(inside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & known
     if not ring.any():
         return False
@@ -92,7 +130,7 @@ def _roughness(source: Floats32, ring: Mask) -> float:
     ys, xs = np.nonzero(ring)
     every = max(1, len(ys) // MOST_SAMPLES)
     ys, xs = ys[::every], xs[::every]
-    values = np.asarray(cv2.GaussianBlur(source, (0, 0), 2.0), np.float64)[ys, xs]
+    values = np.asarray(cv2.blur(source, (7, 7)), np.float64)[ys, xs]
     u, v = (xs - xs.mean()) / max(1.0, float(xs.std())), (ys - ys.mean()) / max(1.0, float(ys.std()))
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
     rest = values - terms @ np.linalg.lstsq(terms, values, rcond=None)[0]
@@ -101,65 +139,71 @@ def _roughness(source: Floats32, ring: Mask) -> float:
 
 def _contact_shadow(source: Floats32, inside: Mask, known: Mask) -> Mask:
     """Known pixels at the hole's rim that are much darker than most: the object's own shadow, no shading to draw in."""
-    reach = 2 * max(3, int(0.15 * np.sqrt(inside.sum()))) + 1
+    reach = 2 * max(3, int(0.15 * np.sqrt(np.count_nonzero(inside)))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     rim = (cv2.dilate(inside.astype(np.uint8), kernel) > 0) & known
-    grey = source.mean(axis=2)
     if not rim.any():
         return rim
+    grey = source @ np.full(3, 1 / 3, np.float32)
     return rim & (grey < np.percentile(grey[rim], 65) - SHADOW_STEP)
 
 
 def push_pull(source: Floats32, known: Mask) -> Floats32:
     """Unknown pixels of [h, w, 3] from known ones: averages down a pyramid, then back up (push-pull)."""
     weight = known.astype(np.float32)
-    levels = [(source * weight[..., None], weight)]
+    kept = _three(weight)
+    levels = [(source * kept, weight)]
     while min(levels[-1][1].shape) > 1 and not (levels[-1][1] > LEAST_WEIGHT).all():
         colours, weights = (np.asarray(cv2.pyrDown(layer), np.float32) for layer in levels[-1])
         levels.append((colours, weights))
     colours, weights = levels[-1]
-    value = colours / np.maximum(weights, LEAST_WEIGHT)[..., None]
+    value = colours / _three(np.maximum(weights, LEAST_WEIGHT))
     for colours, weights in reversed(levels[:-1]):
         coarse = cv2.resize(value, (weights.shape[1], weights.shape[0]), interpolation=cv2.INTER_LINEAR)
-        trust = np.minimum(weights, 1)[..., None]
-        value = np.where(
-            trust > LEAST_WEIGHT, colours / np.maximum(weights, LEAST_WEIGHT)[..., None], 0
-        ) * trust + coarse * (1 - trust)
+        trust = np.where(weights > LEAST_WEIGHT, np.minimum(weights, 1), 0)
+        own = trust / np.maximum(weights, LEAST_WEIGHT)
+        value = colours * _three(np.asarray(own, np.float32)) + coarse * _three(np.asarray(1 - np.minimum(weights, 1), np.float32))
     for _ in range(2):
-        value = np.where(known[..., None], source, cv2.GaussianBlur(value, (0, 0), 2.0))
-    return np.asarray(value, np.float32)
+        value = np.asarray(cv2.GaussianBlur(value, (0, 0), 2.0), np.float32)
+        value += (source - value) * kept
+    return value
+
+
+def _three(values: Floats32) -> Floats32:
+    """Values [h, w] for each of three colours: broadcasting over the last axis is several times slower."""
+    return np.asarray(cv2.merge((values, values, values)), np.float32)
 
 
 def _texture(
-    image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, slice], sigma: float, most: float
+    image: Image, hole: Mask, avoid: Mask | None, crop: tuple[slice, slice], width: int, most: float
 ) -> Floats32:
-    """Detail finer than sigma (px) for the crop, from the calmest neighbouring place of the hole's shape.
+    """Detail finer than a width (px) for the crop, from the calmest neighbouring place of the hole's shape.
 
     Zero where each has detail of more than `most` grey levels: an edge of something else.
     """
     rows, columns = crop
-    height, width = hole.shape
+    height, across = hole.shape
     inner = window_of(hole, 2) or crop
     step_y, step_x = inner[0].stop - inner[0].start, inner[1].stop - inner[1].start
     unusable = hole if avoid is None else hole | avoid
-    shape = hole[inner]
-    best: tuple[float, Floats32] | None = None
+    shape, half = hole[inner][::2, ::2], width // 2
+    best: tuple[float, tuple[slice, slice]] | None = None
     for sx, sy in SHIFTS:
         y, x = inner[0].start + sy * step_y, inner[1].start + sx * step_x
-        if y < 0 or x < 0 or y + step_y > height or x + step_x > width:
+        if y < 0 or x < 0 or y + step_y > height or x + step_x > across:
             continue
         place = slice(y, y + step_y), slice(x, x + step_x)
-        if (unusable[place] & shape).any():
+        if (unusable[place][::2, ::2] & shape).any():
             continue
-        patch = image[place].astype(np.float32)
-        detail = patch - cv2.GaussianBlur(patch, (0, 0), sigma)
-        unrest = float(np.percentile(np.abs(detail[shape]), 99))
+        patch = image[place][::2, ::2].astype(np.float32)  # every other pixel tells enough of its unrest
+        unrest = float(np.percentile(np.abs(patch - cv2.blur(patch, (half, half)))[shape], 99))
         if unrest < (most if best is None else best[0]):
-            best = unrest, detail
+            best = unrest, place
     texture = np.zeros((rows.stop - rows.start, columns.stop - columns.start, 3), np.float32)
     if best is not None:
+        patch = image[best[1]].astype(np.float32)
         top, left = inner[0].start - rows.start, inner[1].start - columns.start
-        texture[top : top + step_y, left : left + step_x] = best[1]
+        texture[top : top + step_y, left : left + step_x] = patch - cv2.blur(patch, (width, width))
     return texture
 
 

@@ -41,7 +41,7 @@ MIN_REST = 0.05  # of a component: less is no part of its own
 OWN_WIDTH = 0.55  # of the broadest colour: black narrower than this is a neck or a wheel
 MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
 
-SURE_CONTRAST = 12.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
+SURE_CONTRAST = 20.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
 SURE_AREA = 300.0  # px at the working size, from which the size takes nothing
 
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
@@ -78,6 +78,7 @@ class _View:
     bright: Floats32  # lightness above the surroundings
     around: Floats32  # lightness of the surroundings
     edges: Floats32  # Lab gradient per px
+    median_edge: float  # of the whole image
     edge_threshold: float  # gradient from which the outline of an object may lie on it
 
     def crop(self, window: tuple[slice, slice]) -> _View:
@@ -85,7 +86,7 @@ class _View:
         gap, bright, around, edges = (
             layer[window] for layer in (self.chroma_gap, self.bright, self.around, self.edges)
         )
-        return _View(self.lab[window], gap, bright, around, edges, self.edge_threshold)
+        return _View(self.lab[window], gap, bright, around, edges, self.median_edge, self.edge_threshold)
 
 
 def find_regions(image: Image) -> tuple[Region, ...]:
@@ -138,8 +139,9 @@ def _view(small: Image) -> _View:
     blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
     dx, dy = cv2.Sobel(blurred, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(blurred, cv2.CV_32F, 0, 1) / 8
     edges = np.sqrt((dx * dx + dy * dy).sum(axis=2))
-    edge_threshold = max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * float(np.median(edges)))
-    return _View(lab, gap, lab[..., 0] - around_l, around_l, edges, edge_threshold)
+    median_edge = float(np.median(edges))
+    edge_threshold = max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * median_edge)
+    return _View(lab, gap, lab[..., 0] - around_l, around_l, edges, median_edge, edge_threshold)
 
 
 def _surroundings(coarse: Image) -> Image:
@@ -152,9 +154,8 @@ def _surroundings(coarse: Image) -> Image:
     plain = (cv2.dilate((off > STRONG_CHROMA_STEP).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0).astype(np.float32)
     if plain.all() or plain.mean() < 0.5:
         return first
-    reach = (0.25 * min(coarse.shape[:2]),) * 2
-    weight = cv2.GaussianBlur(plain, (0, 0), *reach)[..., None]
-    filled = cv2.GaussianBlur(coarse * plain[..., None], (0, 0), *reach) / np.maximum(weight, 1e-3)
+    side = (min(coarse.shape[:2]),) * 2
+    filled = cv2.blur(coarse * plain[..., None], side) / np.maximum(cv2.blur(plain, side)[..., None], 1e-3)
     return _wide_median(np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8))
 
 
@@ -189,7 +190,7 @@ def _white_sides(view: _View, core: Mask) -> Mask:
     height, width = core.shape
     kernel = np.ones((3, 3), np.uint8)
     for floor, factor in EDGE_THRESHOLDS:
-        edge_threshold = max(floor, factor * float(np.median(view.edges)))
+        edge_threshold = max(floor, factor * view.median_edge)
         edges = cv2.morphologyEx((view.edges > edge_threshold).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
         for i in range(1, count):
@@ -198,9 +199,10 @@ def _white_sides(view: _View, core: Mask) -> Mask:
                 continue
             near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
             patch = (labels[near] == i).astype(np.uint8)
-            lit = float(np.median(view.bright[near][patch > 0])) > BRIGHT_REACH
             touched = np.unique(top_labels[near][cv2.dilate(patch, kernel, iterations=4) > 0])
-            for top in touched[touched > 0]:
+            touched = touched[touched > 0]
+            lit = len(touched) > 0 and float(np.median(view.bright[near][patch > 0])) > BRIGHT_REACH
+            for top in touched:
                 tx, ty, tw, _, top_area = (int(v) for v in top_stats[top])
                 overlap = min(x + w, tx + tw + 3) - max(x, tx - 3)
                 hangs = overlap > 0.7 * w and y >= ty
@@ -243,9 +245,9 @@ def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
 def _is_wall(view: _View, part: Mask, border: Mask) -> bool:
     """Whether a pale part runs along the image's border for much of its own length, as a strip of wall does."""
     along = part & border
-    chroma = float(np.median(np.hypot(view.lab[..., 1], view.lab[..., 2])[part]))
-    pale = chroma < 2 * CHROMA_STEP and float(np.median(view.bright[part])) > 0
-    if not pale or not along.any():
+    if not along.any() or float(np.median(view.bright[part])) <= 0:
+        return False
+    if float(np.median(np.hypot(view.lab[..., 1][part], view.lab[..., 2][part]))) >= 2 * CHROMA_STEP:
         return False
     (rows, columns), (edge_rows, edge_columns) = np.nonzero(part), np.nonzero(along)
     wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
@@ -292,9 +294,10 @@ def _coloured_parts(view: _View, component: Mask) -> list[Mask]:
     neutral = component & ~coloured
     bright = neutral & (view.bright > -12) & (lab[..., 0] > 40)
     black = neutral & (lab[..., 0] < BLACK_SHARE * view.around)
-    broad = max((_half_width(seed) for seed in seeds), default=0.0)
+    dark = _blobs(black, min(0.35 * area, OWN_AREA))
+    broad = max((_half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
     seeds.extend(_blobs(bright, min(0.3 * area, OWN_AREA)))
-    for seed in _blobs(black, min(0.35 * area, OWN_AREA)):
+    for seed in dark:
         if _half_width(seed) > OWN_WIDTH * broad or seed.sum() > 0.35 * area:
             seeds.append(seed)
     if len(seeds) <= 1:

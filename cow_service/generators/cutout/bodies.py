@@ -73,7 +73,9 @@ def still_bodies(
     given: GeneratorInput, moving: tuple[MovingBody, ...], size: tuple[int, int], ground: Ground | None
 ) -> tuple[StillBody, ...]:
     """The obstacles that have no path."""
-    taken = np.logical_or.reduce([body.mask for body in moving])
+    taken = np.zeros(moving[0].mask.shape, bool)
+    for body in moving:
+        taken |= body.mask
     found: list[StillBody] = []
     for index, obstacle in enumerate(given.obstacles, start=1):
         if any(body.path.body == index for body in moving):

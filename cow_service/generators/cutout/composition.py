@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cmp_to_key
 
+import cv2
 import numpy as np
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import MovingBody, StillBody
 from cow_service.generators.cutout.layers import Layers, take_apart
-from cow_service.generators.cutout.sprites import Sprite, Window, moved, soft
+from cow_service.generators.cutout.sprites import Sprite, Window, moved
 from cow_service.physics.camera import has_passed
 from cow_service.vision.types import Floats, Floats32, Image
 
@@ -20,7 +21,6 @@ class Compositor:
     """The layers of a scene, and what several frames need of them."""
 
     layers: Layers
-    _open: dict[int | None, Floats32] = field(default_factory=dict, repr=False)
 
     @staticmethod
     def of(given: GeneratorInput) -> Compositor:
@@ -35,22 +35,22 @@ class Compositor:
         for shadow in layers.shadows:
             for drawn in shadow.at(index, size):
                 window = frame[drawn.window]
-                dark = drawn.dark * self._surface(drawn.surface)[drawn.window][..., None]
-                window[:] = np.clip(window * (1 - dark) + 0.5, 0, 255).astype(np.uint8)
+                left = 1 - drawn.dark * self._seen(drawn.surface, drawn.window)
+                window[:] = cv2.multiply(window, left, dtype=cv2.CV_8U)
         for body, sprite in self._far_to_near(index):
             self._draw(frame, body, sprite, index)
         return frame
 
-    def _surface(self, body: int | None) -> Floats32:
-        """Where a surface is seen, 0..1 [h, w]: the floor between the bodies that stand still, or one of these."""
-        if body not in self._open:
-            masks = [other.mask for other in self.layers.still if body in (None, other.index)]
-            covered = np.zeros(self.layers.background.shape[:2], bool)
-            for mask in masks:
-                covered |= mask
-            alpha = soft(covered)
-            self._open[body] = 1 - alpha if body is None else alpha
-        return self._open[body]
+    def _seen(self, surface: int | None, window: Window) -> Floats32 | float:
+        """Where in a window a surface is seen, 0..1 [a, b, 3]: the floor between still bodies, or the top of one."""
+        others = [other for other in self.layers.still if surface in (None, other.index) and _overlap(window, other)]
+        if not others:
+            return 1.0 if surface is None else 0.0
+        rows, columns = window
+        seen = np.ones((rows.stop - rows.start, columns.stop - columns.start), np.float32)
+        for other in others:
+            _hide(seen, window, other)
+        return _three(seen if surface is None else 1 - seen)
 
     def _far_to_near(self, index: int) -> list[tuple[MovingBody, Sprite]]:
         """The bodies before the camera at a frame, in the order in which they are drawn."""
@@ -79,8 +79,13 @@ class Compositor:
             if _overlap(window, other) and not placed.in_front_of(other.placed, self.layers.eye):
                 _hide(pixels, window, other)
         shown = frame[window]
-        mixed = shown * (1 - pixels[..., 3:]) + pixels[..., :3]
-        shown[:] = np.clip(mixed + 0.5, 0, 255).astype(np.uint8)
+        mixed = cv2.multiply(shown, _three(1 - pixels[..., 3]), dtype=cv2.CV_32F) + pixels[..., :3]
+        shown[:] = cv2.convertScaleAbs(mixed)
+
+
+def _three(values: Floats32) -> Floats32:
+    """Values [a, b] for each of three colours."""
+    return np.asarray(cv2.merge((values, values, values)), np.float32)
 
 
 def _overlap(window: Window, other: StillBody) -> bool:
@@ -89,9 +94,10 @@ def _overlap(window: Window, other: StillBody) -> bool:
 
 
 def _hide(pixels: Floats32, window: Window, other: StillBody) -> None:
-    """Takes away the part of a window's pixels [a, b, 4] that another body covers."""
+    """Takes away the part of a window's values [a, b] or [a, b, 4] that another body covers."""
     there, alpha = other.alpha
     both = [slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(window, there, strict=True)]
     inner = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, window, strict=True))
     covered = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, there, strict=True))
-    pixels[inner] *= 1 - alpha[covered][..., None]
+    left = 1 - alpha[covered]
+    pixels[inner] *= left if pixels.ndim == 2 else left[..., None]

@@ -88,7 +88,7 @@ def _hidden(body: MovingBody, moving: tuple[MovingBody, ...], still: tuple[Still
 
 def _hole(body: MovingBody, lost: Mask | None, cues: Mask | None) -> Mask:
     """Where a body [h, w] leaves something to fill in: it, its rim, and what lies in its contact shadow's depth."""
-    growth = max(2, round(HOLE_GROWTH * float(np.sqrt(body.mask.sum()))))
+    growth = max(2, round(HOLE_GROWTH * float(np.sqrt(np.count_nonzero(body.mask)))))
     hole = _dilated(body.mask, 2 * (growth if lost is None else growth + SHADED_RIM) + 1)
     if lost is not None:
         hole |= lost
@@ -109,8 +109,11 @@ def _without(
         objects |= other.mask
         if other.mask[window].any() and body.placed(0).in_front_of(other.placed, eye):
             behind.append(other)
-    support = [other.mask for other in behind if other.index == body.support]
-    rest = hole & ~(objects & ~body.mask & ~np.logical_or.reduce([np.zeros_like(hole), *support]))
+    solid = objects & ~body.mask
+    for other in behind:
+        if other.index == body.support:  # its top around the foot was in the shadow
+            solid &= ~other.mask
+    rest = hole & ~solid
     for other in moving:
         objects |= other.mask & ~body.mask if other is not body else False
     for other in behind:

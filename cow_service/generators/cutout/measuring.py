@@ -58,7 +58,9 @@ def take_shadows(
     factor: float,
 ) -> Lit:
     """The scene [h, w, 3] without the shadows of the bodies that move, and these shadows."""
-    objects = np.logical_or.reduce([*(body.mask for body in moving), *(body.mask for body in still)])
+    objects = np.zeros(image.shape[:2], bool)
+    for body in (*moving, *still):
+        objects |= body.mask
     floor, shadows = _shrunk(~objects), list[Shadow]()
     lost = dict[int, Mask]()
     for body in (body for body in moving if _moves(body)):
@@ -152,5 +154,5 @@ def _lit(image: Image, shade: Shade, where: Mask) -> tuple[Image, Mask]:
     bounded = np.clip(lit, (1 - spread) * floor, (1 + spread) * floor)
     shaded = np.clip(cv2.dilate(dark.max(axis=2), np.ones((5, 5), np.uint8)) / LEAST_SHADE, 0, 1)[..., None]
     result[window] = np.clip(shaded * bounded + (1 - shaded) * lit + 0.5, 0, 255).astype(np.uint8)
-    deep[window] = dark.mean(axis=2) > DEEP
+    deep[window] = dark @ np.full(3, 1 / 3, np.float32) > DEEP
     return result, deep

@@ -13,24 +13,26 @@ import cv2
 import numpy as np
 
 from cow_service.vision.inpainting import push_pull
+from cow_service.vision.masks import window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
-WORKING_SIDE = 72.0  # px: the surroundings are measured at the size at which the object's longer side is so long
-SIDEWAYS, DOWN, UP = 1.1, 0.7, 0.2  # of the object's longer side: how far around its box a shadow is looked for
-TEXTURE = 5  # px at the working size, of a median filter: finer than this is the floor's texture, edges stay
-ROUNDS = 4  # of the floor's fit, each without what lay far from the one before
+WORKING_SIDE = 48.0  # px: the surroundings are measured at the size at which the object's longer side is so long
+SIDEWAYS, DOWN, UP = 1.0, 0.7, 0.2  # of the object's longer side: how far around its box a shadow is looked for
+TEXTURE = 3  # px at the working size, of a median filter: finer than this is the floor's texture, edges stay
+ROUNDS = 3  # of the floor's fit, each without what lay far from the one before
 FAR = 2.0  # deviations of the floor's texture
 FIRST = 0.03  # of the lightness: the least deviation that the fit begins with
 UNEVEN = 0.07  # of the floor's lightness, in deviations: on a floor as varied as this no shadow can be told
 LEAST_SHADE, MOST_SHADE = 0.035, 0.85  # share of the light that is taken away
+NO_SHADE = 0.008  # share of light that nobody sees
 MOST_GIVEN = 0.1  # share of light that a coloured object may add in its own colour
 SAME_HUE = 0.3  # by which the shares that are left of red, green and blue may differ
-TOUCH = 4.0  # px at the working size: a shadow begins so near to its object
+TOUCH = 3.0  # px at the working size: a shadow begins so near to its object
 LEAST_FLOOR, LEAST_TOUCHING = 60, 4  # px at the working size
-NEAR, REACH = (0.7, 1.0), (0.25, 0.6)  # of the longer side: a contact and a cast shadow fade out between these
+NEAR, REACH = (0.65, 0.95), (0.25, 0.6)  # of the longer side: a contact and a cast shadow fade out between these
 OPEN_END = 0.25  # of a dark patch's size, on the border of what is looked at: with more it may be a darker floor
 ALIKE = 0.6  # of the darkness beside the object: it is, if it is as dark as this on the border
-CONTACT = 7  # px at the working size: so far under the object its shadow is as dark as at its rim
+CONTACT = 5  # px at the working size: so far under the object its shadow is as dark as at its rim
 
 Box = tuple[float, float, float, float]
 
@@ -98,7 +100,12 @@ def _measured(
         return None
     near, far = (share * side * scale for share in fade)
     dark = (dark * np.clip((far - away) / (far - near), 0, 1)[..., None]).astype(np.float32)
-    return Shade(dark, lit, texture, (float(x0), float(y0)), (window[1].stop - window[1].start) / size[0])
+    step = (window[1].stop - window[1].start) / size[0]
+    seen = window_of(np.abs(dark).max(axis=2) > NO_SHADE, 1)
+    if seen is None:
+        return None
+    origin = x0 + seen[1].start * step, y0 + seen[0].start * step
+    return Shade(dark[seen], lit[seen], texture, origin, step)
 
 
 def _small(values: Floats32, size: tuple[int, int]) -> Floats32:
@@ -107,8 +114,10 @@ def _small(values: Floats32, size: tuple[int, int]) -> Floats32:
 
 def _without_texture(colours: Floats32, known: Mask) -> Floats32:
     """Colours [h, w, 3] without detail; what is not known takes part with the colours next to it."""
-    near = np.where(known[..., None], colours, push_pull(colours, known)) if known.any() else colours
-    levels = np.clip(near + 0.5, 0, 255).astype(np.uint8)
+    weight = known.astype(np.float32)
+    shares = np.maximum(cv2.boxFilter(weight, -1, (7, 7)), 1e-3)
+    near = cv2.boxFilter(colours * weight[..., None], -1, (7, 7)) / shares[..., None]
+    levels = np.clip(np.where(known[..., None], colours, near) + 0.5, 0, 255).astype(np.uint8)
     median = cv2.medianBlur(levels, TEXTURE).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(median, (0, 0), 0.7), np.float32)
 
@@ -128,7 +137,7 @@ def _floor_in_light(smooth: Floats32, known: Mask, around: Mask) -> tuple[Floats
     if len(ys) < LEAST_FLOOR or around.sum() < LEAST_FLOOR / 2:
         return None
     height, width = known.shape
-    every = max(1, len(ys) // 2000)
+    every = max(1, len(ys) // 1000)
     terms = _terms(2 * xs[::every] / width - 1, 2 * ys[::every] / height - 1)
     values = smooth[ys[::every], xs[::every]].astype(np.float64)
     grey = values.mean(axis=1)
@@ -161,8 +170,10 @@ def _shadow(
     left: Floats32, texture: float, known: Mask, away: Floats32, own: Floats32, *, reject_open: bool
 ) -> Floats32 | None:
     """The share of light taken away [h, w, 3] by the dark patches that touch the object; None without one."""
-    grey = left.mean(axis=2)
-    same_hue = (np.ptp(left, axis=2) < SAME_HUE) & (grey > 1 - MOST_SHADE)
+    grey = left @ np.full(3, 1 / 3, np.float32)
+    red, green, blue = cv2.split(left)
+    spread = cv2.max(cv2.max(red, green), blue) - cv2.min(cv2.min(red, green), blue)
+    same_hue = (spread < SAME_HUE) & (grey > 1 - MOST_SHADE)
     least = max(LEAST_SHADE, 1.5 * texture)
     dark = np.where(known & same_hue, np.clip(1 - grey, 0, None) * own, away == 0).astype(np.float32)
     touching = np.where(away < TOUCH, dark, 0).astype(np.float32)

@@ -133,7 +133,7 @@ class SkyShadow:
         window = clipped(centre - across, centre + across, size)
         if window is not None and foot[2] > 0:
             dark = _sky_taken(ground, foot, window, radius, above)
-            yield Drawn(window, np.repeat(dark[..., None], 3, axis=2).astype(np.float32), surface.body)
+            yield Drawn(window, np.asarray(cv2.merge((dark, dark, dark)), np.float32), surface.body)
 
 
 def cast_onto(ground: Ground, position: Floats, light: Vector, height: float) -> Floats:
@@ -160,10 +160,10 @@ def _drawn(
 ) -> Iterator[Drawn]:
     window = clipped(*reach(shade, matrix, to, start), size)
     if window is not None:
-        yield Drawn(window, strength * drawn(shade, matrix, to, start, window), surface)
+        yield Drawn(window, np.float32(strength) * drawn(shade, matrix, to, start, window), surface)
 
 
-def _sky_taken(ground: Ground, foot: Floats, window: Window, radius: float, above: float) -> Floats:
+def _sky_taken(ground: Ground, foot: Floats, window: Window, radius: float, above: float) -> Floats32:
     """Share [a, b] of the sky's light that a sphere takes from the plane through `foot`, fading out at `EXTENT`."""
     rows, columns = window
     height, width = rows.stop - rows.start, columns.stop - columns.start
@@ -179,5 +179,5 @@ def _sky_taken(ground: Ground, foot: Floats, window: Window, radius: float, abov
     gap = ((rays * length[:, None] - foot) ** 2).sum(axis=1)
     taken = np.where(sink > 1e-6, above * radius**2 / (gap + above**2) ** 1.5, 0.0) ** SHARPNESS
     edge = (above * radius**2 / ((EXTENT * radius) ** 2 + above**2) ** 1.5) ** SHARPNESS
-    taken = np.clip(SKY * (taken - edge), 0, MOST_TAKEN).reshape(cells_y, cells_x)
-    return np.asarray(cv2.resize(taken, (width, height), interpolation=cv2.INTER_LINEAR), np.float64)
+    cells = np.clip(SKY * (taken - edge), 0, MOST_TAKEN).reshape(cells_y, cells_x).astype(np.float32)
+    return np.asarray(cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -76,11 +77,8 @@ def moved(
     """Window and pixels [a, b, 4] of a sprite whose centre has gone to `point` (px); None outside a frame of `size`."""
     parts = [(part, turn) for part, turn in ((sprite.fixed, 0.0), (sprite.turning, rotation)) if part is not None]
     shape = parts[0][0].shape
-    found: list[Floats] = []
-    for _, turn in parts:
-        found.append(_corners(sprite, shape, point, scale, turn))
-    low, high = np.min([c.min(axis=0) for c in found], axis=0), np.max([c.max(axis=0) for c in found], axis=0)
-    window = clipped(low - 1, high + 1, size)
+    corners = np.concatenate([_corners(sprite, shape, point, scale, turn) for _, turn in parts])
+    window = clipped(corners.min(axis=0) - 1, corners.max(axis=0) + 1, size)
     if window is None:
         return None
     total: Floats32 | None = None
@@ -93,8 +91,8 @@ def moved(
 
 def clipped(low: Floats, high: Floats, size: tuple[int, int]) -> Window | None:
     """The window between two corners x, y (px), inside a frame of a size (width, height); None where that is empty."""
-    x0, y0 = (int(v) for v in np.floor(np.clip(low, 0, size)))
-    x1, y1 = (int(v) for v in np.ceil(np.clip(high, 0, size)))
+    x0, y0 = (math.floor(min(max(float(v), 0.0), side)) for v, side in zip(low, size, strict=True))
+    x1, y1 = (math.ceil(min(max(float(v), 0.0), side)) for v, side in zip(high, size, strict=True))
     return (slice(y0, y1), slice(x0, x1)) if x1 > x0 and y1 > y0 else None
 
 
@@ -105,8 +103,8 @@ def soft(mask: Mask) -> Floats32:
 
 def _turn(scale: float, degrees: float) -> Floats:
     """Matrix [2, 2] that scales and turns clockwise in the image, whose y points down."""
-    angle = np.radians(degrees)
-    cosine, sine = np.cos(angle), np.sin(angle)
+    angle = math.radians(degrees)
+    cosine, sine = math.cos(angle), math.sin(angle)
     return scale * np.array([[cosine, -sine], [sine, cosine]])
 
 
