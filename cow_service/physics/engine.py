@@ -35,6 +35,8 @@ COLOURS = 5  # worlds so many places apart, along and across, share a collision 
 REACH = 0.9 * COLOURS * SPACING / 2  # m inside the engine: what gets further away is taken out
 LEAST_STEPS, LEAST_STEPS_OF_MANY = 60.0, 30.0  # steps per second, at least, of a world alone and of many
 FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.3
+MOST_GRAVITY = 500.0  # m/s^2 inside the engine: what is smaller than 3 mm would sink into the floor between two steps
+FORESEEN = 10.0  # m inside the engine, at most: contacts are found that far ahead of what is fast
 GAP = 1e-3  # m inside the engine: how far above what it stands on a body starts
 
 
@@ -115,7 +117,7 @@ class _Engine:
         self.frames = range(0, num_frames, every)
         self.substeps = max(1, math.ceil((LEAST_STEPS if self.is_alone else LEAST_STEPS_OF_MANY) / fps))
         self.scale = ENGINE_SIZE / worlds[0][0].half_width
-        self.world = _empty_world(1 / (fps * self.substeps), GRAVITY * self.scale)
+        self.world = _empty_world(1 / (fps * self.substeps), min(GRAVITY * self.scale, MOST_GRAVITY))
         self.collector = ChannelEventCollector()
         self.world.event_handler = self.collector  # pyright: ignore[reportAttributeAccessIssue]
         floor = Collider.halfspace((0.0, 1.0, 0.0)).friction(FLOOR_FRICTION).restitution(FLOOR_RESTITUTION)
@@ -167,7 +169,7 @@ class _Engine:
         builder = builder.gravity_scale(1.0 if body.falls else 0.0)
         if _acts(body):
             x, y, z = (v * self.scale for v in body.velocity)
-            builder = builder.linvel((x, y, z)).ccd_enabled(not body.ghost)
+            builder = builder.linvel((x, y, z)).ccd_enabled(not body.ghost).soft_ccd_prediction(FORESEEN)
             if body.glides and body.shape == "sphere":  # it rolls
                 radius = body.half_width * self.scale
                 builder = builder.angvel((z / radius, 0.0, -x / radius))
