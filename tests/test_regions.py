@@ -192,3 +192,15 @@ def test_obstacles_are_named_by_the_question_first() -> None:
     cube = next(region.bbox for region in scene.regions if region.colour == "blue")
     obstacles = scene.obstacles(mover, (LocatedObject(object="big blue cube", bbox=cube),))
     assert sorted(obstacle.name for obstacle in obstacles) == ["big blue cube", "green object"]
+
+
+def test_a_white_ball_is_whole_though_its_lower_part_is_as_dark_as_the_floor() -> None:
+    image = floor(grey=128)
+    image = np.clip(image * np.array([1.08, 1.0, 0.88]), 0, 255).astype(np.uint8)  # a floor of another hue
+    ys, xs = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    shade = np.clip(215 - 2.6 * np.maximum(0, ys - 180), 90, 215)
+    inside = np.hypot(xs - 300, ys - 200) <= 40
+    image = np.where(inside[..., None], shade[..., None], image).astype(np.uint8)
+    regions = find_regions(jpeg(image, 90))
+    assert [region.is_disc for region in regions] == [True]
+    assert iou(regions[0].bbox, (260, 160, 340, 240)) > 0.85

@@ -217,7 +217,8 @@ def _is_wall(view: View, part: Mask, border: Mask) -> bool:
 
 def _balls(view: View, component: Mask) -> Iterator[Mask]:
     """Discs among the pale patches between the edges of a component: white balls before or on something white."""
-    pale = component & (view.chroma_gap < CHROMA_STEP) & (view.bright > -12)
+    neutral = np.hypot(view.lab[..., 1], view.lab[..., 2]) < CHROMA_STEP
+    pale = component & ((view.chroma_gap < CHROMA_STEP) | neutral) & (view.bright > -12)
     taken = np.zeros(component.shape, bool)
     for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
         for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
@@ -231,8 +232,10 @@ def _balls(view: View, component: Mask) -> Iterator[Mask]:
 def _parts(view: View, component: Mask) -> list[Mask]:
     """Splits a component into white balls and by colour; wheels, necks and lights stay with what they sit on."""
     balls = list(_balls(view, component))
-    rest = component & ~np.any(balls, axis=0) if balls else component
-    return balls + [part for blob in _blobs(rest, MIN_REST * component.sum()) for part in _coloured_parts(view, blob)]
+    rest = _blobs(component & ~np.any(balls, axis=0) if balls else component, MIN_REST * component.sum())
+    if balls:  # what is left along the edge of a ball is blur
+        rest = [blob for blob in rest if _half_width(blob) > EDGE_BAND]
+    return balls + [part for blob in rest for part in _coloured_parts(view, blob)]
 
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
