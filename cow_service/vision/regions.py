@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision.colours import colour_name, colour_names
 from cow_service.vision.discs import as_disc
-from cow_service.vision.masks import CroppedMask, enlarged, iou, outline_of, scaled
+from cow_service.vision.masks import CroppedMask, enlarged, iou, outline_of, scaled, window_of
 from cow_service.vision.mouths import neck_between
 from cow_service.vision.tops import standing_on
 from cow_service.vision.types import Floats32, Image, Mask
@@ -156,7 +156,7 @@ def _is_wall(view: View, part: Mask, border: Mask) -> bool:
     along = part & border
     if not along.any() or float(np.median(view.bright[part])) <= 0:
         return False
-    if float(np.median(np.hypot(view.lab[..., 1][part], view.lab[..., 2][part]))) >= 2 * CHROMA_STEP:
+    if float(np.median(view.chroma[part])) >= 2 * CHROMA_STEP:
         return False
     (rows, columns), (edge_rows, edge_columns) = np.nonzero(part), np.nonzero(along)
     wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
@@ -165,8 +165,7 @@ def _is_wall(view: View, part: Mask, border: Mask) -> bool:
 
 def _balls(view: View, component: Mask) -> Iterator[Mask]:
     """Discs among the pale patches between the edges of a component: white balls before or on something white."""
-    neutral = np.hypot(view.lab[..., 1], view.lab[..., 2]) < CHROMA_STEP
-    pale = component & ((view.chroma_gap < CHROMA_STEP) | neutral) & (view.bright > -12)
+    pale = component & (np.minimum(view.chroma_gap, view.chroma) < CHROMA_STEP) & (view.bright > -12)
     taken = np.zeros(component.shape, bool)
     for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
         for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
@@ -189,7 +188,7 @@ def _parts(view: View, component: Mask) -> list[Mask]:
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     area = int(component.sum())
     lab = view.lab
-    chroma = np.hypot(lab[..., 1], lab[..., 2])
+    chroma = view.chroma
     hue = np.degrees(np.arctan2(lab[..., 2], lab[..., 1]))
     coloured = component & (view.chroma_gap > CHROMA_STEP) & (chroma > CHROMA_STEP)
     least = min(0.12 * area, OWN_AREA)
@@ -285,7 +284,10 @@ def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
 
 def _region(found: _Found, size: tuple[int, int]) -> Region:
     """A part that was found, as a region of the image (height and width)."""
-    soft = np.asarray(cv2.GaussianBlur(found.mask.astype(np.float32), (0, 0), MASK_SIGMA), np.float32)
+    soft = found.mask.astype(np.float32)
+    near = window_of(found.mask, round(6 * MASK_SIGMA))
+    if near is not None:
+        soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
     mask = enlarged(soft, size)
     chroma = np.hypot(found.lab[:, 1], found.lab[:, 2])
     sample = found.lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else found.lab

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ class View:
     """An image at the working size, against its surroundings."""
 
     lab: Floats32  # [h, w, 3] CIE Lab
+    chroma: Floats32  # distance from grey in the a*b* plane
     chroma_gap: Floats32  # distance from the surroundings in the a*b* plane
     bright: Floats32  # lightness above the surroundings
     around: Floats32  # lightness of the surroundings
@@ -30,10 +31,15 @@ class View:
 
     def crop(self, window: tuple[slice, slice]) -> View:
         """The same measurements for a part of the image."""
-        gap, bright, around, edges = (
-            layer[window] for layer in (self.chroma_gap, self.bright, self.around, self.edges)
+        return replace(
+            self,
+            lab=self.lab[window],
+            chroma=self.chroma[window],
+            chroma_gap=self.chroma_gap[window],
+            bright=self.bright[window],
+            around=self.around[window],
+            edges=self.edges[window],
         )
-        return View(self.lab[window], gap, bright, around, edges, self.median_edge, self.edge_threshold)
 
 
 def view_of(small: Image) -> View:
@@ -43,14 +49,23 @@ def view_of(small: Image) -> View:
     coarse = scaled(np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.uint8), 0.25)
     size = small.shape[1], small.shape[0]
     around = cv2.resize(_surroundings(coarse), size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
-    around_l: Floats32 = np.divide(around[..., 0], 2.55, dtype=np.float32)
-    gap = np.hypot(lab[..., 1] - (around[..., 1] - 128), lab[..., 2] - (around[..., 2] - 128))
+    (lightness, a, b), (around_l, around_a, around_b) = cv2.split(lab), cv2.split(around)
+    around_l = around_l / np.float32(2.55)
+    gap = cv2.magnitude(a - (around_a - 128), b - (around_b - 128))
     blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
-    dx, dy = cv2.Sobel(blurred, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(blurred, cv2.CV_32F, 0, 1) / 8
-    edges = np.sqrt((dx * dx + dy * dy).sum(axis=2))
+    dx, dy = (cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    edges = cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3), np.float32)))
     median_edge = float(np.median(edges))
-    edge_threshold = max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * median_edge)
-    return View(lab, gap, lab[..., 0] - around_l, around_l, edges, median_edge, edge_threshold)
+    return View(
+        lab=lab,
+        chroma=np.asarray(cv2.magnitude(a, b), np.float32),
+        chroma_gap=np.asarray(gap, np.float32),
+        bright=np.asarray(lightness - around_l, np.float32),
+        around=np.asarray(around_l, np.float32),
+        edges=np.asarray(edges, np.float32),
+        median_edge=median_edge,
+        edge_threshold=max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * median_edge),
+    )
 
 
 def _surroundings(coarse: Image) -> Image:

@@ -36,7 +36,7 @@ class _Tops:
         self._near_edges = (
             cv2.dilate((view.edges > view.edge_threshold).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         )
-        self._chroma = np.hypot(view.lab[..., 1], view.lab[..., 2])
+        self._chroma = view.chroma
 
     def is_sharp(self, top: int) -> bool:
         """Whether its outline lies on edges."""
@@ -60,15 +60,14 @@ def white_sides(view: View, core: Mask) -> Mask:
 
     `core` [h, w] are the pixels that are surely of an object.
     """
-    chroma = np.hypot(view.lab[..., 1], view.lab[..., 2])
-    neutral = (chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
+    neutral = (view.chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
     tops = _Tops(view, core & (view.bright > BRIGHT_STEP) & neutral)
     sides = _lit_fronts(view, tops)
     white = tops.surely_white()
     for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if white else [])):
         weak = thresholds == WEAK_EDGES
         for near, patch, box in _enclosed(view, *thresholds):
-            if weak and float(np.median(chroma[near][patch > 0])) > CHROMA_STEP:
+            if weak and float(np.median(view.chroma[near][patch > 0])) > CHROMA_STEP:
                 continue
             touched = set(np.unique(tops.labels[near][cv2.dilate(patch, _KERNEL, iterations=4) > 0]).tolist()) - {0}
             lit = len(touched) > 0 and float(np.median(view.bright[near][patch > 0])) > BRIGHT_REACH
