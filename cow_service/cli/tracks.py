@@ -29,7 +29,7 @@ def export_tracks(
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="tracks.pth or .npz for ATI, tracks.npy for Wan-Move.")],
 ) -> None:
-    """Write a simulation's tracks, in pixels of its input image: of all that moves, the mover's first, then the anchors."""
+    """Write a simulation's tracks, in pixels of its input image: of all that moves, then the anchors."""
     from pydantic import ValidationError  # noqa: PLC0415
 
     from cow_service.generators.wan.track_files import write_tracks  # noqa: PLC0415
