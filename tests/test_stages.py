@@ -247,7 +247,7 @@ def test_the_law_alone_leaves_the_motion_to_the_reader() -> None:
     kept = SimulateRequest.model_validate(asked.model_dump(mode="json", exclude_defaults=True))
     assert kept == asked
     default = SimulateRequest(image="data:,", question="?")
-    assert (default.law, default.ensemble) == ("contact", 200)
+    assert (default.law, default.ensemble) == ("contact", 100)
 
 
 def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Scene) -> None:
@@ -255,7 +255,7 @@ def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Scene) -> N
     x0, y0, x1, y1 = grounded(scene, **POINT).bbox
     radius, gravity = (x1 - x0 + y1 - y0) / 4, thrown.gravity[1]
     assert thrown.speed**2 / (gravity * radius) == pytest.approx(1.8**2 / (9.81 * 0.15))
-    assert (thrown.law, thrown.speed_deviation, thrown.depth_deviation) == ("contact", 0.35, 0)
+    assert (thrown.law, thrown.speed_deviation, thrown.depth_deviation) == ("contact", 0.28, 0)
     ballistic = moved(scene, direction=(1, 0), kind="projectile", law="ballistic")
     assert (ballistic.law, ballistic.speed) == ("ballistic", pytest.approx(0.26 * 640))
     given = moved(scene, direction=(1, 0), kind="projectile", speed=50, depth_deviation=4)
