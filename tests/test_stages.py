@@ -48,8 +48,13 @@ def moved(scene: Scene, path: TrajectoryRequest | None = None, **motion) -> Moti
     return read_motion(run(scene, **given), grounded(scene, **POINT), None).value
 
 
-def rolled(scene: Scene, motion: Motion, path: TrajectoryRequest | None = None, frames=81, fps=16.0) -> Trajectory:
-    return trajectory_of(scene, grounded(scene, **POINT), motion, (), path, frames, fps)
+def rolled(
+    scene: Scene, motion: Motion, path: TrajectoryRequest | None = None, frames=81, fps=16.0, obstacles=()
+) -> Trajectory:
+    """The trajectory under the paper's law, whose paths are known in closed form."""
+    request = run(scene, trajectory=path, num_frames=frames, fps=fps, ensemble=0).request
+    ballistic = motion.model_copy(update={"law": "ballistic"})
+    return trajectory_of(scene, grounded(scene, **POINT), ballistic, obstacles, request)
 
 
 def test_a_point_grounds_the_object_under_it(scene: Scene) -> None:
@@ -131,8 +136,7 @@ def test_anchors_keep_off_where_they_would_else_stand(scene: Scene) -> None:
     here = np.zeros((400, 640), bool)
     here[int(y) - 15 : int(y) + 15, int(x) - 15 : int(x) + 15] = True
     obstacle = Obstacle("vase", (x - 15, y - 15, x + 15, y + 15), CroppedMask.of(here))
-    grounding = grounded(scene, point=(200, 200))
-    kept = trajectory_of(scene, grounding, moved(scene, kind="static"), (obstacle,), None, 5, 16).anchors
+    kept = rolled(scene, moved(scene, kind="static"), frames=5, obstacles=(obstacle,)).anchors
     assert (x, y) not in kept
     assert all(not here[int(b), int(a)] for a, b in kept)
     away = rolled(scene, moved(scene, direction=(x - 200, y - 200), speed=300)).anchors
