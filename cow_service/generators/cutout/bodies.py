@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from cow_service.generators.base import GeneratorInput
@@ -41,6 +42,20 @@ class MovingBody:
     airborne: bool
     ground: Ground | None
     support: int | None  # the still body that it stands on at the first frame, of `Trajectory.bodies`
+
+    @property
+    def disc(self) -> Mask:
+        """Where a sphere is seen at the first frame [h, w], whatever hides it; nothing for other shapes."""
+        disc = np.zeros(self.mask.shape, np.uint8)
+        if self.ground is None or self.ground.bodies[self.path.body].shape != "sphere":
+            return disc > 0
+        first = np.array(self.path.states[0][:3])
+        x, y = self.ground.project(first)
+        per_metre = self.ground.factor * self.ground.camera.focal / self.ground.depth(first)
+        radius = per_metre * self.ground.bodies[self.path.body].size[0] / 2
+        # OpenCV's pixels are counted from their centres; 4 binary places.
+        cv2.circle(disc, (round(16 * (x - 0.5)), round(16 * (y - 0.5))), round(16 * radius), 1, -1, shift=4)
+        return disc > 0
 
     def placed(self, frame: int) -> Placed:
         """At a frame of the clip."""

@@ -72,7 +72,7 @@ def take_apart(given: GeneratorInput) -> Layers:
 
 
 def _hidden(body: MovingBody, moving: tuple[MovingBody, ...], still: tuple[StillBody, ...], eye: float) -> Mask | None:
-    """What nearer bodies hide of a body at the first frame: of its convex hull, since nothing shows the rest."""
+    """What nearer bodies hide of a body at the first frame: of a sphere's disc; of the hull of what is seen, else."""
     placed = body.placed(0)
     window = window_of(body.mask, 2)
     others = [(other.mask, other.placed) for other in still]
@@ -82,7 +82,7 @@ def _hidden(body: MovingBody, moving: tuple[MovingBody, ...], still: tuple[Still
     nearer = [mask for mask, at in others if mask[window].any() and not placed.in_front_of(at, eye)]
     if not nearer:
         return None
-    hidden = _hull(body.mask) & np.logical_or.reduce(nearer) & ~body.mask
+    hidden = (_hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
     return hidden if hidden.any() else None
 
 

@@ -177,7 +177,8 @@ def _shadow(
     least = max(LEAST_SHADE, 1.5 * texture)
     dark = np.where(known & same_hue, np.clip(1 - grey, 0, None) * own, away == 0).astype(np.float32)
     touching = np.where(away < TOUCH, dark, 0).astype(np.float32)
-    if (known & (touching > least)).sum() < LEAST_TOUCHING:
+    beside = touching[known & (touching > least)]
+    if len(beside) < LEAST_TOUCHING:
         return None
     reached = _reached(touching, dark, round(float(away[dark > least].max())))
     patch = known & (reached > least)
@@ -185,7 +186,7 @@ def _shadow(
     border[1:-1, 1:-1] = False
     ends = reached[patch & border]
     is_open = len(ends) > OPEN_END * np.sqrt(patch.sum()) + 2
-    if reject_open and is_open and np.median(ends) > ALIKE * np.median(touching[touching > least]):
+    if reject_open and is_open and np.median(ends) > ALIKE * np.median(beside):
         return None
     share = np.clip(2 * reached / least - 1, 0, 1) * np.minimum(1, reached / np.maximum(dark, 1e-3)) * own
     share = np.asarray(cv2.GaussianBlur(np.where(known, share, 1), (0, 0), 1.0), np.float32) * ~border
@@ -212,24 +213,24 @@ def _reached(marker: Floats32, dark: Floats32, steps: int) -> Floats32:
 
 def drawn(shade: Shade, matrix: Floats, to: Floats, start: Floats, window: tuple[slice, slice]) -> Floats32:
     """The share of light taken away in a window [a, b, 3], when `start` has gone `to` (px), all turned by a matrix."""
-    return _placed(shade.dark, shade, matrix, to, start, window)
+    return _placed(shade.dark, shade, matrix, to, start, window, cv2.BORDER_CONSTANT)
 
 
 def floor_in_light(shade: Shade, window: tuple[slice, slice]) -> Floats32:
     """The floor's colours [a, b, 3] in the light, in a window of the image."""
     none = np.zeros(2)
-    return _placed(shade.floor, shade, np.eye(2), none, none, window)
+    return _placed(shade.floor, shade, np.eye(2), none, none, window, cv2.BORDER_REPLICATE)
 
 
 def _placed(
-    cells: Floats32, shade: Shade, matrix: Floats, to: Floats, start: Floats, window: tuple[slice, slice]
+    cells: Floats32, shade: Shade, matrix: Floats, to: Floats, start: Floats, window: tuple[slice, slice], border: int
 ) -> Floats32:
     rows, columns = window
     first = np.array(shade.origin) + 0.5 * shade.step - start
     shift = to + matrix @ first - 0.5 - np.array([columns.start, rows.start])
     size = columns.stop - columns.start, rows.stop - rows.start
     transform = np.column_stack([matrix * shade.step, shift])
-    return np.asarray(cv2.warpAffine(cells, transform, size, flags=cv2.INTER_LINEAR), np.float32)
+    return np.asarray(cv2.warpAffine(cells, transform, size, flags=cv2.INTER_LINEAR, borderMode=border), np.float32)
 
 
 def reach(shade: Shade, matrix: Floats, to: Floats, start: Floats) -> tuple[Floats, Floats]:
