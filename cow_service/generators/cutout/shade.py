@@ -196,7 +196,7 @@ def _shadow(
     rim = ~known & (cv2.dilate(known.astype(np.uint8), kernel) > 0)
     seen = np.where(known[..., None], lost, np.float32(0))
     seen = np.where(rim[..., None], np.asarray(cv2.dilate(seen, kernel), np.float32), seen)
-    under = push_pull(np.asarray(seen, np.float32), known | rim) * ~border[..., None]
+    under = push_pull(np.asarray(seen, np.float32), known | rim) * (own * ~border)[..., None]
     return np.where(known[..., None], lost, under).astype(np.float32)
 
 
