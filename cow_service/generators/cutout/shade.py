@@ -101,11 +101,17 @@ def _measured(
     near, far = (share * side * scale for share in fade)
     dark = (dark * np.clip((far - away) / (far - near), 0, 1)[..., None]).astype(np.float32)
     step = (window[1].stop - window[1].start) / size[0]
-    seen = window_of(np.abs(dark).max(axis=2) > NO_SHADE, 1)
+    seen = window_of(strongest(dark) > NO_SHADE, 1)
     if seen is None:
         return None
     origin = x0 + seen[1].start * step, y0 + seen[0].start * step
     return Shade(dark[seen], lit[seen], texture, origin, step)
+
+
+def strongest(values: Floats32) -> Floats32:
+    """The largest of the three colours' values [h, w, 3]."""
+    red, green, blue = cv2.split(values)
+    return np.asarray(cv2.max(cv2.max(red, green), blue), np.float32)
 
 
 def _small(values: Floats32, size: tuple[int, int]) -> Floats32:
@@ -171,8 +177,7 @@ def _shadow(
 ) -> Floats32 | None:
     """The share of light taken away [h, w, 3] by the dark patches that touch the object; None without one."""
     grey = left @ np.full(3, 1 / 3, np.float32)
-    red, green, blue = cv2.split(left)
-    spread = cv2.max(cv2.max(red, green), blue) - cv2.min(cv2.min(red, green), blue)
+    spread = strongest(left) + strongest(-left)
     same_hue = (spread < SAME_HUE) & (grey > 1 - MOST_SHADE)
     least = max(LEAST_SHADE, 1.5 * texture)
     dark = np.where(known & same_hue, np.clip(1 - grey, 0, None) * own, away == 0).astype(np.float32)
