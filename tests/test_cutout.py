@@ -78,8 +78,8 @@ def test_the_mover_is_within_two_pixels_of_its_point() -> None:
 @settings(max_examples=15)
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_fractions_of_a_pixel_move_the_mover(dx: float, dy: float) -> None:
-    filmed = shot(ball(floor(320, 300), CENTRE, RADIUS, RED), line(2, dx, dy))
-    first, second = generator.render(filmed, [0, 1], ignore)
+    filmed = shot(ball(floor(320, 300), CENTRE, RADIUS, RED), [CENTRE, (165.0, 205.0), (165 + dx, 205 + dy)])
+    first, second = generator.render(filmed, [1, 2], ignore)
 
     def balance(frame) -> np.ndarray:
         weight = np.clip(frame[..., 0].astype(float) - frame[..., 1] - 40, 0, None)

@@ -16,7 +16,7 @@ from cow_service.vision.inpainting import push_pull
 from cow_service.vision.masks import window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
-WORKING_SIDE = 48.0  # px: the surroundings are measured at the size at which the object's longer side is so long
+WORKING_SIDE = 40.0  # px: the surroundings are measured at the size at which the object's longer side is so long
 SIDEWAYS, DOWN, UP = 1.0, 0.7, 0.2  # of the object's longer side: how far around its box a shadow is looked for
 TEXTURE = 3  # px at the working size, of a median filter: finer than this is the floor's texture, edges stay
 ROUNDS = 3  # of the floor's fit, each without what lay far from the one before
@@ -194,7 +194,7 @@ def _shadow(
     if reject_open and is_open and np.median(ends) > ALIKE * np.median(beside):
         return None
     share = np.clip(2 * reached / least - 1, 0, 1) * np.minimum(1, reached / np.maximum(dark, 1e-3)) * own
-    share = np.asarray(cv2.GaussianBlur(np.where(known, share, 1), (0, 0), 1.0), np.float32) * ~border
+    share = np.asarray(cv2.GaussianBlur(np.where(known, share, own), (0, 0), 1.0), np.float32) * ~border
     lost = np.clip(1 - left, -MOST_GIVEN, MOST_SHADE).astype(np.float32) * share[..., None]
     # Where nothing is known, under the object, the shadow goes on from its rim, where it is darkest.
     kernel = np.ones((CONTACT, CONTACT), np.uint8)
