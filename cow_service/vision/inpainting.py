@@ -24,8 +24,8 @@ LEAST_WEIGHT = 1e-3  # of a pyramid cell known: with less, the coarser level say
 FADE = 0.14  # of the hole's size: how far out its shadow is taken away
 FADE_MOST = 0.011  # of the image's longer side: and no further
 SHIFTS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))  # in sizes of the hole
-COARSE_SIDE = 128  # px: the crop is searched at this size
-TILE = 13  # px at the coarse size: what one patch fills
+COARSE_SIDE = 96  # px: the crop is searched at this size
+TILE = 9  # px at the coarse size: what one patch fills
 CONTEXT = 5  # px around a tile that must fit
 FEATHER = 3  # px over which patches overlap
 

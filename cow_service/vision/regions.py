@@ -8,7 +8,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from cow_service.records import BBox
 from cow_service.vision.colours import colour_name, colour_names
 from cow_service.vision.discs import as_disc
 from cow_service.vision.masks import CroppedMask, enlarged, iou, outline_of, scaled
+from cow_service.vision.tops import standing_on
 from cow_service.vision.types import Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
@@ -26,6 +27,7 @@ STRONG_CHROMA_STEP = 18.0  # Lab units from the surroundings: no wall or floor
 BRIGHT_STEP, BRIGHT_REACH = 5.0, 1.6  # Lab lightness above the surroundings: a top, and another lit face
 EDGE_THRESHOLDS = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median gradient; the larger counts
 SHARP_SHARE = 0.65  # of an outline that must lie on edges
+SHARP_TOP = 0.7  # of the outline of something bright, whose lit front is looked for
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
 MIN_AREA = 0.0004  # of the image
 MAX_AREA = 0.25
@@ -40,6 +42,8 @@ EDGE_BAND = 4.0  # px: half the width of an edge as it is measured
 MIN_REST = 0.05  # of a component: less is no part of its own
 OWN_WIDTH = 0.55  # of the broadest colour: black narrower than this is a neck or a wheel
 MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
+TOP_AREA = 0.3  # of a region: a larger one above it is another object, not what stands on it
+SAME_TOP = 0.6  # of a smaller region, taken up by what stands on another: it is no object of its own
 
 SURE_CONTRAST = 20.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
 SURE_AREA = 300.0  # px at the working size, from which the size takes nothing
@@ -89,6 +93,16 @@ class _View:
         return _View(self.lab[window], gap, bright, around, edges, self.median_edge, self.edge_threshold)
 
 
+@dataclass(frozen=True)
+class _Found:
+    """One object at the working size."""
+
+    mask: Mask  # [h, w]
+    lab: Floats32  # [N, 3]: the Lab colours of its pixels, as it was found
+    confidence: float
+    is_disc: bool
+
+
 def find_regions(image: Image) -> tuple[Region, ...]:
     """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
     height, width = image.shape[:2]
@@ -99,10 +113,11 @@ def find_regions(image: Image) -> tuple[Region, ...]:
         return ()
     solid = (core | _white_sides(view, core)).astype(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    border = np.pad(np.zeros((solid.shape[0] - 2, solid.shape[1] - 2), bool), 1, constant_values=True)
+    border = np.ones(solid.shape, bool)
+    border[1:-1, 1:-1] = False
     walls = border.copy()
     walls[-1, 1:-1] = False  # what the lower border cuts stands in front
-    regions: list[Region] = []
+    found: list[_Found] = []
     count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
     for i in range(1, count):
         if not MIN_AREA * solid.size <= stats[i][4] <= MAX_AREA * solid.size or _is_background(stats[i], solid.shape):
@@ -114,10 +129,11 @@ def find_regions(image: Image) -> tuple[Region, ...]:
                 continue
             disc = as_disc(part, near.edges, view.edge_threshold)
             if disc is not None or _is_sharp(near, part, view.edge_threshold):
-                whole = np.zeros(solid.shape, np.float32)
+                whole = np.zeros(solid.shape, bool)
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
-                regions.append(_region(near.lab[part], whole, (height, width), confidence, disc is not None))
+                found.append(_Found(whole, near.lab[part], confidence, disc is not None))
+    regions = [_region(one, (height, width)) for one in _with_tops(view, found)]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
@@ -212,11 +228,18 @@ def _white_sides(view: _View, core: Mask) -> Mask:
 
 
 def _lit_fronts(view: _View, white: Mask, labels: NDArray[np.int32], stats: NDArray[np.int32]) -> Mask:
-    """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide."""
+    """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide.
+
+    A top without a sharp outline is a shine on the floor.
+    """
+    nearby = cv2.dilate((view.edges > view.edge_threshold).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | white
     fronts = np.zeros(white.shape, bool)
     for top, (x, y, w, h, area) in enumerate(stats.tolist()):
         if top == 0 or area < 20 or not 0.2 * w < h < 0.8 * w:
+            continue
+        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
+        if float(np.mean(nearby[around][outline_of(labels[around] == top)])) < SHARP_TOP:
             continue
         window = slice(y, y + h + w), slice(x, x + w)
         _, blobs = cv2.connectedComponents(lit[window].astype(np.uint8), connectivity=4)
@@ -336,13 +359,35 @@ def _confidence(view: _View, part: Mask, border: Mask, is_disc: bool) -> float:
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
 
 
-def _region(lab: Floats32, part: Floats32, size: tuple[int, int], confidence: float, is_disc: bool) -> Region:
-    """A part [h, w] at the working size, with the Lab colours [N, 3] of its pixels, as a region of the image."""
-    mask = enlarged(np.asarray(cv2.GaussianBlur(part, (0, 0), MASK_SIGMA), np.float32), size)
-    chroma = np.hypot(lab[:, 1], lab[:, 2])
-    sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
+def _with_tops(view: _View, found: Sequence[_Found]) -> list[_Found]:
+    """Adds to each part what stands on it; smaller parts that are taken up by this are left out."""
+    edges = cv2.dilate((view.edges > view.edge_threshold).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    areas = [int(np.count_nonzero(one.mask)) for one in found]
+    kept = dict(enumerate(found))
+    for i in sorted(kept, key=lambda i: -areas[i]):
+        if i not in kept or found[i].is_disc:
+            continue
+        small = [j for j in kept if areas[j] < TOP_AREA * areas[i] and not found[j].is_disc]
+        taken = np.any([kept[j].mask for j in kept if j not in (i, *small)], axis=0) & np.True_
+        top = standing_on(found[i].mask, np.broadcast_to(taken, view.edges.shape), view.lab, edges)
+        if top is None:
+            continue
+        kept[i] = replace(found[i], mask=found[i].mask | top)
+        for j in small:
+            if np.count_nonzero(found[j].mask & top) > SAME_TOP * areas[j]:
+                del kept[j]
+    return list(kept.values())
+
+
+def _region(found: _Found, size: tuple[int, int]) -> Region:
+    """A part that was found, as a region of the image (height and width)."""
+    soft = np.asarray(cv2.GaussianBlur(found.mask.astype(np.float32), (0, 0), MASK_SIGMA), np.float32)
+    mask = enlarged(soft, size)
+    chroma = np.hypot(found.lab[:, 1], found.lab[:, 2])
+    sample = found.lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else found.lab
     seen = [float(v) for v in np.median(sample, axis=0)]
-    return Region(mask, colour_name(*seen), colour_names(*seen), _roundness(mask.patch), confidence, is_disc)
+    names = colour_name(*seen), colour_names(*seen)
+    return Region(mask, *names, _roundness(mask.patch), found.confidence, found.is_disc)
 
 
 def _roundness(mask: Mask) -> float:

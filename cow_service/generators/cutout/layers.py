@@ -37,6 +37,7 @@ class CutoutOptions(BaseModel):
 class Layers:
     """What is composed, at the clip's size."""
 
+    image: Image  # [h, w, 3]: the scene before anything moves
     background: Image  # [h, w, 3] without what moves and its shadows
     moving: tuple[MovingBody, ...]
     sprites: tuple[Sprite, ...]  # of the moving bodies
@@ -68,7 +69,7 @@ def take_apart(given: GeneratorInput) -> Layers:
         shape = None if ground is None else ground.bodies[body.path.body].shape
         start = (factor * float(body.start[0]), factor * float(body.start[1]))
         sprites.append(cut(image, body.mask, hidden, start, shape))
-    return Layers(background, moving, tuple(sprites), lit.shadows, still, eye, factor)
+    return Layers(image, background, moving, tuple(sprites), lit.shadows, still, eye, factor)
 
 
 def _hidden(body: MovingBody, moving: tuple[MovingBody, ...], still: tuple[StillBody, ...], eye: float) -> Mask | None:
