@@ -118,14 +118,18 @@ def _displaced(path: Path) -> float:
 
 
 def _across(path: Path) -> float:
-    """The furthest that it gets to the side or in depth, m."""
-    x, _, z = path.states[0][:3]
-    return max(math.hypot(state[0] - x, state[2] - z) for state in path.states)
+    """How far it gets to the side as it sets out, m: later it may bounce off what it meets."""
+    return abs(path.states[_set_out(path)][0] - path.states[0][0])
+
+
+def _set_out(path: Path) -> int:
+    """The frame by which it has set out."""
+    return max(1, len(path.states) // 10)
 
 
 def _direction(path: Path) -> str:
     """The way that it sets out: later it may bounce off what it meets."""
-    first, then = path.states[0], path.states[max(1, len(path.states) // 10)]
+    first, then = path.states[0], path.states[_set_out(path)]
     x, y, z = (then[axis] - first[axis] for axis in range(3))
     away = math.hypot(y, z)  # a floor that is looked down on rises in the image as it leads away
     if abs(x) >= SIDEWAYS * away:
