@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import all_scenes, example
-from drawn import ball, block, floor, jpeg
+from drawn import Image, ball, block, floor, jpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,6 +36,43 @@ def test_a_ball_of_any_colour_is_found_and_named(colour: str) -> None:
     assert [region.colour for region in regions] == [colour]
     assert iou(regions[0].bbox, (255, 135, 345, 225)) > 0.8
     assert regions[0].roundness > 0.75
+
+
+TALL = {  # what stands on a blue body: (half width at its foot, half width at its end, RGB)
+    "flame": (5, 1, (172, 152, 122)),
+    "neck": (6, 6, (18, 18, 18)),
+    "bright handle": (4, 4, (235, 235, 235)),
+}
+
+
+def with_top(image: Image, foot: int, end: int, rgb: tuple[int, int, int], middle: int = 300) -> Image:
+    corners = np.array([[middle - foot, 202], [middle + foot, 202], [middle + end, 170], [middle - end, 170]], np.int32)
+    cv2.fillPoly(image, [corners], rgb, cv2.LINE_AA)
+    return image
+
+
+@pytest.mark.parametrize("quality", [75, 95])
+@pytest.mark.parametrize("top", sorted(TALL))
+def test_what_stands_in_the_middle_of_the_upper_edge_belongs_to_the_object(top: str, quality: int) -> None:
+    body = block(floor(), (270, 200, 330, 290), RGB["blue"])
+    regions = find_regions(jpeg(with_top(body, *TALL[top]), quality))
+    assert len(regions) == 1
+    assert regions[0].colour == "blue"
+    assert iou(regions[0].bbox, (270, 170, 330, 290)) > 0.9
+
+
+def test_what_is_only_seen_above_the_upper_edge_is_not_added() -> None:
+    wall = floor()
+    wall[:190] = (wall[:190] * 0.8).astype(np.uint8)  # the line of a wall right above
+    pole = block(floor(), (295, 60, 305, 290), RGB["white"])  # goes on
+    shade = floor()
+    blurred = cv2.GaussianBlur(block(np.zeros_like(shade), (292, 170, 308, 240), (255, 255, 255)), (0, 0), 3) / 255
+    shade = (shade * (1 - 0.25 * blurred)).astype(np.uint8)
+    beside = with_top(floor(), *TALL["flame"], middle=322)
+    for behind in (wall, pole, shade, beside):
+        regions = find_regions(jpeg(block(behind, (270, 200, 330, 290), RGB["blue"])))
+        blue = next(region for region in regions if region.colour == "blue")
+        assert blue.bbox[1] > 194
 
 
 def test_touching_objects_of_two_colours_are_two() -> None:

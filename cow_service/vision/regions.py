@@ -20,12 +20,11 @@ from cow_service.vision.discs import as_disc
 from cow_service.vision.masks import CroppedMask, enlarged, iou, outline_of, scaled
 from cow_service.vision.tops import standing_on
 from cow_service.vision.types import Floats32, Image, Mask
+from cow_service.vision.view import EDGE_THRESHOLDS, View, view_of
 
 WORKING_SIDE = 512  # px: images are searched at this size
 CHROMA_STEP = 9.0  # Lab units from the surroundings
-STRONG_CHROMA_STEP = 18.0  # Lab units from the surroundings: no wall or floor
 BRIGHT_STEP, BRIGHT_REACH = 5.0, 1.6  # Lab lightness above the surroundings: a top, and another lit face
-EDGE_THRESHOLDS = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median gradient; the larger counts
 SHARP_SHARE = 0.65  # of an outline that must lie on edges
 SHARP_TOP = 0.7  # of the outline of something bright, whose lit front is looked for
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
@@ -74,26 +73,6 @@ class Region:
 
 
 @dataclass(frozen=True)
-class _View:
-    """The image at the working size, against its surroundings."""
-
-    lab: Floats32  # [h, w, 3] CIE Lab
-    chroma_gap: Floats32  # distance from the surroundings in the a*b* plane
-    bright: Floats32  # lightness above the surroundings
-    around: Floats32  # lightness of the surroundings
-    edges: Floats32  # Lab gradient per px
-    median_edge: float  # of the whole image
-    edge_threshold: float  # gradient from which the outline of an object may lie on it
-
-    def crop(self, window: tuple[slice, slice]) -> _View:
-        """The same measurements for a part of the image."""
-        gap, bright, around, edges = (
-            layer[window] for layer in (self.chroma_gap, self.bright, self.around, self.edges)
-        )
-        return _View(self.lab[window], gap, bright, around, edges, self.median_edge, self.edge_threshold)
-
-
-@dataclass(frozen=True)
 class _Found:
     """One object at the working size."""
 
@@ -107,7 +86,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
-    view = _view(scaled(image, scale))
+    view = view_of(scaled(image, scale))
     core = _core(view)
     if core.mean() > CLUTTER:
         return ()
@@ -143,46 +122,6 @@ def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
     return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT_IOU else None
 
 
-def _view(small: Image) -> _View:
-    """Measures every pixel against a median over half the image around it."""
-    smooth = cv2.bilateralFilter(small, 5, 25, 5)
-    lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
-    coarse = scaled(np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.uint8), 0.25)
-    size = small.shape[1], small.shape[0]
-    around = cv2.resize(_surroundings(coarse), size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
-    around_l: Floats32 = np.divide(around[..., 0], 2.55, dtype=np.float32)
-    gap = np.hypot(lab[..., 1] - (around[..., 1] - 128), lab[..., 2] - (around[..., 2] - 128))
-    blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
-    dx, dy = cv2.Sobel(blurred, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(blurred, cv2.CV_32F, 0, 1) / 8
-    edges = np.sqrt((dx * dx + dy * dy).sum(axis=2))
-    median_edge = float(np.median(edges))
-    edge_threshold = max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * median_edge)
-    return _View(lab, gap, lab[..., 0] - around_l, around_l, edges, median_edge, edge_threshold)
-
-
-def _surroundings(coarse: Image) -> Image:
-    """The median over half the image around every pixel of an 8-bit Lab image [h, w, 3], strong colours left out.
-
-    What is left out is seen in a first pass; without this a large object would count as its own surroundings.
-    """
-    first = _wide_median(coarse)
-    off = np.hypot(*np.moveaxis(coarse[..., 1:].astype(np.float32) - first[..., 1:], 2, 0))
-    plain = (cv2.dilate((off > STRONG_CHROMA_STEP).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0).astype(np.float32)
-    if plain.all() or plain.mean() < 0.5:
-        return first
-    side = (min(coarse.shape[:2]),) * 2
-    filled = cv2.blur(coarse * plain[..., None], side) / np.maximum(cv2.blur(plain, side)[..., None], 1e-3)
-    return _wide_median(np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8))
-
-
-def _wide_median(coarse: Image) -> Image:
-    side = int(0.5 * min(coarse.shape[:2])) | 1
-    pad = side // 2
-    padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)
-    median = cv2.medianBlur(padded, side)[pad : pad + coarse.shape[0], pad : pad + coarse.shape[1]]
-    return np.asarray(median, np.uint8)
-
-
 def _window(stats: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of a component with a little around it."""
     x, y, w, h = (int(v) for v in stats[:4])
@@ -190,14 +129,14 @@ def _window(stats: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[slice, sl
     return slice(max(0, y - pad), min(shape[0], y + h + pad)), slice(max(0, x - pad), min(shape[1], x + w + pad))
 
 
-def _core(view: _View) -> Mask:
+def _core(view: View) -> Mask:
     """Pixels that are surely of an object: another hue, clearly brighter, or nearly black."""
     black = (view.lab[..., 0] < BLACK_SHARE * view.around).astype(np.uint8)
     solid_black = cv2.morphologyEx(black, cv2.MORPH_OPEN, _DISC) > 0  # a contact shadow is a thin strip
     return (view.chroma_gap > CHROMA_STEP) | (view.bright > BRIGHT_STEP) | solid_black
 
 
-def _white_sides(view: _View, core: Mask) -> Mask:
+def _white_sides(view: View, core: Mask) -> Mask:
     """Patches enclosed by edges at a bright neutral top: the other faces of something white, lit or in shade."""
     neutral = (np.hypot(view.lab[..., 1], view.lab[..., 2]) < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
     white = (core & (view.bright > BRIGHT_STEP) & neutral).astype(np.uint8)
@@ -227,7 +166,7 @@ def _white_sides(view: _View, core: Mask) -> Mask:
     return sides
 
 
-def _lit_fronts(view: _View, white: Mask, labels: NDArray[np.int32], stats: NDArray[np.int32]) -> Mask:
+def _lit_fronts(view: View, white: Mask, labels: NDArray[np.int32], stats: NDArray[np.int32]) -> Mask:
     """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide.
 
     A top without a sharp outline is a shine on the floor.
@@ -248,7 +187,7 @@ def _lit_fronts(view: _View, white: Mask, labels: NDArray[np.int32], stats: NDAr
     return fronts
 
 
-def _is_sharp(view: _View, part: Mask, edge_threshold: float) -> bool:
+def _is_sharp(view: View, part: Mask, edge_threshold: float) -> bool:
     """Whether the outline of a part lies on edges, as an object's does and a patch of light does not."""
     nearby = cv2.dilate(view.edges, np.ones((5, 5), np.uint8))
     return float(np.mean(nearby[outline_of(part)] > edge_threshold)) > SHARP_SHARE
@@ -265,7 +204,7 @@ def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
     return spans or sliver or (on_side and (on_top or on_bottom))
 
 
-def _is_wall(view: _View, part: Mask, border: Mask) -> bool:
+def _is_wall(view: View, part: Mask, border: Mask) -> bool:
     """Whether a pale part runs along the image's border for much of its own length, as a strip of wall does."""
     along = part & border
     if not along.any() or float(np.median(view.bright[part])) <= 0:
@@ -277,7 +216,7 @@ def _is_wall(view: _View, part: Mask, border: Mask) -> bool:
     return bool(np.ptp(edge_columns) > ALONG_BORDER * wide or np.ptp(edge_rows) > ALONG_BORDER * high)
 
 
-def _balls(view: _View, component: Mask) -> Iterator[Mask]:
+def _balls(view: View, component: Mask) -> Iterator[Mask]:
     """Discs among the pale patches between the edges of a component: white balls before or on something white."""
     pale = component & (view.chroma_gap < CHROMA_STEP) & (view.bright > -12)
     taken = np.zeros(component.shape, bool)
@@ -290,14 +229,14 @@ def _balls(view: _View, component: Mask) -> Iterator[Mask]:
                 yield disc
 
 
-def _parts(view: _View, component: Mask) -> list[Mask]:
+def _parts(view: View, component: Mask) -> list[Mask]:
     """Splits a component into white balls and by colour; wheels, necks and lights stay with what they sit on."""
     balls = list(_balls(view, component))
     rest = component & ~np.any(balls, axis=0) if balls else component
     return balls + [part for blob in _blobs(rest, MIN_REST * component.sum()) for part in _coloured_parts(view, blob)]
 
 
-def _coloured_parts(view: _View, component: Mask) -> list[Mask]:
+def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     area = int(component.sum())
     lab = view.lab
     chroma = np.hypot(lab[..., 1], lab[..., 2])
@@ -341,7 +280,7 @@ def _blobs(mask: Mask, least: float) -> list[Mask]:
     return [labels == i for i in range(1, count) if stats[i][4] >= max(least, 12)]
 
 
-def _confidence(view: _View, part: Mask, border: Mask, is_disc: bool) -> float:
+def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     """How sure it is that a part is one separable thing with this outline: a product of four shares, each 0..1.
 
     Edges: the share of its outline, image border aside, that lies on edges; a disc was fitted to them. Contrast: its
@@ -359,7 +298,7 @@ def _confidence(view: _View, part: Mask, border: Mask, is_disc: bool) -> float:
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
 
 
-def _with_tops(view: _View, found: Sequence[_Found]) -> list[_Found]:
+def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
     """Adds to each part what stands on it; smaller parts that are taken up by this are left out."""
     edges = cv2.dilate((view.edges > view.edge_threshold).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     areas = [int(np.count_nonzero(one.mask)) for one in found]
@@ -368,8 +307,11 @@ def _with_tops(view: _View, found: Sequence[_Found]) -> list[_Found]:
         if i not in kept or found[i].is_disc:
             continue
         small = [j for j in kept if areas[j] < TOP_AREA * areas[i] and not found[j].is_disc]
-        taken = np.any([kept[j].mask for j in kept if j not in (i, *small)], axis=0) & np.True_
-        top = standing_on(found[i].mask, np.broadcast_to(taken, view.edges.shape), view.lab, edges)
+        taken = np.zeros(edges.shape, bool)
+        for j, other in kept.items():
+            if j != i and j not in small:
+                taken |= other.mask
+        top = standing_on(found[i].mask, taken, view.lab, edges)
         if top is None:
             continue
         kept[i] = replace(found[i], mask=found[i].mask | top)

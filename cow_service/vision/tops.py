@@ -12,16 +12,18 @@ import numpy as np
 from cow_service.vision.masks import outline_of, window_of
 from cow_service.vision.types import Floats32, Mask
 
-STEP, CLEAR_STEP = 2.5, 4.0  # Lab units from both sides: of every pixel, and in the median
+WEIGHTS = np.array([1.0, 0.5, 0.5], np.float32)  # of L, a and b in a step: compression spreads colour, not lightness
+STEP, CLEAR_STEP = 2.0, 4.0  # Lab units from both sides: of every pixel, and in the median
 BLUR = 0.25  # of the largest steps: less is the blur of an edge
 SIDE = 0.5  # of the object's width: how far away the sides are looked at, and the width of what is searched
 LEAST_SIDE = 5  # px at the working size
 UPPER_ROWS = 0.15  # of the object's height: where its middle is taken
 OFF_MIDDLE = 0.15  # of the object's width, by which it may stand beside that middle
 SUNK = 0.25  # of the object's height: so far below the object's upper end its foot may lie
-LEAST_HEIGHT, MOST_HEIGHT = 4, 0.6  # px at the working size: less is blur; of the object's height: more is no part
+LEAST_HEIGHT, MOST_HEIGHT = 3, 0.6  # px at the working size: less is blur; of the object's height: more is no part
 SHARP = 0.6  # share of its outline that lies on edges
-SHADE_HUE, SHADE_DEPTH = 4.0, 0.6  # Lab units in the a*b* plane, and of the sides' lightness: within both is a shadow
+SHADE_HUE = 2.5  # Lab units in the a*b* plane: more is another colour, not a shadow
+DARK, SHADE_DEPTH = 20, 0.65  # the percentile of its lightness that counts, and of the sides' lightness: less is black
 
 
 def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | None:
@@ -40,7 +42,7 @@ def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | N
     if left < side or right + side > part.shape[1] or above < LEAST_HEIGHT:
         return None
     strip, *sides = (np.s_[top:bottom, left + shift : right + shift] for shift in (0, -side, side))
-    steps = np.min([np.linalg.norm(lab[strip] - lab[beside], axis=2) for beside in sides], axis=0)
+    steps = np.min([np.linalg.norm((lab[strip] - lab[beside]) * WEIGHTS, axis=2) for beside in sides], axis=0)
     free = [~(part[area] | taken[area]) for area in (strip, *sides)]
     differs = (steps > STEP) & np.all(free, axis=0)
     if differs.any():
@@ -51,7 +53,7 @@ def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | N
     seen = _above_rim(found[:above])
     if seen is None or abs(float(np.nonzero(seen)[1].mean()) + left - middle) > OFF_MIDDLE * width:
         return None
-    found &= cv2.dilate(seen.any(axis=0).astype(np.uint8)[None], np.ones((1, 3), np.uint8)) > 0
+    found &= cv2.dilate(np.any(seen, axis=0, keepdims=True).astype(np.uint8), np.ones((1, 3), np.uint8)) > 0
     if np.median(steps[found]) < CLEAR_STEP:
         return None
     colours = [lab[area][: len(seen)][seen] for area in (strip, *sides)]
@@ -84,7 +86,9 @@ def _above_rim(found: Mask) -> Mask | None:
 
 
 def _is_shadow(seen: Floats32, *sides: Floats32) -> bool:
-    """Whether Lab colours [N, 3] are those of the sides [N, 3], only darker."""
-    change = np.median(seen - np.mean(sides, axis=0), axis=0)
-    depth = float(np.median(seen[:, 0])) / max(1.0, float(np.median(sides, axis=(0, 1))[0]))
-    return float(change[0]) < 0 and float(np.hypot(change[1], change[2])) < SHADE_HUE and depth > SHADE_DEPTH
+    """Whether Lab colours [N, 3] are those of the sides [N, 3], all three darkened by the same share."""
+    floor = np.median(np.concatenate(sides), axis=0)
+    lightness, *hue = np.median(seen, axis=0)
+    share = float(lightness) / max(1.0, float(floor[0]))
+    darkest = float(np.percentile(seen[:, 0], DARK)) / max(1.0, float(floor[0]))
+    return share < 1 and darkest > SHADE_DEPTH and float(np.hypot(*(hue - share * floor[1:]))) < SHADE_HUE
