@@ -139,7 +139,6 @@ def _direction(path: Path) -> str:
     return "away from the camera" if z > 0 else "towards the camera"
 
 
-
 def _tips(path: Path) -> bool:
     return any(abs(angle) >= TIPPED for angle in path.rotation)
 
