@@ -197,7 +197,9 @@ def _end(trajectory: Trajectory) -> list[str]:
     if until is None or _displaced(trajectory.path) < MOVED:
         return []
     last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1)
-    return [f"comes to rest after {until:.1f} s" if trajectory.path.visible[last] else "leaves the image"]
+    if not trajectory.path.visible[last]:
+        return ["leaves the image"]
+    return [f"comes to rest after {until:.1f} s"] if last < trajectory.num_frames - 1 else []
 
 
 def _agreement(trajectory: Trajectory, met: Sequence[Encounter]) -> float | None:
