@@ -9,6 +9,7 @@ import numpy as np
 from cow_service.physics.world import Worlds
 from cow_service.vision.types import Floats, Mask
 
+MOST_LEAN = np.radians(25)
 PASSED = 0.08  # of its first depth: closer than this, a body has passed the camera
 
 
@@ -55,9 +56,9 @@ def rotation(worlds: Worlds, body: int) -> Floats:
     leaning, plumb = (
         np.unwrap(_lean(worlds, run.positions[body], axis)) for axis in (_turned(turns, upright[0]), upright)
     )
-    # Verticals lean in the image as they come to its side: that is no turn of the body.
     angle = np.unwrap(leaning - plumb)
-    return np.degrees(angle - angle[0])
+    # Verticals lean in the image as they come to its side; close to the camera they lean without bounds.
+    return np.degrees(angle - angle[0] + np.clip(plumb - plumb[0], -MOST_LEAN, MOST_LEAN))
 
 
 def _lean(worlds: Worlds, positions: Floats, axis: Floats) -> Floats:
