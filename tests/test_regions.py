@@ -192,3 +192,31 @@ def test_obstacles_are_named_by_the_question_first() -> None:
     cube = next(region.bbox for region in scene.regions if region.colour == "blue")
     obstacles = scene.obstacles(mover, (LocatedObject(object="big blue cube", bbox=cube),))
     assert sorted(obstacle.name for obstacle in obstacles) == ["big blue cube", "green object"]
+
+
+def test_a_white_ball_is_whole_though_its_lower_part_is_as_dark_as_the_floor() -> None:
+    image = floor(grey=128)
+    image = np.clip(image * np.array([1.08, 1.0, 0.88]), 0, 255).astype(np.uint8)  # a floor of another hue
+    ys, xs = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    shade = np.clip(215 - 2.6 * np.maximum(0, ys - 180), 90, 215)
+    inside = np.hypot(xs - 300, ys - 200) <= 40
+    image = np.where(inside[..., None], shade[..., None], image).astype(np.uint8)
+    regions = find_regions(jpeg(image, 90))
+    assert [region.is_disc for region in regions] == [True]
+    assert iou(regions[0].bbox, (260, 160, 340, 240)) > 0.85
+
+
+def white_vase(neck: int | None) -> Image:
+    """A bright mouth and body; between them a neck of this grey, or the floor."""
+    image = floor(grey=140)
+    if neck is not None:
+        corners = np.array([[260, 150], [340, 150], [318, 200], [282, 200]], np.int32)
+        cv2.fillPoly(image, [corners], (neck, neck, neck), cv2.LINE_AA)
+    cv2.ellipse(image, (300, 150), (40, 10), 0, 0, 360, (225, 225, 225), -1, cv2.LINE_AA)
+    return ball(image, (300, 235), 38, (225, 225, 225))
+
+
+def test_the_mouth_and_the_body_of_a_white_vase_are_one_unless_the_floor_is_seen_between() -> None:
+    (whole,) = find_regions(jpeg(white_vase(134), 90))
+    assert iou(whole.bbox, (260, 140, 340, 273)) > 0.9
+    assert len(find_regions(jpeg(white_vase(None), 90))) == 2

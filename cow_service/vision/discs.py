@@ -20,6 +20,7 @@ RAY = (-0.3, 0.2)  # of the radius: how far inside and outside the circle a ray 
 RAY_ERROR = (1.0, 0.03)  # px, and of the radius: how near the circle its strongest edge must lie; the larger counts
 ON_EDGES = 0.8  # share of the circle
 FILLED, SPILLED = 0.72, 0.14  # share of the disc that the region fills; share of the region outside it
+CAP_FILLED, CAP_RAYS = 0.55, 0.9  # the same share where so many rays are strongest on the circle: a ball's lit cap
 BLED = 2.5  # px by which compression may have spread a colour beyond its outline
 SAMPLES = 72  # points tried on the circle
 LEAST_RADIUS = 5.0  # px
@@ -55,7 +56,8 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
     ys, xs = np.mgrid[:height, :width]
     disc = np.hypot(xs - x, ys - y) <= radius + 0.5
     both = (disc & part).sum()
-    return disc if both > FILLED * disc.sum() and both > (1 - SPILLED) * part.sum() else None
+    filled = CAP_FILLED if sharpest > CAP_RAYS else FILLED
+    return disc if both > filled * disc.sum() and both > (1 - SPILLED) * part.sum() else None
 
 
 def _radius_on_edges(edges: Floats32, x: float, y: float, radius: float, grow: float) -> float:

@@ -7,6 +7,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,19 +19,17 @@ from cow_service.records import BBox
 from cow_service.vision.colours import colour_name, colour_names
 from cow_service.vision.discs import as_disc
 from cow_service.vision.masks import CroppedMask, enlarged, iou, outline_of, scaled
+from cow_service.vision.mouths import neck_between
 from cow_service.vision.tops import standing_on
 from cow_service.vision.types import Floats32, Image, Mask
-from cow_service.vision.view import EDGE_THRESHOLDS, View, view_of
+from cow_service.vision.view import BRIGHT_STEP, CHROMA_STEP, View, view_of
+from cow_service.vision.whites import white_sides
 
 WORKING_SIDE = 512  # px: images are searched at this size
-CHROMA_STEP = 9.0  # Lab units from the surroundings
-BRIGHT_STEP, BRIGHT_REACH = 5.0, 1.6  # Lab lightness above the surroundings: a top, and another lit face
 SHARP_SHARE = 0.65  # of an outline that must lie on edges
-SHARP_TOP = 0.7  # of the outline of something bright, whose lit front is looked for
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
 MIN_AREA = 0.0004  # of the image
 MAX_AREA = 0.25
-MAX_SIDE = 0.1  # of the image: one shaded side of something white
 ALONG_BORDER = 0.5  # of the height or width of something bright and pale that runs along the image's border: a wall
 SAME_OBJECT_IOU = 0.5  # intersection over union from which a region is the object of a box
 MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
@@ -90,7 +89,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     core = _core(view)
     if core.mean() > CLUTTER:
         return ()
-    solid = (core | _white_sides(view, core)).astype(np.uint8)
+    solid = (core | white_sides(view, core)).astype(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     border = np.ones(solid.shape, bool)
     border[1:-1, 1:-1] = False
@@ -112,7 +111,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
                 found.append(_Found(whole, near.lab[part], confidence, disc is not None))
-    regions = [_region(one, (height, width)) for one in _with_tops(view, found)]
+    regions = [_region(one, (height, width)) for one in _with_tops(view, _with_mouths(view, found))]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
@@ -134,57 +133,6 @@ def _core(view: View) -> Mask:
     black = (view.lab[..., 0] < BLACK_SHARE * view.around).astype(np.uint8)
     solid_black = cv2.morphologyEx(black, cv2.MORPH_OPEN, _DISC) > 0  # a contact shadow is a thin strip
     return (view.chroma_gap > CHROMA_STEP) | (view.bright > BRIGHT_STEP) | solid_black
-
-
-def _white_sides(view: View, core: Mask) -> Mask:
-    """Patches enclosed by edges at a bright neutral top: the other faces of something white, lit or in shade."""
-    neutral = (np.hypot(view.lab[..., 1], view.lab[..., 2]) < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
-    white = (core & (view.bright > BRIGHT_STEP) & neutral).astype(np.uint8)
-    _, top_labels, top_stats, _ = cv2.connectedComponentsWithStats(white, connectivity=8)
-    sides = _lit_fronts(view, white > 0, np.asarray(top_labels, np.int32), np.asarray(top_stats, np.int32))
-    height, width = core.shape
-    kernel = np.ones((3, 3), np.uint8)
-    for floor, factor in EDGE_THRESHOLDS:
-        edge_threshold = max(floor, factor * view.median_edge)
-        edges = cv2.morphologyEx((view.edges > edge_threshold).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
-        for i in range(1, count):
-            x, y, w, h, area = (int(v) for v in stats[i])
-            if area < 12 or area > MAX_SIDE * core.size or x == 0 or y == 0 or x + w == width or y + h == height:
-                continue
-            near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
-            patch = (labels[near] == i).astype(np.uint8)
-            touched = np.unique(top_labels[near][cv2.dilate(patch, kernel, iterations=4) > 0])
-            touched = touched[touched > 0]
-            lit = len(touched) > 0 and float(np.median(view.bright[near][patch > 0])) > BRIGHT_REACH
-            for top in touched:
-                tx, ty, tw, _, top_area = (int(v) for v in top_stats[top])
-                overlap = min(x + w, tx + tw + 3) - max(x, tx - 3)
-                hangs = overlap > 0.7 * w and y >= ty
-                if top_area >= 20 and area < 12 * top_area and (lit or hangs):
-                    sides[near] |= cv2.dilate(patch, kernel, iterations=2) > 0
-    return sides
-
-
-def _lit_fronts(view: View, white: Mask, labels: NDArray[np.int32], stats: NDArray[np.int32]) -> Mask:
-    """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide.
-
-    A top without a sharp outline is a shine on the floor.
-    """
-    nearby = cv2.dilate((view.edges > view.edge_threshold).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | white
-    fronts = np.zeros(white.shape, bool)
-    for top, (x, y, w, h, area) in enumerate(stats.tolist()):
-        if top == 0 or area < 20 or not 0.2 * w < h < 0.8 * w:
-            continue
-        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
-        if float(np.mean(nearby[around][outline_of(labels[around] == top)])) < SHARP_TOP:
-            continue
-        window = slice(y, y + h + w), slice(x, x + w)
-        _, blobs = cv2.connectedComponents(lit[window].astype(np.uint8), connectivity=4)
-        joined = np.unique(blobs[labels[window] == top])
-        fronts[window] |= np.isin(blobs, joined[joined > 0])
-    return fronts
 
 
 def _is_sharp(view: View, part: Mask, edge_threshold: float) -> bool:
@@ -218,7 +166,8 @@ def _is_wall(view: View, part: Mask, border: Mask) -> bool:
 
 def _balls(view: View, component: Mask) -> Iterator[Mask]:
     """Discs among the pale patches between the edges of a component: white balls before or on something white."""
-    pale = component & (view.chroma_gap < CHROMA_STEP) & (view.bright > -12)
+    neutral = np.hypot(view.lab[..., 1], view.lab[..., 2]) < CHROMA_STEP
+    pale = component & ((view.chroma_gap < CHROMA_STEP) | neutral) & (view.bright > -12)
     taken = np.zeros(component.shape, bool)
     for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
         for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
@@ -232,8 +181,10 @@ def _balls(view: View, component: Mask) -> Iterator[Mask]:
 def _parts(view: View, component: Mask) -> list[Mask]:
     """Splits a component into white balls and by colour; wheels, necks and lights stay with what they sit on."""
     balls = list(_balls(view, component))
-    rest = component & ~np.any(balls, axis=0) if balls else component
-    return balls + [part for blob in _blobs(rest, MIN_REST * component.sum()) for part in _coloured_parts(view, blob)]
+    rest = _blobs(component & ~np.any(balls, axis=0) if balls else component, MIN_REST * component.sum())
+    if balls:  # what is left along the edge of a ball is blur
+        rest = [blob for blob in rest if _half_width(blob) > EDGE_BAND]
+    return balls + [part for blob in rest for part in _coloured_parts(view, blob)]
 
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
@@ -296,6 +247,18 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
     edges = max(sharp, 0.9) if is_disc else sharp
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
+
+
+def _with_mouths(view: View, found: Sequence[_Found]) -> list[_Found]:
+    """Joins the mouth of something white with its body."""
+    pale = [one for one in found if float(np.median(np.hypot(one.lab[:, 1], one.lab[:, 2]))) < CHROMA_STEP]
+    for mouth, body in itertools.permutations(pale, 2):
+        neck = None if mouth.is_disc else neck_between(mouth.mask, body.mask, view.lab)
+        if neck is not None:
+            lab = np.concatenate([mouth.lab, body.lab])
+            whole = _Found(mouth.mask | neck | body.mask, lab, min(mouth.confidence, body.confidence), False)
+            return _with_mouths(view, [whole, *(one for one in found if one is not mouth and one is not body)])
+    return list(found)
 
 
 def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:

@@ -10,6 +10,8 @@ import numpy as np
 from cow_service.vision.masks import scaled
 from cow_service.vision.types import Floats32, Image
 
+CHROMA_STEP = 9.0  # Lab units from the surroundings: an object
+BRIGHT_STEP = 5.0  # Lab lightness above the surroundings: an object
 STRONG_CHROMA_STEP = 18.0  # Lab units from the surroundings: no wall or floor
 EDGE_THRESHOLDS = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median gradient; the larger counts
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cow_service.errors import CannotGround
+from cow_service.readers.embedded.outlines import clearest
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.records import BBox
 from cow_service.vision.regions import Region
@@ -24,7 +25,10 @@ WHOLE = 0.7  # share of a region that must lie inside a drawn box to be the thin
 
 
 def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase] = ()) -> list[Region]:
-    """Regions that fit a phrase, all equally well; those that the other phrases claim by colour are left out."""
+    """Regions that fit a phrase, all equally well; those that the other phrases claim by colour are left out.
+
+    Where several fit, and the outline of one is clearly the noun's, that one is taken.
+    """
     possible = [region for region in regions if _can_be(region, phrase)]
     if phrase.colour is None:
         claimed = {other.colour for other in others if other.colour is not None}
@@ -34,7 +38,9 @@ def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequen
         exact = [region for region in possible if region.colour == phrase.colour]
         near = [region for region in possible if phrase.colour in region.colours and region.colour not in claimed]
         fitting = exact or [region for region in near if _looks_like(region, phrase)]
-    return [region for region in fitting if _looks_like(region, phrase)] or fitting
+    fitting = [region for region in fitting if _looks_like(region, phrase)] or fitting
+    clear = clearest(fitting, phrase.head)
+    return fitting if clear is None else [clear]
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:
