@@ -5,10 +5,13 @@ Places are metres right of the camera, above the floor and ahead.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cow_service.physics.camera_fit import CameraFit
 
 Floats = NDArray[np.float64]
 Box = tuple[float, float, float, float]
@@ -38,6 +41,20 @@ class TrueCamera:
         """Image points [N, 2] (px)."""
         position = self.positions(places)
         return position[:, :2] * self.focal / position[:, 2:] + np.array(self.size) / 2
+
+    def on_floor(self, point: tuple[float, float]) -> tuple[float, float] | None:
+        """Where on the floor (right, ahead) an image point (px) lies; None above the horizon and far away."""
+        u, v = (np.array(point) - np.array(self.size) / 2) / self.focal
+        roll, pitch = np.radians(self.roll), np.radians(self.pitch)
+        right, down = u * np.cos(roll) - v * np.sin(roll), u * np.sin(roll) + v * np.cos(roll)
+        sink, ahead = down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - down * np.sin(pitch)
+        if sink < 0.12:
+            return None
+        return float(right / sink * self.height), float(ahead / sink * self.height)
+
+    def away(self, place: tuple[float, float]) -> float:
+        """Distance (m) of a place on the floor from the camera."""
+        return math.hypot(*place, self.height)
 
     def box(self, places: Floats) -> Box:
         """The box (px) around the image of places."""
@@ -71,3 +88,10 @@ def outline(shape: str, foot: tuple[float, float], half_width: float, height: fl
     top = np.array([foot]) if shape == "cone" else rim
     raised = [np.column_stack([ring[:, 0], np.full(len(ring), h), ring[:, 1]]) for ring, h in ((rim, 0), (top, height))]
     return np.concatenate(raised)
+
+
+def known(camera: TrueCamera, deviation: float = 1e-8) -> CameraFit:
+    """What a fit says that knows a camera; of the height above the floor and the light it knows nothing."""
+    mean = np.array([math.radians(camera.pitch), math.log(camera.focal / camera.size[0]), math.log(5), 0.0, 0.1])
+    sigma = np.array([deviation, deviation, 0.6, 0.5, 0.45])
+    return CameraFit(mean, np.diag(sigma**2), math.radians(camera.roll), 0.0, "prior")

@@ -49,7 +49,7 @@ from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, ObjectR
 __all__ = ["connect"]  # a fixture
 
 PHOTO = EXAMPLES / "ball-and-mug" / "image.jpg"
-ASKED = "If the yellow ball moves to the right, will it hit the blue mug? (A) Yes (B) No"
+ASKED = "If the yellow ball moves to the left, will it hit the blue mug? (A) Yes (B) No"
 GIVEN: dict[str, Any] = {"grounding": {"point": [60, 80]}, "motion": {"direction": [1, 0]}}
 SMALL: dict[str, Any] = {**GIVEN, "num_frames": 5, "video": False, "frames": {"count": 1}}
 

@@ -32,7 +32,7 @@ PAIRS = [
 SPECIAL = {"__init__", "__enter__", "__exit__", "__aenter__", "__aexit__", "__repr__", "_repr_html_", "_repr_png_"}
 PHOTO = EXAMPLES / "ball-and-mug" / "image.jpg"
 ARROW = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug? (A) Yes (B) No"
-RIGHT = "If the yellow ball moves to the right, will it hit the blue mug? (A) Yes (B) No"
+RIGHT = "If the yellow ball moves to the left, will it hit the blue mug? (A) Yes (B) No"
 SMALL: dict[str, Any] = {
     "grounding": {"point": [60, 80]},
     "motion": {"direction": [1, 0]},

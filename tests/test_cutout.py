@@ -1,24 +1,24 @@
-"""The compositor: the mover is where its trajectory says, and nothing else changes."""
+"""The compositor: bodies and shadows are where the trajectory says, and nothing else changes."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 from drawn import DrawnArrow, ball, block, floor
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from runs import run_of
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import MAX_SIDE, CutoutGenerator, CutoutOptions
-from cow_service.stages.grounding import ground
-from cow_service.stages.motion import read_motion
-from cow_service.stages.trajectory import compute_trajectory
+from cow_service.physics.floor_camera import FloorCamera
+from cow_service.records import Grounding, LocatedObject, Motion, Trajectory
 from cow_service.vision.inpainting import exemplar_inpaint
+from cow_service.vision.scene import Scene
 
-RED, BLUE = (210, 20, 20), (50, 80, 200)
+RED, BLUE, GREEN = (210, 20, 20), (50, 80, 200), (30, 160, 60)
 CENTRE, RADIUS = (160.0, 200.0), 40.0
 generator = CutoutGenerator()
 
@@ -27,14 +27,32 @@ def ignore(done: float) -> None:
     """Nobody listens."""
 
 
-def shot(image, frames: int = 33, fps: float = 16, clean: bool = True, **motion) -> GeneratorInput:
-    run = run_of(image, grounding={"point": CENTRE}, motion=motion, num_frames=frames, fps=fps)
-    grounding = ground(run).value
-    moving = read_motion(run, grounding, None).value
-    trajectory = compute_trajectory(run, grounding, moving).value
-    obstacles = run.scene.obstacles(grounding.bbox)
-    options = CutoutOptions(clean_cues=clean)
-    return GeneratorInput(run.scene, grounding, moving, trajectory, obstacles, 0, options)
+def shot(
+    image, points, scale=None, depths=None, clean: bool = True, kind: str = "linear", bbox=None, named=(), **more
+) -> GeneratorInput:
+    """A clip of what is at `CENTRE`, or in a box, along points (px), without a camera."""
+    scene = Scene(image)
+    bbox = scene.bbox_at(CENTRE) if bbox is None else bbox
+    others = tuple(LocatedObject(object=f"thing {i}", bbox=box) for i, box in enumerate(named))
+    middle = ((bbox[0] + bbox[2]) / 2, (bbox[1] + bbox[3]) / 2)
+    grounding = Grounding(object="thing", point=middle, bbox=bbox, others=others, source="request")
+    motion = Motion.model_validate(
+        {"kind": kind, "direction": (1, 0) if kind != "fall" else None, "cue": "request", "speed": 1, "sentence": "",
+         "metres_per_pixel": {"value": 0.01, "source": "default"}, "source": "request"}
+    )  # fmt: skip
+    count = len(points)
+    depths = [1.0] * count if depths is None else depths
+    path = {
+        "states": [(0, 0, z, 0, 0, 0) for z in depths], "points": points, "visible": [True] * count,
+        "scale": [1.0] * count if scale is None else scale, "tracks": [points],
+    }  # fmt: skip
+    trajectory = Trajectory.model_validate({"fps": 16, "paths": [path], "anchors": []} | more)
+    obstacles = scene.obstacles(bbox, others)
+    return GeneratorInput(scene, grounding, motion, trajectory, obstacles, 0, CutoutOptions(clean_cues=clean))
+
+
+def line(frames: int, dx: float, dy: float = 0.0) -> list[tuple[float, float]]:
+    return [(CENTRE[0] + i * dx, CENTRE[1] + i * dy) for i in range(frames)]
 
 
 def frame_of(filmed: GeneratorInput, index: int) -> np.ndarray:
@@ -51,20 +69,17 @@ def centre_of(mask: np.ndarray) -> tuple[float, float]:
 
 
 def test_the_mover_is_within_two_pixels_of_its_point() -> None:
-    filmed = shot(ball(floor(), CENTRE, RADIUS, RED), direction=(1, -0.3), speed=137)
+    filmed = shot(ball(floor(), CENTRE, RADIUS, RED), line(33, 8.6, -2.6))
     for index, frame in enumerate(generator.render(filmed, range(33), ignore)):
-        x, y = filmed.trajectory.points[index]
-        if x < 590:
-            assert centre_of(redness(frame)) == pytest.approx((x, y), abs=2)
+        x, y = filmed.trajectory.path.points[index]
+        assert centre_of(redness(frame)) == pytest.approx((x, y), abs=2)
 
 
 @settings(max_examples=15)
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_fractions_of_a_pixel_move_the_mover(dx: float, dy: float) -> None:
-    filmed = shot(ball(floor(320, 300), CENTRE, RADIUS, RED), frames=2, fps=1, direction=(1, 0), speed=0)
-    start = filmed.trajectory.points[0]
-    moved = filmed.trajectory.model_copy(update={"points": (start, (start[0] + dx, start[1] + dy))})
-    first, second = generator.render(replace(filmed, trajectory=moved), [0, 1], ignore)
+    filmed = shot(ball(floor(320, 300), CENTRE, RADIUS, RED), [CENTRE, (165.0, 205.0), (165 + dx, 205 + dy)])
+    first, second = generator.render(filmed, [1, 2], ignore)
 
     def balance(frame) -> np.ndarray:
         weight = np.clip(frame[..., 0].astype(float) - frame[..., 1] - 40, 0, None)
@@ -76,30 +91,36 @@ def test_fractions_of_a_pixel_move_the_mover(dx: float, dy: float) -> None:
 
 def test_away_from_mover_and_hole_pixels_equal_the_input() -> None:
     image = block(ball(floor(), CENTRE, RADIUS, RED), (440, 150, 520, 250), BLUE)
-    filmed = shot(image, direction=(0, -1), speed=100)
+    filmed = shot(image, line(21, 0, -6))
     ys, xs = np.mgrid[:400, :640] + 0.5
     for index, frame in zip((0, 5, 20), generator.render(filmed, (0, 5, 20), ignore), strict=True):
-        x, y = filmed.trajectory.points[index]
+        x, y = filmed.trajectory.path.points[index]
         near = (np.hypot(xs - x, ys - y) < RADIUS + 15) | (np.hypot(xs - CENTRE[0], ys - CENTRE[1]) < RADIUS + 15)
         assert (frame[~near] == image[~near]).all()
 
 
 def test_behind_the_mover_the_floor_is_filled_in() -> None:
     plain = floor()
-    filmed = shot(ball(plain, CENTRE, RADIUS, RED), direction=(1, 0), speed=400)
-    frame = frame_of(filmed, 30)
+    frame = frame_of(shot(ball(plain, CENTRE, RADIUS, RED), line(31, 25)), 30)
     ys, xs = np.mgrid[:400, :640] + 0.5
     hole = np.hypot(xs - CENTRE[0], ys - CENTRE[1]) < RADIUS
     assert np.abs(frame[hole].astype(int) - plain[hole]).mean() < 8
     assert not redness(frame).any()
 
 
+def test_an_edge_behind_the_mover_goes_on_through_the_hole() -> None:
+    wall = floor()
+    wall[:200] = np.clip(wall[:200].astype(int) - 40, 0, 255)
+    frame = frame_of(shot(ball(wall, CENTRE, RADIUS, RED), line(31, 25), bbox=(120, 160, 200, 240)), 30).astype(int)
+    hole = slice(130, 190)
+    assert np.abs(frame[180:194, hole] - wall[180:194, hole]).mean() < 12
+    assert np.abs(frame[206:220, hole] - wall[206:220, hole]).mean() < 12
+
+
 @pytest.mark.parametrize(("foot", "hidden"), [(180, False), (300, True)])
-def test_what_stands_lower_is_drawn_in_front(foot: int, hidden: bool) -> None:
+def test_without_a_camera_what_stands_lower_is_drawn_in_front(foot: int, hidden: bool) -> None:
     image = block(ball(floor(), CENTRE, RADIUS, RED), (330, foot - 110, 410, foot), BLUE)
-    filmed = shot(image, frames=16, direction=(1, 0), speed=230)
-    index = min(range(16), key=lambda i: abs(filmed.trajectory.points[i][0] - 370))
-    frame = frame_of(filmed, index)
+    frame = frame_of(shot(image, line(16, 14)), 15)
     middle = frame[205 if hidden else 175, 370]
     assert (middle[2] > middle[0]) == hidden
 
@@ -107,28 +128,35 @@ def test_what_stands_lower_is_drawn_in_front(foot: int, hidden: bool) -> None:
 def test_drawn_cues_are_taken_out_unless_asked_to_stay() -> None:
     image = DrawnArrow((220, 200), 0.0, 120, 6, (30, 160, 30), "filled").on(ball(floor(), CENTRE, RADIUS, RED))
     for clean in (True, False):
-        frame = frame_of(shot(image, clean=clean, direction=(0, -1)), 12).astype(int)
+        frame = frame_of(shot(image, line(13, 0, -10), clean=clean), 12).astype(int)
         green = frame[..., 1] - np.maximum(frame[..., 0], frame[..., 2]) > 60
         assert green.any() != clean
 
 
 def test_coming_closer_it_grows() -> None:
-    filmed = shot(ball(floor(), CENTRE, RADIUS, RED), frames=17, direction=(0, 1), depth=-0.9, speed=60)
-    sizes = [redness(frame).sum() for frame in generator.render(filmed, (0, 8, 16), ignore)]
+    scale = [1, 1.3, 1.6]
+    filmed = shot(ball(floor(), CENTRE, RADIUS, RED), line(3, 0, 20), scale=scale, depths=[1 / s for s in scale])
+    sizes = [redness(frame).sum() for frame in generator.render(filmed, (0, 1, 2), ignore)]
     assert sizes[0] < sizes[1] < sizes[2]
-    assert sizes[2] / sizes[0] == pytest.approx(filmed.trajectory.scale[16] ** 2, rel=0.15)
+    assert sizes[2] / sizes[0] == pytest.approx(1.6**2, rel=0.15)
 
 
 def test_past_the_camera_it_is_gone() -> None:
-    image = ball(floor(320, 240), CENTRE, 20, RED)
-    filmed = shot(image, frames=81, direction=(0, 1), depth=-1, speed=400)
-    assert filmed.trajectory.visible[-1] is False
-    assert not redness(frame_of(filmed, 80)).any()
+    filmed = shot(ball(floor(320, 260), CENTRE, 20, RED), line(2, 0), scale=[1, 12], depths=[1, 0.05])
+    assert not redness(frame_of(filmed, 1)).any()
+
+
+def test_until_something_moves_the_frame_is_the_image() -> None:
+    image = ball(floor(), CENTRE, RADIUS, RED)
+    filmed = shot(image, [CENTRE, (CENTRE[0] + 0.1, CENTRE[1]), (CENTRE[0] + 3, CENTRE[1])])
+    first, second, third = generator.render(filmed, range(3), ignore)
+    assert (first == image).all()
+    assert (second == image).all()
+    assert (third != image).any()
 
 
 def test_edges_are_soft() -> None:
-    filmed = shot(ball(floor(), CENTRE, RADIUS, RED), frames=3, direction=(0, -1), speed=0)
-    frame = frame_of(filmed, 1).astype(int)
+    frame = frame_of(shot(ball(floor(), CENTRE, RADIUS, RED), line(3, 0, -4)), 1).astype(int)
     row = frame[200, 110:130, 0] - frame[200, 110:130, 1]
     assert ((row > 3) & (row < 0.9 * row.max())).sum() >= 2
 
@@ -136,25 +164,22 @@ def test_edges_are_soft() -> None:
 def test_a_varied_background_is_continued_not_smeared() -> None:
     rng = np.random.default_rng(0)
     tiles = rng.integers(40, 220, (50, 80, 1)).astype(np.uint8).repeat(8, axis=0).repeat(8, axis=1).repeat(3, axis=2)
-    filmed = shot(ball(tiles, CENTRE, RADIUS, RED), frames=33, direction=(1, 0), speed=500)
-    frame = frame_of(filmed, 32).astype(int)
+    frame = frame_of(shot(ball(tiles, CENTRE, RADIUS, RED), line(33, 31)), 32).astype(int)
     hole = frame[175:225, 135:185, 1]
     assert hole.std() > 25
     assert not redness(frame[160:240, 120:200]).any()
 
 
 def test_out_of_the_image_only_the_background_is_left() -> None:
-    filmed = shot(ball(floor(), CENTRE, RADIUS, RED), direction=(-1, 0), speed=600)
-    frame = frame_of(filmed, 32)
-    assert not redness(frame).any()
+    assert not redness(frame_of(shot(ball(floor(), CENTRE, RADIUS, RED), line(33, -37)), 32)).any()
 
 
 def test_large_images_give_a_smaller_clip() -> None:
-    filmed = shot(ball(floor(2000, 1000), CENTRE, RADIUS, RED), direction=(1, 0), speed=300)
+    filmed = shot(ball(floor(2000, 1000), CENTRE, RADIUS, RED), line(17, 19))
     assert generator.size(2000, 1000) == (MAX_SIDE, 640)
     frame = frame_of(filmed, 16)
     assert frame.shape == (640, 1280, 3)
-    x, y = filmed.trajectory.points[16]
+    x, y = filmed.trajectory.path.points[16]
     assert centre_of(redness(frame)) == pytest.approx((x * 0.64, y * 0.64), abs=2)
 
 
@@ -163,6 +188,235 @@ def test_any_size_stays_within_bounds(width: int, height: int) -> None:
     w, h = generator.size(width, height)
     assert 1 <= w <= min(width, MAX_SIDE)
     assert 1 <= h <= min(height, MAX_SIDE)
+
+
+def test_a_shadow_without_a_camera_goes_with_the_mover_and_keeps_the_texture() -> None:
+    plain = floor()
+    image = shaded(plain, [((200, 244), (50, 12), 0.5)])
+    filmed = shot(block(image, (160, 160, 240, 240), RED), [(200 + 12.5 * i, 200.0) for i in range(17)],
+                  bbox=(160, 160, 240, 240))  # fmt: skip
+    frame = frame_of(filmed, 16).astype(int)
+    left, there = (slice(249, 255), slice(170, 230)), (slice(246, 252), slice(370, 430))
+    assert np.abs(frame[left] - plain[left]).mean() < 5
+    assert np.corrcoef(frame[left].ravel(), plain[left].ravel())[0, 1] > 0.25
+    ratio = frame[there] / plain[there]
+    assert 0.4 < ratio.mean() < 0.72
+
+
+# With a camera: metres, as stage 3 gives them.
+
+ESTIMATE = {
+    "focal": 640, "pitch": 30, "roll": 0, "height": 1.5, "source": "request",
+    "deviations": {"focal": 0, "pitch": 0, "roll": 0, "height": 0},
+}  # fmt: skip
+
+
+def shaded(image, ellipses) -> np.ndarray:
+    """The image with soft dark ellipses: centre, half axes (px) and the share of light taken away."""
+    ys, xs = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    result = image.astype(float)
+    for (x, y), (a, b), share in ellipses:
+        radius = np.hypot((xs - x) / a, (ys - y) / b)
+        result *= 1 - share * np.clip((1.1 - radius) / 0.2, 0, 1)[..., None]
+    return np.clip(result, 0, 255).astype(np.uint8)
+
+
+@dataclass
+class World:
+    """Things on a floor that a camera sees. Coordinates: metres to the right, above the floor, and ahead."""
+
+    image: np.ndarray
+
+    def __post_init__(self) -> None:
+        trajectory = Trajectory.model_validate(
+            {"fps": 16, "camera": ESTIMATE, "anchors": [],
+             "paths": [{"states": [], "points": [], "visible": [], "scale": [], "tracks": []}]}
+        )  # fmt: skip
+        assert trajectory.camera is not None
+        self.camera = FloorCamera.of(trajectory.camera, 640, 400)
+        self.bodies: list[dict] = []
+        self.paths: list[dict] = []
+
+    def at(self, *places) -> np.ndarray:
+        return self.camera.from_floor(np.array(places, float))
+
+    def pixel(self, place) -> tuple[float, float]:
+        x, y = self.camera.project(self.at(place))[0]
+        return float(x), float(y)
+
+    def radius(self, place, metres: float) -> float:
+        return metres * 640 / float(self.at(place)[0, 2])
+
+    def add(self, bbox, place, shape="box", support="floor", size=0.3, path=None, rotation=()) -> None:
+        self.bodies.append(
+            {"object": f"body {len(self.bodies)}", "bbox": bbox, "shape": shape, "size": (size,) * 3,
+             "position": tuple(self.at(place)[0]), "support": support, "source": "request", "confidence": 1}
+        )  # fmt: skip
+        if path is not None:
+            positions = self.at(*path)
+            points = [(float(x), float(y)) for x, y in self.camera.project(positions)]
+            self.paths.append(
+                {"body": len(self.bodies) - 1, "states": [(*p, 0, 0, 0) for p in positions], "points": points,
+                 "visible": [True] * len(path), "scale": [float(positions[0, 2] / p[2]) for p in positions],
+                 "rotation": rotation, "tracks": []}
+            )  # fmt: skip
+
+    def ball(self, place, rgb, radius=0.15, **rest) -> tuple[float, float, float]:
+        (x, y), r = self.pixel(place), self.radius(place, radius)
+        self.image = ball(self.image, (x, y), r, rgb)
+        self.add((x - r, y - r, x + r, y + r), place, shape="sphere", size=2 * radius, **rest)
+        return x, y, r
+
+    def block(self, place, rgb, **rest) -> tuple[float, float, float]:
+        (x, y), r = self.pixel(place), self.radius(place, 0.15)
+        bbox = (round(x - r), round(y - r), round(x + r), round(y + r))
+        self.image = block(self.image, bbox, rgb)
+        self.add(bbox, place, **rest)
+        return x, y, r
+
+    def filmed(self, **more) -> GeneratorInput:
+        first = self.bodies[0]
+        given = shot(
+            self.image, self.paths[0]["points"], bbox=first["bbox"], named=[body["bbox"] for body in self.bodies[1:]],
+            paths=self.paths, bodies=self.bodies, camera=ESTIMATE, law="contact", **more,
+        )  # fmt: skip
+        named = given.obstacles[: len(self.bodies) - 1]
+        assert [o.bbox for o in named] == [tuple(map(float, body["bbox"])) for body in self.bodies[1:]]
+        return replace(given, obstacles=named)
+
+
+def colour_at(frame, x: float, y: float) -> str:
+    return "rgb"[int(frame[round(y), round(x)].argmax())]
+
+
+@pytest.mark.parametrize(("ahead", "seen"), [(2.5, "r"), (3.2, "b")])
+def test_the_nearer_of_a_moving_and_a_still_body_is_in_front(ahead: float, seen: str) -> None:
+    world = World(floor())
+    world.block((-0.6, 0.15, ahead), RED, path=[(-0.6, 0.15, ahead), (0.5, 0.15, ahead)])
+    x, y, r = world.block((0.5, 0.15, 2.8), BLUE)
+    frame = frame_of(world.filmed(), 1)
+    where = y + (0.6 if ahead < 2.8 else -0.6) * r
+    assert colour_at(frame, x, where) == seen
+
+
+def test_everything_that_moves_is_moved_and_the_nearer_covers_the_farther() -> None:
+    world = World(floor())
+    near, far = (0.0, 0.15, 2.4), (0.0, 0.15, 2.9)
+    world.ball((-0.8, 0.15, 2.4), RED, path=[(-0.8, 0.15, 2.4), near])
+    x0, y0, r0 = world.ball((0.8, 0.15, 2.9), GREEN, path=[(0.8, 0.15, 2.9), far])
+    frame = frame_of(world.filmed(), 1)
+    assert colour_at(frame, *world.pixel(near)) == "r"
+    x, y = world.pixel(far)
+    assert colour_at(frame, x, y - 0.7 * r0) == "g"
+    gone = frame[round(y0 - r0 / 2) : round(y0 + r0 / 2), round(x0 - r0 / 2) : round(x0 + r0 / 2)].astype(int)
+    assert np.abs(gone[..., 1] - gone[..., 0]).max() < 25
+
+
+def test_a_body_on_top_of_another_is_in_front_of_it() -> None:
+    world = World(floor())
+    world.ball((0.0, 1.0, 2.75), RED, support="air", path=[(0.0, 1.0, 2.75), (0.0, 0.45, 2.75)])
+    world.block((0.0, 0.15, 2.6), BLUE)  # nearer to the camera, and yet beneath
+    frame = frame_of(world.filmed(), 1)
+    x, y = world.pixel((0.0, 0.45, 2.75))
+    assert colour_at(frame, x, y + 0.7 * world.radius((0.0, 0.45, 2.75), 0.15)) == "r"
+
+
+def test_a_tipping_body_turns_about_its_centre() -> None:
+    world = World(floor())
+    x, y, _ = world.block((0.0, 0.15, 2.6), RED, path=[(0.0, 0.15, 2.6)] * 2, rotation=(0.0, 90.0))
+    first, turned = generator.render(world.filmed(), [0, 1], ignore)
+    bright = first[..., 0].astype(int) - first[..., 1] > 180  # the lit top
+    assert centre_of(bright)[1] < y - 10
+    lit = turned[..., 0].astype(int) - turned[..., 1] > 180
+    assert centre_of(lit)[0] > x + 10
+    assert centre_of(redness(turned)) == pytest.approx((x, y), abs=2)
+
+
+@pytest.mark.parametrize("printed", [False, True])
+def test_a_rolling_ball_turns_what_is_printed_on_it_and_not_its_shading(printed: bool) -> None:
+    world = World(floor())
+    x, y, r = world.ball((0.0, 0.15, 2.4), RED, path=[(0.0, 0.15, 2.4)] * 2, rotation=(0.0, 180.0))
+    if printed:
+        for i in range(4):
+            cv2.circle(world.image, (round(x + (i - 2) * 9), round(y - r / 2)), 4, (250, 250, 250), -1)
+    first, turned = (frame.astype(int) for frame in generator.render(world.filmed(), [0, 1], ignore))
+    above, below = slice(round(y - 0.7 * r), round(y - 0.3 * r)), slice(round(y + 0.3 * r), round(y + 0.7 * r))
+    inner = slice(round(x - r / 2), round(x + r / 2))
+    white = [(frame[rows, inner, 1] > 110).sum() for frame in (first, turned) for rows in (above, below)]
+    if printed:
+        assert white[0] > 5 * max(1, white[1])
+        assert white[3] > 5 * max(1, white[2])
+    else:
+        assert np.abs(first - turned)[above.start : below.stop, inner].max() <= 1
+
+
+def test_a_contact_shadow_stays_behind_nowhere_and_fades_as_the_body_rises() -> None:
+    plain = floor()
+    world = World(plain)
+    start, there, high = (-0.7, 0.15, 2.6), (0.5, 0.15, 2.6), (0.5, 0.6, 2.6)
+    (x, y), r = world.pixel(start), world.radius(start, 0.15)
+    world.image = shaded(plain, [((x, y + 1.1 * r), (1.2 * r, 0.3 * r), 0.5)])
+    world.block(start, RED, path=[start, there, high])
+    first, moved, risen = (f.astype(int) for f in generator.render(world.filmed(), range(3), ignore))
+    under = slice(round(y + 1.12 * r), round(y + 1.3 * r))
+    old, new = ((under, slice(round(px - r), round(px + r))) for px in (x, world.pixel(there)[0]))
+    assert np.abs(first[old] - world.image[old]).mean() < 6
+    assert np.abs(moved[old] - plain[old]).mean() < 6
+    assert (moved[new] / plain[new]).mean() < 0.75
+    assert np.abs(risen[new] - plain[new]).mean() < 6
+
+
+def flying(still: bool = False) -> tuple[World, GeneratorInput, tuple[float, float]]:
+    """A ball that comes down to the right, with its shadow, and where that is at the first frame."""
+    world, light = World(floor()), (-0.4, 0.2)
+    start = (-0.2, 0.75, 2.7)
+    cast = world.pixel((start[0] + 0.75 * light[0], 0, start[2] + 0.75 * light[1]))
+    r = world.radius((start[0] + 0.75 * light[0], 0, start[2] + 0.75 * light[1]), 0.15)
+    world.image = shaded(world.image, [(cast, (r, 0.55 * r), 0.3)])
+    world.ball(start, RED, support="air", path=[start, (0.3, 0.4, 2.7), (0.7, 0.15, 2.7)])
+    if still:
+        world.block((0.14, 0.15, 2.5), BLUE)
+    return world, world.filmed(light=light), cast
+
+
+def test_a_cast_shadow_leaves_its_place_and_meets_the_ball_as_it_lands() -> None:
+    plain = floor()
+    world, filmed, (x, y) = flying()
+    first, middle, landed = (f.astype(int) for f in generator.render(filmed, range(3), ignore))
+    spot = slice(round(y - 4), round(y + 5)), slice(round(x - 10), round(x + 11))
+    assert (first[spot] / plain[spot]).mean() == pytest.approx(0.7, abs=0.06)
+    for frame in (middle, landed):
+        assert (frame[spot] / plain[spot]).mean() == pytest.approx(1, abs=0.04)
+    x, y = world.pixel((0.3 - 0.4 * 0.4, 0, 2.7 + 0.2 * 0.4))
+    assert (middle[round(y), round(x)] / plain[round(y), round(x)]).mean() == pytest.approx(0.7, abs=0.12)
+    x, y = world.pixel((0.7, 0.15, 2.7))
+    r = world.radius((0.7, 0.15, 2.7), 0.15)
+    beneath = slice(round(y + 1.04 * r), round(y + 1.15 * r)), slice(round(x - 5), round(x + 6))
+    assert (landed[beneath] / plain[beneath]).mean() < 0.6
+
+
+def test_shadows_do_not_fall_onto_what_stands_there() -> None:
+    world, filmed, _ = flying(still=True)
+    frame = frame_of(filmed, 1)
+    x0, y0, x1, y1 = (round(v) for v in world.bodies[1]["bbox"])
+    inner = slice(y0 + 15, y1 - 3), slice(x0 + 3, x1 - 3)
+    seen = redness(frame[inner])
+    assert (frame[inner][~seen] == world.image[inner][~seen]).all(axis=-1).mean() > 0.95
+
+
+def test_a_ball_partly_hidden_at_the_start_is_whole_later() -> None:
+    world = World(floor())
+    start = (-0.4, 0.15, 3.0)
+    x, y, r = world.ball(start, RED, path=[start, (0.6, 0.15, 3.0)])
+    world.block((-0.28, 0.15, 2.6), BLUE)
+    filmed = world.filmed()
+    ys, xs = np.mgrid[:400, :640] + 0.5
+    x0, y0, x1, y1 = world.bodies[1]["bbox"]
+    whole = np.hypot(xs - x, ys - y) < r
+    filmed.scene.preset_mask(filmed.grounding.bbox, lambda: whole & ~((xs > x0) & (xs < x1) & (ys > y0) & (ys < y1)))
+    filmed.scene._masks.clear()
+    frame = frame_of(filmed, 1)
+    assert redness(frame).sum() > 0.93 * whole.sum()
 
 
 def test_quilting_copies_what_is_around() -> None:

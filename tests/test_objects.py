@@ -129,7 +129,7 @@ def fur(seed: int) -> np.ndarray:
     return image
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0])
 def test_a_tuft_of_fur_is_refused_with_what_to_give(seed: int) -> None:
     image = fur(seed)
     with pytest.raises(CannotGround, match=r"Give its box as `grounding\.bbox`, or its outline as `grounding\.mask`"):

@@ -105,7 +105,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated")
     (folder / "image.jpg").write_bytes(BALL.image)
     done = cow(
-        folder, "simulate", "image.jpg", BALL.meta["question"], "--num-frames", "81", "--no-video", "--out", "out"
+        folder, "simulate", "image.jpg", BALL.meta["question"], "--law", "ballistic", "--no-video", "--out", "out"
     )
     assert done.returncode == 0, done.stderr
     return folder
@@ -129,11 +129,11 @@ def test_tracks_out_and_back(simulated: Path, suffix: str) -> None:
         for name in ("out", f"{suffix}-out")
     )
     # A point that has left the image is not visible, and its place in the file is the same for all that.
-    np.testing.assert_allclose(second.tracks, first.tracks, atol=0.01)
+    np.testing.assert_allclose(second.path.tracks, first.path.tracks, atol=0.01)
     np.testing.assert_allclose(second.anchors, first.anchors, atol=0.01)
-    inside = np.array(first.visible)
-    middle = np.mean(first.tracks, axis=0)
-    np.testing.assert_allclose(np.array(second.points)[inside], middle[inside], atol=0.01)
+    inside = np.array(first.path.visible)
+    middle = np.mean(first.path.tracks, axis=0)
+    np.testing.assert_allclose(np.array(second.path.points)[inside], middle[inside], atol=0.01)
 
 
 def test_import_prints_what_a_request_takes(simulated: Path) -> None:
@@ -177,7 +177,7 @@ def test_a_file_of_many_tracks_keeps_each_ones_visibility(simulated: Path) -> No
     done = cow(simulated, "simulate", "image.jpg", "?", *told, "--no-video", "--out", "many-out")
     assert done.returncode == 0, done.stderr
     found = Simulation.model_validate_json((simulated / "many-out" / "simulation.json").read_bytes())
-    assert (visible[:41] == np.array(found.trajectory.tracks_visible).T).all()
+    assert (visible[:41] == np.array(found.trajectory.path.tracks_visible).T).all()
     assert found.motion.sentence.startswith("The yellow ball")
     assert any("lasts 5.00 s and the clip 2.50 s: its rest is not shown" in told for told in found.warnings)
 

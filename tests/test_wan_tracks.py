@@ -17,6 +17,7 @@ from cow_service.generators.wan.track_files import read_tracks, write_tracks
 from cow_service.generators.wan.tracks import (
     FILE_SAMPLES,
     MAX_FRAMES,
+    MAX_OTHER_TRACKS,
     Tracks,
     from_ati_file,
     nearest_lengths,
@@ -116,6 +117,22 @@ def test_visibility_of_tracks_and_anchors() -> None:
     shown = trajectory(points, [True] * 4, tracks=[points, other], tracks_visible=given)
     assert tracks_of(shown, 100, 100).visible[:, 0].tolist() == [True, False, False, True]
     assert (found.points[:, 2] == [5, 5]).all()
+
+
+def test_every_body_that_moves_has_tracks_the_mover_first() -> None:
+    points = [(50.0, 50.0), (60.0, 50.0)]
+    pushed = [(20.0, 20.0), (130.0, 20.0)]
+    one = trajectory(points, [True, True], tracks=[points])
+    path = one.path.model_copy(
+        update={"body": 1, "points": tuple(pushed), "visible": (True, False), "tracks": (pushed,) * 5}
+    )
+    both = one.model_copy(update={"paths": (one.path, path)})
+    found = tracks_of(both, 100, 100)
+    assert found.points[0].tolist() == [[50, 50], *[[20, 20]] * 5, [5, 5], [90, 5]]
+    assert found.visible[1].tolist() == [True, *[False] * 5, True, True]
+    many = tracks_of(one.model_copy(update={"paths": (one.path, *[path] * 60)}), 100, 100)
+    assert many.points.shape == (2, 1 + MAX_OTHER_TRACKS + 2, 2)
+    assert (many.points[:, 0] == found.points[:, 0]).all()
 
 
 def test_a_track_that_is_not_seen_stays_where_it_was_seen() -> None:

@@ -45,7 +45,7 @@ class AsyncClient(_Base):
     >>> async def ask(question):
     ...     async with AsyncClient(base_url) as client:
     ...         return (await client.answer("image.jpg", question)).option
-    >>> asyncio.run(ask("If the yellow ball moves to the right, will it hit the blue mug? (A) Yes (B) No"))
+    >>> asyncio.run(ask("If the yellow ball moves to the left, will it hit the blue mug? (A) Yes (B) No"))
     'No'
     """
 

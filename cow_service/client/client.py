@@ -42,7 +42,7 @@ class Client(_Base):
     said where one waits for it. `retries` is how often a call is sent again that may then succeed. `http_client` brings
     proxies, certificates, transports; it is not closed here. Safe to share between threads.
 
-    >>> question = "If the yellow ball moves to the right, will it hit the blue mug? (A) Yes (B) No"
+    >>> question = "If the yellow ball moves to the left, will it hit the blue mug? (A) Yes (B) No"
     >>> with Client(base_url) as client:
     ...     answer = client.answer("image.jpg", question)
     >>> answer.option

@@ -174,7 +174,7 @@ class _Answer(records.Answer):
 class Simulation(_Simulation):
     """A simulation, as `Client` returns it.
 
-    >>> simulation = client.simulate("image.jpg", "If the yellow ball moves to the right, will it hit the blue mug?")
+    >>> simulation = client.simulate("image.jpg", "If the yellow ball moves to the left, will it hit the blue mug?")
     >>> [frame.index for frame in simulation.frames]
     [1, 3, 5]
     >>> simulation.numpy_frames().shape
@@ -246,12 +246,12 @@ class AsyncSimulation(_Simulation):
 class Answer(_Answer):
     """An answer, as `Client` returns it; its `simulation` has the pictures that it was reasoned on.
 
-    >>> question = "If the yellow ball moves to the right, will it hit the blue mug? (A) Yes (B) No"
+    >>> question = "If the yellow ball moves to the left, will it hit the blue mug? (A) Yes (B) No"
     >>> answer = client.answer("image.jpg", question)
     >>> answer.answer, answer.option
     ('B', 'No')
-    >>> [encounter.kind for encounter in answer.simulation.trajectory.encounters]
-    ['occluded-by']
+    >>> answer.simulation.trajectory.outcome.probability
+    0.0
     """
 
     simulation: Simulation | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: nobody assigns it

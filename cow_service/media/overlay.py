@@ -16,6 +16,7 @@ OUTLINE, PATH, ARROW, LIGHT, DARK = (255, 196, 0), (0, 229, 255), (255, 64, 129)
 PUSHED = (255, 150, 60)  # the paths of other bodies
 ENCOUNTERS = {"touches": (255, 82, 82), "occludes": (190, 120, 255), "occluded-by": (120, 200, 255)}  # RGB
 BAND_OPACITY = 0.3
+AT_REST = 0.25  # px per frame: what moves less rests
 SUBPIXEL = 4  # binary places of the coordinates handed to OpenCV
 FARTHEST = 20_000  # px: OpenCV draws no farther
 
@@ -73,11 +74,13 @@ def _words(encounter: Encounter, fps: float) -> str:
 
 
 def _draw_band(canvas: Image, path: Path, colour: Colour) -> None:
-    """The boxes between the 10th and 90th percentile, joined along the path; translucent."""
+    """The boxes between the 10th and 90th percentile, joined along the path until it rests; translucent."""
     if not path.band:
         return
     height, width = canvas.shape[:2]
-    boxes = np.clip(np.array(path.band, np.float64), -FARTHEST, FARTHEST)
+    steps = np.linalg.norm(np.diff(np.array(path.points), axis=0), axis=1)
+    moving = int(np.flatnonzero(steps > AT_REST).max(initial=-1)) + 2
+    boxes = np.clip(np.array(path.band[:moving], np.float64), -FARTHEST, FARTHEST)
     corners = boxes[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 4, 2)
     covered = np.zeros((height, width), np.uint8)
     for before, after, seen in zip(corners, corners[1:], path.visible[1:], strict=False):

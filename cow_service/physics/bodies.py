@@ -36,6 +36,12 @@ class SeenBody:
         return (self.bbox[0] + self.bbox[2]) / 2, self.bbox[3]
 
     @property
+    def fullness(self) -> float:
+        """Volume of the body that its outline would turn to about its axis, of that of the cylinder around it."""
+        widths = self.mask.patch.sum(axis=1)
+        return float(np.mean((widths / max(1, int(widths.max()))) ** 2)) if len(widths) else 1.0
+
+    @property
     def is_flying(self) -> bool:
         """Said to be in the air."""
         return self.prior is not None and self.prior.stands_on == "air"

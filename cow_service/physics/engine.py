@@ -34,7 +34,7 @@ SPACING = 24.0  # m inside the engine, between worlds
 COLOURS = 5  # worlds so many places apart, along and across, share a collision group
 REACH = 0.9 * COLOURS * SPACING / 2  # m inside the engine: what gets further away is taken out
 LEAST_STEPS, LEAST_STEPS_OF_MANY = 60.0, 30.0  # steps per second, at least, of a world alone and of many
-FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.3
+FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.25
 MOST_GRAVITY = 500.0  # m/s^2 inside the engine: what is smaller than 3 mm would sink into the floor between two steps
 FORESEEN = 10.0  # m inside the engine, at most: contacts are found that far ahead of what is fast
 GAP = 1e-3  # m inside the engine: how far above what it stands on a body starts
@@ -51,6 +51,7 @@ class RigidShape:
     position: tuple[float, float, float]  # of its centre
     yaw: float = 0.0  # radians about the vertical
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s
+    density: float = 1.0  # against that of the others
     friction: float = 0.5
     restitution: float = 0.5
     starts: bool = False  # it is set in motion or let go; what is not sleeps until it is touched
@@ -175,7 +176,7 @@ class _Engine:
                 builder = builder.angvel((z / radius, 0.0, -x / radius))
         else:
             builder = builder.sleeping(True)
-        collider = _collider(body, self.scale).friction(0.0 if body.glides else body.friction)
+        collider = _collider(body, self.scale).density(body.density).friction(0.0 if body.glides else body.friction)
         collider = _combined(collider.restitution(body.restitution)).sensor(_passes(body))
         collider = collider.collision_groups(InteractionGroups(self.groups[k], self.groups[k]))
         handle = self.world.add_body(builder, colliders=[collider.active_events(ActiveEvents.COLLISION_EVENTS)])

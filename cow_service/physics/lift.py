@@ -130,14 +130,17 @@ def above(
     near = rays[:, [0, 2]] * (height / _safe(-rays[:, 1]))[:, None]
     distance = np.linalg.norm(near, axis=1)
     way = near / distance[:, None]
-    half, centre = np.zeros(len(foot)), np.zeros((len(foot), 3))
-    for _ in range(4):
+    half, tall, centre = np.zeros(len(foot)), np.zeros(len(foot)), np.zeros((len(foot), 3))
+    wide = (x1 - x0) / (2 * cameras.focal)
+    for _ in range(5):
         middle = near + way * (half * depth_share)[:, None]
-        centre = np.stack([middle[:, 0], plane, middle[:, 1]], axis=1)
-        half = (x1 - x0) * np.maximum(cameras.depth(centre), 1e-3 * height) / (2 * cameras.focal)
-    deep = half * depth_share
-    tall = _half_height(cameras, bbox, shape, distance + deep, deep, plane)
-    centre[:, 1] = plane + tall
+        # What is seen from above is widest at its top, which is nearer; a cone is at its foot.
+        widest = plane + (0.0 if shape == "cone" else 2 * tall)
+        depth = cameras.depth(np.stack([middle[:, 0], widest, middle[:, 1]], axis=1))
+        half = wide / np.sqrt(1 + wide**2) * np.maximum(depth, 1e-3 * height)
+        deep = half * depth_share
+        tall = _half_height(cameras, bbox, shape, distance + deep, deep, plane)
+        centre = np.stack([middle[:, 0], plane + tall, middle[:, 1]], axis=1)
     return Placed(shape, centre, half * stretch, tall, True, depth_share)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from cow_service.physics.world import Worlds
 from cow_service.vision.types import Floats, Mask
 
+MOST_LEAN = np.radians(25)
 PASSED = 0.08  # of its first depth: closer than this, a body has passed the camera
 
 
@@ -51,12 +52,21 @@ def rotation(worlds: Worlds, body: int) -> Floats:
         # Right, up and ahead are a left-handed frame: there a positive turn about the line of sight is anticlockwise.
         about = -np.einsum("fi,fi->f", _steps(turns), sight[1:])
         return np.concatenate([[0.0], np.degrees(np.cumsum(about))])
-    upper = _turned(turns, np.array([0.0, 1.0, 0.0])) * worlds.shapes[0][body].half_height
-    ends = np.stack([run.positions[body] + upper, run.positions[body] - upper])
-    points, _ = cameras.project(ends[None])
+    upright = np.tile(np.array([0.0, 1.0, 0.0]), (len(turns), 1))
+    leaning, plumb = (
+        np.unwrap(_lean(worlds, run.positions[body], axis)) for axis in (_turned(turns, upright[0]), upright)
+    )
+    angle = np.unwrap(leaning - plumb)
+    # Verticals lean in the image as they come to its side; close to the camera they lean without bounds.
+    return np.degrees(angle - angle[0] + np.clip(plumb - plumb[0], -MOST_LEAN, MOST_LEAN))
+
+
+def _lean(worlds: Worlds, positions: Floats, axis: Floats) -> Floats:
+    """Radians [F] by which directions [F, 3] at positions [F, 3] lean to the right in the image of the first draw."""
+    step = 1e-3 * float(worlds.scene.cameras.height[0])
+    points, _ = worlds.scene.cameras.part(slice(0, 1)).project((positions + np.stack([axis, -axis]) * step)[None])
     way = points[0, 0] - points[0, 1]
-    angle = np.unwrap(np.arctan2(way[:, 0], -way[:, 1]))
-    return np.degrees(angle - angle[0])
+    return np.arctan2(way[:, 0], -way[:, 1])
 
 
 def _steps(turns: Floats) -> Floats:

@@ -99,6 +99,7 @@ def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) 
                 half_height=half if placed.shape == "sphere" else float(np.clip(placed.half_height[k], low, high)),
                 position=(position[0], position[1], position[2]),
                 yaw=yaw if placed.shape == "box" and not seen.elongated else 0.0,
+                density=seen.fullness if placed.shape == "cylinder" else 1.0,
                 friction=friction,
                 restitution=restitution,
                 falls=placed.stands,

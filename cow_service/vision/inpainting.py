@@ -25,7 +25,7 @@ FADE = 0.14  # of the hole's size: how far out its shadow is taken away
 FADE_MOST = 0.011  # of the image's longer side: and no further
 SHIFTS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))  # in sizes of the hole
 COARSE_SIDE = 96  # px: the crop is searched at this size
-TILE = 13  # px at the coarse size: what one patch fills
+TILE = 9  # px at the coarse size: what one patch fills
 CONTEXT = 5  # px around a tile that must fit
 FEATHER = 3  # px over which patches overlap
 
@@ -161,10 +161,9 @@ def push_pull(source: Floats32, known: Mask) -> Floats32:
     for colours, weights in reversed(levels[:-1]):
         coarse = cv2.resize(value, (weights.shape[1], weights.shape[0]), interpolation=cv2.INTER_LINEAR)
         trust = np.where(weights > LEAST_WEIGHT, np.minimum(weights, 1), 0)
-        own = trust / np.maximum(weights, LEAST_WEIGHT)
-        value = colours * _three(np.asarray(own, np.float32)) + coarse * _three(
-            np.asarray(1 - np.minimum(weights, 1), np.float32)
-        )
+        own = np.asarray(trust / np.maximum(weights, LEAST_WEIGHT), np.float32)
+        rest = np.asarray(1 - np.minimum(weights, 1), np.float32)
+        value = colours * _three(own) + coarse * _three(rest)
     for _ in range(2):
         value = np.asarray(cv2.GaussianBlur(value, (0, 0), 2.0), np.float32)
         value += (source - value) * kept

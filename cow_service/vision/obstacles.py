@@ -32,14 +32,14 @@ def find_obstacles(
     """Everything but the mover: first what the question names, by that name, then other regions, by their colour.
 
     `silhouette` gives the mask [H, W] of the object in a box; of known regions their own mask, which is cheaper, is
-    taken.
+    taken, unless a mask was given.
     """
     body = silhouette(mover)
     near = cv2.dilate(body.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     obstacles: list[Obstacle] = []
     for other in named:
         if iou(other.bbox, mover) < SAME_OBJECT_IOU:
-            region = region_of(regions, other.bbox)
+            region = None if other.mask is not None else region_of(regions, other.bbox)
             mask = CroppedMask.of(silhouette(other.bbox)) if region is None else region.mask
             found = region is not None and region.bbox == other.bbox  # here, not by the request or another reader
             confidence = region.confidence if region is not None and found else 1.0

@@ -91,7 +91,8 @@ def find_regions(image: Image) -> tuple[Region, ...]:
         return ()
     solid = (core | white_sides(view, core)).astype(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    border = np.pad(np.zeros((solid.shape[0] - 2, solid.shape[1] - 2), bool), 1, constant_values=True)
+    border = np.ones(solid.shape, bool)
+    border[1:-1, 1:-1] = False
     walls = border.copy()
     walls[-1, 1:-1] = False  # what the lower border cuts stands in front
     found: list[_Found] = []

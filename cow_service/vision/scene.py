@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
 from cow_service.vision.types import Image, Mask
 
+Found = TypeVar("Found")
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -29,10 +32,17 @@ class Scene:
 
     image: Image
     _masks: dict[BBox, Mask] = field(default_factory=dict, repr=False)
+    _found: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any], repr=False)
     _preset: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
     _obstacles: dict[tuple[BBox, tuple[LocatedObject, ...]], tuple[Obstacle, ...]] = field(
         default_factory=dict, repr=False
     )
+
+    def once(self, key: Hashable, measure: Callable[[], Found]) -> Found:
+        """What `measure` finds in this image, found once for the same key."""
+        if key not in self._found:
+            self._found[key] = measure()
+        return self._found[key]
 
     @property
     def width(self) -> int:

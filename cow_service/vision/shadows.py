@@ -61,6 +61,10 @@ class _Floor:
 
 def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None where it has none or several patches could be it."""
+    return scene.once(("shadow", bbox), lambda: _find_shadow(scene, bbox))
+
+
+def _find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     region = scene.region_of(bbox)
     width = bbox[2] - bbox[0]
     if region is None or width < LEAST_WIDTH:

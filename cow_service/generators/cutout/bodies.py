@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from cow_service.generators.base import GeneratorInput
@@ -13,6 +15,8 @@ from cow_service.generators.cutout.sprites import MARGIN, Window, soft
 from cow_service.records import FALLING_KINDS, BBox, Path
 from cow_service.vision.masks import resized_mask, window_of
 from cow_service.vision.types import Floats, Floats32, Mask
+
+UNMOVED = 0.3  # px
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,27 @@ class MovingBody:
     airborne: bool
     ground: Ground | None
     support: int | None  # the still body that it stands on at the first frame, of `Trajectory.bodies`
+
+    @property
+    def disc(self) -> Mask:
+        """Where a sphere is seen at the first frame [h, w], whatever hides it; nothing for other shapes."""
+        disc = np.zeros(self.mask.shape, np.uint8)
+        if self.ground is None or self.ground.bodies[self.path.body].shape != "sphere":
+            return disc > 0
+        first = np.array(self.path.states[0][:3])
+        x, y = self.ground.project(first)
+        per_metre = self.ground.factor * self.ground.camera.focal / self.ground.depth(first)
+        radius = per_metre * self.ground.bodies[self.path.body].size[0] / 2
+        # OpenCV's pixels are counted from their centres; 4 binary places.
+        cv2.circle(disc, (round(16 * (x - 0.5)), round(16 * (y - 0.5))), round(16 * radius), 1, -1, shift=4)
+        return disc > 0
+
+    def is_unmoved(self, frame: int) -> bool:
+        """Whether it is where and as it was at the first frame, to a fraction of a pixel."""
+        (x, y), (x0, y0) = self.path.points[frame], self.start
+        side = max(self.bbox[2] - self.bbox[0], self.bbox[3] - self.bbox[1])
+        turned = math.radians(self.path.rotation[frame]) if self.path.rotation else 0.0
+        return max(math.hypot(x - x0, y - y0), side * abs(self.path.scale[frame] - 1), side * abs(turned)) < UNMOVED
 
     def placed(self, frame: int) -> Placed:
         """At a frame of the clip."""

@@ -30,6 +30,8 @@ class Compositor:
     def frame(self, index: int) -> Image:
         """The clip frame [h, w, 3] of an index."""
         layers = self.layers
+        if all(body.is_unmoved(index) for body in layers.moving):
+            return layers.image.copy()
         frame = layers.background.copy()
         size = frame.shape[1], frame.shape[0]
         for shadow in layers.shadows:

@@ -37,6 +37,7 @@ class CutoutOptions(BaseModel):
 class Layers:
     """What is composed, at the clip's size."""
 
+    image: Image  # [h, w, 3]: the scene before anything moves
     background: Image  # [h, w, 3] without what moves and its shadows
     moving: tuple[MovingBody, ...]
     sprites: tuple[Sprite, ...]  # of the moving bodies
@@ -68,11 +69,11 @@ def take_apart(given: GeneratorInput) -> Layers:
         shape = None if ground is None else ground.bodies[body.path.body].shape
         start = (factor * float(body.start[0]), factor * float(body.start[1]))
         sprites.append(cut(image, body.mask, hidden, start, shape))
-    return Layers(background, moving, tuple(sprites), lit.shadows, still, eye, factor)
+    return Layers(image, background, moving, tuple(sprites), lit.shadows, still, eye, factor)
 
 
 def _hidden(body: MovingBody, moving: tuple[MovingBody, ...], still: tuple[StillBody, ...], eye: float) -> Mask | None:
-    """What nearer bodies hide of a body at the first frame: of its convex hull, since nothing shows the rest."""
+    """What nearer bodies hide of a body at the first frame: of a sphere's disc; of the hull of what is seen, else."""
     placed = body.placed(0)
     window = window_of(body.mask, 2)
     others = [(other.mask, other.placed) for other in still]
@@ -82,7 +83,7 @@ def _hidden(body: MovingBody, moving: tuple[MovingBody, ...], still: tuple[Still
     nearer = [mask for mask, at in others if mask[window].any() and not placed.in_front_of(at, eye)]
     if not nearer:
         return None
-    hidden = _hull(body.mask) & np.logical_or.reduce(nearer) & ~body.mask
+    hidden = (_hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
     return hidden if hidden.any() else None
 
 

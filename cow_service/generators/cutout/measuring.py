@@ -19,6 +19,7 @@ from cow_service.generators.cutout.shade import (
     drawn,
     floor_in_light,
     reach,
+    strongest,
 )
 from cow_service.generators.cutout.shadows import (
     AttachedShadow,
@@ -152,7 +153,7 @@ def _lit(image: Image, shade: Shade, where: Mask) -> tuple[Image, Mask]:
     # At a sharp edge of the shadow a pixel more or less would leave a line: nothing differs more than its texture.
     floor, spread = floor_in_light(shade, window), max(LEAST_SPREAD, TEXTURE * shade.texture)
     bounded = np.clip(lit, (1 - spread) * floor, (1 + spread) * floor)
-    shaded = np.clip(cv2.dilate(dark.max(axis=2), np.ones((5, 5), np.uint8)) / LEAST_SHADE, 0, 1)[..., None]
+    shaded = np.clip(cv2.dilate(strongest(dark), np.ones((5, 5), np.uint8)) / LEAST_SHADE, 0, 1)[..., None]
     result[window] = np.clip(shaded * bounded + (1 - shaded) * lit + 0.5, 0, 255).astype(np.uint8)
     deep[window] = dark @ np.full(3, 1 / 3, np.float32) > DEEP
     return result, deep

@@ -16,7 +16,7 @@ from cow_service.vision.inpainting import push_pull
 from cow_service.vision.masks import window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
-WORKING_SIDE = 48.0  # px: the surroundings are measured at the size at which the object's longer side is so long
+WORKING_SIDE = 40.0  # px: the surroundings are measured at the size at which the object's longer side is so long
 SIDEWAYS, DOWN, UP = 1.0, 0.7, 0.2  # of the object's longer side: how far around its box a shadow is looked for
 TEXTURE = 3  # px at the working size, of a median filter: finer than this is the floor's texture, edges stay
 ROUNDS = 3  # of the floor's fit, each without what lay far from the one before
@@ -101,11 +101,17 @@ def _measured(
     near, far = (share * side * scale for share in fade)
     dark = (dark * np.clip((far - away) / (far - near), 0, 1)[..., None]).astype(np.float32)
     step = (window[1].stop - window[1].start) / size[0]
-    seen = window_of(np.abs(dark).max(axis=2) > NO_SHADE, 1)
+    seen = window_of(strongest(dark) > NO_SHADE, 1)
     if seen is None:
         return None
     origin = x0 + seen[1].start * step, y0 + seen[0].start * step
     return Shade(dark[seen], lit[seen], texture, origin, step)
+
+
+def strongest(values: Floats32) -> Floats32:
+    """The largest of the three colours' values [h, w, 3]."""
+    red, green, blue = cv2.split(values)
+    return np.asarray(cv2.max(cv2.max(red, green), blue), np.float32)
 
 
 def _small(values: Floats32, size: tuple[int, int]) -> Floats32:
@@ -171,13 +177,13 @@ def _shadow(
 ) -> Floats32 | None:
     """The share of light taken away [h, w, 3] by the dark patches that touch the object; None without one."""
     grey = left @ np.full(3, 1 / 3, np.float32)
-    red, green, blue = cv2.split(left)
-    spread = cv2.max(cv2.max(red, green), blue) - cv2.min(cv2.min(red, green), blue)
+    spread = strongest(left) + strongest(-left)
     same_hue = (spread < SAME_HUE) & (grey > 1 - MOST_SHADE)
     least = max(LEAST_SHADE, 1.5 * texture)
     dark = np.where(known & same_hue, np.clip(1 - grey, 0, None) * own, away == 0).astype(np.float32)
     touching = np.where(away < TOUCH, dark, 0).astype(np.float32)
-    if (known & (touching > least)).sum() < LEAST_TOUCHING:
+    beside = touching[known & (touching > least)]
+    if len(beside) < LEAST_TOUCHING:
         return None
     reached = _reached(touching, dark, round(float(away[dark > least].max())))
     patch = known & (reached > least)
@@ -185,17 +191,17 @@ def _shadow(
     border[1:-1, 1:-1] = False
     ends = reached[patch & border]
     is_open = len(ends) > OPEN_END * np.sqrt(patch.sum()) + 2
-    if reject_open and is_open and np.median(ends) > ALIKE * np.median(touching[touching > least]):
+    if reject_open and is_open and np.median(ends) > ALIKE * np.median(beside):
         return None
     share = np.clip(2 * reached / least - 1, 0, 1) * np.minimum(1, reached / np.maximum(dark, 1e-3)) * own
-    share = np.asarray(cv2.GaussianBlur(np.where(known, share, 1), (0, 0), 1.0), np.float32) * ~border
+    share = np.asarray(cv2.GaussianBlur(np.where(known, share, own), (0, 0), 1.0), np.float32) * ~border
     lost = np.clip(1 - left, -MOST_GIVEN, MOST_SHADE).astype(np.float32) * share[..., None]
     # Where nothing is known, under the object, the shadow goes on from its rim, where it is darkest.
     kernel = np.ones((CONTACT, CONTACT), np.uint8)
     rim = ~known & (cv2.dilate(known.astype(np.uint8), kernel) > 0)
     seen = np.where(known[..., None], lost, np.float32(0))
     seen = np.where(rim[..., None], np.asarray(cv2.dilate(seen, kernel), np.float32), seen)
-    under = push_pull(np.asarray(seen, np.float32), known | rim) * ~border[..., None]
+    under = push_pull(np.asarray(seen, np.float32), known | rim) * (own * ~border)[..., None]
     return np.where(known[..., None], lost, under).astype(np.float32)
 
 
@@ -212,24 +218,24 @@ def _reached(marker: Floats32, dark: Floats32, steps: int) -> Floats32:
 
 def drawn(shade: Shade, matrix: Floats, to: Floats, start: Floats, window: tuple[slice, slice]) -> Floats32:
     """The share of light taken away in a window [a, b, 3], when `start` has gone `to` (px), all turned by a matrix."""
-    return _placed(shade.dark, shade, matrix, to, start, window)
+    return _placed(shade.dark, shade, matrix, to, start, window, cv2.BORDER_CONSTANT)
 
 
 def floor_in_light(shade: Shade, window: tuple[slice, slice]) -> Floats32:
     """The floor's colours [a, b, 3] in the light, in a window of the image."""
     none = np.zeros(2)
-    return _placed(shade.floor, shade, np.eye(2), none, none, window)
+    return _placed(shade.floor, shade, np.eye(2), none, none, window, cv2.BORDER_REPLICATE)
 
 
 def _placed(
-    cells: Floats32, shade: Shade, matrix: Floats, to: Floats, start: Floats, window: tuple[slice, slice]
+    cells: Floats32, shade: Shade, matrix: Floats, to: Floats, start: Floats, window: tuple[slice, slice], border: int
 ) -> Floats32:
     rows, columns = window
     first = np.array(shade.origin) + 0.5 * shade.step - start
     shift = to + matrix @ first - 0.5 - np.array([columns.start, rows.start])
     size = columns.stop - columns.start, rows.stop - rows.start
     transform = np.column_stack([matrix * shade.step, shift])
-    return np.asarray(cv2.warpAffine(cells, transform, size, flags=cv2.INTER_LINEAR), np.float32)
+    return np.asarray(cv2.warpAffine(cells, transform, size, flags=cv2.INTER_LINEAR, borderMode=border), np.float32)
 
 
 def reach(shade: Shade, matrix: Floats, to: Floats, start: Floats) -> tuple[Floats, Floats]:

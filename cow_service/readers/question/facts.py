@@ -22,6 +22,8 @@ _NOT_MET: dict[str, str] = {
 }
 _NOTHING_MET: dict[str, str] = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
 
+SIDEWAYS = 0.7  # of the speed in depth: from that on something moves to the side
+
 
 def facts_of(mover: str, trajectory: Trajectory) -> str:
     """One sentence: how the mover goes, what it meets, how it ends, and how many worlds agree with that.
@@ -99,7 +101,9 @@ def _motion(trajectory: Trajectory, met: Sequence[Encounter]) -> list[str]:
     if body is None:
         verb = "moves"
     elif body.support == "air":
-        return ["falls" if _across(path) < MOVED else f"flies {_direction(path)}"]
+        rises = path.states[-1][1] < path.states[0][1]
+        still = _across(path) < MOVED
+        return [("rises" if rises else "falls") if still else f"flies {_direction(path)}"]
     else:
         verb = on
     if body is not None and not round_body and _tips(path):
@@ -114,18 +118,24 @@ def _displaced(path: Path) -> float:
 
 
 def _across(path: Path) -> float:
-    """The furthest that it gets to the side or in depth, m."""
-    x, _, z = path.states[0][:3]
-    return max(math.hypot(state[0] - x, state[2] - z) for state in path.states)
+    """How far it gets to the side as it sets out, m: later it may bounce off what it meets."""
+    return abs(path.states[_set_out(path)][0] - path.states[0][0])
+
+
+def _set_out(path: Path) -> int:
+    """The frame by which it has set out."""
+    return max(1, len(path.states) // 10)
 
 
 def _direction(path: Path) -> str:
-    first, last = path.states[0], path.states[-1]
-    x, y, z = (last[axis] - first[axis] for axis in range(3))
-    if abs(y) > max(abs(x), abs(z)):
-        return "up" if y < 0 else "down"
-    if abs(x) >= abs(z):
+    """The way that it sets out: later it may bounce off what it meets."""
+    first, then = path.states[0], path.states[_set_out(path)]
+    x, y, z = (then[axis] - first[axis] for axis in range(3))
+    away = math.hypot(y, z)  # a floor that is looked down on rises in the image as it leads away
+    if abs(x) >= SIDEWAYS * away:
         return "to the right" if x > 0 else "to the left"
+    if abs(y) > abs(z):
+        return "up" if y < 0 else "down"
     return "away from the camera" if z > 0 else "towards the camera"
 
 
@@ -187,7 +197,9 @@ def _end(trajectory: Trajectory) -> list[str]:
     if until is None or _displaced(trajectory.path) < MOVED:
         return []
     last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1)
-    return [f"comes to rest after {until:.1f} s" if trajectory.path.visible[last] else "leaves the image"]
+    if not trajectory.path.visible[last]:
+        return ["leaves the image"]
+    return [f"comes to rest after {until:.1f} s"] if last < trajectory.num_frames - 1 else []
 
 
 def _agreement(trajectory: Trajectory, met: Sequence[Encounter]) -> float | None:

@@ -1,0 +1,123 @@
+"""The camera by the shadow of a ball: shadows made by known cameras are fitted within the deviations that it states."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from conftest import SCALE
+from floors import TrueCamera
+
+from cow_service.physics.camera_fit import MEASUREMENT_SIGMA, fit_shadow, prior
+from cow_service.records import BBox
+from cow_service.vision.shadows import Shadow
+
+SIZE = (640, 400)
+NAMES = ("pitch", "focal", "height", "slant right", "slant ahead")
+
+
+def shadow_of(camera: TrueCamera, ball: tuple[float, float, float], light: tuple[float, float]) -> Shadow:
+    """The shadow of a ball of radius 1 (m, as all lengths), lit from far away: an ellipse on the floor."""
+    slant = np.array(light)
+    turns = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    along = slant / max(float(np.hypot(*slant)), 1e-9)
+    rim = circle + np.outer(circle @ along, along) * (math.sqrt(1 + slant @ slant) - 1)
+    rim += np.array([ball[0], ball[2]]) + ball[1] * slant
+    points = camera.seen(np.column_stack([rim[:, 0], np.zeros(len(rim)), rim[:, 1]]))
+    (x, y), spread = points.mean(axis=0), np.cov(points.T, bias=True) / 2
+    (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
+    return Shadow((x0, y0, x1, y1), (x, y), (spread[0, 0], spread[1, 1], spread[0, 1]), 0.3)
+
+
+def measured(shadow: Shadow, radius: float, rng: np.random.Generator) -> Shadow:
+    """As it is measured: with the errors that the fit takes measurements to have."""
+    dx, dy, width, height, turn = rng.normal(0, MEASUREMENT_SIGMA)
+    xx, yy, xy = shadow.spread
+    correlation = xy / math.sqrt(xx * yy) + turn
+    xx, yy = xx * math.exp(2 * width), yy * math.exp(2 * height)
+    centre = shadow.centre[0] + radius * dx, shadow.centre[1] + radius * dy
+    return Shadow(shadow.bbox, centre, (xx, yy, correlation * math.sqrt(xx * yy)), shadow.shade)
+
+
+def throw(rng: np.random.Generator) -> tuple[np.ndarray, BBox, Shadow] | None:
+    """A camera and a light as the priors have them: what is true of them, the ball's box and its shadow."""
+    start = prior()
+    truth = start.mean + np.sqrt(np.diag(start.covariance)) * rng.normal(0, 1, 5)
+    height, distance = math.exp(truth[2]), rng.uniform(12, 25)
+    camera = TrueCamera(
+        pitch=math.degrees(truth[0]), focal=640 * math.exp(truth[1]), size=SIZE,
+        height=1 + distance * math.tan(truth[0]),
+    )  # fmt: skip
+    ball = rng.uniform(-0.3, 0.3) * distance, height, distance
+    box, shadow = camera.sphere_box(ball, 1.0), shadow_of(camera, ball, (truth[3], truth[4]))
+    seen = (
+        min(*box[:2], *shadow.bbox[:2]) > 0 and max(box[2], shadow.bbox[2]) < 640 and max(box[3], shadow.bbox[3]) < 400
+    )
+    return (truth, box, shadow) if seen and height > 1.4 and 5 < truth[0] * 57 < 60 else None
+
+
+@pytest.mark.soak
+def test_errors_are_as_large_as_the_deviations_say() -> None:
+    rng = np.random.default_rng(3)
+    errors: list[np.ndarray] = []
+    refused = 0
+    while len(errors) < 50 * SCALE:
+        made = throw(rng)
+        if made is None:
+            continue
+        truth, box, shadow = made
+        fit = fit_shadow(prior(), box, measured(shadow, (box[2] - box[0]) / 2, rng), SIZE)
+        if fit is None:
+            refused += 1
+            continue
+        errors.append((fit.mean - truth) / np.sqrt(np.diag(fit.covariance)))
+    assert refused <= 0.1 * len(errors)
+    ratio = np.sqrt((np.array(errors) ** 2).mean(axis=0))
+    assert ratio.max() < 2, dict(zip(NAMES, ratio.tolist(), strict=True))
+    assert ratio.min() > 0.4, "deviations are not stated larger than they are"
+
+
+def test_it_knows_more_than_before() -> None:
+    rng = np.random.default_rng(5)
+    narrower = []
+    while len(narrower) < 20:
+        made = throw(rng)
+        fit = None if made is None else fit_shadow(prior(), made[1], made[2], SIZE)
+        if fit is not None:
+            assert fit.source == "shadow"
+            narrower.append(np.sqrt(np.diag(fit.covariance) / np.diag(prior().covariance)))
+    median = np.median(narrower, axis=0)
+    assert median[2] < 0.5, "the height above the floor"
+    assert median[0] < 0.85, "the pitch"
+    assert (median < 1.01).all()
+
+
+def test_a_tilted_photograph_is_fitted_with_its_roll() -> None:
+    for roll in (-12.0, 12.0):
+        camera = TrueCamera(pitch=28, roll=roll, height=9.0, size=SIZE)
+        ball = (0.5, 4.5, 15.0)
+        fit = fit_shadow(
+            prior(math.radians(roll)), camera.sphere_box(ball, 1.0), shadow_of(camera, ball, (0.2, 0.2)), SIZE
+        )
+        assert fit is not None
+        assert fit.roll == pytest.approx(math.radians(roll))
+        assert math.degrees(fit.mean[0]) == pytest.approx(28, abs=5)
+        assert math.exp(fit.mean[2]) == pytest.approx(4.5, rel=0.2)
+
+
+@pytest.mark.parametrize("change", ["above the ball", "far to the side", "too large", "a streak"])
+def test_what_can_be_no_shadow_of_the_ball_gives_nothing(change: str) -> None:
+    camera = TrueCamera(pitch=28, height=9.0, size=SIZE)
+    ball = (0.0, 4.0, 15.0)
+    box, shadow = camera.sphere_box(ball, 1.0), shadow_of(camera, ball, (0.1, 0.1))
+    assert fit_shadow(prior(), box, shadow, SIZE) is not None
+    (x, y), (xx, yy, xy) = shadow.centre, shadow.spread
+    centre, spread = {
+        "above the ball": ((x, box[1] - 30), shadow.spread),
+        "far to the side": ((x - 600, y), shadow.spread),
+        "too large": ((x, y), (9 * xx, 9 * yy, 9 * xy)),
+        "a streak": ((x, y), (xx, 30 * yy, xy)),
+    }[change]
+    assert fit_shadow(prior(), box, Shadow(shadow.bbox, centre, spread, 0.3), SIZE) is None

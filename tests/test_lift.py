@@ -1,0 +1,267 @@
+"""From boxes to bodies on a floor and back, against a camera whose geometry is written independently."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from conftest import SCALE
+from floors import TrueCamera, known, outline
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.physics.draws import ensemble, likeliest, one_at_a_time
+from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.lift import BOX_SIDE, Cameras, above, in_the_air
+from cow_service.physics.placing import place
+from cow_service.physics.projection import seen_paths
+from cow_service.physics.world import WorldInput, run_world
+from cow_service.records import MetresPerPixel, Motion, ObjectPrior
+from cow_service.vision.masks import CroppedMask
+
+METRES = 3 / 640  # per pixel
+
+cameras = st.builds(
+    TrueCamera,
+    pitch=st.floats(12, 55),
+    roll=st.floats(-6, 6),
+    focal=st.floats(450, 1000),
+    height=st.floats(-1, 1).map(lambda power: 10**power),
+)
+
+
+feet = st.tuples(st.floats(60, 580), st.floats(150, 380))  # px
+
+
+def exactly(camera: TrueCamera) -> Cameras:
+    return Cameras.drawn(known(camera), camera.size, likeliest())[0].at_height(np.array([camera.height]))
+
+
+def filled(shape: tuple[int, int], bbox) -> CroppedMask:
+    """A mask that fills a box."""
+    mask = np.zeros(shape, bool)
+    x0, y0, x1, y1 = (max(0, round(v)) for v in bbox)
+    mask[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)] = True
+    return CroppedMask.of(mask)
+
+
+def body(bbox, shape="box", name="thing", prior=None) -> SeenBody:
+    return SeenBody(name, bbox, filled((400, 640), bbox), shape, prior=prior)
+
+
+def motion(kind="static", direction=None, speed=0.0, **other) -> Motion:
+    return Motion(
+        kind=kind, law="contact", direction=direction, cue="request", speed=speed, sentence="", source="request",
+        metres_per_pixel=MetresPerPixel(value=METRES, source="default"), **other,
+    )  # fmt: skip
+
+
+class TestProjection:
+    @given(cameras, st.floats(-3, 3), st.floats(0, 3), st.floats(2, 30))
+    def test_places_are_seen_where_the_true_camera_sees_them(self, camera, right, up, ahead) -> None:
+        places = camera.height * np.array([[right, up, ahead]])
+        if camera.positions(places)[0, 2] < 0.1 * camera.height:
+            return
+        points, depth = exactly(camera).project(places)
+        assert points[0] == pytest.approx(camera.seen(places)[0], abs=1e-6 * (1 + np.abs(camera.seen(places)).max()))
+        assert depth[0] == pytest.approx(camera.positions(places)[0, 2])
+        single = FloorCamera(
+            *camera.size, camera.focal, math.radians(camera.pitch), math.radians(camera.roll), camera.height
+        )
+        assert single.project(single.from_floor(places))[0] == pytest.approx(points[0], rel=1e-6, abs=1e-6)
+        assert single.to_floor(single.from_floor(places)) == pytest.approx(places)
+        if up == 0:
+            assert single.to_floor(single.floor_points(points))[0] == pytest.approx(places[0], rel=1e-5, abs=1e-5)
+
+    def test_points_at_and_above_the_horizon_lie_nowhere_on_the_floor(self) -> None:
+        camera = FloorCamera(640, 400, 640, math.radians(10), 0.0, 1.5)
+        horizon = 200 - 640 * math.tan(math.radians(10))
+        found = camera.floor_points(np.array([[320.0, horizon - 1], [320.0, horizon + 40]]))
+        assert np.isnan(found[0]).all()
+        assert np.isfinite(found[1]).all()
+
+
+def round_trip(shape: str, rng: np.random.Generator) -> tuple[float, float, float] | None:
+    """How far a solid is placed from where it stands, in half widths; and width and height placed, of the true ones."""
+    camera = TrueCamera(
+        pitch=rng.uniform(20, 35),
+        roll=rng.uniform(-2, 2),
+        focal=rng.uniform(450, 1000),
+        height=10 ** rng.uniform(-1, 1),
+    )
+    there = camera.on_floor((rng.uniform(60, 580), rng.uniform(150, 380)))
+    if there is None:
+        return None
+    half = rng.uniform(0.02, 0.05) * camera.away(there)
+    tall = half * (1 if shape == "sphere" else rng.uniform(0.5, 1.5))
+    if shape == "sphere":
+        bbox = camera.sphere_box((there[0], half, there[1]), half)
+    else:
+        bbox = camera.box(outline(shape, there, half, 2 * tall, rng.uniform(0, 3)))
+    found = above(exactly(camera), bbox, shape, likeliest(), np.zeros(1))
+    assert found is not None
+    assert found.stands
+    assert found.centre[0, 1] == pytest.approx(found.half_height[0]), "it stands on the floor"
+    away = float(np.hypot(*(found.centre[0, [0, 2]] - there))) / half
+    width = float(found.half_width[0]) * (BOX_SIDE if shape == "box" else 1.0) / half
+    return away, width, float(found.half_height[0]) / tall
+
+
+class TestStanding:
+    @pytest.mark.soak
+    @pytest.mark.parametrize(
+        ("shape", "median", "worst", "widths", "heights"),
+        [
+            ("sphere", 0.05, 0.25, (0.99, 1.1), (0.99, 1.1)),
+            ("cone", 0.1, 0.35, (0.98, 1.2), (0.8, 1.1)),
+            ("cylinder", 0.3, 1.25, (0.98, 1.8), (0.4, 1.1)),
+            ("box", 0.3, 1.25, (0.8, 1.85), (0.35, 1.2)),
+        ],
+    )
+    def test_what_stands_on_the_floor_is_found_again(self, shape, median, worst, widths, heights) -> None:
+        """Positions in half widths. Placing has nothing but the box: the top of what is tall is nearer and looks wider,
+        the far rim of its top is not in the middle, and a box may be seen across."""
+        rng = np.random.default_rng(1)
+        tried = [round_trip(shape, rng) for _ in range(150 * SCALE)]
+        away, width, height = np.array([found for found in tried if found is not None]).T
+        assert len(away) > 60 * SCALE
+        assert np.median(away) < median
+        assert away.max() < worst
+        assert widths[0] < width.min()
+        assert np.median(width) < 1.25
+        assert width.max() < widths[1]
+        assert heights[0] < height.min()
+        assert np.median(height) > 0.9
+        assert height.max() < heights[1]
+
+    @given(cameras, feet, st.floats(0.05, 0.4))
+    def test_a_ball_on_a_table_is_as_high_as_the_table(self, camera, foot, table) -> None:
+        there = camera.on_floor(foot)
+        assume(there is not None)
+        half, top = 0.03 * camera.away(there), table * camera.height
+        centre = (there[0], top + half, there[1])
+        found = above(exactly(camera), camera.sphere_box(centre, half), "sphere", likeliest(), np.array([top]))
+        assert found is not None
+        assert found.centre[0] == pytest.approx(centre, abs=0.8 * half)
+        assert found.centre[0, 1] == pytest.approx(top + half, abs=0.2 * half)
+
+    def test_a_foot_above_the_horizon_stands_nowhere(self) -> None:
+        camera = exactly(TrueCamera(pitch=5))
+        assert above(camera, (300, 20, 340, 60), "cylinder", likeliest(), np.zeros(1)) is None
+        assert above(camera, (300, 280, 340, 320), "cylinder", likeliest(), np.zeros(1)) is not None
+
+    @given(cameras, feet, st.floats(2, 30))
+    def test_in_the_air_it_is_where_its_depth_puts_it(self, camera, point, depth) -> None:
+        x, y = point[0], 400 - point[1]
+        radius = 20.0
+        found = in_the_air(
+            exactly(camera), (x - radius, y - radius, x + radius, y + radius), "sphere", np.array([depth])
+        )
+        assert camera.seen(found.centre)[0] == pytest.approx((x, y), abs=1e-4)
+        assert camera.positions(found.centre)[0, 2] == pytest.approx(depth)
+        assert found.half_width[0] == found.half_height[0] == pytest.approx(radius * depth / camera.focal)
+        assert not found.stands
+
+
+class TestPlacedScene:
+    def test_a_camera_that_looks_up_sees_bodies_in_the_air(self) -> None:
+        bodies = body((300, 150, 340, 190), "sphere"), body((100, 100, 200, 260), "cylinder")
+        for draws in (likeliest(), ensemble(20), one_at_a_time()):
+            scene = place(bodies, motion(), known(TrueCamera(pitch=-35), 0.1), (640, 400), draws)
+            assert not any(placed.stands for placed in scene.bodies)
+            for placed in scene.bodies:
+                assert np.isfinite(placed.centre).all()
+                assert (placed.half_width > 0).all()
+                assert (placed.centre[:, 1] > 0).all(), "what is seen lies above the floor"
+
+    def test_a_foot_above_the_horizon_is_in_the_air_and_nobody_elses_concern(self) -> None:
+        bodies = body((300, 250, 340, 290), "sphere"), body((100, 10, 140, 40), "box"), body((500, 240, 540, 300))
+        scene = place(bodies, motion(), known(TrueCamera(pitch=8)), (640, 400), likeliest())
+        assert [placed.stands for placed in scene.bodies] == [True, False, True]
+        assert scene.bodies[1].centre[0, 1] > scene.cameras.height[0]
+
+    def test_the_metres_are_those_of_the_mover(self) -> None:
+        camera = TrueCamera(height=1.2)
+        half = 0.1
+        ball = camera.sphere_box((0.2, half, 3.0), half)
+        bodies = body(ball, "sphere"), body(camera.box(outline("cylinder", (-0.6, 4.0), 0.15, 0.5)), "cylinder")
+        scale = camera.positions(np.array([[0.2, half, 3.0]]))[0, 2] / camera.focal
+        there = motion().model_copy(update={"metres_per_pixel": MetresPerPixel(value=scale, source="reference")})
+        scene = place(bodies, there, known(camera), camera.size, likeliest())
+        assert scene.cameras.height[0] == pytest.approx(1.2, rel=0.03)
+        assert scene.bodies[0].centre[0] == pytest.approx((0.2, half, 3.0), abs=0.05)
+        assert scene.bodies[1].centre[0, [0, 2]] == pytest.approx((-0.6, 4.0), abs=0.1)
+
+    @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.6, 0.8), (0.0, -1.0), (-0.8, -0.6), (0.0, 1.0)])
+    def test_along_the_floor_it_goes_where_it_is_seen_to_go(self, direction) -> None:
+        given_ = motion("linear", direction, speed=100)
+        world = WorldInput((body((280, 240, 330, 290), "sphere"),), given_, known(TrueCamera()), (640, 400), 17, 16.0)
+        worlds = run_world(world, likeliest())
+        seen = seen_paths(worlds, 0).points[0]
+        step = (seen[10] - seen[3]) / np.linalg.norm(seen[10] - seen[3])
+        assert step == pytest.approx(direction, abs=0.02)
+        assert worlds.scene.velocity[0, 1] == 0
+        speed = float(np.linalg.norm(worlds.scene.velocity[0]))
+        assert speed == pytest.approx(100 * METRES), "speeds are along the floor, at the first depth"
+
+    @pytest.mark.parametrize("roll", [-15.0, 0.0, 8.0])
+    def test_in_a_tilted_photograph_things_fall_along_its_vertical(self, roll: float) -> None:
+        lean = math.radians(roll)
+        given_ = motion("fall", gravity=(0, 9.81 / METRES), down=(math.sin(lean), math.cos(lean)))
+        ball = body((300, 60, 340, 100), "sphere")
+        world = WorldInput((ball,), given_, known(TrueCamera(pitch=0, roll=roll)), (640, 400), 17, 16.0)
+        worlds = run_world(world, likeliest())
+        seen = seen_paths(worlds, 0).points[0]
+        way = seen[4] - seen[0]
+        assert way / np.linalg.norm(way) == pytest.approx((math.sin(lean), math.cos(lean)), abs=0.01)
+        t = 4 / 16
+        assert np.linalg.norm(way) * METRES == pytest.approx(9.81 * t * t / 2, rel=0.05)
+
+    def test_every_draw_of_an_ensemble_is_placed(self) -> None:
+        bodies = body((280, 240, 330, 290), "sphere"), body((400, 200, 470, 300)), body((100, 150, 180, 260), "cone")
+        scene = place(bodies, motion("linear", (1.0, 0.0), 100), known(TrueCamera(), 0.1), (640, 400), ensemble(50))
+        first = scene.part(slice(7, 8))
+        for placed, one in zip(scene.bodies, first.bodies, strict=True):
+            assert placed.centre.shape == (50, 3)
+            assert np.isfinite(placed.centre).all()
+            assert (placed.centre[7] == one.centre[0]).all()
+
+
+class TestSupports:
+    def table(self, top: int = 200, bottom: int = 330) -> SeenBody:
+        return body((200, top, 440, bottom), "box", "table")
+
+    def test_a_ball_on_a_table_stands_on_it(self) -> None:
+        assert supports_of([body((300, 180, 340, 220), "sphere"), self.table()]) == [1, None]
+
+    def test_one_behind_a_box_does_not_and_one_before_it_neither(self) -> None:
+        assert supports_of([body((300, 150, 340, 200), "sphere"), self.table()]) == [None, None]
+        assert supports_of([body((300, 290, 340, 330), "sphere"), self.table()]) == [None, None]
+        assert supports_of([body((10, 180, 60, 220), "sphere"), self.table()]) == [None, None]
+
+    def test_nothing_stands_on_a_ball_or_on_what_is_narrower(self) -> None:
+        ball = body((300, 180, 340, 220), "sphere")
+        assert supports_of([ball, body((200, 200, 440, 330), "sphere")])[0] is None
+        assert supports_of([ball, body((305, 200, 335, 330))])[0] is None
+
+    @pytest.mark.parametrize(
+        ("said", "on"), [("table", 1), ("floor", None), ("air", None), ("a table that is not there", 1)]
+    )
+    def test_what_is_said_goes_before_what_is_seen(self, said: str, on: int | None) -> None:
+        ball = body((300, 180, 340, 220), "sphere", prior=ObjectPrior(stands_on=said))
+        assert supports_of([ball, self.table()])[0] == on
+
+    def test_what_is_said_holds_where_nothing_is_seen(self) -> None:
+        ball = body((300, 100, 340, 140), "sphere", prior=ObjectPrior(stands_on="table"))
+        assert supports_of([ball, self.table()])[0] == 1
+
+    def test_circles_end(self) -> None:
+        a = body((200, 180, 300, 260), "box", "a", ObjectPrior(stands_on="b"))
+        b = body((320, 180, 420, 260), "box", "b", ObjectPrior(stands_on="a"))
+        itself = body((20, 180, 120, 260), "box", "c", ObjectPrior(stands_on="c"))
+        for bodies in ([a, b, itself], [itself, b, a]):
+            scene = place(bodies, motion("linear", (1.0, 0.0), 50), known(TrueCamera(), 0.1), (640, 400), ensemble(10))
+            assert all(np.isfinite(placed.centre).all() for placed in scene.bodies)
+        assert supports_of([itself]) == [None]

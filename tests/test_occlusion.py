@@ -1,0 +1,87 @@
+"""How much of one silhouette another hides: rectangles with known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cow_service.physics.occlusion import shares
+from cow_service.physics.projection import SeenPaths
+from cow_service.vision.masks import CroppedMask
+
+
+def block(x0: int, y0: int, x1: int, y1: int) -> CroppedMask:
+    mask = np.zeros((200, 400), bool)
+    mask[y0:y1, x0:x1] = True
+    return CroppedMask.of(mask)
+
+
+def path(points, depth, scale=None) -> SeenPaths:
+    """One draw, a point per frame."""
+    frames = len(points)
+    grown = np.ones(frames) if scale is None else np.array(scale, float)
+    depths = np.full(frames, depth) if scale is None else depth / grown
+    return SeenPaths(np.array([points], float), depths[None], grown[None], np.zeros((1, frames), bool))
+
+
+MOVER = block(20, 80, 60, 120)  # its middle at (40, 100)
+OTHER = block(200, 80, 240, 120)
+
+
+def test_half_over_it_covers_a_half() -> None:
+    places = [(40, 100), (180, 100), (200, 100), (220, 100), (230, 110), (280, 100)]
+    found = shares(MOVER, path(places, 2.0), OTHER, np.array([3.0]))
+    assert found.covers[0] == pytest.approx([0, 0, 0.5, 1, 0.75 * 0.75, 0], abs=0.06)
+    assert found.covered[0].tolist() == [0] * 6, "the farther covers nothing of the nearer"
+
+
+def test_behind_it_it_is_covered_itself() -> None:
+    places = [(40, 100), (200, 100), (220, 100), (230, 100)]
+    found = shares(MOVER, path(places, 4.0), OTHER, np.array([3.0]))
+    assert found.covered[0] == pytest.approx([0, 0.5, 1, 0.75], abs=0.06)
+    assert found.covers[0].tolist() == [0] * 4
+
+
+def test_shares_are_of_what_is_hidden() -> None:
+    large, there = block(180, 40, 280, 140), [(230, 100)]
+    first = path([(40, 100), *there], 4.0)
+    assert shares(MOVER, first, large, np.array([3.0])).covered[0, 1] == pytest.approx(1, abs=0.03)
+    before = path([(40, 100), *there], 2.0)
+    assert shares(MOVER, before, large, np.array([3.0])).covers[0, 1] == pytest.approx(0.16, abs=0.05)
+
+
+def test_it_grows_as_it_comes_nearer() -> None:
+    large = block(180, 60, 260, 140)
+    found = shares(MOVER, path([(40, 100), (220, 100), (220, 100)], 4.0, [1, 1, 2]), large, np.array([4.5]))
+    assert found.covers[0] == pytest.approx([0, 0.25, 1], abs=0.06)
+
+
+def test_what_has_passed_the_camera_hides_nothing() -> None:
+    seen = path([(40, 100), (220, 100)], 2.0)
+    gone = SeenPaths(seen.points, seen.depth, seen.scale, np.array([[False, True]]))
+    assert shares(MOVER, gone, OTHER, np.array([3.0])).covers[0].tolist() == [0, 0]
+
+
+def test_each_draw_has_its_own_depths() -> None:
+    one = path([(40, 100), (220, 100)], 2.0)
+    two = SeenPaths(*(np.repeat(v, 2, axis=0) for v in (one.points, one.depth, one.scale, one.passed)))
+    found = shares(MOVER, two, OTHER, np.array([3.0, 1.0]))
+    assert found.covers[:, 1] == pytest.approx([1, 0])
+    assert found.covered[:, 1] == pytest.approx([0, 1])
+
+
+@given(
+    st.tuples(st.integers(0, 300), st.integers(0, 150), st.integers(1, 100), st.integers(1, 50)),
+    st.tuples(st.integers(0, 300), st.integers(0, 150), st.integers(1, 100), st.integers(1, 50)),
+    st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)),
+    st.floats(1e-3, 12.5),
+    st.floats(0.1, 100),
+)
+def test_shares_are_shares(a, b, point, scale, depth) -> None:
+    mover, other = (block(x, y, x + w, y + h) for x, y, w, h in (a, b))
+    found = shares(mover, path([(50, 50), point], depth, [1, scale]), other, np.array([10.0]))
+    for values in (found.covers, found.covered):
+        assert ((values >= 0) & (values <= 1)).all()
+    assert ((found.covers == 0) | (found.covered == 0)).all()

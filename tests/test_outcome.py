@@ -1,0 +1,157 @@
+"""What constructed worlds answer to a question, and how sure: probabilities, forms, negation, what it depends on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cow_service.physics.draws import COLUMN, NAMES, PARAMETERS, ensemble, likeliest, one_at_a_time
+from cow_service.physics.events import KINDS, NEVER, Events
+from cow_service.physics.outcome import SURE, Decided, agrees, decide
+from cow_service.records import Asked, AskedForm, AskedRelation
+
+COUNT = 100
+DRAWS = ensemble(COUNT)
+VARIED = one_at_a_time()
+
+
+def events(touches=None, occludes=None, covered=None, count=COUNT, bodies=4, stands_on=()) -> Events:
+    """Times [K] per body; what is not given never happens."""
+    times = {}
+    for kind, given in zip(KINDS, (touches, occludes, covered), strict=True):
+        times[kind] = np.full((count, bodies), NEVER)
+        for body, values in (given or {}).items():
+            times[kind][:, body] = values
+    eligible = np.array([i != 0 and i not in stands_on for i in range(bodies)])
+    return Events(times, {kind: np.zeros((count, bodies)) for kind in KINDS}, eligible)
+
+
+def share(value: float, time: float = 1.0) -> np.ndarray:
+    """Times of which a share is finite, spread evenly over the draws."""
+    return np.where(np.argsort(np.argsort(np.modf(np.arange(COUNT) * 0.618)[0])) < value * COUNT, time, NEVER)
+
+
+def asked(
+    form: AskedForm = "whether", relation: AskedRelation = "touches", target: str | None = "box", negated: bool = False
+) -> Asked:
+    return Asked(form=form, relation=relation, target=target, negated=negated)
+
+
+def decided(question: Asked, target: int | None, found: Events, draws=DRAWS, varied: Events | None = None) -> Decided:
+    if varied is None:  # where one parameter deviates, all is as in most worlds
+        first = {kind: np.median(values, axis=0) for kind, values in found.times.items()}
+        times = {kind: np.tile(row, (len(VARIED), 1)) for kind, row in first.items()}
+        varied = Events(times, {kind: np.zeros_like(values) for kind, values in times.items()}, found.eligible)
+    return decide(question, target, found, draws, varied)
+
+
+@pytest.mark.parametrize(
+    ("value", "sure"), [(0.0, True), (0.2, True), (0.45, False), (0.6, False), (0.9, True), (1.0, True)]
+)
+def test_probability_and_sureness_of_whether(value: float, sure: bool) -> None:
+    found = decided(asked(), 2, events(touches={2: share(value), 1: 0.5}))
+    assert found.probability == pytest.approx(value)
+    assert found.sure == sure
+    missed = decided(asked(negated=True), 2, events(touches={2: share(value), 1: 0.5}))
+    assert missed.probability == pytest.approx(1 - value)
+    assert missed.sure == sure
+
+
+def test_it_is_sure_from_the_stated_share_on() -> None:
+    assert decided(asked(), 1, events(touches={1: share(SURE)})).sure
+    assert not decided(asked(), 1, events(touches={1: share(SURE - 0.01)})).sure
+
+
+@pytest.mark.parametrize(("relation", "kind"), [("touches", "touches"), ("covers", "occludes"), ("covered", "covered")])
+def test_each_relation_looks_at_its_own_kind_of_event(relation: AskedRelation, kind: str) -> None:
+    found = events(**{kind: {1: 1.0}})
+    for other in ("touches", "covers", "covered"):
+        assert decided(asked(relation=other), 1, found).probability == (1.0 if other == relation else 0.0)
+
+
+def test_of_anything_any_will_do_but_what_it_stands_on() -> None:
+    halves = share(0.5)
+    found = events(touches={1: halves, 2: np.where(np.isfinite(halves), NEVER, 2.0), 3: 0.0}, stands_on=(3,))
+    assert decided(asked(target=None), None, found).probability == 1.0
+    assert decided(asked(target=None), None, events(touches={3: 0.0}, stands_on=(3,))).probability == 0.0
+    assert decided(asked(), 1, found).probability == pytest.approx(0.5)
+
+
+def test_which_is_met_first() -> None:
+    soon, late = share(0.8, 0.5), np.full(COUNT, 1.0)
+    found = decided(asked("which-first", target=None), None, events(touches={2: soon, 1: late}))
+    assert (found.first, found.probability, found.sure) == (2, pytest.approx(0.8), True)
+    none = decided(asked("which-first", target=None), None, events())
+    assert (none.first, none.probability, none.sure) == (None, 1.0, True)
+    open_ = decided(asked("which-first", target=None), None, events(touches={2: share(0.5, 0.5), 1: late}))
+    assert not open_.sure
+
+
+def test_when_it_happens() -> None:
+    times = np.linspace(1, 2, COUNT)
+    times[:10] = NEVER
+    found = decided(asked("when"), 1, events(touches={1: times}))
+    assert found.probability == pytest.approx(0.9)
+    assert found.time == pytest.approx(np.median(times[10:]))
+    assert found.time_band == pytest.approx((np.quantile(times[10:], 0.1), np.quantile(times[10:], 0.9)))
+    never = decided(asked("when"), 1, events())
+    assert (never.probability, never.time, never.time_band) == (0.0, None, None)
+
+
+def test_how_many_are_met() -> None:
+    found = decided(asked("how-many", target=None), None, events(touches={1: 1.0, 2: share(0.85), 3: share(0.05)}))
+    assert found.count == 2
+    assert found.probability == pytest.approx(0.8, abs=0.051)
+    assert found.sure
+    none = decided(asked("how-many", target=None), None, events())
+    assert (none.count, none.probability) == (0, 1.0)
+
+
+@pytest.mark.parametrize("name", ["speed", "depth", "pitch", "friction", "size", "slant_ahead"])
+def test_it_depends_on_what_goes_with_the_answer(name: str) -> None:
+    column = COLUMN[name]
+    split = [np.where(rows[:, column] > 0.6, 1.0, NEVER) for rows in (DRAWS, VARIED)]
+    found = decide(asked(), 1, events(touches={1: split[0]}), DRAWS, events(touches={1: split[1]}, count=len(VARIED)))
+    assert found.depends_on[0] == PARAMETERS[name]
+    assert not found.robust
+    far = [np.where(rows[:, column] > 1.2, 1.0, NEVER) for rows in (DRAWS, VARIED)]
+    firm = decide(asked(), 1, events(touches={1: far[0]}), DRAWS, events(touches={1: far[1]}, count=len(VARIED)))
+    assert firm.robust, "one deviation does not change it"
+    assert firm.depends_on[0] == PARAMETERS[name]
+
+
+def test_what_always_happens_depends_on_nothing() -> None:
+    found = decided(asked(), 1, events(touches={1: 1.0}))
+    assert (found.robust, found.depends_on) == (True, ())
+
+
+def test_worlds_that_answer_as_most_do() -> None:
+    around = events(touches={1: share(0.8)})
+    yes, no = events(touches={1: 1.0}, count=1), events(count=1)
+    same = agrees(asked(), 1, yes, around)
+    assert same.shape == (COUNT + 1,)
+    assert same[:-1].tolist() == np.isfinite(share(0.8)).tolist()
+    assert same[-1]
+    assert not agrees(asked(), 1, no, around)[-1]
+    assert agrees(asked(negated=True), 1, yes, around)[-1], "what happens is the same, however it is asked for"
+
+
+class TestDraws:
+    def test_of_each_parameter_every_quantile_occurs_once(self) -> None:
+        for count in (1, 7, 100):
+            rows = ensemble(count)
+            assert rows.shape == (count, len(NAMES))
+            assert (np.sort(rows, axis=0) == np.sort(rows[:, :1], axis=0)).all()
+            assert np.abs(rows.mean(axis=0)).max() < 1e-9
+        assert DRAWS.std(axis=0) == pytest.approx(np.ones(len(NAMES)), abs=0.05)
+        mixed = np.abs(np.corrcoef(DRAWS.T) - np.eye(len(NAMES)))
+        assert mixed.max() < 0.4
+
+    def test_they_are_the_same_every_time(self) -> None:
+        assert ensemble(50).tobytes() == ensemble(50).tobytes()
+
+    def test_one_deviates_at_a_time(self) -> None:
+        assert (np.abs(VARIED).sum(axis=1) == 1).all()
+        assert VARIED[COLUMN["speed"], COLUMN["speed"]] == 1
+        assert VARIED[len(NAMES) + COLUMN["speed"], COLUMN["speed"]] == -1
+        assert not likeliest().any()

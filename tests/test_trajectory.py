@@ -1,0 +1,294 @@
+"""Stage 3 as a whole, on drawn scenes: what happens, what is said of it, and input that cannot be meant."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from drawn import ball, block, floor
+from hypothesis import given
+from hypothesis import strategies as st
+from runs import run_of
+
+from cow_service.records import Grounding, LocatedObject, ObjectPrior, Trajectory
+from cow_service.stages.grounding import ground
+from cow_service.stages.motion import read_motion
+from cow_service.stages.trajectory import compute_trajectory, trajectory_of
+from cow_service.vision.masks import CroppedMask
+from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.scene import Scene
+from cow_service.vision.types import Image
+
+RED, BLUE, GREEN = (200, 30, 30), (40, 60, 200), (40, 160, 60)
+MOVER = {"object": "red ball", "bbox": (80, 210, 130, 260)}
+BEFORE, BESIDE, BEHIND = (300, 270, 370, 350), (330, 190, 400, 268), (330, 150, 380, 200)
+TALL = (290, 190, 380, 350)  # stands before its way, and hides it
+
+
+def scene(*blocks: tuple[int, int, int, int]) -> Image:
+    image = floor(640, 400)
+    for bbox in sorted(blocks, key=lambda bbox: bbox[3]):
+        image = block(image, bbox, BLUE)
+    return ball(image, (105, 235), 25, RED)
+
+
+def simulated(image: Image, objects=(), grounding=MOVER, motion=None, **request: Any) -> Trajectory:
+    """Stages 1 to 3 of a request that says all that a reader would."""
+    others = [{"object": f"block {i}" if i else "cube", "shape": "box", "bbox": bbox} for i, bbox in enumerate(objects)]
+    motion = {"kind": "linear", "direction": (1, 0), "speed": 160} if motion is None else motion
+    asked = {"question": "Will the ball hit the cube?", "num_frames": 49, "ensemble": 15} | request
+    run = run_of(image, grounding=grounding, motion=motion, objects=others, **asked)
+    grounded = ground(run).value
+    return compute_trajectory(run, grounded, read_motion(run, grounded, None).value).value
+
+
+def numbers(value: Any) -> list[float]:
+    """All numbers of a record."""
+    if isinstance(value, dict):
+        return [number for part in value.values() for number in numbers(part)]
+    if isinstance(value, list | tuple):
+        return [number for part in value for number in numbers(part)]
+    return [value] if isinstance(value, int | float) else []
+
+
+def is_sane(trajectory: Trajectory, frames: int = 49) -> None:
+    assert all(math.isfinite(number) for number in numbers(trajectory.model_dump()))
+    assert trajectory.paths[0].body == 0
+    assert len({path.body for path in trajectory.paths}) == len(trajectory.paths)
+    for path in trajectory.paths:
+        parts = [path.states, path.points, path.visible, path.scale, *path.tracks]
+        assert {len(part) for part in parts} == {frames}
+        assert len(path.rotation) in (0, frames)
+        assert len(path.band) in (0, frames)
+        assert all(x0 <= x1 and y0 <= y1 for x0, y0, x1, y1 in path.band)
+        assert min(path.scale) > 0
+    for body in trajectory.bodies:
+        assert min(body.size) > 0
+    names = {body.object for body in trajectory.bodies}
+    assert all(body.support in names | {"floor", "air"} for body in trajectory.bodies)
+    assert all(body.support != body.object for body in trajectory.bodies)
+    for encounter in trajectory.encounters:
+        assert 0 <= encounter.first_frame < frames
+        assert trajectory.bodies[encounter.body or 0].object == encounter.object
+
+
+class TestWhatHappens:
+    def test_what_stands_on_its_way_is_hit_and_moves(self) -> None:
+        told = simulated(scene(BESIDE), [BESIDE])
+        is_sane(told)
+        assert told.law == "contact"
+        (hit,) = (encounter for encounter in told.encounters if encounter.kind == "touches")
+        assert (hit.object, hit.body) == ("cube", 1)
+        assert hit.probability == told.outcome.probability > 0.9
+        assert told.outcome.sure
+        assert [path.body for path in told.paths] == [0, 1]
+        met = next(contact for contact in told.contacts if contact.b == 1)
+        assert met.impulse > 0
+        assert 320 < met.point[0] < 410
+        # The rims meet when the middle of the ball is 25 px before the block's near edge.
+        assert met.time == pytest.approx((330 - 25 - 105) / 160, abs=0.25)
+        assert hit.first_frame == pytest.approx(met.time * 16, abs=2)
+        assert told.paths[1].points[-1][0] > told.paths[1].points[0][0] + 1
+        assert told.path.points[0] == (105, 235)
+
+    def test_what_stands_before_or_behind_is_passed(self) -> None:
+        told = simulated(scene(BEFORE, BEHIND), [BEFORE, BEHIND])
+        is_sane(told)
+        assert len(told.paths) == 1
+        assert "touches" not in {encounter.kind for encounter in told.encounters}
+        assert told.outcome.probability < 0.3
+        behind = simulated(
+            scene(TALL), [TALL], question="If the ball rolls to the right, will it be hidden by the cube?"
+        )
+        assert {encounter.kind for encounter in behind.encounters} == {"occluded-by"}
+        assert behind.outcome.probability > 0.7
+
+    def test_without_an_ensemble_nothing_is_said_of_probabilities(self) -> None:
+        told = simulated(scene(BESIDE), [BESIDE], ensemble=0)
+        is_sane(told)
+        assert told.ensemble == 0
+        assert [encounter.probability for encounter in told.encounters] == [None] * len(told.encounters)
+        assert told.path.band == ()
+        assert (told.outcome.probability, told.outcome.sure) == (None, False)
+
+    def test_a_question_about_nothing_has_no_outcome(self) -> None:
+        assert simulated(scene(BESIDE), [BESIDE], question="What a day!").outcome is None
+        unknown = simulated(scene(BESIDE), [BESIDE], question="Will the ball hit the giraffe?").outcome
+        assert (unknown.object, unknown.probability, unknown.sure) == (None, None, False)
+
+    @pytest.mark.parametrize(
+        ("kind", "depth"), [("linear", 0.0), ("linear", -0.4), ("projectile", 0.0), ("projectile", 0.3)]
+    )
+    def test_the_paths_of_the_ballistic_law_are_those_of_the_paper(self, kind: str, depth: float) -> None:
+        motion = {"kind": kind, "direction": (0.6, -0.8), "depth": depth, "speed": 160, "law": "ballistic"}
+        told = simulated(scene(BESIDE), [BESIDE], motion=motion)
+        is_sane(told)
+        metres = 3 / 640
+        for i, (state, point, scale) in enumerate(
+            zip(told.path.states, told.path.points, told.path.scale, strict=True)
+        ):
+            t, across = i / 16, 160 * metres * math.sqrt(1 - depth**2)
+            pull = 9.81 if kind == "projectile" else 0.0
+            x, y = (105 - 320) * metres + 0.6 * across * t, (235 - 200) * metres - 0.8 * across * t + pull * t * t / 2
+            z = 640 * metres + 160 * metres * depth * t
+            assert state == pytest.approx(
+                (x, y, z, 0.6 * across, -0.8 * across + pull * t, 160 * metres * depth), abs=1e-9
+            )
+            near = max(z, 0.08 * 640 * metres)
+            assert point == pytest.approx((320 + 640 * x / near, 200 + 640 * y / near), rel=1e-9)
+            assert scale == pytest.approx(640 * metres / near, rel=1e-9)
+        assert told.law == "ballistic"
+        assert len(told.paths) == 1, "it passes through everything"
+        assert all(contact.impulse == 0 for contact in told.contacts)
+
+    def test_a_given_path_leads_through_everything(self) -> None:
+        points = [(105, 235), (380, 235), (380, 235)]
+        told = simulated(scene(BESIDE), [BESIDE], motion=None, grounding=MOVER, trajectory={"points": points, "fps": 1})
+        is_sane(told)
+        assert told.path.points[16] == pytest.approx((380, 235))
+        assert told.path.points[48] == pytest.approx((380, 235))
+        assert len(told.paths) == 1
+        assert any(encounter.kind == "touches" for encounter in told.encounters)
+
+    def test_the_same_request_gives_the_same_bytes(self) -> None:
+        first, again = (simulated(scene(BESIDE, BEHIND), [BESIDE, BEHIND]).model_dump_json() for _ in range(2))
+        assert first == again
+
+    def test_a_thrown_ball_comes_down_on_the_floor_and_rests(self) -> None:
+        image = ball(floor(640, 400), (150, 100), 20, RED)
+        there = {"object": "ball", "bbox": (130, 80, 170, 120)}
+        motion = {"kind": "projectile", "direction": (0.9, -0.43), "speed": 250}
+        told = simulated(image, grounding=there, motion=motion, num_frames=65)
+        is_sane(told, 65)
+        bounces = [contact for contact in told.contacts if contact.b is None]
+        assert bounces
+        assert bounces[0].impulse > 1.05 * abs(bounces[-1].impulse) or len(bounces) == 1
+        camera = told.camera
+        up = np.array([0, -math.cos(math.radians(camera.pitch)), -math.sin(math.radians(camera.pitch))])
+        heights = np.array(told.path.states)[:, :3] @ up + camera.height
+        radius = told.bodies[0].size[1] / 2
+        assert heights.min() > 0.9 * radius
+        assert heights[-1] == pytest.approx(radius, rel=0.15)
+        assert 0 < told.moving_until <= 64 / 16
+
+
+def many(count: int) -> list[tuple[int, int, int, int]]:
+    return [(20 + i % 10 * 60, 60 + i // 10 * 80, 60 + i % 10 * 60, 120 + i // 10 * 80) for i in range(count)]
+
+
+@pytest.mark.parametrize("law", ["contact", "ballistic"])
+def test_things_that_stand_on_each_other_in_a_circle(law: str) -> None:
+    objects = [
+        {"object": "tray", "bbox": (300, 200, 420, 300), "stands_on": "crate"},
+        {"object": "crate", "bbox": (320, 150, 400, 230), "stands_on": "tray"},
+    ]
+    run = run_of(
+        scene(BESIDE), grounding=MOVER | {"stands_on": "crate"}, objects=objects, ensemble=5, num_frames=33,
+        motion={"direction": (1, 0), "law": law}, question="Will the ball hit the tray?",
+    )  # fmt: skip
+    grounded = ground(run).value
+    is_sane(compute_trajectory(run, grounded, read_motion(run, grounded, None).value).value, 33)
+
+
+boxes = st.tuples(st.floats(0, 600), st.floats(0, 360), st.floats(2.1, 400), st.floats(2.1, 300)).map(
+    lambda box: (box[0], box[1], min(640.0, box[0] + box[2]), min(400.0, box[1] + box[3]))
+)
+
+
+def masked(bbox: tuple[float, float, float, float]) -> CroppedMask:
+    """A mask that fills a box: to cut one out of the image takes longer than all of stage 3."""
+    mask = np.zeros((400, 640), bool)
+    mask[int(bbox[1]) : max(int(bbox[1]) + 1, int(bbox[3])), int(bbox[0]) : max(int(bbox[0]) + 1, int(bbox[2]))] = True
+    return CroppedMask.of(mask)
+
+
+SEEN = Scene(scene(BESIDE, BEHIND))
+
+
+def seen(mover, others, prior: ObjectPrior | None = None, **request: Any) -> Trajectory:
+    """Stage 3 alone, of things whose boxes are full."""
+    asked = {"question": "Will it hit thing 0?", "num_frames": 13, "ensemble": 3} | request
+    run = run_of(SEEN.image, grounding={"bbox": mover}, **asked)
+    named = [
+        LocatedObject(object=f"thing {i}", bbox=bbox, prior=prior) for i, bbox in enumerate(others) if bbox != mover
+    ]
+    middle = ((mover[0] + mover[2]) / 2, (mover[1] + mover[3]) / 2)
+    grounding = Grounding(object="ball", bbox=mover, point=middle, prior=prior, others=tuple(named), source="request")
+    SEEN.preset_mask(mover, lambda: masked(mover).full())
+    obstacles = [Obstacle(other.object, other.bbox, masked(other.bbox)) for other in named]
+    return trajectory_of(SEEN, grounding, read_motion(run, grounding, None).value, obstacles, run.request)
+
+
+BAD: dict[str, dict[str, Any]] = {
+    "boxes that contradict the floor": {"others": [(300, 5, 330, 20), (320, 0, 640, 399), (10, 390, 40, 399)]},
+    "objects inside each other": {"others": [(280, 180, 420, 330), (300, 200, 400, 310), (320, 220, 380, 290)]},
+    "objects inside the mover": {"others": [(90, 220, 120, 250), (70, 200, 140, 270)]},
+    "a mover as large as the image": {"mover": (0, 0, 640, 400), "others": [BESIDE]},
+    "a mover of two pixels": {"mover": (100, 200, 102, 202), "others": [BESIDE]},
+    "a sliver": {"mover": (100, 10, 102, 390), "others": [(0, 200, 640, 202)]},
+    "straight up": {"motion": {"direction": (0, -1), "speed": 200}},
+    "thrown straight down": {"motion": {"kind": "projectile", "direction": (0, 1), "speed": 400}},
+    "thrown straight away": {"motion": {"kind": "projectile", "direction": (0, -1), "depth": 1, "speed": 400}},
+    "straight at the camera": {"motion": {"direction": (0, 1), "depth": -1, "speed": 900}},
+    "no speed": {"motion": {"direction": (1, 0), "speed": 0}},
+    "the greatest speed": {"motion": {"direction": (1, 0), "speed": 100_000}, "others": [BESIDE]},
+    "the greatest throw": {"motion": {"kind": "projectile", "direction": (1, -1), "speed": 100_000}},
+    "the smallest scale": {"motion": {"kind": "fall", "metres_per_pixel": 1e-6}, "others": [BESIDE]},
+    "the largest scale": {"motion": {"kind": "projectile", "direction": (1, 0), "metres_per_pixel": 1000}},
+    "a camera that looks up": {"camera": {"pitch": -60}, "others": [BESIDE, BEHIND]},
+    "a camera that looks straight up": {"camera": {"pitch": -90}, "others": [BESIDE]},
+    "a camera that looks straight down": {"camera": {"pitch": 90}, "others": [BESIDE]},
+    "a camera on its head": {"camera": {"roll": 180}, "others": [BESIDE]},
+    "a telescope": {"camera": {"focal": 1_000_000}, "others": [BESIDE]},
+    "a fisheye": {"camera": {"focal": 1}, "others": [BESIDE]},
+    "two frames": {"num_frames": 2, "fps": 60, "others": [BESIDE]},
+    "many frames": {"num_frames": 481, "fps": 60, "ensemble": 2, "others": [BESIDE]},
+    "few frames a second": {"num_frames": 20, "fps": 1, "others": [BESIDE]},
+    "one world": {"ensemble": 1, "others": [BESIDE]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_meant_gives_a_sane_result(name: str) -> None:
+    rolling = {"direction": (1, 0), "speed": 160}
+    given_ = {"mover": MOVER["bbox"], "others": [], "motion": rolling, "num_frames": 33, "ensemble": 10} | BAD[name]
+    is_sane(seen(**given_), given_["num_frames"])
+
+
+@pytest.mark.parametrize("name", ["objects inside each other", "a mover as large as the image"])
+def test_what_cannot_be_meant_is_cut_out_of_the_image_as_well(name: str) -> None:
+    bad = BAD[name]
+    there = {"object": "ball", "bbox": bad.get("mover", MOVER["bbox"])}
+    is_sane(simulated(scene(BESIDE), bad["others"], grounding=there, num_frames=17, ensemble=2), 17)
+
+
+@pytest.mark.parametrize("kind", ["linear", "projectile"])
+def test_forty_objects(kind: str) -> None:
+    told = seen(
+        (80, 210, 130, 260), many(40), motion={"kind": kind, "direction": (1, -0.3), "speed": 300}, num_frames=33
+    )
+    is_sane(told, 33)
+    assert len(told.bodies) == 41
+
+
+@given(
+    boxes,
+    st.lists(boxes, max_size=8, unique=True),
+    st.sampled_from(["linear", "projectile", "fall", "static"]),
+    st.floats(-math.pi, math.pi),
+    st.floats(-1, 1),
+    st.floats(0, 5).map(lambda power: 10**power),
+    st.sampled_from(["sphere", "box", "cylinder", "cone", None]),
+    st.sampled_from(["floor", "air", "thing 0", None]),
+    st.floats(-90, 90) | st.none(),
+)
+def test_any_request_gives_a_sane_result(mover, others, kind, angle, depth, speed, shape, stands_on, pitch) -> None:
+    directed = {"direction": (math.cos(angle), math.sin(angle)), "depth": depth, "speed": speed}
+    told = seen(
+        mover, others, ObjectPrior(shape=shape, stands_on=stands_on),
+        camera=None if pitch is None else {"pitch": pitch},
+        motion={"kind": kind} | (directed if kind in ("linear", "projectile") else {}),
+    )  # fmt: skip
+    is_sane(told, 13)
