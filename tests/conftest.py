@@ -35,7 +35,7 @@ from cow_service.settings import Settings
 
 # How much the crash, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
 SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
-settings.register_profile("cow", deadline=None, derandomize=True, database=None, max_examples=20 * SCALE)
+settings.register_profile("cow", deadline=None, derandomize=True, database=None, max_examples=12 * SCALE)
 settings.load_profile("cow")
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -23,6 +23,8 @@ def database(request: pytest.FixtureRequest) -> Iterator[str | None]:
     if request.param == "sqlite":
         yield None
         return
+    if SCALE == 1:
+        pytest.skip("kills on PostgreSQL are tested in `make soak`; recovery on it is in test_recovery.py")
     with postgres_server() as url:
         yield url
 

@@ -63,7 +63,7 @@ def test_every_answer_is_in_the_contract(contract, method: str, path: str, mode:
     operation = contract[path][method]
 
     @given(case=operation.as_strategy(generation_mode=mode))
-    @settings(max_examples=6 * SCALE, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=3 * SCALE, deadline=None, suppress_health_check=list(HealthCheck))
     def check(case) -> None:
         if mode is GenerationMode.POSITIVE and isinstance(case.body, dict) and case.media_type == "application/json":
             case.body = doable(path, case.body, case.body.get("num_frames", 9) % 20 + 2)
@@ -80,8 +80,8 @@ def test_a_real_server_keeps_the_contract(server: Server) -> None:
     """Examples, coverage of every constraint, fuzzing, and chains of calls along the links of `openapi.yaml`."""
     command = [
         str(Path(sys.executable).with_name("schemathesis")), "run", str(ROOT / "openapi.yaml"), "--url", server.address,
-        "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", str(2 * SCALE), "--seed", "1",
-        "--suppress-health-check", "all", "--max-time", str(20 * SCALE),
+        "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", str(SCALE), "--seed", "1",
+        "--suppress-health-check", "all", "--max-time", str(10 * SCALE),
         "--checks", ",".join(check.__name__ for check in CHECKS), "--request-timeout", "60",
         "--no-color", "--no-shrink",
         "--generation-database", "none", "--continue-on-failure", "--report-dir", str(server.data / "fuzz"),

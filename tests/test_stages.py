@@ -251,7 +251,7 @@ def test_the_law_alone_leaves_the_motion_to_the_reader() -> None:
     kept = SimulateRequest.model_validate(asked.model_dump(mode="json", exclude_defaults=True))
     assert kept == asked
     default = SimulateRequest(image="data:,", question="?")
-    assert (default.law, default.ensemble) == ("contact", 100)
+    assert (default.law, default.ensemble) == ("contact", 50)
 
 
 def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Scene) -> None:

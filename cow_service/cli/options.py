@@ -48,7 +48,7 @@ def request_body(
             "may be repeated.",
         ),
     ] = None,
-    ensemble: Annotated[int, typer.Option(help="How many worlds the probabilities are counted in; 0: none.")] = 100,
+    ensemble: Annotated[int, typer.Option(help="How many worlds the probabilities are counted in; 0: none.")] = 50,
     trajectory: Annotated[
         Path | None,
         typer.Option(

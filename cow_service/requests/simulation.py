@@ -54,7 +54,7 @@ class SimulateRequest(Record):
     )
     camera: CameraRequest | None = None
     ensemble: Whole = Field(
-        default=100,
+        default=50,
         ge=0,
         le=500,
         description="How many worlds the probabilities are counted in; 0: none, and no probabilities.",
