@@ -1,6 +1,6 @@
 """Measures how sure the world is: probabilities of throws with known truth, from geometry alone.
 
-    python benchmarks/throws.py [--count N] [--seed N] [--wide] [--ensemble N] [--json FILE]
+    python benchmarks/throws.py [--count N] [--seed N] [--wide] [--ensemble N] [--bound] [--json FILE]
 
 Each throw is drawn at random: a camera, a ball in the air with its shadow, a target and other things on the floor, a
 speed, a rise and a heading out of the plane of the image (15 degrees, one standard deviation; with `--wide` any up to
@@ -8,7 +8,8 @@ speed, a rise and a heading out of the plane of the image (15 degrees, one stand
 engine says with the true values whether the ball meets the target. Stage 3 sees what an image shows: boxes, the
 shadow's ellipse and the direction in the image, each with a little noise; not camera, heights, depth or speed.
 Printed are the Brier score (mean squared difference of probability and truth), that of always saying the base rate, and
-how often answers are right.
+how often answers are right. With `--bound` the same is printed of one who knows what no image tells: the camera, the
+bodies and how these throws are drawn, so that only heading, rise and speed are open. Nobody can be surer than that.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import math
 import statistics
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -185,6 +186,43 @@ def probability(throw: Throw, size: int) -> tuple[float, bool]:
     return float(found.happens("touches")[:, 1].mean()), bool(single.happens("touches")[0, 1])
 
 
+def best_probability(throw: Throw, size: int, rng: np.random.Generator) -> float:
+    """That the ball meets the target, for one who knows everything of `draw_throw` but heading, rise and speed."""
+    ball, *others = throw.bodies
+    place, sense = np.array(ball.position), math.copysign(1.0, ball.velocity[0])
+    seen = math.atan2(throw.direction[1], throw.direction[0])
+    rises = np.radians(np.arange(5, 33))
+    worlds, weights = list[tuple[RigidShape, ...]](), list[float]()
+    deviations = np.linspace(-4, 4, size)
+    for deviation, speed in zip(deviations, rng.uniform(1.2, 2.4, size), strict=True):
+        turn = math.radians(TURN_SIGMA) * deviation
+        level = np.array([sense * math.cos(turn), 0.0, math.sin(turn)])
+        ways = np.cos(rises)[:, None] * level + np.sin(rises)[:, None] * np.array([0.0, 1.0, 0.0])
+        ends = throw.camera.project(throw.camera.from_floor(np.concatenate([place[None], place + 1e-3 * ways])))
+        step = ends[1:] - ends[0]
+        off = (np.degrees(np.arctan2(step[:, 1], step[:, 0]) - seen) + 180) % 360 - 180
+        fits = np.exp(-0.5 * (off / DIRECTION_NOISE) ** 2)
+        if fits.sum() > 1e-9:
+            way = ways[rng.choice(len(rises), p=fits / fits.sum())]
+            worlds.append((replace(ball, velocity=tuple((speed * way).tolist())), *others))
+            weights.append(
+                float(fits.sum())
+                * math.exp(-0.5 * deviation**2)
+                * _target_density(np.array(others[0].position) - place, level)
+            )
+    hits = [
+        any(meeting.a == 0 and meeting.b == 1 for meeting in run.meetings) for run in run_worlds(worlds, FRAMES, FPS, 2)
+    ]
+    return float(np.average(hits, weights=weights))
+
+
+def _target_density(away: Floats, level: Floats) -> float:
+    """Of a target at a place from the ball, for a heading: half lie about on the way, half anywhere."""
+    along, aside = away[0] * level[0] + away[2] * level[2], away[2] * level[0] - away[0] * level[2]
+    ahead = math.exp(-0.5 * (aside / 0.15) ** 2) / (0.15 * math.sqrt(2 * math.pi)) / 1.2 if 0.6 < along < 1.8 else 0.0
+    return 0.5 * ahead + 0.5 / (2.4 * 1.8)
+
+
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
@@ -192,6 +230,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--wide", action="store_true", help="headings of up to 45 degrees out of the image")
     parser.add_argument("--ensemble", type=int, default=100)
+    parser.add_argument("--bound", action="store_true", help="also what one could know at best (not with --wide)")
     parser.add_argument("--json", type=Path, default=None, help="write the figures here")
     arguments = parser.parse_args()
     rng = np.random.default_rng(arguments.seed)
@@ -207,8 +246,12 @@ def main() -> int:
         times.append(1000 * (time.process_time() - started))
         told.append(likely)
         shown.append(single)
-    figures = summarise(np.array(told), np.array(shown), np.array([throw.hits for throw in throws]))
+    truth = np.array([throw.hits for throw in throws])
+    figures = summarise(np.array(told), np.array(shown), truth)
     figures["CPU per throw, median (ms)"] = round(statistics.median(times), 1)
+    if arguments.bound and not arguments.wide:
+        best = np.array([best_probability(throw, 160, rng) for throw in throws])
+        figures["Brier score at best"] = summarise(best, (best >= 0.5).astype(float), truth)["Brier score"]
     for name, value in figures.items():
         print(f"{name}: {value}")
     if arguments.json is not None:

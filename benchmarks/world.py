@@ -5,10 +5,11 @@
 Each DIR holds one folder per scene with image.jpg and meta.json, as `examples/` does. A scene is asked by image and
 question alone, but for the direction of vehicles, which the embedded reader cannot read. Per scene: the answer against
 the truth, with its probability; path error (% of the image's width: mean distance of the true centres, up to the first
-contact, to the path), size error (% of the apparent size at the nearest point of the path, for what stands on a floor),
-push error (of what is pushed: distance of its last centre to the true one, as a share of how far off it would be if it
-had stayed), and whether the path shown agrees with the answer. Scenes of forms that the service does not know yet
-(`remove`, `billiards`, `place`, `trail`) are left out.
+contact, to the path) and the same with the true path moved to where the path begins (the middle of a box is not where
+the middle of a car or a candle is seen), size error (% of the apparent size at the nearest point of the path, for what
+stands on a floor), push error (of what is pushed: distance of its last centre to the true one, as a share of how far
+off it would be if it had stayed), and whether the path shown agrees with the answer. Scenes of forms that the service
+does not know yet (`remove`, `billiards`, `place`, `trail`) are left out.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
 
+LINEAR = ("linear", "slide", "slide-occlude", "car")
 LEFT_OUT = ("remove", "billiards", "place", "trail")
 PUSHED = 5.0  # px: what truly moves less is not pushed
 TOUCHING = 1.15  # of the summed half extents: bodies of one path that come nearer than this are shown to touch
@@ -50,6 +52,7 @@ class Row:
     outcome: str  # right, wrong, not sure, or the code of an error
     probability: float | None = None
     path_error: float | None = None
+    moved_path_error: float | None = None
     size_error: float | None = None
     push_error: float | None = None
     agrees: bool | None = None
@@ -89,6 +92,7 @@ def _row(folder: Path, form: str, meta: dict[str, Any], answer: Answer, trajecto
         outcome=said,
         probability=None if told is None else told.probability,
         path_error=_path_error(trajectory, meta),
+        moved_path_error=_path_error(trajectory, meta, moved=True),
         size_error=_size_error(trajectory, meta) if meta["motion"] == "linear" and form != "table" else None,
         push_error=_push_error(trajectory, meta),
         agrees=None if happens is None else _shown(trajectory, meta) == happens,
@@ -107,8 +111,9 @@ def _fine(points: tuple[tuple[float, float], ...]) -> Floats:
     return np.stack([np.interp(stamps, np.arange(len(path)), path[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def _path_error(trajectory: Trajectory, meta: dict[str, Any]) -> float:
+def _path_error(trajectory: Trajectory, meta: dict[str, Any], moved: bool = False) -> float:
     true = np.array(meta["track"][: _until_contact(meta) + 1])
+    true = true + moved * (np.array(trajectory.path.points[0]) - true[0])
     gaps = np.linalg.norm(true[:, None] - _fine(trajectory.path.points)[None], axis=2).min(axis=1)
     return float(100 * gaps.mean() / meta["image_size"][0])
 
@@ -202,7 +207,8 @@ def summarise(rows: list[Row]) -> dict[str, Any]:
         "Brier score": round(statistics.mean((p - truth) ** 2 for p, truth in told), 4) if told else None,
         "path error, throws parallel to the image": _spread(rows, "path_error", ("projectile",)),
         "path error, all throws and falls from tables": _spread(throws, "path_error", None),
-        "path error, linear": _spread(rows, "path_error", ("linear", "slide", "slide-occlude", "car")),
+        "path error, linear": _spread(rows, "path_error", LINEAR),
+        "path error, linear, from the same first point": _spread(rows, "moved_path_error", LINEAR),
         "size error, linear": _spread(rows, "size_error", None),
         "push error": _spread(rows, "push_error", None),
         "shown against the answer": sum(row.agrees is False for row in rows),

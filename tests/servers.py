@@ -97,6 +97,7 @@ class Served:
             found = re.search(r"running on (http://\S+)", self.log()[said:])
             return found and found[1]
 
+        self.http.close()  # to a server that ended by itself
         self.http = httpx.Client(base_url=eventually(address), timeout=PATIENCE)
         eventually(lambda: self.http.get("/readyz").status_code == 200)
 

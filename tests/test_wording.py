@@ -69,9 +69,9 @@ def test_a_notebook_shows_the_same(simulation: Simulation) -> None:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"probability": 0.97}, "what is asked happens in 97 of 100 worlds; no single doubt changes it"),
+        ({"probability": 0.97}, "what is asked happens in 97 of 100 worlds; robust"),
         ({"sure": False, "robust": False, "depends_on": ("camera",)}, "not sure; it depends on camera"),
-        ({"asked": Asked(form="which-first", relation="touches"), "first": "mug"}, "first: mug; no single doubt"),
+        ({"asked": Asked(form="which-first", relation="touches"), "first": "mug"}, "first: mug; robust"),
         ({"asked": Asked(form="how-many", relation="touches"), "count": 2, "probability": 0.8}, "count: 2, 80 of 100"),
         (
             {"asked": Asked(form="when", relation="touches"), "time": 1.13, "time_band": (0.9, 1.4)},

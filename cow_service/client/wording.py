@@ -53,7 +53,7 @@ def outcome_words(outcome: Outcome) -> str:
     if outcome.depends_on:
         parts.append(f"it depends on {' and '.join(outcome.depends_on)}")
     elif outcome.robust and outcome.sure:
-        parts.append("no single doubt changes it")
+        parts.append("robust")
     return "; ".join(parts)
 
 

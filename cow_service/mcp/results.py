@@ -51,7 +51,7 @@ class Outcome(Result):
     count: int | None = Field(description="How many, where that is asked.")
     time_s: float | None = Field(description="Seconds until it happens.")
     sure: bool = Field(description="Whether the world is certain enough for an answer.")
-    robust: bool = Field(description="Whether no single doubt changes the answer.")
+    robust: bool = Field(description="Whether at least 90% of the worlds give the answer.")
     depends_on: list[Doubt] = Field(description="What the answer depends on, most first.")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -35,7 +36,7 @@ class SeenBody:
         """Where it stands, px: the middle of its box's lower edge."""
         return (self.bbox[0] + self.bbox[2]) / 2, self.bbox[3]
 
-    @property
+    @cached_property
     def fullness(self) -> float:
         """Volume of the body that its outline would turn to about its axis, of that of the cylinder around it."""
         widths = self.mask.patch.sum(axis=1)

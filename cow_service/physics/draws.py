@@ -35,12 +35,6 @@ def likeliest() -> Floats:
     return np.zeros((1, len(NAMES)))
 
 
-def one_at_a_time() -> Floats:
-    """Rows [2 P, P] of the worlds in which one parameter deviates by one standard deviation, either way."""
-    steps = np.eye(len(NAMES))
-    return np.concatenate([steps, -steps])
-
-
 def ensemble(count: int) -> Floats:
     """Rows [count, P] by Latin hypercube sampling: of each parameter every quantile occurs once."""
     quantiles = np.array([NormalDist().inv_cdf((i + 0.5) / count) for i in range(count)])

@@ -35,14 +35,6 @@ class Events:
         """[K, B]."""
         return np.isfinite(self.times[kind])
 
-    def part(self, rows: slice) -> Events:
-        """Those of some draws."""
-        return Events(_rows(self.times, rows), _rows(self.shares, rows), self.eligible)
-
-
-def _rows(table: PerKind, rows: slice) -> PerKind:
-    return {kind: values[rows] for kind, values in table.items()}
-
 
 def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats) -> Events:
     """The events of every draw [K, P]. What the mover stands on at the start is no encounter."""

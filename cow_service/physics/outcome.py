@@ -1,7 +1,7 @@
 """How a question is answered by an ensemble of worlds, and how sure that is.
 
-The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds. It is
-robust where no single parameter, one deviation either way, changes it.
+The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds, and robust
+where it has at least `ROBUST` of them.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from cow_service.records import Asked, AskedRelation, Doubt, EncounterKind
 from cow_service.vision.types import Floats, Mask
 
 SURE = 0.7  # share of the worlds from which an answer is given
+ROBUST = 0.9
 MATTERS = 0.2  # correlation with the outcome from which a parameter is named
 MOST_NAMED = 3
 
@@ -38,21 +39,20 @@ class Decided:
     time_band: tuple[float, float] | None = None
 
 
-def decide(asked: Asked, target: int | None, ensemble: Events, draws: Floats, varied: Events) -> Decided:
-    """The answer of an ensemble with draws [K, P]; `varied` are worlds in which one parameter deviates each."""
-    answers, others = (_answers(asked, target, events) for events in (ensemble, varied))
+def decide(asked: Asked, target: int | None, ensemble: Events, draws: Floats) -> Decided:
+    """The answer of an ensemble with draws [K, P]."""
+    answers = _answers(asked, target, ensemble)
     counted = Counter(answers)
     answer, most = max(counted.items(), key=lambda item: (item[1], item[0]))
     probability = most / len(answers)
     times = _times(asked, target, ensemble)
     times = times[np.isfinite(times)]
     shown = asked.form in ("whether", "when")
-    changed = np.array([other != answer for other in others])
     return Decided(
         probability=_said(asked, answer, probability) if shown else probability,
         sure=probability >= SURE,
-        robust=not changed.any(),
-        depends_on=_depends_on(np.array([found == answer for found in answers]), draws, changed),
+        robust=probability >= ROBUST,
+        depends_on=_depends_on(np.array([found == answer for found in answers]), draws),
         first=answer if asked.form == "which-first" and answer >= 0 else None,
         count=answer if asked.form == "how-many" else None,
         time=float(np.median(times)) if len(times) else None,
@@ -97,17 +97,15 @@ def _per_body(asked: Asked, target: int | None, events: Events) -> Floats:
     return np.where(meant[None], events.times[KIND_OF[asked.relation]], np.inf)
 
 
-def _depends_on(same: Mask, draws: Floats, changed: Mask) -> tuple[Doubt, ...]:
-    """Doubts whose parameters go with the answer, those that change it by one deviation first."""
+def _depends_on(same: Mask, draws: Floats) -> tuple[Doubt, ...]:
+    """Doubts whose parameters go with the answer, the closest first."""
     weights: dict[Doubt, float] = {}
     for place, name in enumerate(NAMES):
         column = draws[:, place]
         spread = float(same.std() * column.std())
         related = abs(float(((same - same.mean()) * (column - column.mean())).mean())) / spread if spread > 0 else 0.0
-        flips = changed[[place, place + len(NAMES)]].any()
-        weight = related + (1.0 if flips else 0.0)
-        doubt = PARAMETERS[name]
-        if flips or related >= MATTERS:
-            weights[doubt] = max(weights.get(doubt, 0.0), weight)
+        if related >= MATTERS:
+            doubt = PARAMETERS[name]
+            weights[doubt] = max(weights.get(doubt, 0.0), related)
     ranked: Sequence[Doubt] = sorted(weights, key=lambda doubt: -weights[doubt])
     return tuple(ranked[:MOST_NAMED])

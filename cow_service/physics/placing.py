@@ -22,9 +22,8 @@ TURN_SIGMA: dict[Cue, float] = {
 }  # fmt: skip
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
 RISE, RISE_SIGMA = math.radians(20), math.radians(8)  # above the horizontal: how things are thrown
-TURNS = np.linspace(-5, 5, 81)  # in deviations: turns out of the plane of the image that are weighed
-TURN_WIDTHS = ((0.6, 0.55), (3.0, 0.45))  # deviations and shares: most throws go nearly along the image, some do not
-AIMED, AIM_SIGMA = 1.0, math.radians(9)  # how much likelier a heading to what is asked about is, and how exact
+TURNS = np.linspace(-4, 4, 65)  # in deviations: turns out of the plane of the image that are weighed
+AIMED, AIM_SIGMA = 4.0, math.radians(9)  # how much likelier a heading to what is asked about is, and how exact
 LOW = 0.08  # sine of the angle between a ray and a horizontal plane below which the plane through the foot is taken
 APART = 0.98  # of the distance of two bodies: together they are so wide at most
 VEHICLE_WIDTH = 0.5  # of a vehicle's length
@@ -40,11 +39,6 @@ class PlacedScene:
     supports: tuple[int | None, ...]  # index of the body that each stands on; None: the floor, or nothing
     velocity: Floats  # [K, 3] m/s, of the mover
     light: Floats  # [K, 2]: metres that a shadow lies to the right and ahead, per metre of height
-
-    def part(self, rows: slice) -> PlacedScene:
-        """The scene of some draws."""
-        bodies = tuple(body.part(rows) for body in self.bodies)
-        return PlacedScene(self.cameras.part(rows), bodies, self.supports, self.velocity[rows], self.light[rows])
 
 
 def place(
@@ -220,8 +214,7 @@ def _thrown(
         turns, count = mean + sigma * TURNS, len(TURNS)
         one, facing = mover.repeated(count), np.repeat(direction[:1], count, axis=0)
         rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
-        weight = sum(share / width * np.exp(-0.5 * (TURNS / width) ** 2) for width, share in TURN_WIDTHS)
-        weight = weight * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
+        weight = np.exp(-0.5 * TURNS**2) * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
         if asked is not None:
             away = asked.centre[0] - mover.centre[0]
             bearing = math.atan2(float(away[2]), float(np.sign(direction[0, 0]) * away[0]))

@@ -58,10 +58,6 @@ class Worlds:
     every: int  # frames between recorded ones
     fps: float  # of the clip
 
-    def part(self, rows: slice) -> Worlds:
-        """The worlds of some draws."""
-        return Worlds(self.scene.part(rows), self.shapes[rows], self.runs[rows], self.every, self.fps)
-
 
 def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""

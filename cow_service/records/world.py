@@ -124,7 +124,7 @@ class Outcome(Record):
     time: float | None = Field(default=None, description="Seconds until it first happens, the median of the worlds.")
     time_band: tuple[float, float] | None = Field(default=None, description="Its 10th and 90th percentile, s.")
     sure: bool = Field(description="Whether the world is certain enough for an answer; else the answer is not sure.")
-    robust: bool = Field(description="Whether no single doubt, one deviation either way, would change the answer.")
+    robust: bool = Field(description="Whether at least 90% of the worlds give the answer.")
     depends_on: tuple[Doubt, ...] = Field(default=(), description="What the answer depends on, most first.")
     facts: str = Field(default="", description="What happens, in one sentence made of the facts.")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cow_service.physics.draws import ensemble, likeliest, one_at_a_time
+from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.events import Events, find_events
 from cow_service.physics.outcome import Decided, agrees, decide
 from cow_service.physics.world import WorldInput, Worlds, run_world
@@ -38,12 +38,10 @@ def imagine(world: WorldInput, asked: Asked | None, target: int | None, size: in
     if size == 0:
         return Imagined(shown, events, None, None, None)
     rows = ensemble(size)
-    varied = one_at_a_time()
-    all_worlds, all_events = _run(world, np.concatenate([rows, varied]), EVERY)
-    around, around_events = all_worlds.part(slice(0, size)), all_events.part(slice(0, size))
+    around, around_events = _run(world, rows, EVERY)
     if asked is None:
         return Imagined(shown, events, around, around_events, None)
-    decided = decide(asked, target, around_events, rows, all_events.part(slice(size, None)))
+    decided = decide(asked, target, around_events, rows)
     if decided.sure:
         shown, events = _agreeing(world, asked, target, rows, around_events, shown, events)
     return Imagined(shown, events, around, around_events, decided)

@@ -43,7 +43,8 @@ def _outcome_words(trajectory: Trajectory, mover: str) -> tuple[str, ...]:
     lines = [_one_line(outcome.facts)] if outcome.facts else []
     if outcome.probability is not None:
         lines.append(f"{_share(outcome.probability, trajectory.ensemble)}: {_event(outcome, _one_line(mover))}.")
-        lines.append(_robustness(outcome))
+    if outcome.depends_on:
+        lines.append(f"It depends most on {', '.join(DOUBTS[doubt] for doubt in outcome.depends_on)}.")
     return tuple(lines)
 
 
@@ -61,14 +62,6 @@ def _event(outcome: Outcome, mover: str) -> str:
         return event
     early, late = outcome.time_band or (outcome.time, outcome.time)
     return f"{event}, first after {outcome.time:.2f} s ({early:.2f} to {late:.2f} s in the middle 80% of the worlds)"
-
-
-def _robustness(outcome: Outcome) -> str:
-    sense = (
-        "no single estimate behind it changes this" if outcome.robust else "a single estimate behind it changes this"
-    )
-    doubts = ", ".join(DOUBTS[doubt] for doubt in outcome.depends_on)
-    return f"Off by one standard deviation, {sense}{f'; it depends most on {doubts}' if doubts else ''}."
 
 
 def _encounter_words(encounter: Encounter, trajectory: Trajectory) -> str:
