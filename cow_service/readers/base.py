@@ -16,6 +16,7 @@ from cow_service.records import (
     BBox,
     Cue,
     Grounding,
+    Intervention,
     LocatedObject,
     MetresPerPixel,
     MotionKind,
@@ -25,12 +26,43 @@ from cow_service.records import (
     Record,
     Simulation,
     Source,
+    Until,
     Usage,
     Vector,
 )
 from cow_service.vision.scene import Scene
 
 SpeedWord = Literal["slow", "normal", "fast"]
+Unit = Literal["px", "m", "widths", "px/s", "m/s", "widths/s"]  # `widths`: of the image
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number with its unit, as somebody said it."""
+
+    value: float
+    unit: Unit
+
+
+@dataclass(frozen=True)
+class StepReading:
+    """A further leg of a motion."""
+
+    direction: Vector  # any length, px
+    depth: float = 0.0
+    distance: Quantity | None = None
+    duration: float | None = None  # s
+
+
+@dataclass(frozen=True)
+class OtherMotionReading:
+    """Another thing that is set moving at the same time."""
+
+    object: LocatedObject
+    kind: MotionKind
+    direction: Vector | None  # any length, px
+    depth: float = 0.0
+    speed: SpeedWord | Quantity | None = None
 
 
 @dataclass
@@ -87,6 +119,7 @@ class GroundingReading:
     point: Point | None = None  # where the reader pointed, if it gave no box; by default the centre of the box
     others: tuple[LocatedObject, ...] = ()
     warnings: tuple[str, ...] = ()
+    interventions: tuple[Intervention, ...] = ()
     hints: MotionHints | None = None
     prior: ObjectPrior | None = None  # of the mover
 
@@ -101,7 +134,13 @@ class MotionReading:
     along_arrow: bool | None = None
     depth: float = 0.0  # see `Motion.depth`
     depth_deviation: float | None = None  # degrees; null where the reader says nothing of the depth
-    speed: SpeedWord | None = None  # as for such a thing
+    speed: SpeedWord | Quantity | None = None  # a word: as for such a thing
+    distance: Quantity | None = None  # after which it is stopped
+    duration: float | None = None  # s, after which it is stopped
+    until: Until | None = None
+    steps: tuple[StepReading, ...] = ()
+    trail: tuple[Point, ...] = ()  # earlier positions that are shown, oldest first, px
+    others: tuple[OtherMotionReading, ...] = ()
     speed_deviation: float | None = None  # of ln speed; null where the reader says nothing of the speed
     metres_per_pixel: MetresPerPixel | None = None  # null where the reader cannot tell
     down: Vector = (0.0, 1.0)  # unit vector: which way things fall in the image

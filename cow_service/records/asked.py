@@ -8,8 +8,8 @@ from pydantic import Field
 
 from cow_service.records.base import Record
 
-AskedRelation = Literal["touches", "covers", "covered"]
-AskedForm = Literal["whether", "which-first", "when", "how-many"]
+AskedRelation = Literal["touches", "covers", "covered", "inside", "tips", "moves", "leaves"]
+AskedForm = Literal["whether", "which-first", "when", "how-many", "where", "what-happens", "changes"]
 
 
 class Asked(Record):
@@ -17,8 +17,15 @@ class Asked(Record):
 
     form: AskedForm = "whether"
     relation: AskedRelation = Field(
-        description="`touches`: the mover hits it or lands on it; `covers`: the mover hides it; `covered`: the mover "
-        "is hidden by it."
+        description="`touches`: the subject hits it or lands on it; `covers`: the subject hides it; `covered`: the "
+        "subject is hidden by it; `inside`: the subject fits or ends up in it; `tips`: the target is knocked over; "
+        "`moves`: the target is set in motion; `leaves`: the subject leaves the image."
+    )
+    subject: str | None = Field(
+        default=None, description="Who does it, in the question's words, where that is not the mover; null: the mover."
     )
     target: str | None = Field(default=None, description="The thing asked about in the question's words; null: any.")
     negated: bool = Field(default=False, description="Asked is that it does not happen: to miss, to stay visible.")
+    among: tuple[str, ...] = Field(
+        default=(), description="Of `which-first`: the alternatives that the question names; empty: any."
+    )

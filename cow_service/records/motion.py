@@ -9,12 +9,15 @@ from pydantic import Field
 from cow_service.records.base import Artifact, BBox, Point, Record, Vector
 
 Source = Literal["mllm", "embedded", "request"]
-MotionKind = Literal["linear", "projectile", "fall", "static"]
+MotionKind = Literal["linear", "projectile", "fall", "static", "place"]
 DIRECTED_KINDS: tuple[MotionKind, ...] = ("linear", "projectile")  # these need a direction, and have a speed
 FALLING_KINDS: tuple[MotionKind, ...] = ("projectile", "fall")  # these are in the air, and gravity acts on them
 Law = Literal["contact", "ballistic"]
 Shape = Literal["sphere", "box", "cylinder", "cone"]
 ObjectRole = Literal["target", "obstacle"]
+InterventionKind = Literal["remove", "place"]
+PlaceRelation = Literal["into", "onto", "between", "in-front-of", "behind", "next-to", "left-of", "right-of"]
+Until = Literal["contact", "out-of-view"]
 Cue = Literal["arrow", "trail", "orientation", "text", "gravity", "request"]
 
 
@@ -45,6 +48,15 @@ class LocatedObject(Record):
     source: Source | None = Field(default=None, description="Who located it; null in results of older versions.")
 
 
+class Intervention(Record):
+    """A change of the scene before anything moves."""
+
+    kind: InterventionKind
+    object: LocatedObject = Field(description="What is taken away or put somewhere.")
+    relation: PlaceRelation | None = Field(default=None, description="Of `place`: how it is put to the `targets`.")
+    targets: tuple[LocatedObject, ...] = Field(default=(), description="Of `place`: two for `between`, else one.")
+
+
 class Grounding(Record):
     """Stage 1: which object moves, and where it is. It does not say how it moves."""
 
@@ -54,6 +66,9 @@ class Grounding(Record):
     mask: Artifact | None = Field(default=None, description="PNG of the image's size, white where the object is.")
     others: tuple[LocatedObject, ...] = Field(
         default=(), description="Other things that the question names or that matter, where they were found."
+    )
+    interventions: tuple[Intervention, ...] = Field(
+        default=(), description="What is taken away or put in before the motion; not among `others`."
     )
     prior: ObjectPrior | None = None
     source: Source
@@ -65,6 +80,26 @@ class MetresPerPixel(Record):
     value: float = Field(gt=0, description="Metres per pixel at the object's depth.")
     source: Literal["default", "reference", "request"]
     note: str = Field(default="", description="What it was taken from, in words.")
+
+
+class MotionStep(Record):
+    """A further leg of a motion, after the one before has ended."""
+
+    direction: Vector = Field(description="Unit vector in the image, px.")
+    depth: float = Field(default=0.0, ge=-1, le=1, description="As `Motion.depth`.")
+    distance: float | None = Field(default=None, gt=0, description="px at the depth of the first frame.")
+    duration: float | None = Field(default=None, gt=0, description="s.")
+
+
+class AlsoMoving(Record):
+    """Another object that is set moving at the first frame."""
+
+    object: LocatedObject
+    kind: MotionKind
+    direction: Vector | None = Field(default=None, description="As `Motion.direction`.")
+    depth: float = Field(default=0.0, ge=-1, le=1, description="As `Motion.depth`.")
+    speed: float = Field(ge=0, description="px/s at the depth of the first frame.")
+    speed_deviation: float = Field(default=0.0, ge=0, le=3, description="As `Motion.speed_deviation`.")
 
 
 class Motion(Record):
@@ -92,6 +127,18 @@ class Motion(Record):
     speed_deviation: float = Field(
         default=0.0, ge=0, le=3, description="One standard deviation of the speed's natural logarithm."
     )
+    distance: float | None = Field(
+        default=None, gt=0, description="px at the depth of the first frame, after which the object is stopped."
+    )
+    duration: float | None = Field(default=None, gt=0, description="s, after which the object is stopped.")
+    until: Until | None = Field(
+        default=None, description="contact: stopped where it first meets something; null: it goes on by itself."
+    )
+    steps: tuple[MotionStep, ...] = Field(default=(), description="Further legs; the first is this motion.")
+    trail: tuple[Point, ...] = Field(
+        default=(), description="[x, y], px: earlier positions of the object's centre that are shown, oldest first."
+    )
+    others: tuple[AlsoMoving, ...] = Field(default=(), description="What is set moving at the same time.")
     gravity: Vector = Field(default=(0.0, 0.0), description="px/s^2.")
     down: Vector = Field(default=(0.0, 1.0), description="Unit vector: which way things fall in the image.")
     metres_per_pixel: MetresPerPixel

@@ -97,6 +97,7 @@ class Encounter(Record):
     object: str
     bbox: BBox = Field(description="[x0, y0, x1, y1], px, of the other object at the first frame.")
     body: int | None = Field(default=None, ge=0, description="Which of `Trajectory.bodies`.")
+    subject: int = Field(default=0, ge=0, description="Which of `Trajectory.bodies` meets it; 0: the mover.")
     kind: EncounterKind
     first_frame: int = Field(ge=0, description="The first clip frame of the encounter, in the likeliest world.")
     share: float | None = Field(
@@ -127,6 +128,28 @@ class Outcome(Record):
     robust: bool = Field(description="Whether at least 90% of the worlds give the answer.")
     depends_on: tuple[Doubt, ...] = Field(default=(), description="What the answer depends on, most first.")
     facts: str = Field(default="", description="What happens, in one sentence made of the facts.")
+
+
+PlacementResult = Literal["inside", "sticks-out", "on-the-rim", "on-top", "beside", "overlaps", "falls-off", "tips"]
+
+
+class Placement(Record):
+    """What becomes of an object that is put somewhere."""
+
+    object: str
+    result: PlacementResult = Field(description="In the likeliest world.")
+    probabilities: dict[PlacementResult, float] = Field(
+        default_factory=dict, description="Share of the ensemble's worlds with each result; empty without an ensemble."
+    )
+    fits: float | None = Field(
+        default=None, ge=0, le=1, description="Probability that it goes in without resting on the rim or sticking out."
+    )
+    clearance: float | None = Field(
+        default=None, description="Width of the opening less that of the object, as a share of the opening."
+    )
+    above_rim: float | None = Field(
+        default=None, ge=0, le=1, description="Share of the object's height that is higher than the rim."
+    )
 
 
 class TrajectoryUnits(Record):
@@ -169,6 +192,11 @@ class Trajectory(Record):
     ensemble: int = Field(default=0, ge=0, description="How many worlds the probabilities are counted in.")
     outcome: Outcome | None = Field(
         default=None, description="Null where the question asks for nothing that the world can tell."
+    )
+    placement: Placement | None = Field(default=None, description="Null where nothing is put anywhere.")
+    factual: Trajectory | None = Field(
+        default=None,
+        description="The same motion in the scene as it is, where something is taken away; null where nothing is.",
     )
 
     @property

@@ -1,5 +1,6 @@
 """What a caller may ask: the bodies of `POST /simulate` and `POST /answer`. Checked once, here, then trusted."""
 
+from cow_service.requests.interventions import InterventionRequest
 from cow_service.requests.motion import CameraRequest, MotionRequest, TrajectoryRequest
 from cow_service.requests.places import GroundingRequest, ObjectRequest, PlaceRequest
 from cow_service.requests.simulation import AnswerRequest, FramesRequest, SimulateRequest, Stage
@@ -15,6 +16,7 @@ __all__ = [
     "ImageArtifact",
     "ImageRef",
     "ImageUrl",
+    "InterventionRequest",
     "MaskRef",
     "MotionRequest",
     "ObjectRequest",

@@ -7,7 +7,14 @@ from typing import Annotated
 
 from pydantic import Field, field_validator, model_validator
 
-from cow_service.records import DIRECTED_KINDS, Law, MotionKind, Point, Record, Vector
+from cow_service.records import (
+    DIRECTED_KINDS,
+    Law,
+    MotionKind,
+    Point,
+    Record,
+    Vector,
+)
 from cow_service.requests.values import Finite, Flags, Points
 
 MAX_TRACKS = 1024

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 
 from cow_service.records import FramePolicy, Law, Record
+from cow_service.requests.interventions import InterventionRequest
 from cow_service.requests.motion import CameraRequest, MotionRequest, TrajectoryRequest
 from cow_service.requests.places import MAX_OBJECTS, GroundingRequest, ObjectRequest
 from cow_service.requests.values import Finite, Flag, ImageRef, MaskRef, Name, Whole, Words, writable
@@ -51,6 +52,9 @@ class SimulateRequest(Record):
         default=(),
         max_length=MAX_OBJECTS,
         description="Other objects of the image: they come before what the reader finds there.",
+    )
+    interventions: tuple[InterventionRequest, ...] = Field(
+        default=(), max_length=8, description="What is taken away or put in before the motion, beside the question's."
     )
     camera: CameraRequest | None = None
     ensemble: Whole = Field(
