@@ -8,7 +8,7 @@ from typing import Any
 
 from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, GRAVITY
 from cow_service.readers.base import MotionHints, MotionReading, Quantity
-from cow_service.readers.question.wording import motion_sentence
+from cow_service.readers.question.wording import direction_words, motion_sentence
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
@@ -20,7 +20,7 @@ from cow_service.records import (
     Vector,
 )
 from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
-from cow_service.stages.legs import also_moving, given_others, step_of, step_reading, unit
+from cow_service.stages.legs import also_moving, given_others, other_words, step_of, step_reading, unit
 from cow_service.stages.quantities import Measures
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
@@ -118,8 +118,22 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         gravity=_gravity(reading.down, scale) if reading.kind in FALLING_KINDS else (0.0, 0.0),
         down=reading.down,
         metres_per_pixel=scale,
-        sentence=motion_sentence(grounding.object, reading.kind, direction, depth, reading.sentence),
+        sentence=_sentence(grounding, reading, direction, depth),
         source=source,
+    )
+
+
+def _sentence(grounding: Grounding, reading: MotionReading, direction: Vector | None, depth: float) -> str:
+    """The whole motion in words."""
+    return motion_sentence(
+        grounding.object,
+        reading.kind,
+        direction,
+        depth,
+        reading.sentence,
+        further=[direction_words(step.direction, step.depth) for step in reading.steps],
+        stops=any(value is not None for value in (reading.distance, reading.duration, reading.until)),
+        also=[other_words(other) for other in reading.others],
     )
 
 
