@@ -22,6 +22,7 @@ from cow_service.records import (
 from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
+from cow_service.stages.trails import along_trail
 
 THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
 THROW_DEPTH_DEVIATION = 15.0  # degrees: words and arrows tell a throw's heading in the image alone
@@ -44,6 +45,10 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     else:
         reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, hints), run.reader.source
     motion = _complete(run.scene.width, grounding, reading, speed, source, run.request.law)
+    if motion.cue == "trail":
+        with run.cpu():
+            told = speed is not None or reading.speed is not None
+            motion = along_trail(run.scene, grounding, motion, run.request.camera, told)
     return StageResult(value=motion, warnings=(*reading.warnings, *_assumed(motion, speed)))
 
 
@@ -135,7 +140,7 @@ def _gravity(down: Vector, scale: MetresPerPixel) -> Vector:
 
 def _assumed(motion: Motion, speed: float | None) -> tuple[str, ...]:
     """A warning for a throw, whose reach depends on a speed that nobody gave."""
-    if motion.kind != "projectile" or speed is not None:
+    if motion.kind != "projectile" or speed is not None or motion.trail:
         return ()
     return (
         f"How far a throw reaches depends on its speed: {motion.speed:.0f} px/s was assumed; `motion.speed` sets it.",

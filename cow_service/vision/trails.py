@@ -81,6 +81,12 @@ class Trail:
         """Where it was, the oldest first."""
         return self.positions[:-1]
 
+    @property
+    def heading(self) -> Vector:
+        """Image velocity at the present position, px per interval between positions."""
+        c, b, a = (position.centre for position in self.positions[-1:-4:-1])
+        return (3 * c[0] - 4 * b[0] + a[0]) / 2, (3 * c[1] - 4 * b[1] + a[1]) / 2
+
     def ending(self, end: TrailEnd) -> Trail:
         """The same positions with the present one at an end."""
         ends = self.positions[0], self.positions[-1]

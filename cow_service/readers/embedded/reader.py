@@ -8,6 +8,7 @@ from dataclasses import replace
 from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
+from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
@@ -22,6 +23,7 @@ from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
 from cow_service.vision.scene import Scene
+from cow_service.vision.trails import Trail, trail_of
 
 
 class EmbeddedReader:
@@ -161,6 +163,9 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
             f"up. {GIVE_DIRECTION}"
         )
+    trail = trail_of(scene, grounding.bbox)
+    if trail is not None:
+        return _along_trail(trail, words)
     near = arrows_near(scene, grounding.bbox)
     if near and question.names_direction:
         raise CannotReadDirection(
@@ -175,6 +180,13 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         )
     note = "The question names no direction; the arrow drawn at the object was followed."
     return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
+
+
+def _along_trail(trail: Trail, words: MotionWords) -> MotionReading:
+    """On from the present position, which is the last of those that are shown."""
+    kind = words.kind or ("projectile" if is_thrown(trail.positions) else "linear")
+    earlier = tuple(position.centre for position in trail.older)
+    return MotionReading(kind, trail.heading, "trail", trail=earlier)
 
 
 def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:
