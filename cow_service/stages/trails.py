@@ -17,7 +17,7 @@ def along_trail(
     scene: Scene, grounding: Grounding, motion: Motion, camera: CameraRequest | None, speed_given: bool
 ) -> Motion:
     """A motion read from a trail, with what the trail at the mover measures; others unchanged."""
-    trail = trail_of(scene, grounding.bbox) if motion.cue == "trail" else None
+    trail = trail_of(scene.trails, grounding.bbox) if motion.cue == "trail" else None
     if trail is None:
         return motion
     motion = motion.model_copy(update={"trail": tuple(position.centre for position in trail.older)})

@@ -15,7 +15,7 @@ import numpy as np
 from cow_service.vision.inpainting import fill_hole
 from cow_service.vision.masks import scaled
 from cow_service.vision.trails import Trail
-from cow_service.vision.types import Floats32, Image, Mask
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_WIDTH = 16.0  # px: the image is searched at the size at which the ball is so wide
 LEAST_WIDTH = 16.0  # px of the ball in the image
@@ -29,7 +29,8 @@ LEAST_SHADE, MOST_SHADE = 0.025, 0.6  # of the floor's lightness that shadows ta
 SAME_HUE = 7.0  # Lab units in the a*b* plane, by which a shade may differ from the floor about it
 STANDS_OUT = 0.55  # of the shade inside: by so much it must exceed that about it
 EACH = 0.6  # of the mean shade: what each shadow must have at least
-GROWN, OWN = 1.3, 1.08  # of an ellipse: what is filled in, and what stays as the shadow of the present position
+FIT_REACH = 1.7  # of the ellipses first found: so far around them the row is fitted
+GROWN, OWN = 1.25, 1.05  # of an ellipse: what is filled in, and what stays as the shadow of the present position
 
 
 @dataclass(frozen=True)
@@ -48,41 +49,102 @@ class _Row:
         return mask
 
 
-def without_ghost_shadows(image: Image, trail: Trail) -> Image:
+def without_ghost_shadows(image: Image, trail: Trail, objects: Mask) -> Image:
     """The image [H, W, 3], its ghosts taken out, with the shadow of the present position alone.
 
-    The image as it is where no shadows of a trail can be told.
+    `objects` [H, W] hide the floor, and stay. The image as it is where no shadows of a trail can be told.
     """
-    row = _find_row(image, trail)
+    row = _find_row(image, trail, objects)
     if row is None:
         return image
     shape = image.shape[0], image.shape[1]
-    own = row.mask(shape, slice(-1, None), OWN)
-    hole = row.mask(shape, slice(0, -1), GROWN) & ~own
-    return fill_hole(image, hole, row.mask(shape, slice(-1, None), GROWN) & ~hole)
+    rim = cv2.dilate(objects.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    hole = row.mask(shape, slice(0, -1), GROWN) & ~row.mask(shape, slice(-1, None), OWN) & ~rim
+    return fill_hole(image, hole, (row.mask(shape, slice(-1, None), GROWN) | rim) & ~hole)
 
 
-def _find_row(image: Image, trail: Trail) -> _Row | None:
-    width = 2 * trail.present.radius
-    if width < LEAST_WIDTH:
+def _find_row(image: Image, trail: Trail, objects: Mask) -> _Row | None:
+    """The shadows, found at a coarse size and fitted at twice that; None where there are none."""
+    if 2 * trail.present.radius < LEAST_WIDTH:
         return None
-    scale = min(1.0, WORKING_WIDTH / width)
-    small = scaled(image, scale)
-    fx, fy = small.shape[1] / image.shape[1], small.shape[0] / image.shape[0]
-    shade, weight = _shade(small, width * fx)
-    places = np.array([(p.x * fx, p.y * fy) for p in trail.positions])
-    allowed = _below(places[-1], width * fx, shade.shape)
-    best: tuple[float, _Row] | None = None
-    for wide, flat, drift in product(WIDTHS, FLATNESS, DRIFTS):
-        half = wide * width * fx / 2, flat * wide * width * fx / 2
-        times = np.linspace(-1, 0, len(places))
-        offsets = np.stack([wide * (places[:, 0] - places[-1, 0]), times * drift * width * fx], axis=1)
-        found = _darkest(shade, weight, allowed, offsets, half)
-        if found is not None and (best is None or found[0] > best[0]):
-            x, y = found[1]
-            centres = tuple(((x + dx + 0.5) / fx, (y + dy + 0.5) / fy) for dx, dy in offsets.tolist())
-            best = found[0], _Row(centres, (half[0] / fx, half[1] / fy))
-    return None if best is None else best[1]
+    coarse = _Floor.of(image, trail, objects, WORKING_WIDTH)
+    found = coarse.darkest()
+    return None if found is None else _Floor.of(image, trail, objects, 2 * WORKING_WIDTH).fitted(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Floor:
+    """The floor at a working size, and where the ball is: a row of shadows is a place (share of the image's size), a
+    width and a drift (in the ball's width) and a flatness."""
+
+    shade: Floats32  # [h, w]: the share of the light that is taken away
+    weight: Floats32  # [h, w]: 1 where it may be floor
+    places: Floats  # [N, 2] px
+    width: float  # px, of the ball
+    stretch: tuple[float, float]  # back to the image's size
+
+    @staticmethod
+    def of(image: Image, trail: Trail, objects: Mask, working_width: float) -> _Floor:
+        """The floor where the ball is as wide as a working width (px), or as it is if that is less."""
+        width = 2 * trail.present.radius
+        small = scaled(image, min(1.0, working_width / width))
+        fx, fy = small.shape[1] / image.shape[1], small.shape[0] / image.shape[0]
+        shade, weight = _shade(small, width * fx)
+        taken = cv2.resize(objects.astype(np.float32), (small.shape[1], small.shape[0]), interpolation=cv2.INTER_AREA)
+        weight = weight * np.asarray(taken < 0.05, np.float32)
+        places = np.array([(p.x * fx - 0.5, p.y * fy - 0.5) for p in trail.positions])
+        return _Floor(shade, weight, places, width * fx, (1 / fx, 1 / fy))
+
+    def ellipses(self, parameters: Floats) -> tuple[Floats, tuple[float, float]]:
+        """Centres [N, 2] and half axes (px) at this size, of a row: x, y, width, flatness, drift."""
+        x, y, wide, flat, drift = (float(p) for p in parameters)
+        times = np.linspace(-1, 0, len(self.places))
+        offsets = [wide * (self.places[:, 0] - self.places[-1, 0]), times * drift * self.width]
+        at = np.array([x * self.shade.shape[1], y * self.shade.shape[0]])
+        return at + np.stack(offsets, axis=1), (wide * self.width / 2, flat * wide * self.width / 2)
+
+    def darkest(self) -> Floats | None:
+        """The row that is darkest against the floor about it; None where none is."""
+        allowed = _below(self.places[-1], self.width, self.shade.shape)
+        best: tuple[float, Floats] | None = None
+        for wide, flat, drift in product(WIDTHS, FLATNESS, DRIFTS):
+            centres, half = self.ellipses(np.array([0.0, 0.0, wide, flat, drift]))
+            found = _darkest(self.shade, self.weight, allowed, centres, half)
+            if found is not None and (best is None or found[0] > best[0]):
+                x, y = found[1]
+                at = x / self.shade.shape[1], y / self.shade.shape[0]
+                best = found[0], np.array([*at, wide, flat, drift])
+        return None if best is None else best[1]
+
+    def fitted(self, start: Floats) -> _Row:
+        """The row whose even shade leaves least of the shade around it unexplained, by a pattern search."""
+        centres, half = self.ellipses(start)
+        height, width = self.shade.shape
+        ys, xs = np.mgrid[:height, :width]
+        near = np.hypot((xs[..., None] - centres[:, 0]) / half[0], (ys[..., None] - centres[:, 1]) / half[1]).min(axis=2)
+        kept = (near < FIT_REACH) & (self.weight > 0)
+        points, shade = np.stack([xs[kept], ys[kept]], axis=1), self.shade[kept].astype(np.float64)
+
+        def unexplained(parameters: Floats) -> float:
+            middle, (a, b) = self.ellipses(parameters)
+            away = np.hypot((points[:, :1] - middle[:, 0]) / a, (points[:, 1:] - middle[:, 1]) / b).min(axis=1)
+            inside = np.clip((1 - away) * b + 0.5, 0, 1)
+            terms = np.stack([np.ones_like(inside), inside], axis=1)
+            rest = shade - terms @ np.linalg.solve(terms.T @ terms + 1e-6 * np.eye(2), terms.T @ shade)
+            return float(rest @ rest)
+
+        best, least = start, unexplained(start)
+        steps = np.array([0.25 * self.width / width, 0.12 * self.width / height, 0.1, 0.06, 0.25])
+        while steps[2] > 0.004:
+            before = least
+            for i, side in product(range(5), (-1.0, 1.0)):
+                tried = best + side * steps * (np.arange(5) == i)
+                if 0.5 < tried[2] < 1.8 and 0.15 < tried[3] < 0.9 and (value := unexplained(tried)) < least:
+                    best, least = tried, value
+            if least >= before:
+                steps = steps / 2
+        (centres, half), (fx, fy) = self.ellipses(best), self.stretch
+        return _Row(tuple(((x + 0.5) * fx, (y + 0.5) * fy) for x, y in centres.tolist()), (half[0] * fx, half[1] * fy))
 
 
 def _shade(small: Image, width: float) -> tuple[Floats32, Floats32]:
@@ -102,7 +164,7 @@ def _shade(small: Image, width: float) -> tuple[Floats32, Floats32]:
     return shade.astype(np.float32), plain.astype(np.float32)
 
 
-def _below(present: Floats32, width: float, shape: tuple[int, ...]) -> Mask:
+def _below(present: Floats, width: float, shape: tuple[int, ...]) -> Mask:
     """Where the middle of the present position's shadow may lie [h, w]."""
     ys, xs = np.mgrid[: shape[0], : shape[1]]
     x, y = float(present[0]), float(present[1])
@@ -110,7 +172,7 @@ def _below(present: Floats32, width: float, shape: tuple[int, ...]) -> Mask:
 
 
 def _darkest(
-    shade: Floats32, weight: Floats32, allowed: Mask, offsets: Floats32, half: tuple[float, float]
+    shade: Floats32, weight: Floats32, allowed: Mask, offsets: Floats, half: tuple[float, float]
 ) -> tuple[float, tuple[int, int]] | None:
     """How much darker the darkest row of ellipses is than the floor about it, and where its last one lies."""
     reach_x = int(np.ceil(np.abs(offsets[:, 0]).max() + RING * half[0])) + 1

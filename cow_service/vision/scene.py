@@ -12,6 +12,7 @@ import numpy as np
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.arrows import Arrow, find_arrows
 from cow_service.vision.boxes import DrawnBox, find_boxes
+from cow_service.vision.ghost_shadows import without_ghost_shadows
 from cow_service.vision.ghosts import without_ghosts
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import bbox_of
@@ -34,6 +35,7 @@ class Scene:
 
     image: Image
     mover: BBox | None = None  # the present position of what moves, once it is known: it tells which end of a trail is
+    trail_named: bool = False  # the question speaks of a trail: balls that look alike, one after another, are one
     _masks: dict[BBox, Mask] = field(default_factory=dict, repr=False)
     _found: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any], repr=False)
     _preset: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
@@ -88,20 +90,22 @@ class Scene:
     @cached_property
     def trails(self) -> tuple[Trail, ...]:
         """Several positions of one ball each, the present one last: at the mover, or as it shows, or as a guess."""
-        found = find_trails(self._undrawn)
+        found = [trail for trail in find_trails(self._undrawn) if trail.evident or self.trail_named]
         own = None if self.mover is None else trail_ending_at(found, self.mover)
         if own is None:
-            return found
-        kept = (trail for trail in found if set(trail.positions) != set(own.positions))
-        return (own, *kept)
+            return tuple(found)
+        return (own, *(trail for trail in found if set(trail.positions) != set(own.positions)))
 
     @cached_property
     def clean(self) -> Image:
-        """The image [H, W, 3] without its cues: neither drawings nor earlier positions of an evident trail."""
+        """The image [H, W, 3] without its cues: neither drawings nor earlier positions of a trail and their shadows."""
         image = self._undrawn
         for trail in self.trails:
-            if trail.evident:
-                image = without_ghosts(image, trail)
+            image = without_ghosts(image, trail)
+            objects = np.zeros((self.height, self.width), bool)
+            for region in find_regions(image):
+                region.mask.add_to(objects)
+            image = without_ghost_shadows(image, trail, objects)
         return image
 
     @cached_property
@@ -109,7 +113,7 @@ class Scene:
         """Objects of the image, largest first; empty where it is too cluttered to tell."""
         found = find_regions(self.clean)
         for trail in self.trails:
-            if trail.evident and region_of(found, trail.present.bbox) is None:
+            if region_of(found, trail.present.bbox) is None:
                 found = (*found, disc_region(self.clean, trail.present.disc((self.height, self.width))))
         return tuple(sorted(found, key=lambda region: -region.mask.area))
 

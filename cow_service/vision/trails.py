@@ -7,10 +7,10 @@ along which place and size change smoothly. Balls that merely look alike are no 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
 from cow_service.vision.masks import iou
 from cow_service.vision.types import Floats, Floats32, Image, Mask
-
-if TYPE_CHECKING:
-    from cow_service.vision.scene import Scene
 
 END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
 SEEN_SUPPORT = 0.75  # of what the other positions leave to be seen of a circumference, on edges
@@ -96,8 +93,8 @@ class Trail:
             gaps = [-position.x * end.side[0] - position.y * end.side[1] for position in ends]
         else:
             return self
-        positions = self.positions if gaps[1] <= gaps[0] else self.positions[::-1]
-        return Trail(positions, self.evident, True)
+        is_last = (gaps[1] <= gaps[0]) != end.is_oldest
+        return Trail(self.positions if is_last else self.positions[::-1], self.evident, True)
 
 
 @dataclass(frozen=True)
@@ -106,11 +103,12 @@ class TrailEnd:
 
     near: BBox | None = None  # of another object
     side: Vector | None = None  # in the image: (-1, 0) for the leftmost
+    is_oldest: bool = False  # that end is the oldest position, the other one the present
 
 
-def trail_of(scene: Scene, bbox: BBox, end: TrailEnd | None = None) -> Trail | None:
+def trail_of(trails: Sequence[Trail], bbox: BBox, end: TrailEnd | None = None) -> Trail | None:
     """The trail that has a position in a box [x0, y0, x1, y1], with its present position at an end that is named."""
-    for trail in scene.trails:
+    for trail in trails:
         if any(iou(position.bbox, bbox) >= SAME_POSITION_IOU for position in trail.positions):
             return trail if end is None else trail.ending(end)
     return None
@@ -286,8 +284,8 @@ def _trail(looks: _Looks, chain: tuple[Circle, ...]) -> Trail | None:
         return None
     opacity = np.clip(shares / shares.max(), 0, 1)
     positions = tuple(Position(c.x, c.y, c.radius, float(o)) for c, o in zip(chain, opacity, strict=True))
-    overlap = all(math.dist(a.centre, b.centre) < 0.95 * (a.radius + b.radius)
-                  for a, b in zip(positions, positions[1:], strict=False))  # fmt: skip
+    neighbours = itertools.pairwise(positions)
+    overlap = all(math.dist(a.centre, b.centre) < 0.95 * (a.radius + b.radius) for a, b in neighbours)
     known = abs(float(opacity[0] - opacity[-1])) > 1 - FADED
     faded = float(np.sort(opacity)[:-1].max()) < FADED if known else False
     rank = (opacity[0], opacity[-1]) if known else (chain[0].support, chain[-1].support)
@@ -334,7 +332,8 @@ class _Looks:
             both = free[i] & free[model]
             if np.count_nonzero(both) < 6:
                 both = free[i] | free[model]
-            share = _opacity(inner[i][both] - about[i], inner[model][both] - about[model], inner[i][both] - inner[model][both])
+            seen, wanted = inner[i][both], inner[model][both]
+            share = _opacity(seen - about[i], wanted - about[model], seen - wanted)
             if share is None:
                 return None
             shares.append(share)

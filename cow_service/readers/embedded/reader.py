@@ -8,11 +8,11 @@ from dataclasses import replace
 from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
-from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, without
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
+from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked
@@ -24,7 +24,6 @@ from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region
 from cow_service.vision.scene import Scene
-from cow_service.vision.trails import Trail, trail_of
 
 
 class EmbeddedReader:
@@ -44,6 +43,7 @@ class EmbeddedReader:
             )
         with given.cpu():
             check_changes(question)
+            scene = scene_of_mover(scene, question)
             removed = find_removed(scene, question)
             regions = without(scene.regions, removed)
             bbox = _mover(scene, regions, question, question.mover)
@@ -151,6 +151,8 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
+    if words.trail is not None and (on := along_trail(scene, grounding, words)) is not None:
+        return on
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
     if words.arrow is not None:
@@ -170,9 +172,9 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
             f"up. {GIVE_DIRECTION}"
         )
-    trail = trail_of(scene, grounding.bbox)
-    if trail is not None:
-        return _along_trail(trail, words)
+    on = along_trail(scene, grounding, words)
+    if on is not None:
+        return on
     near = arrows_near(scene, grounding.bbox)
     if near and question.names_direction:
         raise CannotReadDirection(
@@ -187,13 +189,6 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         )
     note = "The question names no direction; the arrow drawn at the object was followed."
     return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
-
-
-def _along_trail(trail: Trail, words: MotionWords) -> MotionReading:
-    """On from the present position, which is the last of those that are shown."""
-    kind = words.kind or ("projectile" if is_thrown(trail.positions) else "linear")
-    earlier = tuple(position.centre for position in trail.older)
-    return MotionReading(kind, trail.heading, "trail", trail=earlier)
 
 
 def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:
