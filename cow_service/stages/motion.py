@@ -24,6 +24,7 @@ from cow_service.stages.legs import also_moving, given_others, other_words, step
 from cow_service.stages.quantities import Measures
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
+from cow_service.stages.trails import along_trail
 
 THROW_DEPTH_DEVIATION = 15.0  # degrees: words and arrows tell a throw's heading in the image alone
 _GLIDING_ONLY = ("distance", "duration", "until", "steps")  # what only a motion along a line can have
@@ -49,6 +50,9 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         reading = replace(reading, others=given_others(run.request.motion.others, grounding))
     reading, unused = _fitting(reading)
     motion = _complete(run.scene.width, grounding, reading, source, run.request.law)
+    if motion.cue == "trail":
+        with run.cpu():
+            motion = along_trail(run.scene, grounding, motion, run.request.camera, reading.speed is not None)
     return StageResult(value=motion, warnings=(*reading.warnings, *unused, *_assumed(motion, reading)))
 
 
@@ -162,7 +166,7 @@ def _gravity(down: Vector, scale: MetresPerPixel) -> Vector:
 def _assumed(motion: Motion, reading: MotionReading) -> tuple[str, ...]:
     """Warnings for what nobody said: how fast a throw is, and the scale of lengths in metres."""
     told: list[str] = []
-    if motion.kind == "projectile" and not isinstance(reading.speed, Quantity):
+    if motion.kind == "projectile" and not isinstance(reading.speed, Quantity) and not motion.trail:
         told.append(
             f"How far a throw reaches depends on its speed: {motion.speed:.0f} px/s was assumed; "
             "`motion.speed` sets it."
