@@ -46,6 +46,12 @@ class WorldInput:
     fps: float
     asked: int | None = None  # the body that the question is about
     led: Led | None = None  # the mover is led along a path, through everything
+    taken: tuple[SeenBody, ...] = ()  # placed with the others, then taken away before anything moves
+    turns_wanted: bool = False  # how bodies turn is recorded of an ensemble, too
+
+    def as_it_is(self) -> WorldInput:
+        """With nothing taken away: those things are then the last bodies."""
+        return replace(self, bodies=(*self.bodies, *self.taken), taken=())
 
 
 @dataclass(frozen=True)
@@ -61,10 +67,11 @@ class Worlds:
 
 def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""
-    scene = place(given.bodies, given.motion, given.fit, given.size, draws, given.asked)
+    bodies = (*given.bodies, *given.taken)
+    scene = place(bodies, given.motion, given.fit, given.size, draws, given.asked).first(len(given.bodies))
     shapes = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
     finished = None if len(draws) == 1 else partial(_has_left, scene.cameras, given.size[0])
-    runs = run_worlds(shapes, given.num_frames, given.fps, every, finished)
+    runs = run_worlds(shapes, given.num_frames, given.fps, every, finished, given.turns_wanted)
     return Worlds(scene, shapes, tuple(runs), every, given.fps)
 
 
@@ -102,6 +109,8 @@ def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) 
             )
         )
     bodies[0] = _set_going(given, scene, k, bodies[0])
+    for loose in scene.unsupported:
+        bodies[loose] = replace(bodies[loose], starts=True)
     return tuple(bodies)
 
 
