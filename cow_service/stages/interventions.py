@@ -56,7 +56,7 @@ def without_removed(
 ) -> tuple[LocatedObject, ...]:
     """The objects that are not taken away."""
     removed = [each.object.bbox for each in interventions if each.kind == "remove"]
-    return tuple(other for other in others if not any(_same(other.bbox, bbox) for bbox in removed))
+    return tuple(other for other in others if not _is_among(other.bbox, removed))
 
 
 def _named(words: str, places: Sequence[LocatedObject], pointer: str) -> LocatedObject:
@@ -80,28 +80,32 @@ def _bare(words: str) -> str:
 
 def _fault(each: Intervention, mover: LocatedObject, before: Sequence[Intervention]) -> str | None:
     """Why a change cannot be made, as a sentence."""
-    name = each.object.object
+    name, place = each.object.object, each.object.bbox
+    taken = [other.object.bbox for other in before if other.kind == "remove"]
+    put = [other for other in before if other.kind == "place"]
     if each.kind == "remove":
-        if _same(each.object.bbox, mover.bbox):
-            return f"'{name}' is what moves: it cannot be taken away."
-        if any(other.kind == "remove" and _same(other.object.bbox, each.object.bbox) for other in before):
-            return f"'{name}' is taken away twice: name each object once."
-    if any(_same(each.object.bbox, target.bbox) for target in each.targets):
-        return f"'{name}' cannot be put {_words(each)} itself."
-    gone = [other.object for other in before if other.kind == "remove"]
-    if each.kind == "place":
-        for thing in (each.object, *each.targets):
-            if any(_same(thing.bbox, other.bbox) for other in gone):
-                return f"'{thing.object}' is taken away and cannot be used to put something."
-        if any(other.kind == "place" and _same(other.object.bbox, each.object.bbox) for other in before):
-            return f"'{name}' is put somewhere twice: name each object once."
-    elif any(_same(each.object.bbox, thing.bbox) for other in before for thing in (other.object, *other.targets)):
-        return f"'{name}' is put somewhere, or something is put to it: it cannot be taken away as well."
-    return None
+        used = [thing.bbox for other in put for thing in (other.object, *other.targets)]
+        faults = {
+            f"'{name}' is what moves: it cannot be taken away.": _is_among(place, [mover.bbox]),
+            f"'{name}' is taken away twice: name each object once.": _is_among(place, taken),
+            f"'{name}' is put somewhere, or something is put to it: it cannot be taken away.": _is_among(place, used),
+        }
+    else:
+        targets = [target.bbox for target in each.targets]
+        relation = (each.relation or "to").replace("-", " ")
+        gone = [thing.object for thing in (each.object, *each.targets) if _is_among(thing.bbox, taken)]
+        faults = {
+            f"'{name}' cannot be put {relation} itself.": _is_among(place, targets),
+            f"'{name}' is put somewhere twice: name each object once.": _is_among(
+                place, [other.object.bbox for other in put]
+            ),
+            f"'{gone[0] if gone else ''}' is taken away: it cannot be put, nor anything to it.": bool(gone),
+        }
+    return next((fault for fault, holds in faults.items() if holds), None)
 
 
-def _words(each: Intervention) -> str:
-    return (each.relation or "to").replace("-", " ")
+def _is_among(bbox: BBox, boxes: Sequence[BBox]) -> bool:
+    return any(_same(bbox, other) for other in boxes)
 
 
 def _same_change(a: Intervention, b: Intervention) -> bool:
