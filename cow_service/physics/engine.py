@@ -95,14 +95,16 @@ def run_worlds(
     fps: float,
     every: int = 1,
     finished: Finished | None = None,
+    turns_wanted: bool = False,
 ) -> list[WorldRun]:
     """Runs worlds for the time of a clip, recording every `every`-th frame. They have equally many bodies each.
 
-    With more than one world, turns and impulses are not recorded, and those that are finished go on in a straight line.
+    With more than one world, impulses are not recorded, nor turns where they are not wanted, and worlds that are
+    finished go on in a straight line.
 
     The same input gives the same output, bit by bit.
     """
-    return _Engine(worlds, num_frames, fps, every, finished).run()
+    return _Engine(worlds, num_frames, fps, every, finished, turns_wanted).run()
 
 
 class _Engine:
@@ -115,9 +117,11 @@ class _Engine:
         fps: float,
         every: int,
         finished: Finished | None,
+        turns_wanted: bool,
     ) -> None:
         self.worlds, self.fps, self.every, self.finished = worlds, fps, every, finished
         self.is_alone = len(worlds) == 1
+        self.records_turns = turns_wanted or self.is_alone
         self.frames = range(0, num_frames, every)
         self.substeps = max(1, math.ceil((LEAST_STEPS if self.is_alone else LEAST_STEPS_OF_MANY) / fps))
         self.scale = ENGINE_SIZE / worlds[0][0].half_width
@@ -289,7 +293,7 @@ class _Engine:
         positions = np.array([body.translation.to_tuple() for body in bodies]) - self.origin[k]
         self.positions[k, i, row] = positions / self.scale
         self.velocities[k, i, row] = np.array([body.linvel.to_tuple() for body in bodies]) / self.scale
-        if self.is_alone:
+        if self.records_turns:
             turns = [body.rotation for body in bodies]
             self.turns[k, i, row] = np.array([(turn.i, turn.j, turn.k, turn.w) for turn in turns])
         for far in np.nonzero(np.abs((positions - self.middle[k])[:, [0, 2]]).max(axis=1) > REACH)[0].tolist():
