@@ -30,6 +30,7 @@ class Events:
     times: PerKind
     shares: PerKind  # 0 for touches
     eligible: Mask  # [B]: neither the mover nor what it stands on
+    placed: Floats | None = None  # [K] s: when the mover is where it was to be put; infinite where it does not fit
 
     def happens(self, kind: EncounterKind) -> Mask:
         """[K, B]."""
@@ -58,7 +59,7 @@ def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: F
             seen = np.where(before, values, 0.0)
             most[kind][:, other] = seen.max(axis=1)
             times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)
-    return Events(times, most, eligible)
+    return Events(times, most, eligible, None if worlds.placements is None else worlds.placements.times)
 
 
 def encounters(

@@ -94,6 +94,9 @@ def _per_body(asked: Asked, target: int | None, events: Events) -> Floats:
     meant = events.eligible.copy()
     if target is not None:
         meant &= np.arange(len(meant)) == target
+    if asked.relation == "inside":
+        times = np.full((1, 1), np.inf) if events.placed is None else events.placed[:, None]
+        return np.where(meant[None], times, np.inf)
     return np.where(meant[None], events.times[KIND_OF[asked.relation]], np.inf)
 
 

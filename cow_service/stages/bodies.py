@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.readers.question.choices import plain
-from cow_service.readers.question.shapes import is_vehicle, shape_of
+from cow_service.readers.question.shapes import is_cube, is_vehicle, shape_of
 from cow_service.records import Asked, Grounding, LocatedObject, Shape
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.obstacles import Obstacle
@@ -23,6 +23,7 @@ def seen_bodies(scene: Scene, grounding: Grounding, obstacles: Sequence[Obstacle
         source=grounding.source,
         prior=grounding.prior,
         elongated=is_vehicle(grounding.object),
+        equal_sided=is_cube(grounding.object),
     )
     return mover, *(_obstacle(scene, grounding, obstacle) for obstacle in obstacles)
 

@@ -15,6 +15,7 @@ from cow_service.media.overlay import draw_overlay
 from cow_service.media.video import write_mp4
 from cow_service.records import Clip, Frame, Grounding, Motion, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
+from cow_service.stages.placing import others_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 
@@ -75,7 +76,7 @@ def generate(
     """
     request, scene, artifacts = run.request, run.scene, run.backends.artifacts
     with run.cpu():
-        obstacles = scene.obstacles(grounding.bbox, grounding.others)
+        obstacles = scene.obstacles(grounding.bbox, others_of(grounding))
     given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, request.seed, run.generator_options)
     with run.device():
         frames, video = _render(given, run.generator, request, artifacts, run.report_share)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.readers.base import MotionHints, MotionReading
@@ -20,6 +21,7 @@ from cow_service.records import (
     Vector,
 )
 from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
+from cow_service.stages.placing import placed_mover, placing_sentence
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 
@@ -35,14 +37,19 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     Raises what the reader raises.
     """
     given, path = run.request.stated_motion, run.request.trajectory
+    placed = placed_mover(grounding)
     speed: float | None = None
     source: Source = "request"
     if given is not None:
         reading, speed = _given(given), given.speed
     elif path is not None:
         reading, speed = _along(path)
+    elif placed is not None and grounding.source == "request":
+        reading = MotionReading("place", None, "request")
     else:
         reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, hints), run.reader.source
+    if placed is not None and reading.kind == "place":
+        reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
     motion = _complete(run.scene.width, grounding, reading, speed, source, run.request.law)
     return StageResult(value=motion, warnings=(*reading.warnings, *_assumed(motion, speed)))
 

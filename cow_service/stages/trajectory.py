@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from cow_service.stages.paths import (
     start_of,
     tracks,
 )
+from cow_service.stages.placing import others_of, placement_of, put_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.warnings import warnings_of
@@ -44,7 +46,7 @@ from cow_service.vision.types import Floats
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
-        obstacles = run.scene.obstacles(grounding.bbox, grounding.others)
+        obstacles = run.scene.obstacles(grounding.bbox, others_of(grounding))
         trajectory = trajectory_of(run.scene, grounding, motion, obstacles, run.request)
         return StageResult(value=trajectory, warnings=warnings_of(run.scene, run.request, grounding, trajectory))
 
@@ -59,8 +61,13 @@ def trajectory_of(
     asked = read_asked(parse(request.question))
     target = None if asked is None else target_of(asked, grounding, bodies)
     world = _world(scene, bodies, motion, request, free, grounding, target)
+    put = put_of(scene, grounding, motion, bodies)
+    world = replace(world, put=put)
     tellable = asked is not None and known and (asked.target is None or target is not None)
-    imagined = imagine(world, asked if tellable else None, target, request.ensemble)
+    if put is not None and not tellable:  # what is shown is what most worlds do
+        imagined = imagine(world, Asked(relation="inside"), put.targets[0], request.ensemble)
+    else:
+        imagined = imagine(world, asked if tellable else None, target, request.ensemble)
     trajectory = _record(scene, grounding, motion, request, world, imagined, free, known)
     outcome = None if asked is None else _outcome(asked, target, bodies, imagined)
     return trajectory if outcome is None else _with_facts(trajectory, outcome, grounding)
@@ -125,6 +132,7 @@ def _record(
         anchors=anchors,
         encounters=encounters(imagined.events, imagined.around_events, world.bodies, request.fps, request.num_frames),
         encounters_known=known,
+        placement=placement_of(grounding.object, shown.placements, imagined.around and imagined.around.placements),
         ensemble=request.ensemble,
     )
 
