@@ -22,6 +22,7 @@ DROP = 0.06  # of its half width: from so high it is let go
 BESIDE_GAP = 0.5  # of its half width: between it and what it is put beside
 AIM_SIGMA = 0.03  # of its half width, along and across: where it is let go
 AIM_OFF = 0.01  # of its half width, to the right: nothing is put on top of a ball so exactly that it stays
+HIDDEN_HEIGHT = 0.5  # of a container's width: its height at least, where its foot is hidden
 CLEARANCE = 0.5  # of its half width: so high it passes over what it is carried over
 LEAST_RISE = 0.3  # of the way that it is carried
 
@@ -53,7 +54,7 @@ def let_go(put: Put, shapes: Sequence[RigidShape], row: Floats) -> tuple[RigidSh
     """
     bodies = list(shapes)
     if put.opening is not None:
-        target = bodies[put.targets[0]]
+        target = _whole(bodies[put.targets[0]], put.opening)
         hollow = hollow_of(put.opening, target.half_width, target.half_height, row)
         bodies[put.targets[0]] = replace(target, hollow=hollow)
     mover = bodies[0]
@@ -64,6 +65,13 @@ def let_go(put: Put, shapes: Sequence[RigidShape], row: Floats) -> tuple[RigidSh
     still = (0.0, 0.0, 0.0)
     bodies[0] = replace(mover, position=(x, y, z), velocity=still, starts=True, falls=True, glides=False)
     return tuple(bodies)
+
+
+def _whole(target: RigidShape, seen: SeenOpening) -> RigidShape:
+    """A container whose foot is hidden is at least as high as common ones of its width."""
+    half = max(target.half_height, HIDDEN_HEIGHT * target.half_width) if seen.foot_hidden else target.half_height
+    x, y, z = target.position
+    return replace(target, half_height=half, position=(x, y + half - target.half_height, z))
 
 
 def _end(put: Put, bodies: Sequence[RigidShape]) -> tuple[float, float, float]:

@@ -1,10 +1,9 @@
 """What becomes of a body that was put somewhere: in, on, over, beside, or fallen off, in each world of an ensemble.
 
-The rule for `into`, by where things come to rest. The body is `inside` where it has gone through the opening: it is
-narrower than the opening, its lower end lies below the rim by a quarter of the container's depth or more, and at least
-a quarter of its own height is below the rim. Narrower but with more than that above the rim, it `sticks-out`. Wider
-than the opening, or held up at the rim, it is `on-the-rim`. Whether a thing fits is the share of worlds in which it
-ends as it was meant to: inside, on top, or, beside others, without overlapping them.
+The rule for `into`, by where things come to rest. What is wider than the opening, or whose lower end lies no more than
+a tenth of the container's depth below the rim, is `on-the-rim`: it is held up there. What has gone through the opening
+`sticks-out` where its upper end is higher above the rim than the container is deep, and else is `inside`. A thing fits
+in the worlds in which it ends as it was meant to: inside; on top; or, beside others, without overlapping them.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from cow_service.physics.engine import RigidShape, WorldRun
 from cow_service.records import PlacementResult, PlaceRelation
 from cow_service.vision.types import Floats, Mask
 
-STICKS_OUT = 0.75  # share of the height above the rim
-GONE_IN = 0.25  # of the container's depth: how far below the rim the lower end of what is inside is
+STICKS_OUT = 1.0  # of the container's depth: how far the upper end is above the rim
+GONE_IN = 0.1  # of the container's depth: how far below the rim the lower end of what is inside is
 TIPPED = math.cos(math.radians(45))  # upright component of an axis that was upright
 SUNK = 0.1  # of the smaller half height: how far below a top the lower end of what lies on it may seem to be
 OVERLAPPING = 0.02  # of the half width: so much too close, bodies are taken to touch, not to overlap
@@ -92,7 +91,7 @@ def _into(
         return "tips", clearance, above
     if clearance <= 0 or rim - low < GONE_IN * hollow.depth:
         return "on-the-rim", clearance, above
-    return ("sticks-out" if above > STICKS_OUT else "inside"), clearance, above
+    return ("sticks-out" if high - rim > STICKS_OUT * hollow.depth else "inside"), clearance, above
 
 
 def _onto(body: RigidShape, target: RigidShape, run: WorldRun, index: int, tipped: bool) -> PlacementResult:

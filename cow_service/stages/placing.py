@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from cow_service.vision.openings import SeenOpening, measure_opening
 from cow_service.vision.regions import SAME_OBJECT_IOU
 from cow_service.vision.scene import Scene
 
+BELOW = 4  # px below the outline of a body in which another one that hides it begins
+HIDDEN = 0.25  # of the columns of a body: with so many ending at another one, its foot is hidden
 PREPOSITIONS = {
     "into": "into", "onto": "onto", "between": "between", "in-front-of": "in front of", "behind": "behind",
     "next-to": "next to", "left-of": "to the left of", "right-of": "to the right of",
@@ -68,6 +71,8 @@ def put_of(scene: Scene, grounding: Grounding, motion: Motion, bodies: Sequence[
     if len(set(targets)) < len(targets):
         raise CannotGround(f"'{placed.targets[0].object}' and '{placed.targets[1].object}' were found at one place.")
     opening = _opening(scene, bodies[targets[0]]) if placed.relation == "into" else None
+    if opening is not None and _foot_hidden(bodies, targets[0]):
+        opening = replace(opening, foot_hidden=True)
     return Put(placed.relation, targets, opening, _free_side(scene, bodies, targets[0]))
 
 
@@ -114,6 +119,19 @@ def _opening(scene: Scene, target: SeenBody) -> SeenOpening:
             f"No opening is seen in '{target.name}': call it what it is, such as a bowl, a cup or a box."
         )
     return seen
+
+
+def _foot_hidden(bodies: Sequence[SeenBody], target: int) -> bool:
+    """Whether another thing begins right below a good part of the lower outline of a body."""
+    mask = bodies[target].mask
+    below = np.zeros(mask.shape, bool)
+    for i, body in enumerate(bodies):
+        if i not in (0, target) and body.bbox[3] > bodies[target].bbox[3]:
+            body.mask.add_to(below)
+    columns = np.nonzero(mask.patch.any(axis=0))[0]
+    lowest = mask.rows.start + mask.patch.shape[0] - 1 - mask.patch[::-1].argmax(axis=0)
+    met = [below[lowest[x] + 1 : lowest[x] + 1 + BELOW, mask.columns.start + x].any() for x in columns]
+    return float(np.mean(met)) > HIDDEN
 
 
 def _free_side(scene: Scene, bodies: Sequence[SeenBody], target: int) -> int:

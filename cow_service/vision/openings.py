@@ -32,6 +32,7 @@ class SeenOpening:
     square: bool = False  # four walls, not a round one
     rim: tuple[float, float, float, float] | None = None  # x, y, half width, half height of its ellipse, px
     has_edge: bool = False  # the inner edge of a rim is seen
+    foot_hidden: bool = False  # something stands before its lower end: it is higher than it is seen
 
 
 def measure_opening(image: Image, mask: CroppedMask, square: bool = False) -> SeenOpening:
