@@ -21,6 +21,7 @@ from cow_service.records import (
 )
 from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
 from cow_service.stages.legs import also_moving, given_others, other_words, step_of, step_reading, unit
+from cow_service.stages.placing import placed_mover, placing_sentence
 from cow_service.stages.quantities import Measures
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
@@ -37,15 +38,20 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     `InvalidRequest` for a second mover that is none of the `objects`.
     """
     given, path = run.request.stated_motion, run.request.trajectory
+    placed = placed_mover(grounding)
     source: Source = "request"
     if given is not None:
         reading = _given(given)
     elif path is not None:
         reading = _along(path)
+    elif placed is not None and grounding.source == "request":
+        reading = MotionReading("place", None, "request")
     else:
         reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, hints), run.reader.source
         if run.request.motion is not None:
             reading = _with_lengths(reading, run.request.motion)
+    if placed is not None and reading.kind == "place":
+        reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
     if run.request.motion is not None and run.request.motion.others:
         reading = replace(reading, others=given_others(run.request.motion.others, grounding))
     reading, unused = _fitting(reading)
