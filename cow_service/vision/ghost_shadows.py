@@ -121,7 +121,9 @@ class _Floor:
         centres, half = self.ellipses(start)
         height, width = self.shade.shape
         ys, xs = np.mgrid[:height, :width]
-        near = np.hypot((xs[..., None] - centres[:, 0]) / half[0], (ys[..., None] - centres[:, 1]) / half[1]).min(axis=2)
+        near = np.hypot((xs[..., None] - centres[:, 0]) / half[0], (ys[..., None] - centres[:, 1]) / half[1]).min(
+            axis=2
+        )
         kept = (near < FIT_REACH) & (self.weight > 0)
         points, shade = np.stack([xs[kept], ys[kept]], axis=1), self.shade[kept].astype(np.float64)
 

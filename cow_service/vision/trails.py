@@ -1,4 +1,4 @@
-"""Finds trails: three or more positions of one ball in one image, faded, or as opaque as a multiple exposure shows them.
+"""Finds trails: three or more positions of one ball in one image, faded or as opaque as in a multiple exposure.
 
 Two circles that look alike are the start; others that look like them are sought between and beyond them, on a path
 along which place and size change smoothly. Balls that merely look alike are no trail by themselves: see
@@ -31,8 +31,9 @@ LEAST_GAP, MOST_GAP = 0.35, 5.0  # radii between neighbours
 MOST_SAG = 0.3  # of the distance of two positions: how far those between may lie off the line
 MAX_POSITIONS = 12
 SAME_POSITION_IOU = 0.4
+# Radii: offsets from the centre at which looks are compared.
 OFFSETS = np.array([(r * math.cos(t), r * math.sin(t)) for r in (0.25, 0.5, 0.7, 0.85)
-                    for t in np.linspace(0, 2 * math.pi, 24, endpoint=False)])  # radii: where looks are compared  # fmt: skip
+                    for t in np.linspace(0, 2 * math.pi, 24, endpoint=False)])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,7 @@ def _between(edges: Edges, looks: _Looks, a: Circle, b: Circle, inner: int) -> t
     across = np.array([a.y - b.y, b.x - a.x]) / apart
     shares = np.arange(1, inner + 1) / (inner + 1)
     most = MOST_SAG * apart if inner else 0.0
-    for bulge in sorted(np.arange(-most, most + 1e-9, 0.35 * mean).tolist() + [0.0], key=abs):
+    for bulge in sorted([0.0, *np.arange(-most, most + 1e-9, 0.35 * mean).tolist()], key=abs):
         chain, seeds = [a], []
         for t in shares:
             middle = np.array([a.x, a.y]) * (1 - t) + np.array([b.x, b.y]) * t + 4 * t * (1 - t) * bulge * across
