@@ -28,6 +28,9 @@ MAX_CIRCLES = 32
 NEAR = 0.035, 1.0  # of the radius, px: edges this close to a circle lie on it
 FACING = 0.93  # cosine of the angle between an edge's gradient and the radius
 BINS = 72  # of the circumference
+NOTCH_FACING = 0.7  # cosine of the angle between an edge's gradient and the line of two centres, at most, in a notch
+NOTCH_REACH = 1.5  # px beyond the notch's depth in which edges are of it
+LEAST_NOTCH = 4  # edges
 SAME = 0.15  # of the radius, by which centres and radii of one circle may differ
 
 
@@ -91,6 +94,32 @@ class Edges:
         fx, fy = self.stretch
         fitted = self._fitted(x / fx - 0.5, y / fy - 0.5, 2 * radius / (fx + fy))
         return None if fitted is None else self._enlarged(*fitted)
+
+    def notch(self, a: Circle, b: Circle) -> float | None:
+        """How deep the outline is notched where two circles overlap: 1 as theirs is, 0 as straight as a bottle's side.
+
+        None where no edges are seen there, or the circles lie apart.
+        """
+        stretch = np.array(self.stretch)
+        start, end = (np.array([c.x, c.y]) / stretch - 0.5 for c in (a, b))
+        first, last = (2 * c.radius / float(stretch.sum()) for c in (a, b))
+        gap = float(np.linalg.norm(end - start))
+        if gap > 1.9 * min(first, last):
+            return None
+        along = (end - start) / gap
+        way = (self.points - start) @ along / gap
+        aside = np.abs((self.points - start) @ np.array([-along[1], along[0]]))
+        radius = first + (last - first) * way
+        depth = radius - np.sqrt(np.maximum(radius**2 - (gap * np.minimum(np.abs(way), np.abs(1 - way))) ** 2, 0))
+        facing = np.abs(self.normals @ along) < NOTCH_FACING
+        facing &= np.abs(aside - radius + depth / 2) < depth / 2 + NOTCH_REACH
+        between = facing & (np.abs(way - 0.5) < 0.22)
+        beside = facing & (np.minimum(np.abs(way), np.abs(1 - way)) < 0.2)
+        if min(np.count_nonzero(between), np.count_nonzero(beside)) < LEAST_NOTCH:
+            return None
+        # Against the outline beside the centres: fitted radii are not exact to the notch's depth.
+        step = float((aside - radius)[beside].mean() - (aside - radius)[between].mean())
+        return step / max(float(depth[between].mean() - depth[beside].mean()), 1e-6)
 
     def _fitted(self, x: float, y: float, radius: float) -> tuple[float, float, float, frozenset[int]] | None:
         reach = 1.6 * radius

@@ -21,6 +21,7 @@ from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
 SEEN_SUPPORT = 0.75  # of what the other positions leave to be seen of a circumference, on edges
+NOTCHED = 0.35  # of the depth that the outline of two overlapping circles has between them: less is a straight side
 SIZES = 1.35  # between the radii of neighbours, at most
 LOOKS, LEAST_CONTRAST = 0.3, 12.0  # difference of the looks over the contrast, at most; grey levels of that contrast
 FADED = 0.85  # of the opacity of the most opaque: with less, a position was faded
@@ -170,7 +171,7 @@ def _chain(edges: Edges, looks: _Looks, a: Circle, b: Circle) -> tuple[Circle, .
         if chain is None:
             continue
         chain = _beyond(edges, looks, _beyond(edges, looks, chain)[::-1])
-        if len(chain) > max(2, len(best)) and _is_path(chain) and looks.alike(chain) and _is_outlined(chain):
+        if len(chain) > max(2, len(best)) and _is_path(chain) and looks.alike(chain) and _is_outlined(edges, chain):
             best = chain
     return best or None
 
@@ -256,8 +257,15 @@ def _is_path(chain: Sequence[Circle]) -> bool:
     return bool(uneven < 0.12 and (spread > SPACING[0]).all() and (spread < SPACING[1]).all())
 
 
-def _is_outlined(chain: Sequence[Circle]) -> bool:
-    """Whether edges show as much of each circle as the others leave to be seen: circles fitted into a bottle do not."""
+def _is_outlined(edges: Edges, chain: Sequence[Circle]) -> bool:
+    """Whether edges show as much of each circle as the others leave to be seen, and the notches between them.
+
+    Circles that were fitted into a bottle do not pass.
+    """
+    notches = [edges.notch(a, b) for a, b in itertools.pairwise(chain)]
+    seen_notches = [notch for notch in notches if notch is not None]
+    if seen_notches and float(np.median(seen_notches)) < NOTCHED:
+        return False
     turns = (np.arange(BINS) + 0.5) * 2 * math.pi / BINS
     for i, circle in enumerate(chain):
         rim = np.stack([circle.x + circle.radius * np.cos(turns), circle.y + circle.radius * np.sin(turns)], axis=1)
