@@ -58,8 +58,11 @@ def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
     if negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
     asking = Asking(form, relation, negations == 1, None, things[0] if things else None, tuple(map(str, listed)))
-    if str(next(iter(subject), "")) == "they":
+    pronoun = next((str(token) for token in subject if token.type == "PRONOUN"), None)
+    if pronoun == "they":
         return _together(asking, beside)
+    if pronoun is not None and beside is not None:
+        return None  # which of the two movers is meant is open
     return asking if listed and form == "which-first" else _with_subject(asking, tree, subject, done_to)
 
 
@@ -87,7 +90,9 @@ def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_
     thing = next((str(token) for token in subject if token.type == "T"), None)
     relation, target, doer = asking.relation, asking.target, thing
     mover_acted = any(t.type in MOVER for node in tree.find_data("object") for t in _tokens(node))
-    if done_to and relation == "covers":
+    if asking.form == "what-happens":
+        target, doer = thing or target, None
+    elif done_to and relation == "covers":
         # Hidden: the mover by another, one thing by another, or a thing by the mover.
         by_other = target is not None and thing is not None
         if (subject and thing is None) or by_other:

@@ -20,8 +20,8 @@ from cow_service.readers.question.words import PRONOUNS, Word, base_forms
 from cow_service.records import Asked
 
 _STARTS = lex.words(
-    "will would do does did can could shall might may be tell say predict know when at in after how what which with",
-    "into on onto",
+    "will would do does did can could shall might may be tell say predict know when where at in after how what which",
+    "with into on onto true",
 )
 _OPENERS = lex.words(", and then so but now please")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
@@ -103,7 +103,7 @@ def _read(question: Question) -> _Reading | None:
         covered = reading.covered if place == at else frozenset[int]()
         if place != at and _INVERTED.fullmatch(" ".join(sentence.tokens)):
             return None
-        if not _leaves_world(sentence, covered):
+        if not _leaves_world(sentence, covered, question):
             return None
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
@@ -181,7 +181,7 @@ def _relates(token: str, after: str) -> bool:
     return subject or (token == "when" and after.removesuffix("-ing") in lex.VERBS)
 
 
-def _leaves_world(sentence: Sentence, covered: frozenset[int]) -> bool:
+def _leaves_world(sentence: Sentence, covered: frozenset[int], question: Question) -> bool:
     """Whether the words around a question leave its world as it is: one thing moves, and hits nothing yet."""
     tokens, rest = sentence.tokens, [at for at in range(len(sentence.tokens)) if at not in covered]
     words = [word for at in rest for word in sentence.words[at]]
@@ -189,15 +189,18 @@ def _leaves_world(sentence: Sentence, covered: frozenset[int]) -> bool:
         return True
     if not _INTERVENTIONS.isdisjoint(words) or _NOT_THERE.fullmatch(" ".join(words)):
         return False
-    return not any(_moves_another(sentence, at) or _hits(tokens, at) for at in rest)
+    return not any(_moves_another(sentence, at, question) or _hits(tokens, at) for at in rest)
 
 
-def _moves_another(sentence: Sentence, at: int) -> bool:
+def _moves_another(sentence: Sentence, at: int, question: Question) -> bool:
     """Whether another thing than the mover, or a hand that moves it, is the subject of a verb of motion at a place."""
     tokens = sentence.tokens
     verb = lex.VERBS.get(tokens[at])
     subject = at - 2 if at > 1 and tokens[at - 1] == "be" else at - 1
     if verb is None or verb.kind in {None, "static"} or subject < 0 or tokens[subject] not in sentence.phrases:
+        return False
+    known = [other.object for other in question.motion.others]
+    if sentence.phrases[tokens[subject]] in known:
         return False
     if sentence.phrases[tokens[subject]].head in lex.AGENTS and tokens[at + 1 : at + 2] == ["M"]:
         return False
