@@ -39,6 +39,8 @@ _NOT_THERE = re.compile(r".*\b(?:not|n't|never) (?:there|here|present|exist|exis
 _SHORT_ANSWER = lex.words(
     "please answer reply respond say just only with by in a single word yes no or not sure either"
 )
+_MAX_TRIES = 8  # of one sentence: each takes some ms
+MAX_SENTENCES = 12  # of one question; more are not read
 _LIST = re.compile(r"(?P<list>T\d+(?: , T\d+)*(?: ,)? or T\d+)")
 _LIST_AT_END = re.compile(r".*?, " + _LIST.pattern)
 _BEFORE_PLACES = lex.words("to of by near behind beside in on at from under above below with toward towards into")
@@ -93,7 +95,7 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
 def _read(question: Question) -> _Reading | None:
     """The one clause of the question that asks; None where none is understood, or several ask."""
     found = sentences(question)
-    if any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
+    if len(found) > MAX_SENTENCES or any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
         return None
     readings = [(at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question))]
     if len(readings) != 1:
@@ -114,9 +116,13 @@ def _read(question: Question) -> _Reading | None:
 def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
     """The longest part of a sentence, up to its end or to a condition, that a pattern covers."""
     tokens = sentence.tokens
+    tries = 0
     ends = [len(tokens), *(at for at, token in enumerate(tokens) if token in _CONDITIONS)]
     for start in (at for at, token in enumerate(tokens) if token in _STARTS and _opens(tokens[:at])):
         for end in (end for end in ends if end > start):
+            tries += 1
+            if tries > _MAX_TRIES:
+                return None
             reading = _match(sentence, _without_insertion(tokens, start, end), question)
             if reading is not None:
                 return reading
