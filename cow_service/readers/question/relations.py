@@ -54,6 +54,7 @@ class _Reading:
     asking: Asking
     phrases: dict[str, ObjectPhrase]
     covered: frozenset[int]
+    items: frozenset[int] = frozenset()
     listed: tuple[ObjectPhrase, ...] = ()
 
 
@@ -91,6 +92,12 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     return (*(reading.phrases[token] for token in reading.asking.among), *reading.listed)
 
 
+def covered_items(question: Question) -> frozenset[int]:
+    """The places in `Question.items` of the clause that asks, as far as it was read."""
+    reading = _read(question)
+    return frozenset() if reading is None else reading.items
+
+
 @lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
 def _read(question: Question) -> _Reading | None:
     """The one clause of the question that asks; None where none is understood, or several ask."""
@@ -110,7 +117,7 @@ def _read(question: Question) -> _Reading | None:
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
         return None
-    return replace(reading, listed=listed)
+    return replace(reading, listed=listed, items=frozenset(found[at].items[place] for place in reading.covered))
 
 
 def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
