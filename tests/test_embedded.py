@@ -134,7 +134,7 @@ def test_the_only_ball_needs_no_colour() -> None:
 @pytest.mark.parametrize(
     ("words", "x"),
     [
-        ("the ball on the left", 110), ("the leftmost ball", 110), ("the right ball", 480), 
+        ("the ball on the left", 110), ("the leftmost ball", 110), ("the right ball", 480),
         ("the ball in the back", 300),
         ("the largest ball", 480), ("the smallest ball", 300), ("the ball in the middle", 300),
     ],

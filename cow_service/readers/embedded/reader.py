@@ -14,6 +14,7 @@ from cow_service.readers.embedded.changes import check_changes, find_placed, fin
 from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
+from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.accounting import unread_warnings
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
@@ -45,6 +46,7 @@ class EmbeddedReader:
             )
         with given.cpu():
             check_changes(question)
+            scene = scene_of_mover(scene, question)
             removed = find_removed(scene, question)
             regions = without(scene.regions, removed)
             bbox = _mover(scene, regions, question, question.mover)
@@ -157,6 +159,8 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
+    if words.trail is not None and (on := along_trail(scene, grounding, words)) is not None:
+        return on
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
     if words.arrow is not None:
@@ -176,6 +180,9 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
             f"up. {GIVE_DIRECTION}"
         )
+    on = along_trail(scene, grounding, words)
+    if on is not None:
+        return on
     near = arrows_near(scene, grounding.bbox)
     if near and question.names_direction:
         raise CannotReadDirection(
