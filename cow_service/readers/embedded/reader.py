@@ -11,9 +11,11 @@ from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, without
+from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
+from cow_service.readers.question.accounting import unread_warnings
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked
@@ -62,8 +64,11 @@ class EmbeddedReader:
             others = _others(regions, question, bbox)
             found = {other.object for other in others}
             missing = [_not_found(scene, phrase.text) for phrase in question.others if phrase.text not in found]
+            boxes = {other.object: other.bbox for other in others} | {question.mover.text: bbox}
+            things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
+            doubts = [*noun_warnings(scene, things), *unread_warnings(question)]
         return GroundingReading(
-            question.mover.text, bbox, others=others, warnings=tuple(missing), interventions=(*removed, *placed)
+            question.mover.text, bbox, others=others, warnings=(*missing, *doubts), interventions=(*removed, *placed)
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
