@@ -25,6 +25,7 @@ PARAMETERS: dict[str, Doubt] = {
     "outline": "size",
     "friction": "friction",
     "restitution": "friction",
+    "other_speed": "speed",
 }  # what is uncertain in a world, and the kind of doubt that it belongs to
 NAMES = tuple(PARAMETERS)
 COLUMN = {name: place for place, name in enumerate(NAMES)}

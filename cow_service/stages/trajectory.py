@@ -42,6 +42,8 @@ from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Floats
 
+_OWN = ("kind", "direction", "depth", "speed", "speed_deviation")  # of each mover
+
 
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
     """The world over the whole clip; a path from the request is followed through everything."""
@@ -110,9 +112,21 @@ def _world(
         fps=request.fps,
         asked=None if query is None else query.target,
         led=led,
+        others={} if led is not None else _others((*bodies, *taken), motion),
         taken=taken,
         turns_wanted=query is not None and query.asked.relation == "tips",
     )
+
+
+def _others(bodies: Sequence[SeenBody], motion: Motion) -> dict[int, Motion]:
+    """The motions of other bodies that are set moving, by their places among the bodies."""
+    alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": ()}
+    return {
+        i: motion.model_copy(update=alone | {name: getattr(other, name) for name in _OWN})
+        for other in motion.others
+        for i, body in enumerate(bodies)
+        if i and body.bbox == other.object.bbox
+    }
 
 
 def _record(

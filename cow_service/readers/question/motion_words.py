@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.arrow_words import ArrowSense, has_opposite, is_arrow
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, phrase_at
+from cow_service.readers.question.trail_words import TrailWords
 from cow_service.records import MotionKind, Vector
 
 SLIGHTLY = math.tan(math.pi / 8)  # "slightly up": half of a diagonal's 45 degrees
@@ -40,7 +41,7 @@ class MotionWords:
     ("falls to the left"): its kind stays "fall". `depth` is the sine of the angle out of the image plane: -1 towards
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
     form, empty where no known verb of motion stands in the question. `towards` is the object that the motion aims at;
-    the direction to it is for the caller to measure.
+    the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
     """
 
     kind: MotionKind | None
@@ -50,6 +51,7 @@ class MotionWords:
     forward: bool | None
     verb: str
     towards: ObjectPhrase | None = None
+    trail: TrailWords | None = None
 
 
 def read_motion(
