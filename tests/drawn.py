@@ -40,6 +40,25 @@ def block(image: Image, bbox: tuple[int, int, int, int], rgb: tuple[int, int, in
     return result
 
 
+def bowl(
+    image: Image, middle: tuple[float, float], half: float, height: float, rgb: tuple[int, int, int], base: float = 0.5
+) -> Image:
+    """A round open bowl seen from above at 30 degrees: `middle` is that of its rim, `base` its floor's share of it."""
+    x, y = middle
+    tall = half / 2
+    result = np.ascontiguousarray(image).copy()
+    angles = np.linspace(0, 2 * np.pi, 80)
+    foot = np.stack([x + base * half * np.cos(angles), y + height + base * tall * np.sin(angles)], axis=1)
+    rim = np.stack([x + half * np.cos(angles), y + tall * np.sin(angles)], axis=1)
+    outer = cv2.convexHull(np.concatenate([foot, rim]).astype(np.float32)).round().astype(np.int32)
+    cv2.fillConvexPoly(result, outer, tuple(int(0.75 * part) for part in rgb), cv2.LINE_AA)
+    for share, light in ((1.0, 1.15), (0.9, 0.5)):
+        shown = tuple(int(min(255, light * part)) for part in rgb)
+        axes = (round(share * half), round(share * tall))
+        cv2.ellipse(result, (round(x), round(y)), axes, 0, 0, 360, shown, -1, cv2.LINE_AA)
+    return result
+
+
 @dataclass(frozen=True)
 class DrawnArrow:
     tail: tuple[float, float]
@@ -105,3 +124,26 @@ def angle_between(a: tuple[float, float], b: tuple[float, float]) -> float:
 
 def _whole(point: NDArray[np.float64]) -> tuple[int, int]:
     return round(float(point[0])), round(float(point[1]))
+
+
+def thrown_past(
+    start: tuple[float, float], velocity: tuple[float, float], gravity: float, count: int, step: float = 1.0
+) -> list[tuple[float, float]]:
+    """Places of a ball at equal times up to the present, the oldest first: where it is now comes last."""
+    times = [step * (i - count + 1) for i in range(count)]
+    return [(start[0] + velocity[0] * t, start[1] + velocity[1] * t + gravity * t * t / 2) for t in times]
+
+
+def trail(
+    image: Image,
+    places: list[tuple[float, float]],
+    radii: list[float],
+    rgb: tuple[int, int, int],
+    opacities: list[float],
+) -> Image:
+    """A ball at places, the last on top, each so opaque over the image (1: as a multiple exposure shows it)."""
+    result = image
+    for place, radius, opacity in zip(places, radii, opacities, strict=True):
+        solid = ball(result, place, radius, rgb)
+        result = np.round(opacity * solid.astype(float) + (1 - opacity) * result).astype(np.uint8)
+    return result

@@ -59,6 +59,7 @@ class WorldEvents:
     moved: Floats  # [K, B] s: when it is set in motion
     tipped: Floats  # [K, B] s: when it is knocked over; infinite where that was not looked for
     gone: Floats  # [K, B] s: when it leaves the image
+    placed: Floats | None = None  # [K] s: when the mover is where it was to be put; infinite where it does not fit
     order: tuple[int, ...] = (0,)  # of the first draw: what moves, in the order in which it is set in motion
 
 
@@ -74,6 +75,7 @@ def find_world_events(
         moved=times_moved(worlds),
         tipped=times_tipped(worlds),
         gone=times_gone(paths, size, worlds),
+        placed=None if worlds.placements is None else worlds.placements.times,
         order=order,
     )
 

@@ -19,7 +19,7 @@ from cow_service.vision.types import Floats
 
 # Degrees, one standard deviation of a direction in the image, by where it was read.
 TURN_SIGMA: dict[Cue, float] = {
-    "arrow": 1.5, "trail": 3.0, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
+    "arrow": 1.5, "trail": 1.5, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
 }  # fmt: skip
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
 RISE, RISE_SIGMA = math.radians(20), math.radians(8)  # above the horizontal: how things are thrown
@@ -240,8 +240,10 @@ def _thrown(
     if sigma > 0:
         turns, count = mean + sigma * TURNS, len(TURNS)
         one, facing = mover.repeated(count), np.repeat(direction[:1], count, axis=0)
-        rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
-        weight = np.exp(-0.5 * TURNS**2) * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
+        weight = np.exp(-0.5 * TURNS**2)
+        if motion.cue != "trail":  # along a trail it may have come to any point of its path
+            rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
+            weight = weight * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
         if asked is not None:
             away = asked.centre[0] - mover.centre[0]
             bearing = math.atan2(float(away[2]), float(np.sign(direction[0, 0]) * away[0]))

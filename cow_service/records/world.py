@@ -149,7 +149,11 @@ class Placement(Record):
         default_factory=dict, description="Share of the ensemble's worlds with each result; empty without an ensemble."
     )
     fits: float | None = Field(
-        default=None, ge=0, le=1, description="Probability that it goes in without resting on the rim or sticking out."
+        default=None,
+        ge=0,
+        le=1,
+        description="Probability that it ends as it was meant to: inside and not held up at the rim, on top, or beside "
+        "without overlapping.",
     )
     clearance: float | None = Field(
         default=None, description="Width of the opening less that of the object, as a share of the opening."

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.outcome import Query
 from cow_service.readers.question.choices import plain
-from cow_service.readers.question.shapes import is_vehicle, shape_of
+from cow_service.readers.question.shapes import is_cube, is_vehicle, shape_of
 from cow_service.records import Asked, Grounding, LocatedObject, Shape
+from cow_service.stages.placing import others_of
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
@@ -26,6 +27,7 @@ def seen_bodies(scene: Scene, grounding: Grounding, obstacles: Sequence[Obstacle
         source=grounding.source,
         prior=grounding.prior,
         elongated=is_vehicle(grounding.object),
+        equal_sided=is_cube(grounding.object),
     )
     return mover, *(_obstacle(scene, grounding, obstacle) for obstacle in obstacles)
 
@@ -33,13 +35,13 @@ def seen_bodies(scene: Scene, grounding: Grounding, obstacles: Sequence[Obstacle
 def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ...], tuple[Obstacle, ...]]:
     """What stands beside the mover, and what of it is taken away before the motion."""
     removed = removed_objects(grounding)
-    found = scene.obstacles(grounding.bbox, (*grounding.others, *removed))
+    found = scene.obstacles(grounding.bbox, (*others_of(grounding), *removed))
     boxes = {each.bbox for each in removed}
     taken = tuple(each for each in found if each.bbox in boxes)
     masks = [each.mask.full() for each in taken]
     # A part of what is taken away, such as its lit top, may have been found as a region of its own.
     parts = {each.bbox for each in found if any(each.mask.shared_with(m) > PART * each.mask.area for m in masks)}
-    named = {other.bbox for other in grounding.others}
+    named = {other.bbox for other in others_of(grounding)}
     kept = (each for each in found if each.bbox not in boxes and (each.bbox in named or each.bbox not in parts))
     return tuple(kept), taken
 
@@ -65,13 +67,13 @@ def body_named(words: str, grounding: Grounding, bodies: Sequence[SeenBody]) -> 
     name = plain(words)
     if name == plain(grounding.object):
         return 0
-    placed = (*grounding.others, *removed_objects(grounding))
+    placed = (*others_of(grounding), *removed_objects(grounding))
     boxes = {other.bbox for other in placed if plain(other.object) == name}
     return next((i for i, body in enumerate(bodies) if i and body.bbox in boxes), None)
 
 
 def _obstacle(scene: Scene, grounding: Grounding, obstacle: Obstacle) -> SeenBody:
-    placed = (*grounding.others, *removed_objects(grounding))
+    placed = (*others_of(grounding), *removed_objects(grounding))
     located = next((other for other in placed if other.bbox == obstacle.bbox), None)
     located = located or LocatedObject(object=obstacle.name, bbox=obstacle.bbox)
     return SeenBody(

@@ -37,6 +37,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         with run.cpu():
             reading = _given(run, place)
     with run.cpu():
+        run.place_mover(reading.bbox)
         mask = _store_mask(run, reading.bbox)
         given, warnings = _given_objects(run, reading.bbox)
     read = (other.model_copy(update={"source": other.source or source}) for other in reading.others)
@@ -63,6 +64,7 @@ def use_stored_masks(run: Run[SimulateRequest], grounding: Grounding) -> None:
 
     A mask cut again from its box may differ from one that was cut around a point, or given.
     """
+    run.place_mover(grounding.bbox)
     changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
     for placed in (grounding, *grounding.others, *changed):
         if placed.mask is not None:

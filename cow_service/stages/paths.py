@@ -18,6 +18,7 @@ from cow_service.records import Body, CameraDeviations, CameraEstimate, Contact,
 from cow_service.vision.types import Floats
 
 MOVED = 0.5  # px: what moves less in the image stays where it is
+PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
 SETTLED = 0.25  # px per frame: what moves less is at rest
 LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
 LOW, HIGH = 10, 90  # percentiles of the band
@@ -73,9 +74,10 @@ def path_records(
 ) -> tuple[Path, ...]:
     """Paths of the mover, from its grounded point, and of what it set in motion; `around` are the ensemble's worlds."""
     records: list[Path] = []
+    moved = MOVED if worlds.placements is None else PUSHED
     for body in sorted({0} | worlds.runs[0].moved):
         seen = seen_paths(worlds, body)
-        if body == 0 or float(np.linalg.norm(seen.points[0] - seen.points[0, :1], axis=1).max()) > MOVED:
+        if body == 0 or float(np.linalg.norm(seen.points[0] - seen.points[0, :1], axis=1).max()) > moved:
             at = start_of(bodies, body, start)
             records.append(_path(bodies[body], body, np.array(at), worlds, seen, size, around))
     return tuple(records)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from cow_service.physics.sweeping import swept
 from cow_service.physics.world import Led, WorldInput
 from cow_service.readers.question.relations import read_asked
 from cow_service.readers.question.sentences import parse
-from cow_service.records import Grounding, Motion, Path, Trajectory
+from cow_service.records import Asked, Grounding, Motion, Path, Trajectory
 from cow_service.requests import SimulateRequest, TrajectoryRequest
 from cow_service.stages.bodies import obstacles_of, query_of, seen_bodies
 from cow_service.stages.camera import camera_of
@@ -35,6 +36,7 @@ from cow_service.stages.paths import (
     tracks,
     with_times,
 )
+from cow_service.stages.placing import placement_of, put_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.warnings import warnings_of
@@ -69,8 +71,11 @@ def trajectory_of(
     query = None if asked is None else query_of(asked, grounding, bodies)
     kept = len(bodies) - len(taken)
     world = _world(scene, (bodies[:kept], bodies[kept:]), motion, request, free, grounding, query)
+    put = put_of(scene, grounding, motion, bodies)
     tellable = query if known and query is not None and can_tell(query, kept) else None
-    imagined = imagine(world, tellable, request.ensemble)
+    if put is not None and tellable is None:  # what is shown is what most worlds do
+        tellable = Query(Asked(relation="inside"), put.targets[0])
+    imagined = imagine(replace(world, put=put), tellable, request.ensemble)
     trajectories = [_record(scene, grounding, motion, request, each, free, known) for each in imagined]
     told = with_outcomes(trajectories, imagined, asked, query, grounding)
     factual = told[1].model_copy(update={"anchors": ()}) if len(told) > 1 else None
@@ -159,6 +164,7 @@ def _record(
         anchors=anchors,
         encounters=encounters(imagined.events, imagined.around_events, world.bodies, request.fps, request.num_frames),
         encounters_known=known,
+        placement=placement_of(grounding.object, shown.placements, imagined.around and imagined.around.placements),
         ensemble=request.ensemble,
     )
 

@@ -12,6 +12,8 @@ from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, 
 from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, without
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
+from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
+from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked
@@ -42,6 +44,7 @@ class EmbeddedReader:
             )
         with given.cpu():
             check_changes(question)
+            scene = scene_of_mover(scene, question)
             removed = find_removed(scene, question)
             regions = without(scene.regions, removed)
             bbox = _mover(scene, regions, question, question.mover)
@@ -59,7 +62,9 @@ class EmbeddedReader:
         Raises `CannotReadDirection`.
         """
         with given.cpu():
-            return _read_motion(given.scene, parse(given.question), grounding)
+            question = parse(given.question)
+            reading = _read_motion(given.scene, question, grounding)
+            return _with_quantities(given.scene, question, grounding, reading)
 
     def answer(
         self,
@@ -149,6 +154,8 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
+    if words.trail is not None and (on := along_trail(scene, grounding, words)) is not None:
+        return on
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
     if words.arrow is not None:
@@ -168,6 +175,9 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
             f"up. {GIVE_DIRECTION}"
         )
+    on = along_trail(scene, grounding, words)
+    if on is not None:
+        return on
     near = arrows_near(scene, grounding.bbox)
     if near and question.names_direction:
         raise CannotReadDirection(
@@ -182,6 +192,15 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         )
     note = "The question names no direction; the arrow drawn at the object was followed."
     return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
+
+
+def _with_quantities(scene: Scene, question: Question, grounding: Grounding, reading: MotionReading) -> MotionReading:
+    """How fast, how far and how long, the further legs, and what else moves."""
+    words = question.motion
+    parted = any(each.share is not None for each in words.quantities)
+    way = length(_towards(scene, words.towards, grounding)) if parted and words.towards is not None else None
+    steps, others = step_readings(words.steps), other_readings(words.others, grounding)
+    return replace(reading, **quantities(words.quantities, way), steps=steps, others=others)
 
 
 def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:
