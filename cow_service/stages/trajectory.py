@@ -117,7 +117,7 @@ def _world(
         fps=request.fps,
         asked=None if query is None else query.target,
         led=led,
-        others={} if led is not None else _others(bodies, motion),
+        others={} if led is not None else _others((*bodies, *taken), motion),
         taken=taken,
         turns_wanted=query is not None and query.asked.relation == "tips",
     )
