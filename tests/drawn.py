@@ -40,6 +40,25 @@ def block(image: Image, bbox: tuple[int, int, int, int], rgb: tuple[int, int, in
     return result
 
 
+def bowl(
+    image: Image, middle: tuple[float, float], half: float, height: float, rgb: tuple[int, int, int], base: float = 0.5
+) -> Image:
+    """A round open bowl seen from above at 30 degrees: `middle` is that of its rim, `base` its floor's share of it."""
+    x, y = middle
+    tall = half / 2
+    result = np.ascontiguousarray(image).copy()
+    angles = np.linspace(0, 2 * np.pi, 80)
+    foot = np.stack([x + base * half * np.cos(angles), y + height + base * tall * np.sin(angles)], axis=1)
+    rim = np.stack([x + half * np.cos(angles), y + tall * np.sin(angles)], axis=1)
+    outer = cv2.convexHull(np.concatenate([foot, rim]).astype(np.float32)).round().astype(np.int32)
+    cv2.fillConvexPoly(result, outer, tuple(int(0.75 * part) for part in rgb), cv2.LINE_AA)
+    for share, light in ((1.0, 1.15), (0.9, 0.5)):
+        shown = tuple(int(min(255, light * part)) for part in rgb)
+        axes = (round(share * half), round(share * tall))
+        cv2.ellipse(result, (round(x), round(y)), axes, 0, 0, 360, shown, -1, cv2.LINE_AA)
+    return result
+
+
 @dataclass(frozen=True)
 class DrawnArrow:
     tail: tuple[float, float]

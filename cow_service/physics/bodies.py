@@ -30,6 +30,7 @@ class SeenBody:
     confidence: float = 1.0
     prior: ObjectPrior | None = None
     elongated: bool = False  # a vehicle: longer along its heading than across
+    equal_sided: bool = False  # a cube: as wide as high
 
     @property
     def foot(self) -> tuple[float, float]:

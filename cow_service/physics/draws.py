@@ -26,6 +26,9 @@ PARAMETERS: dict[str, Doubt] = {
     "friction": "friction",
     "restitution": "friction",
     "other_speed": "speed",
+    "opening": "size",
+    "let_go_right": "place",
+    "let_go_ahead": "place",
 }  # what is uncertain in a world, and the kind of doubt that it belongs to
 NAMES = tuple(PARAMETERS)
 COLUMN = {name: place for place, name in enumerate(NAMES)}

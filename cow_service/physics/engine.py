@@ -26,6 +26,14 @@ from rapier3d import (
     Vec3,
 )
 
+from cow_service.physics.containers import (
+    BOX_SIDES,
+    Hollow,
+    floor_radius,
+    floor_thickness,
+    relative_density,
+    wall_segments,
+)
 from cow_service.physics.course import Course
 from cow_service.physics.dynamics import GRAVITY
 from cow_service.records import Shape
@@ -40,6 +48,7 @@ FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.25
 MOST_GRAVITY = 500.0  # m/s^2 inside the engine: what is smaller than 3 mm would sink into the floor between two steps
 FORESEEN = 10.0  # m inside the engine, at most: contacts are found that far ahead of what is fast
 GAP = 1e-3  # m inside the engine: how far above what it stands on a body starts
+FLOOR = (-1, -1)  # its owner
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,7 @@ class RigidShape:
     falls: bool = True  # gravity acts on it
     ghost: bool = False  # passes through everything; what it meets is told all the same
     course: Course | None = None  # of what glides: its legs, and where it stops
+    hollow: Hollow | None = None  # it is an open container
     follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
 
 
@@ -95,14 +105,16 @@ def run_worlds(
     fps: float,
     every: int = 1,
     finished: Finished | None = None,
+    turns_wanted: bool = False,
 ) -> list[WorldRun]:
     """Runs worlds for the time of a clip, recording every `every`-th frame. They have equally many bodies each.
 
-    With more than one world, turns and impulses are not recorded, and those that are finished go on in a straight line.
+    With more than one world, impulses are not recorded, nor turns where they are not wanted, and worlds that are
+    finished go on in a straight line.
 
     The same input gives the same output, bit by bit.
     """
-    return _Engine(worlds, num_frames, fps, every, finished).run()
+    return _Engine(worlds, num_frames, fps, every, finished, turns_wanted).run()
 
 
 class _Engine:
@@ -115,9 +127,11 @@ class _Engine:
         fps: float,
         every: int,
         finished: Finished | None,
+        turns_wanted: bool,
     ) -> None:
         self.worlds, self.fps, self.every, self.finished = worlds, fps, every, finished
         self.is_alone = len(worlds) == 1
+        self.records_turns = turns_wanted or self.is_alone
         self.frames = range(0, num_frames, every)
         self.substeps = max(1, math.ceil((LEAST_STEPS if self.is_alone else LEAST_STEPS_OF_MANY) / fps))
         self.scale = ENGINE_SIZE / worlds[0][0].half_width
@@ -153,6 +167,7 @@ class _Engine:
         self.awake = [{i for i, body in enumerate(bodies) if _acts(body)} for bodies in worlds]
         self.drift = np.zeros(shape[:2], bool)  # taken out: they go on in a straight line
         self.touching: list[dict[int, set[int]]] = [{} for _ in worlds]
+        self.joined: dict[frozenset[tuple[int, int]], int] = {}  # pairs of colliders that touch, per pair of bodies
 
     def run(self) -> list[WorldRun]:
         self._record([(k, i) for k, bodies in enumerate(self.worlds) for i in range(len(bodies))], 0)
@@ -185,11 +200,18 @@ class _Engine:
                 builder = builder.angvel((z / radius, 0.0, -x / radius))
         else:
             builder = builder.sleeping(True)
-        collider = _collider(body, self.scale).density(body.density).friction(0.0 if body.glides else body.friction)
-        collider = _combined(collider.restitution(body.restitution)).sensor(_passes(body))
-        collider = collider.collision_groups(InteractionGroups(self.groups[k], self.groups[k]))
-        handle = self.world.add_body(builder, colliders=[collider.active_events(ActiveEvents.COLLISION_EVENTS)])
-        self.owner[self._body(handle).colliders[0].index] = k, i
+        group = InteractionGroups(self.groups[k], self.groups[k])
+        colliders: list[Collider | ColliderBuilder] = [
+            _combined(part.friction(0.0 if body.glides else body.friction))
+            .restitution(body.restitution)
+            .sensor(_passes(body))
+            .collision_groups(group)
+            .active_events(ActiveEvents.COLLISION_EVENTS)
+            for part in _colliders(body, self.scale)
+        ]
+        handle = self.world.add_body(builder, colliders=colliders)
+        for collider in self._body(handle).colliders:
+            self.owner[collider.index] = k, i
         return handle
 
     def _body(self, handle: RigidBodyHandle) -> RigidBody:
@@ -204,8 +226,16 @@ class _Engine:
             before = self._velocities() if self.is_alone else {}
             self.world.step()
             for event in self.collector.drain_collision_events():
-                if event.started:
-                    self._meet(time, event.collider1.index, event.collider2.index, before)
+                first, second = event.collider1.index, event.collider2.index
+                if self._begins(first, second, event.started):
+                    self._meet(time, first, second, before)
+
+    def _begins(self, first: int, second: int, started: bool) -> bool:
+        """Whether two bodies begin to touch, by an event of two of their colliders: containers have many."""
+        pair = frozenset((self.owner.get(first, FLOOR), self.owner.get(second, FLOOR)))
+        before = self.joined.get(pair, 0)
+        self.joined[pair] = before + 1 if started else max(0, before - 1)
+        return started and before == 0
 
     def _lead(self, time: float) -> None:
         """Sets where bodies that follow a path are to be at a time."""
@@ -235,8 +265,8 @@ class _Engine:
     def _let_go(self, k: int, i: int) -> None:
         """A body glides no more: from now on it is subject to friction."""
         self.courses.pop((k, i), None)
-        collider = self._body(self.handles[k][i]).colliders[0]
-        self.world.colliders[collider].friction = self.worlds[k][i].friction
+        for collider in self._body(self.handles[k][i]).colliders:
+            self.world.colliders[collider].friction = self.worlds[k][i].friction
 
     def _velocities(self) -> dict[tuple[int, int], Floats]:
         return {
@@ -289,7 +319,7 @@ class _Engine:
         positions = np.array([body.translation.to_tuple() for body in bodies]) - self.origin[k]
         self.positions[k, i, row] = positions / self.scale
         self.velocities[k, i, row] = np.array([body.linvel.to_tuple() for body in bodies]) / self.scale
-        if self.is_alone:
+        if self.records_turns:
             turns = [body.rotation for body in bodies]
             self.turns[k, i, row] = np.array([(turn.i, turn.j, turn.k, turn.w) for turn in turns])
         for far in np.nonzero(np.abs((positions - self.middle[k])[:, [0, 2]]).max(axis=1) > REACH)[0].tolist():
@@ -324,6 +354,19 @@ def _passes(body: RigidShape) -> bool:
 def _combined(collider: ColliderBuilder) -> ColliderBuilder:
     rule = CoefficientCombineRule.MULTIPLY
     return collider.friction_combine_rule(rule).restitution_combine_rule(rule)
+
+
+def _colliders(body: RigidShape, scale: float) -> list[ColliderBuilder]:
+    """Of one solid piece, or a container's floor and wall segments."""
+    if body.hollow is None:
+        return [_collider(body, scale).density(body.density)]
+    sizes = body.hollow, body.half_width, body.half_height
+    half, radius = floor_thickness(body.hollow, body.half_height) / 2 * scale, floor_radius(*sizes[:2]) * scale
+    # A flat cylinder stands on the floor as a hull of its corners does not: that sinks into it.
+    floor = Collider.cylinder(half, radius) if body.hollow.sides > BOX_SIDES else Collider.cuboid(radius, half, radius)
+    parts = [floor.translation((0.0, half - body.half_height * scale, 0.0))]
+    parts += [Collider.convex_hull(corners * scale) for corners in wall_segments(*sizes)]
+    return [part.density(body.density * relative_density(*sizes)) for part in parts]
 
 
 def _collider(body: RigidShape, scale: float) -> ColliderBuilder:

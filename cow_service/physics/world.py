@@ -12,10 +12,12 @@ import numpy as np
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera_fit import CameraFit
+from cow_service.physics.carrying import Put, arc, carried, frames_carried, frames_to_run, height_over, let_go
 from cow_service.physics.course import course_of
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
 from cow_service.physics.lift import BOX_SIDE, FARTHEST, Cameras, Placed
+from cow_service.physics.placement import Placements, classify
 from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place, speed_factors
 from cow_service.records import FALLING_KINDS, Motion
 from cow_service.vision.types import Floats, Mask
@@ -49,6 +51,13 @@ class WorldInput:
     asked: int | None = None  # the body that the question is about
     led: Led | None = None  # the mover is led along a path, through everything
     others: Mapping[int, Motion] = field(default_factory=dict[int, Motion])  # of other bodies, by their places
+    taken: tuple[SeenBody, ...] = ()  # placed with the others, then taken away before anything moves
+    turns_wanted: bool = False  # how bodies turn is recorded of an ensemble, too
+    put: Put | None = None  # the mover is carried somewhere and let go
+
+    def as_it_is(self) -> WorldInput:
+        """With nothing taken away: those things are then the last bodies."""
+        return replace(self, bodies=(*self.bodies, *self.taken), taken=())
 
 
 @dataclass(frozen=True)
@@ -60,19 +69,45 @@ class Worlds:
     runs: tuple[WorldRun, ...]  # per draw
     every: int  # frames between recorded ones
     fps: float  # of the clip
+    placements: Placements | None = None  # where something is put somewhere
 
 
 def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""
-    scene = place(given.bodies, given.motion, given.fit, given.size, draws, given.asked, given.others)
+    bodies = (*given.bodies, *given.taken)
+    everything = place(bodies, given.motion, given.fit, given.size, draws, given.asked, given.others)
+    scene = everything.first(len(given.bodies))
     shapes = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
-    finished = (
-        None
-        if len(draws) == 1 or given.motion.steps or given.others
-        else partial(_has_left, scene.cameras, given.size[0])
-    )
-    runs = run_worlds(shapes, given.num_frames, given.fps, every, finished)
+    if given.put is not None:
+        return _run_put(given, given.put, scene, shapes, draws, every)
+    left = partial(_has_left, scene.cameras, given.size[0])
+    finished = None if len(draws) == 1 or given.motion.steps else left
+    runs = run_worlds(shapes, given.num_frames, given.fps, every, finished, given.turns_wanted)
     return Worlds(scene, shapes, tuple(runs), every, given.fps)
+
+
+def _run_put(
+    given: WorldInput,
+    put: Put,
+    scene: PlacedScene,
+    shapes: tuple[tuple[RigidShape, ...], ...],
+    draws: Floats,
+    every: int,
+) -> Worlds:
+    """Worlds in which the mover is carried somewhere and let go; there the engine begins."""
+    count, rows = frames_carried(given.num_frames, given.fps), len(range(0, given.num_frames, every))
+    ready = tuple(let_go(put, bodies, row) for bodies, row in zip(shapes, draws, strict=True))
+    settled = run_worlds(ready, frames_to_run(given.num_frames, given.fps), given.fps, every, turns_wanted=True)
+    found = [classify(put, *each) for each in zip(ready, settled, shapes, strict=True)]
+    runs: list[WorldRun] = []
+    for bodies, then, run in zip(shapes, ready, settled, strict=True):
+        start, end = np.array(bodies[0].position), np.array(then[0].position)
+        path = arc(start, end, height_over(then, put.targets), count, every)
+        runs.append(carried(run, path, count, rows, given.fps, every))
+    results, clearance, above = zip(*found, strict=True)
+    told = Placements(put.relation, results, np.array(clearance), np.array(above), count / given.fps)
+    hollow = tuple((before[0], *then[1:]) for before, then in zip(shapes, ready, strict=True))
+    return Worlds(scene, hollow, tuple(runs), every, given.fps, told)
 
 
 def _has_left(cameras: Cameras, width: int, positions: Floats, velocities: Floats) -> Mask:
@@ -92,14 +127,17 @@ def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) 
     bodies: list[RigidShape] = []
     for seen, placed in zip(given.bodies, scene.bodies, strict=True):
         half = float(np.clip(placed.half_width[k], low, high))
+        tall = half if placed.shape == "sphere" else float(np.clip(placed.half_height[k], low, high))
         side = half if placed.shape != "box" else BOX_SIDE * half
+        if given.put is not None and placed.shape == "box" and seen.equal_sided:
+            side = min(max(tall, half / math.sqrt(2)), half)  # it is seen between its face's width and its diagonal
         position = placed.centre[k].tolist()
         bodies.append(
             RigidShape(
                 shape=placed.shape,
                 half_width=side,
                 half_depth=side,
-                half_height=half if placed.shape == "sphere" else float(np.clip(placed.half_height[k], low, high)),
+                half_height=tall,
                 position=(position[0], position[1], position[2]),
                 yaw=yaw if placed.shape == "box" and not seen.elongated else 0.0,
                 density=seen.fullness if placed.shape == "cylinder" else 1.0,
@@ -109,6 +147,8 @@ def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) 
             )
         )
     bodies[0] = _set_going(given, scene, draws, k, bodies[0])
+    for loose in scene.unsupported:
+        bodies[loose] = replace(bodies[loose], starts=True)
     for i, motion in given.others.items():
         factor = float(speed_factors(motion, draws[k : k + 1], "other_speed")[0])
         bodies[i] = replace(bodies[i], **_moving(given, scene, k, i, motion, (scene.others[i][k],), factor, bodies[i]))

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.readers.base import OtherMotionReading, Quantity, StepReading
 from cow_service.readers.question.choices import plain
+from cow_service.readers.question.wording import bare_name, direction_words
 from cow_service.records import DIRECTED_KINDS, AlsoMoving, Grounding, LocatedObject, MotionStep, Vector
 from cow_service.requests import MotionStepRequest, OtherMotionRequest
 from cow_service.stages.quantities import Measures
@@ -65,3 +66,10 @@ def also_moving(other: OtherMotionReading, measures: Measures) -> AlsoMoving:
         speed=measures.speed(other.kind, other.object.bbox, other.speed),
         speed_deviation=measures.speed_deviation(other.kind, other.speed),
     )
+
+
+def other_words(other: OtherMotionReading) -> str:
+    """What another mover does, such as "car moves to the left"."""
+    verb = {"projectile": "is thrown", "fall": "falls", "static": "stays where it is"}.get(other.kind, "moves")
+    way = "" if other.kind in ("fall", "static") else direction_words(other.direction, other.depth)
+    return " ".join([bare_name(other.object.object), verb, way]).rstrip()

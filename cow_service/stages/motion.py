@@ -8,7 +8,7 @@ from typing import Any
 
 from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, GRAVITY
 from cow_service.readers.base import MotionHints, MotionReading, Quantity
-from cow_service.readers.question.wording import motion_sentence
+from cow_service.readers.question.wording import direction_words, motion_sentence
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
@@ -20,7 +20,8 @@ from cow_service.records import (
     Vector,
 )
 from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
-from cow_service.stages.legs import also_moving, given_others, step_of, step_reading, unit
+from cow_service.stages.legs import also_moving, given_others, other_words, step_of, step_reading, unit
+from cow_service.stages.placing import placed_mover, placing_sentence
 from cow_service.stages.quantities import Measures
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
@@ -37,15 +38,20 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     `InvalidRequest` for a second mover that is none of the `objects`.
     """
     given, path = run.request.stated_motion, run.request.trajectory
+    placed = placed_mover(grounding)
     source: Source = "request"
     if given is not None:
         reading = _given(given)
     elif path is not None:
         reading = _along(path)
+    elif placed is not None and grounding.source == "request":
+        reading = MotionReading("place", None, "request")
     else:
         reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, hints), run.reader.source
         if run.request.motion is not None:
             reading = _with_lengths(reading, run.request.motion)
+    if placed is not None and reading.kind == "place":
+        reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
     if run.request.motion is not None and run.request.motion.others:
         reading = replace(reading, others=given_others(run.request.motion.others, grounding))
     reading, unused = _fitting(reading)
@@ -122,8 +128,22 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         gravity=_gravity(reading.down, scale) if reading.kind in FALLING_KINDS else (0.0, 0.0),
         down=reading.down,
         metres_per_pixel=scale,
-        sentence=motion_sentence(grounding.object, reading.kind, direction, depth, reading.sentence),
+        sentence=_sentence(grounding, reading, direction, depth),
         source=source,
+    )
+
+
+def _sentence(grounding: Grounding, reading: MotionReading, direction: Vector | None, depth: float) -> str:
+    """The whole motion in words."""
+    return motion_sentence(
+        grounding.object,
+        reading.kind,
+        direction,
+        depth,
+        reading.sentence,
+        further=[direction_words(step.direction, step.depth) for step in reading.steps],
+        stops=any(value is not None for value in (reading.distance, reading.duration, reading.until)),
+        also=[other_words(other) for other in reading.others],
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from cow_service.physics.anchors import points_inside
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera_fit import CameraFit
+from cow_service.physics.events import WorldEvents
 from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.projection import SeenPaths, rotation, seen_paths, states
 from cow_service.physics.world import Worlds
@@ -17,6 +18,7 @@ from cow_service.records import Body, CameraDeviations, CameraEstimate, Contact,
 from cow_service.vision.types import Floats
 
 MOVED = 0.5  # px: what moves less in the image stays where it is
+PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
 SETTLED = 0.25  # px per frame: what moves less is at rest
 LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
 LOW, HIGH = 10, 90  # percentiles of the band
@@ -50,7 +52,8 @@ def body_records(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[Body, ...]
     ):
         centre = np.array(shape.position) - np.array([0.0, cameras.height[0], 0.0])
         x, y, z = (float(v) for v in centre @ cameras.axes[0])
-        support = bodies[on].name if on is not None else "floor" if placed.stands else "air"
+        stands = placed.stands and len(records) not in worlds.scene.unsupported
+        support = bodies[on].name if on is not None else "floor" if stands else "air"
         records.append(
             Body(
                 object=seen.name,
@@ -71,12 +74,23 @@ def path_records(
 ) -> tuple[Path, ...]:
     """Paths of the mover, from its grounded point, and of what it set in motion; `around` are the ensemble's worlds."""
     records: list[Path] = []
+    moved = MOVED if worlds.placements is None else PUSHED
     for body in sorted({0} | worlds.runs[0].moved):
         seen = seen_paths(worlds, body)
-        if body == 0 or float(np.linalg.norm(seen.points[0] - seen.points[0, :1], axis=1).max()) > MOVED:
+        if body == 0 or float(np.linalg.norm(seen.points[0] - seen.points[0, :1], axis=1).max()) > moved:
             at = start_of(bodies, body, start)
             records.append(_path(bodies[body], body, np.array(at), worlds, seen, size, around))
     return tuple(records)
+
+
+def with_times(paths: Sequence[Path], events: WorldEvents) -> tuple[Path, ...]:
+    """The paths with the times at which their bodies are set in motion and knocked over in the first draw."""
+    found: list[Path] = []
+    for path in paths:
+        moved, tipped = (float(times[0, path.body]) for times in (events.moved, events.tipped))
+        times = {name: time for name, time in (("moved_at", moved), ("tipped_at", tipped)) if math.isfinite(time)}
+        found.append(path.model_copy(update=times))
+    return tuple(found)
 
 
 def _path(

@@ -63,7 +63,12 @@ class Compositor:
                 there.append((body, sprite))
         eye = self.layers.eye
 
+        container = self.layers.container
+
         def order(a: tuple[MovingBody, Sprite], b: tuple[MovingBody, Sprite]) -> int:
+            for one, other, sign in ((a[0], b[0], 1), (b[0], a[0], -1)):
+                if container is not None and other.path.body == container.index and container.takes(one, index):
+                    return sign  # the container first, then what is in it
             return 1 if a[0].placed(index).in_front_of(b[0].placed(index), eye) else -1
 
         return sorted(there, key=cmp_to_key(order)) if len(there) > 1 else there
@@ -76,13 +81,22 @@ class Compositor:
         if found is None:
             return
         window, pixels = found
-        placed = body.placed(index)
-        for other in self.layers.still:
-            if _overlap(window, other) and not placed.in_front_of(other.placed, self.layers.eye):
+        for other in self._before(body, index):
+            if _overlap(window, other):
                 _hide(pixels, window, other)
         shown = frame[window]
         mixed = cv2.multiply(shown, _three(1 - pixels[..., 3]), dtype=cv2.CV_32F) + pixels[..., :3]
         shown[:] = cv2.convertScaleAbs(mixed)
+
+    def _before(self, body: MovingBody, index: int) -> list[StillBody]:
+        """What hides a body at a frame: of the container that it goes into, the front wall alone."""
+        placed, container = body.placed(index), self.layers.container
+        taken = container is not None and container.takes(body, index)
+        hiding = [other for other in self.layers.still if not placed.in_front_of(other.placed, self.layers.eye)]
+        if container is None or not taken:
+            return hiding
+        hiding = [other for other in hiding if other.index != container.index]
+        return [*hiding, container.front] if container.covers(body, index) else hiding
 
 
 def _three(values: Floats32) -> Floats32:

@@ -12,6 +12,7 @@ from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, 
 from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, without
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
+from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
@@ -73,7 +74,8 @@ class EmbeddedReader:
         with given.cpu():
             question = parse(given.question)
             on = along_trail(given.scene, grounding, question.motion) if question.motion.trail is not None else None
-            return on or _read_motion(given.scene, question, grounding)
+            reading = on or _read_motion(given.scene, question, grounding)
+            return _with_quantities(given.scene, question, grounding, reading)
 
     def answer(
         self,
@@ -201,6 +203,15 @@ def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: M
         )
     note = "The question names no direction; the arrow drawn at the object was followed."
     return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
+
+
+def _with_quantities(scene: Scene, question: Question, grounding: Grounding, reading: MotionReading) -> MotionReading:
+    """How fast, how far and how long, the further legs, and what else moves."""
+    words = question.motion
+    parted = any(each.share is not None for each in words.quantities)
+    way = length(_towards(scene, words.towards, grounding)) if parted and words.towards is not None else None
+    steps, others = step_readings(words.steps), other_readings(words.others, grounding)
+    return replace(reading, **quantities(words.quantities, way), steps=steps, others=others)
 
 
 def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:

@@ -13,10 +13,18 @@ from functools import lru_cache
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.arrow_words import read_arrow
 from cow_service.readers.question.chunks import items
-from cow_service.readers.question.clauses import SENTENCE_END, Clauses, clause_end, is_passive, is_vague, read_clauses
+from cow_service.readers.question.clauses import (
+    SENTENCE_END,
+    Clauses,
+    MotionCandidate,
+    clause_end,
+    is_passive,
+    is_vague,
+    read_clauses,
+)
 from cow_service.readers.question.interventions import InterventionWords, split_interventions
 from cow_service.readers.question.listed_options import split_options
-from cow_service.readers.question.motion_words import MotionWords, read_motion
+from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 
@@ -62,8 +70,12 @@ def parse(question: str) -> Question:
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
     verb, kind = (best.verb, best.kind) if best else ("", None)
-    motion = read_motion(found[at:end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked)
-    motion = replace(motion, trail=trail)
+    end = min([end, *(other.start for other in _movers_beside(clauses, best))])
+    shared = _sharing(found, at, end)
+    motion = read_motion(
+        found[at : shared or end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked
+    )
+    motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
     put = next((change for change in interventions if change.kind == "place"), None)
     if put is not None and (best is None or best.asked):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
@@ -100,6 +112,44 @@ def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhras
     asked = [(place, phrase) for place, phrase in clauses.question_subjects if phrase.head not in lex.ABSTRACT]
     before = [phrase for place, phrase in asked if place < at] + [phrase for place, phrase in named if place < at]
     return next(iter(before + [phrase for _, phrase in asked + named]), None)
+
+
+def _movers_beside(clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
+    """Motions of other things than the mover's, said in the same way: "the ball moves left and the car goes right"."""
+    if best is None or best.asked or best.subject is None or best.subject.head in lex.AGENTS:
+        return []
+    return [
+        each
+        for each in clauses.candidates
+        if each.rank == best.rank and each.at > best.at and each.kind not in {None, "static"}
+        and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
+    ]  # fmt: skip
+
+
+def _sharing(found: Sequence[Item], at: int, end: int) -> int | None:
+    """Where a second mover shares the verb: "the ball moves left and the car to the right"."""
+    for place in range(at + 1, end - 2):
+        phrase = found[place + 1].phrase
+        if found[place].key in {"and", "while"} and phrase is not None and phrase.is_thing:
+            way = read_motion(found[place + 1 : end], "", None, None, None)
+            if way.direction is not None or way.depth:
+                return place
+    return None
+
+
+def _other_motions(
+    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, shared: int | None, end: int
+) -> tuple[OtherWords, ...]:
+    """What else moves at the same time, and how."""
+    others: list[OtherWords] = []
+    if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
+        motion = read_motion(found[shared + 1 : end], best.verb, best.kind, None, thing)
+        others.append(OtherWords(thing, motion))
+    for each in _movers_beside(clauses, best):
+        if each.subject is not None and all(each.subject != other.object for other in others):
+            words = found[each.at : clause_end(found, each.at)]
+            others.append(OtherWords(each.subject, read_motion(words, each.verb, each.kind, None, each.subject)))
+    return tuple(others)
 
 
 def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:

@@ -10,6 +10,7 @@ _SPHERES = words("ball sphere orb marble basketball football baseball balloon gl
 _BOXES = words(
     "cube box block brick cuboid die dice book chair table desk carton parcel package crate drawer shelf cabinet"
 )
+_CUBES = words("cube die dice")
 _CONES = words("cone pyramid")
 _CYLINDERS = words(
     "cylinder bottle vase mug cup glass jar can candle tin tube pencil pen lamp pot bowl bucket barrel pawn person man",
@@ -30,6 +31,11 @@ def shape_of(name: str) -> Shape | None:
 def is_vehicle(name: str) -> bool:
     """Whether it is longer along its heading than across."""
     return _head(name) in _VEHICLES
+
+
+def is_cube(name: str) -> bool:
+    """Whether it is a box as wide as high."""
+    return _head(name) in _CUBES
 
 
 def _head(name: str) -> str | None:

@@ -19,8 +19,10 @@ _SAME: dict[str, tuple[str, ...]] = {
     "wo": ("will",),
     "ca": ("can",),
     "longer": ("long", "-er"),
+    "leaves": ("leave",),
+    "leaving": ("leave", "-ing"),
 }
-_PRONOUNS = frozenset(["it", "itself", "they", "them", "he", "she"])
+PRONOUNS = frozenset(["it", "itself", "they", "them", "he", "she"])
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ def words_of(found: Sequence[Item]) -> list[Word]:
 
 def _of_item(item: Item, at: int) -> list[Word]:
     if item.phrase is None:
-        kind = "PRONOUN" if item.key in _PRONOUNS else ""
+        kind = "PRONOUN" if item.key in PRONOUNS else ""
         return [Word(kind, text, at) for text in base_forms(item.key)]
     if _is_words(item, item.phrase):
         return [Word("", text, at) for word in item.words for text in base_forms(word)]

@@ -1,0 +1,113 @@
+"""Measures the opening of a container that is seen from above: the ellipse of its rim, outside and inside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from cow_service.vision.masks import CroppedMask
+from cow_service.vision.types import Floats, Floats32, Image
+
+FLATTEST, ROUNDEST = 0.04, 0.7  # of the ellipse's width: its height
+LEAST_RIM = 0.75  # of half the width of the mask: a narrower rim beside a handle is not looked for
+ARC = 0.9  # of its half width: so far to either side its upper half is compared with the outline
+FITS = 0.035  # of its half width, mean distance of the two: a worse one is no ellipse
+SAME_WIDTH = 0.97  # of the widest rim: they differ by the outline's noise
+NARROWEST, WIDEST = 0.75, 0.975  # of the outer ellipse: where the inner one is looked for
+EDGE = 4.0  # Lab units across the inner edge of a rim, in the mean: less is no edge
+THICKNESS = 0.93  # inner of outer radius, where no inner edge is seen
+MEASURED_SIGMA, ASSUMED_SIGMA = 0.04, 0.06  # of the logarithm of the opening's width
+TAPERED = 0.35  # of the rim's width: a floor is not narrower
+
+
+@dataclass(frozen=True)
+class SeenOpening:
+    """The opening of a container, in shares of half its width."""
+
+    inner: float  # half the width of the opening
+    deviation: float  # one standard deviation of its logarithm
+    bottom: float  # half the outer width at its lower end
+    square: bool = False  # four walls, not a round one
+    rim: tuple[float, float, float, float] | None = None  # x, y, half width, half height of its ellipse, px
+    has_edge: bool = False  # the inner edge of a rim is seen
+    foot_hidden: bool = False  # something stands before its lower end: it is higher than it is seen
+
+
+def measure_opening(image: Image, mask: CroppedMask, square: bool = False) -> SeenOpening:
+    """The opening of a thing that is known to be a container; where no rim is seen, that of common ones."""
+    rim = _outer_rim(mask)
+    if rim is None:
+        return SeenOpening(THICKNESS, ASSUMED_SIGMA, 1.0 if square else 0.7, square)
+    x0, _, x1, _ = mask.bbox
+    share = min(1.0, 2 * rim[2] / (x1 - x0))  # a handle stands beside the rim
+    inner = _inner_share(image, mask, rim)
+    bottom = 1.0 if square else _bottom(mask, rim)
+    if inner is None:
+        return SeenOpening(THICKNESS * share, ASSUMED_SIGMA, bottom * share, square, rim)
+    return SeenOpening(inner * share, MEASURED_SIGMA, bottom * share, square, rim, True)
+
+
+def _outer_rim(mask: CroppedMask) -> tuple[float, float, float, float] | None:
+    """The ellipse (x, y, half width, half height, px) whose upper half is the upper outline of a mask."""
+    patch = mask.patch
+    height, width = patch.shape
+    tops = np.where(patch.any(axis=0), patch.argmax(axis=0), height).astype(np.float64)
+    found: list[tuple[float, tuple[float, float, float, float]]] = []
+    for tall in np.arange(max(1.0, FLATTEST * width / 2), min(ROUNDEST * width / 2, 0.9 * height), 0.5).tolist():
+        across = np.nonzero(patch[min(height - 1, round(tall))])[0]
+        half, middle = float(across[-1] - across[0] + 1) / 2, float(across[-1] + across[0] + 1) / 2
+        if half < max(3.0, LEAST_RIM * width / 2):
+            continue
+        columns = np.arange(width)[np.abs(np.arange(width) + 0.5 - middle) < ARC * half]
+        off = (columns + 0.5 - middle) / half
+        error = float(np.mean(np.abs(tops[columns] - tall * (1 - np.sqrt(1 - off**2))))) / half
+        if error < FITS:
+            found.append((error, (mask.columns.start + middle, mask.rows.start + tall, half, tall)))
+    if not found:
+        return None
+    # The upper arc of an ellipse fits smaller ones too.
+    widest = max(rim[2] for _, rim in found)
+    return min(each for each in found if each[1][2] > SAME_WIDTH * widest)[1]
+
+
+def _inner_share(image: Image, mask: CroppedMask, rim: tuple[float, float, float, float]) -> float | None:
+    """The inner ellipse's width, of the outer's: where the colours change most along its nearer half."""
+    x, y, half, tall = rim
+    shown = (image[mask.rows, mask.columns] / np.float32(255)).astype(np.float32)
+    lab = np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2LAB), np.float32)
+    step = max(0.015, 1.0 / half)
+    shares = np.arange(NARROWEST, WIDEST, 0.005)
+    profile = _along(lab, (x - mask.columns.start, y - mask.rows.start, half, tall), shares + step)
+    inside = _along(lab, (x - mask.columns.start, y - mask.rows.start, half, tall), shares - step)
+    change = np.linalg.norm(profile - inside, axis=2).mean(axis=1)
+    strongest = int(change.argmax())
+    return float(shares[strongest]) if change[strongest] > EDGE else None
+
+
+def _along(lab: Floats32, rim: tuple[float, float, float, float], shares: Floats) -> Floats:
+    """Colours [S, A, 3] along the nearer half of ellipses of so many shares of the rim."""
+    x, y, half, tall = rim
+    angles = np.radians(np.linspace(25, 155, 40))
+    columns = (x + half * shares[:, None] * np.cos(angles) - 0.5).astype(np.float32)
+    rows = (y + tall * shares[:, None] * np.sin(angles) - 0.5).astype(np.float32)
+    found = cv2.remap(lab, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found, np.float64)
+
+
+def _bottom(mask: CroppedMask, rim: tuple[float, float, float, float]) -> float:
+    """Outer width at the lower end, of the rim's: the sides run straight from the rim to an ellipse of its form."""
+    x, y, half, tall = rim
+    x -= mask.columns.start
+    first, last = round(y - mask.rows.start), mask.patch.shape[0]
+    rows = np.arange(first, first + max(2, round(0.7 * (last - first))))
+    rows = rows[rows < last]
+    right = np.array([float(np.nonzero(row)[0][-1] + 1) - x if row.any() else 0.0 for row in mask.patch[rows]])
+    left = np.array([x - float(np.nonzero(row)[0][0]) if row.any() else half for row in mask.patch[rows]])
+    sides = np.minimum(left, right)  # a handle is on one side
+    if len(rows) < 3:
+        return 1.0
+    slope = float(np.polyfit(rows - first, sides, 1)[0])
+    lowest = (half + slope * (last - first)) / max(1 + slope * tall / half, 0.1)
+    return min(1.0, max(TAPERED, lowest / half))
