@@ -21,7 +21,17 @@ from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked
 from cow_service.readers.question.sentences import Question, parse
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import DIRECTED_KINDS, AnswerOption, BBox, Grounding, LocatedObject, ReaderInfo, Source, Vector
+from cow_service.records import (
+    DIRECTED_KINDS,
+    AnswerOption,
+    BBox,
+    Grounding,
+    LocatedObject,
+    MotionKind,
+    ReaderInfo,
+    Source,
+    Vector,
+)
 from cow_service.settings import Settings
 from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
 from cow_service.vision.masks import iou
@@ -163,6 +173,11 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         return on
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
+    return _as_said(scene, words, kind, grounding) or _as_shown(scene, question, kind, grounding)
+
+
+def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grounding) -> MotionReading | None:
+    """The motion whose direction the words give; None where they give none."""
     if words.arrow is not None:
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
         along = words.arrow == "along"
@@ -174,6 +189,12 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         return MotionReading(kind, direction, "text", depth=depth)
     if words.towards is not None:
         return MotionReading(kind, _towards(scene, words.towards, grounding), "text")
+    return None
+
+
+def _as_shown(scene: Scene, question: Question, kind: MotionKind, grounding: Grounding) -> MotionReading:
+    """The motion whose direction the image shows, by a trail or an arrow. Raises `CannotReadDirection`."""
+    words = question.motion
     if words.forward is not None:
         raise CannotReadDirection(
             f"The question says that the {grounding.object} moves {'forward' if words.forward else 'backward'}. "
