@@ -18,7 +18,7 @@ from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.accounting import unread_warnings
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.relations import read_alternatives, read_asked
+from cow_service.readers.question.relations import read_alternatives, read_asked, unread_clause
 from cow_service.readers.question.sentences import Question, parse
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
@@ -93,7 +93,9 @@ class EmbeddedReader:
         question = parse(given.question)
         outcome = None if imagined is None else imagined.simulation.trajectory.outcome
         alternatives = read_alternatives(question)
-        reading = answer_from(options, read_asked(question), outcome, imagined is not None, alternatives)
+        reading = answer_from(
+            options, read_asked(question), outcome, imagined is not None, alternatives, unread_clause(question)
+        )
         if votes > 1:
             again = "The embedded reader gives the same answer every time: more votes say no more."
             reading = replace(reading, notes=(*reading.notes, again))
