@@ -21,6 +21,7 @@ _TELLING = lex.words(
     "remove delete erase eliminate exclude withdraw discard take rid not gone go absent missing no disappear vanish",
     "without absence put place insert set position drop lower throw release",
 )
+THINGS = frozenset({"NP", "PRONOUN"})  # terminals of what is named
 _RELATIONS: dict[str, PlaceRelation] = {
     "into": "into", "onto": "onto", "between": "between", "in_front_of": "in-front-of", "behind": "behind",
     "next_to": "next-to", "left_of": "left-of", "right_of": "right-of",
@@ -57,6 +58,21 @@ def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords,
     return tuple(changes), [item for at, item in enumerate(found) if at not in gone]
 
 
+def implied_placing(found: Sequence[Item]) -> tuple[InterventionWords, ...]:
+    """ "Will the apple fit into the bowl?": where nothing moves, the apple is put there."""
+    words = words_of(found)
+    for place, word in enumerate(words):
+        if word.text == "fit" and place > 1 and (parsed := parse_from("fitting", words[place - 2 : place + 8])):
+            named = [phrase for token in named_in(parsed[0]) if (phrase := _phrase(found, token.line or 0))]
+            return (_placing(parsed[0], named),) if named else ()
+    return ()
+
+
+def _placing(tree: Tree[Token], named: Sequence[ObjectPhrase]) -> InterventionWords:
+    relation: PlaceRelation = next(_RELATIONS[str(n.data)] for n in tree.iter_subtrees() if n.data in _RELATIONS)
+    return InterventionWords("place", named[0], relation, tuple(named[1:]))
+
+
 def _starts(found: Sequence[Item]) -> Iterator[int]:
     """Where a clause may begin that takes something away or puts it somewhere."""
     for at, item in enumerate(found):
@@ -79,10 +95,7 @@ def _read(found: Sequence[Item], words: Sequence[Word]) -> tuple[list[Interventi
         return None
     if next(tree.find_data("removal"), None) is not None:
         return [InterventionWords("remove", phrase) for phrase in named], end
-    relation: PlaceRelation = next(
-        _RELATIONS[str(node.data)] for node in tree.iter_subtrees() if node.data in _RELATIONS
-    )
-    return [InterventionWords("place", named[0], relation, tuple(named[1:]))], end
+    return [_placing(tree, named)], end
 
 
 def _begins_clause(words: Sequence[Word], end: int) -> bool:
@@ -92,7 +105,7 @@ def _begins_clause(words: Sequence[Word], end: int) -> bool:
 
 def named_in(tree: Tree[Token]) -> Iterator[Token]:
     """The noun phrases of a tree, in order."""
-    return (token for token in tree.scan_values(lambda value: isinstance(value, Token) and bool(value.type)))
+    return (token for token in tree.scan_values(lambda value: isinstance(value, Token) and value.type in THINGS))
 
 
 def _phrase(found: Sequence[Item], at: int) -> ObjectPhrase | None:

@@ -92,6 +92,16 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     return (*(reading.phrases[token] for token in reading.asking.among), *reading.listed)
 
 
+def unread_clause(question: Question) -> str:
+    """The words of the question from where it asks on, where they are not understood."""
+    for sentence in sentences(question) if _read(question) is None else []:
+        starts = [at for at, token in enumerate(sentence.tokens) if token in _STARTS and _opens(sentence.tokens[:at])]
+        if starts and not _INVERTED.fullmatch(" ".join(sentence.tokens[: starts[0]])):
+            items = list(dict.fromkeys(sentence.items[starts[0] :]))
+            return " ".join(" ".join(question.items[at].words) or question.items[at].key for at in items)
+    return ""
+
+
 def covered_items(question: Question) -> frozenset[int]:
     """The places in `Question.items` of the clause that asks, as far as it was read."""
     reading = _read(question)

@@ -22,7 +22,7 @@ from cow_service.readers.question.clauses import (
     is_vague,
     read_clauses,
 )
-from cow_service.readers.question.interventions import InterventionWords, split_interventions
+from cow_service.readers.question.interventions import InterventionWords, implied_placing, split_interventions
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
@@ -78,6 +78,8 @@ def parse(question: str) -> Question:
         found[at : shared or end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked
     )
     motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
+    if best is None and not interventions:
+        interventions = implied_placing(found)
     put = next((change for change in interventions if change.kind == "place"), None)
     if put is not None and (best is None or best.asked):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
