@@ -35,7 +35,8 @@ from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.outcome import SURE
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
-from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, throw_speed
+from cow_service.stages.motion import THROW_DEPTH_DEVIATION
+from cow_service.stages.quantities import SPEED_DEVIATIONS, throw_speed
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.shadows import Shadow
 from cow_service.vision.types import Floats

@@ -124,3 +124,26 @@ def angle_between(a: tuple[float, float], b: tuple[float, float]) -> float:
 
 def _whole(point: NDArray[np.float64]) -> tuple[int, int]:
     return round(float(point[0])), round(float(point[1]))
+
+
+def thrown_past(
+    start: tuple[float, float], velocity: tuple[float, float], gravity: float, count: int, step: float = 1.0
+) -> list[tuple[float, float]]:
+    """Places of a ball at equal times up to the present, the oldest first: where it is now comes last."""
+    times = [step * (i - count + 1) for i in range(count)]
+    return [(start[0] + velocity[0] * t, start[1] + velocity[1] * t + gravity * t * t / 2) for t in times]
+
+
+def trail(
+    image: Image,
+    places: list[tuple[float, float]],
+    radii: list[float],
+    rgb: tuple[int, int, int],
+    opacities: list[float],
+) -> Image:
+    """A ball at places, the last on top, each so opaque over the image (1: as a multiple exposure shows it)."""
+    result = image
+    for place, radius, opacity in zip(places, radii, opacities, strict=True):
+        solid = ball(result, place, radius, rgb)
+        result = np.round(opacity * solid.astype(float) + (1 - opacity) * result).astype(np.uint8)
+    return result

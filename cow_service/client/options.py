@@ -11,6 +11,7 @@ if TYPE_CHECKING:
         CameraRequest,
         FramesRequest,
         GroundingRequest,
+        InterventionRequest,
         MotionRequest,
         ObjectRequest,
         TrajectoryRequest,
@@ -34,6 +35,7 @@ class SimulateOptions(TypedDict, total=False):
     motion: MotionRequest | Given | None
     trajectory: TrajectoryRequest | Given | None
     objects: Sequence[ObjectRequest | Given] | None
+    interventions: Sequence[InterventionRequest | Given] | None
     camera: CameraRequest | Given | None
     law: Law | None
     ensemble: int | None

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from cow_service.errors import FieldError, InvalidRequest, pointer_part
-from cow_service.records import FramePolicy, Law, MotionKind
+from cow_service.records import FramePolicy, Law, MotionKind, PlaceRelation, Until
 
 
 def _list_from_json(value: Any) -> Any:
@@ -34,6 +34,16 @@ class NamedBox(BaseModel):
 
     object: str = Field(description="In words ('blue mug').")
     bbox: Box = Field(description="[x0, y0, x1, y1], pixels.")
+
+
+class PlaceInput(BaseModel):
+    """A thing that is put somewhere."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    object: str = Field(description="In words ('apple').")
+    relation: PlaceRelation
+    targets: list[str] = Field(description="What it is put to: one thing, or two for `between`.", max_length=2)
 
 
 class ToolInput(BaseModel):
@@ -68,7 +78,16 @@ class ToolInput(BaseModel):
         "fall: dropped; static: stays. By default it is read from the question.",
     )
     speed: Number | None = Field(
-        default=None, description="Pixels per second, with `direction`. By default 0.26 image widths per second."
+        default=None, description="Pixels per second. By default 0.26 image widths per second."
+    )
+    distance: Number | None = Field(default=None, description="Pixels, after which it is stopped.")
+    duration: Number | None = Field(default=None, description="Seconds, after which it is stopped.")
+    until: Until | None = Field(default=None, description="contact: it is stopped where it first meets something.")
+    remove: Annotated[list[str] | None, FromJson] = Field(
+        default=None, description="Things that are taken away before anything moves, in words ('vase')."
+    )
+    place: Annotated[list[PlaceInput] | None, FromJson] = Field(
+        default=None, description="Things that are put somewhere before anything else moves."
     )
     law: Law | None = Field(
         default=None,
@@ -95,18 +114,24 @@ class ToolInput(BaseModel):
     def request_fields(self) -> dict[str, Any]:
         """The fields of the service's request beside image and question."""
         grounding = _given(object=self.object, bbox=self.bbox, point=self.point)
-        motion = _given(direction=self.direction, kind=self.motion_kind, speed=self.speed, law=self.law)
+        names = ("direction", "speed", "distance", "duration", "until", "law")
+        motion = _given(kind=self.motion_kind, **{name: getattr(self, name) for name in names})
         frames = _given(policy=self.frames_policy, count=self.frames_count)
         return _given(
             grounding=grounding or None,
             motion=motion or None,
             frames=frames or None,
             objects=None if self.objects is None else [thing.model_dump() for thing in self.objects],
+            interventions=self._interventions() or None,
             num_frames=self.num_frames,
             seed=self.seed,
             generator=self.generator,
             reader=self.reader,
         )
+
+    def _interventions(self) -> list[dict[str, Any]]:
+        removed = [{"kind": "remove", "object": name} for name in self.remove or ()]
+        return removed + [{"kind": "place", **placed.model_dump()} for placed in self.place or ()]
 
 
 class SimulateInput(ToolInput):

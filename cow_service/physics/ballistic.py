@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from cow_service.physics.camera import Camera
+from cow_service.physics.course import course_of
 from cow_service.physics.dynamics import roll_out
-from cow_service.records import Grounding, Motion
+from cow_service.records import Grounding, Motion, Vector
 from cow_service.requests import TrajectoryRequest
 from cow_service.vision.types import Floats, Mask
 
@@ -27,13 +28,25 @@ class FreePath:
 
 
 def ballistic_path(camera: Camera, grounding: Grounding, motion: Motion, times: Floats) -> FreePath:
-    """The path of the motion from the grounded point, at times [F] (s)."""
+    """The path of the motion from the grounded point, at times [F] (s); along legs, where it has several or an end."""
     metres = motion.metres_per_pixel.value
-    dx, dy = motion.direction or (0.0, 0.0)
-    across = float(np.sqrt(1 - motion.depth**2))
-    velocity = motion.speed * metres * np.array([across * dx, across * dy, motion.depth])
+    velocity = metres * motion.speed * _unit(motion.direction, motion.depth)
+    start, clip = camera.lift(grounding.point), float(times[-1] - times[0])
+    legs = [velocity, *(metres * motion.speed * _unit(step.direction, step.depth) for step in motion.steps)]
+    course = course_of(motion, legs, motion.speed, clip)
+    if course is not None and motion.kind == "linear":
+        moved = np.array([course.mean_velocity(0.0, t) * t if t > 0 else np.zeros(3) for t in times])
+        now = np.array([course.mean_velocity(t, t + 1e-6) for t in times])
+        return _seen(camera, np.hstack([start + moved, now]))
     acceleration = metres * np.array([*motion.gravity, 0.0])
-    return _seen(camera, roll_out(camera.lift(grounding.point), velocity, acceleration, times))
+    return _seen(camera, roll_out(start, velocity, acceleration, times))
+
+
+def _unit(direction: Vector | None, depth: float) -> Floats:
+    """[3]: of a direction in the image and the sine of the angle out of its plane."""
+    dx, dy = direction or (0.0, 0.0)
+    across = float(np.sqrt(1 - depth**2))
+    return np.array([across * dx, across * dy, depth])
 
 
 def given_path(camera: Camera, given: TrajectoryRequest, times: Floats) -> FreePath:

@@ -25,6 +25,7 @@ PARAMETERS: dict[str, Doubt] = {
     "outline": "size",
     "friction": "friction",
     "restitution": "friction",
+    "other_speed": "speed",
     "opening": "size",
     "let_go_right": "place",
     "let_go_ahead": "place",

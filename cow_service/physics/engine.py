@@ -23,6 +23,7 @@ from rapier3d import (
     PhysicsWorld,
     RigidBody,
     RigidBodyHandle,
+    Vec3,
 )
 
 from cow_service.physics.containers import (
@@ -33,6 +34,7 @@ from cow_service.physics.containers import (
     relative_density,
     wall_segments,
 )
+from cow_service.physics.course import Course
 from cow_service.physics.dynamics import GRAVITY
 from cow_service.records import Shape
 from cow_service.vision.types import Floats, Mask
@@ -68,6 +70,7 @@ class RigidShape:
     falls: bool = True  # gravity acts on it
     ghost: bool = False  # passes through everything; what it meets is told all the same
     hollow: Hollow | None = None  # it is an open container
+    course: Course | None = None  # of what glides: its legs, and where it stops
     follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
 
 
@@ -151,6 +154,12 @@ class _Engine:
             for i, body in enumerate(bodies)
             if body.follows is not None
         }
+        self.courses = {
+            (k, i): body.course
+            for k, bodies in enumerate(worlds)
+            for i, body in enumerate(bodies)
+            if body.course is not None
+        }
         self.handles = [[self._add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
         shape = len(worlds), len(worlds[0]), len(self.frames)
         self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
@@ -213,6 +222,7 @@ class _Engine:
         for step in range(self.every * self.substeps):
             time = frame / self.fps + step / (self.fps * self.substeps)
             self._lead(time + 1 / (self.fps * self.substeps))
+            self._steer(time, 1 / (self.fps * self.substeps))
             before = self._velocities() if self.is_alone else {}
             self.world.step()
             for event in self.collector.drain_collision_events():
@@ -234,6 +244,29 @@ class _Engine:
             low = min(int(at), len(path) - 2)
             there = (path[low] + (at - low) * (path[low + 1] - path[low])) * self.scale + self.origin[k]
             self._body(self.handles[k][i]).set_next_kinematic_translation(tuple(there.tolist()))
+
+    def _steer(self, time: float, step: float) -> None:
+        """Gives bodies on a course the velocity that they have from a time on for one step (s)."""
+        for (k, i), course in list(self.courses.items()):
+            if course.changes(time - 1.5 * step, time + step):
+                self._set_velocity(k, i, course.mean_velocity(time, time + step))
+            if course.end <= time:
+                self._let_go(k, i)
+
+    def _set_velocity(self, k: int, i: int, velocity: Floats) -> None:
+        """Of a body [3] (m/s); what falls keeps its vertical velocity, and a sphere on the floor rolls."""
+        body, shape = self._body(self.handles[k][i]), self.worlds[k][i]
+        x, y, z = (velocity * self.scale).tolist()
+        body.linvel = Vec3(x, body.linvel.y if shape.falls else y, z)
+        if shape.shape == "sphere" and shape.falls:
+            radius = shape.half_width * self.scale
+            body.angvel = Vec3(z / radius, 0.0, -x / radius)
+
+    def _let_go(self, k: int, i: int) -> None:
+        """A body glides no more: from now on it is subject to friction."""
+        self.courses.pop((k, i), None)
+        for collider in self._body(self.handles[k][i]).colliders:
+            self.world.colliders[collider].friction = self.worlds[k][i].friction
 
     def _velocities(self) -> dict[tuple[int, int], Floats]:
         return {
@@ -262,8 +295,12 @@ class _Engine:
         self._wake(k, {a, b})
         for i in (a, b):
             if self.worlds[k][i].glides:
-                for collider in self._body(self.handles[k][i]).colliders:
-                    self.world.colliders[collider].friction = self.worlds[k][i].friction
+                course = self.courses.get((k, i))
+                self._let_go(k, i)
+                if course is not None and course.halts:
+                    for stopped in (a, b):
+                        self._body(self.handles[k][stopped]).linvel = Vec3(0.0, 0.0, 0.0)
+                        self._body(self.handles[k][stopped]).angvel = Vec3(0.0, 0.0, 0.0)
 
     def _wake(self, k: int, bodies: set[int]) -> None:
         """Has bodies recorded from now on, and what they have touched: it stands on them or leans against them."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
+from types import MappingProxyType
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from cow_service.vision.types import Floats
 
 # Degrees, one standard deviation of a direction in the image, by where it was read.
 TURN_SIGMA: dict[Cue, float] = {
-    "arrow": 1.5, "trail": 3.0, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
+    "arrow": 1.5, "trail": 1.5, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
 }  # fmt: skip
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
 RISE, RISE_SIGMA = math.radians(20), math.radians(8)  # above the horizontal: how things are thrown
@@ -38,6 +39,8 @@ class PlacedScene:
     bodies: tuple[Placed, ...]
     supports: tuple[int | None, ...]  # index of the body that each stands on; None: the floor, or nothing
     velocity: Floats  # [K, 3] m/s, of the mover
+    further: tuple[Floats, ...]  # [K, 3] m/s, of the mover in each further leg
+    others: dict[int, Floats]  # [K, 3] m/s, of other bodies that are set moving
     light: Floats  # [K, 2]: metres that a shadow lies to the right and ahead, per metre of height
 
 
@@ -48,8 +51,12 @@ def place(
     size: tuple[int, int],
     draws: Floats,
     asked: int | None = None,
+    others: Mapping[int, Motion] = MappingProxyType({}),
 ) -> PlacedScene:
-    """Places bodies seen in an image of a size (width, height), px. `asked` is the body that the question is about."""
+    """Places bodies seen in an image of a size (width, height), px. `asked` is the body that the question is about.
+
+    `others` are motions of other bodies, by their places among `bodies`.
+    """
     cameras, parameters = Cameras.drawn(fit, size, draws)
     supports = supports_of(bodies)
     mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
@@ -59,13 +66,13 @@ def place(
         if unit is not None:
             cameras = cameras.at_height(depth / np.maximum(cameras.depth(unit.centre), 1e-6))
             placed = _with_others(bodies, supports, motion, cameras, draws, None, share)
-            return _going(placed, supports, motion, cameras, parameters, draws, asked)
+            return _going(placed, supports, motion, cameras, parameters, draws, asked, others)
     ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
     height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
     cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
     placed = in_the_air(cameras, mover.bbox, mover.shape, depth)
-    others = _with_others(bodies, supports, motion, cameras, draws, placed)
-    return _going(others, supports, motion, cameras, parameters, draws, asked)
+    all_placed = _with_others(bodies, supports, motion, cameras, draws, placed)
+    return _going(all_placed, supports, motion, cameras, parameters, draws, asked, others)
 
 
 def flies(mover: SeenBody, motion: Motion) -> bool:
@@ -119,12 +126,16 @@ def _going(
     parameters: Floats,
     draws: Floats,
     asked: int | None,
+    others: Mapping[int, Motion],
 ) -> PlacedScene:
-    """The bodies apart from each other, and the velocity of the mover."""
+    """The bodies apart from each other, and the velocities of those that are set moving."""
     velocity = _velocity(placed[0], motion, cameras, draws, None if asked is None else placed[asked])
+    legs = [motion.model_copy(update={"direction": step.direction, "depth": step.depth}) for step in motion.steps]
+    further = tuple(_velocity(placed[0], leg, cameras, draws, None) for leg in legs)
+    also = {i: _velocity(placed[i], each, cameras, draws, None, "other_speed") for i, each in others.items()}
     placed = _apart(placed)
     resting = tuple(on if body.stands else None for on, body in zip(supports, placed, strict=True))
-    return PlacedScene(cameras, tuple(placed), resting, velocity, parameters[:, 3:5])
+    return PlacedScene(cameras, tuple(placed), resting, velocity, further, also, parameters[:, 3:5])
 
 
 def _stand(
@@ -160,11 +171,13 @@ def _depth_share(
     return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
 
 
-def _velocity(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, asked: Placed | None) -> Floats:
+def _velocity(
+    mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, asked: Placed | None, speed_name: str = "speed"
+) -> Floats:
     """[K, 3] m/s right, up and ahead."""
     if motion.direction is None or motion.speed == 0:
         return np.zeros((len(draws), 3))
-    speed = motion.speed * motion.metres_per_pixel.value * np.exp(motion.speed_deviation * draws[:, COLUMN["speed"]])
+    speed = motion.speed * motion.metres_per_pixel.value * speed_factors(motion, draws, speed_name)
     turn = np.radians(TURN_SIGMA[motion.cue]) * draws[:, COLUMN["turn"]]
     cosine, sine = np.cos(turn), np.sin(turn)
     dx, dy = motion.direction
@@ -176,6 +189,11 @@ def _velocity(mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, as
     else:
         way = np.einsum("kij,kj->ki", cameras.axes, _with_depth(direction, motion.depth))
     return way * speed[:, None]
+
+
+def speed_factors(motion: Motion, draws: Floats, name: str = "speed") -> Floats:
+    """[K]: speeds of draws, in likeliest ones."""
+    return np.exp(motion.speed_deviation * draws[:, COLUMN[name]])
 
 
 def _with_depth(direction: Floats, depth: float) -> Floats:
@@ -213,8 +231,10 @@ def _thrown(
     if sigma > 0:
         turns, count = mean + sigma * TURNS, len(TURNS)
         one, facing = mover.repeated(count), np.repeat(direction[:1], count, axis=0)
-        rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
-        weight = np.exp(-0.5 * TURNS**2) * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
+        weight = np.exp(-0.5 * TURNS**2)
+        if motion.cue != "trail":  # along a trail it may have come to any point of its path
+            rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
+            weight = weight * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
         if asked is not None:
             away = asked.centre[0] - mover.centre[0]
             bearing = math.atan2(float(away[2]), float(np.sign(direction[0, 0]) * away[0]))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -12,11 +13,12 @@ import numpy as np
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera_fit import CameraFit
 from cow_service.physics.carrying import Put, arc, carried, frames_carried, frames_to_run, height_over, let_go
+from cow_service.physics.course import course_of
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
-from cow_service.physics.lift import BOX_SIDE, FARTHEST, Cameras
+from cow_service.physics.lift import BOX_SIDE, FARTHEST, Cameras, Placed
 from cow_service.physics.placement import Placements, classify
-from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place
+from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place, speed_factors
 from cow_service.records import FALLING_KINDS, Motion
 from cow_service.vision.types import Floats, Mask
 
@@ -48,6 +50,7 @@ class WorldInput:
     fps: float
     asked: int | None = None  # the body that the question is about
     led: Led | None = None  # the mover is led along a path, through everything
+    others: Mapping[int, Motion] = field(default_factory=dict[int, Motion])  # of other bodies, by their places
     put: Put | None = None  # the mover is carried somewhere and let go
 
 
@@ -65,11 +68,15 @@ class Worlds:
 
 def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""
-    scene = place(given.bodies, given.motion, given.fit, given.size, draws, given.asked)
+    scene = place(given.bodies, given.motion, given.fit, given.size, draws, given.asked, given.others)
     shapes = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
     if given.put is not None:
         return _run_put(given, given.put, scene, shapes, draws, every)
-    finished = None if len(draws) == 1 else partial(_has_left, scene.cameras, given.size[0])
+    finished = (
+        None
+        if len(draws) == 1 or given.motion.steps or given.others
+        else partial(_has_left, scene.cameras, given.size[0])
+    )
     runs = run_worlds(shapes, given.num_frames, given.fps, every, finished)
     return Worlds(scene, shapes, tuple(runs), every, given.fps)
 
@@ -134,23 +141,46 @@ def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) 
                 falls=placed.stands,
             )
         )
-    bodies[0] = _set_going(given, scene, k, bodies[0])
+    bodies[0] = _set_going(given, scene, draws, k, bodies[0])
+    for i, motion in given.others.items():
+        factor = float(speed_factors(motion, draws[k : k + 1], "other_speed")[0])
+        bodies[i] = replace(bodies[i], **_moving(given, scene, k, i, motion, (scene.others[i][k],), factor, bodies[i]))
     return tuple(bodies)
 
 
-def _set_going(given: WorldInput, scene: PlacedScene, k: int, body: RigidShape) -> RigidShape:
+def _set_going(given: WorldInput, scene: PlacedScene, draws: Floats, k: int, body: RigidShape) -> RigidShape:
     """The mover: thrown, let go, moving by itself, or led along a path."""
-    motion, mover = given.motion, given.bodies[0]
-    velocity = scene.velocity[k]
-    changes: dict[str, Any] = {"velocity": tuple(velocity.tolist()), "starts": motion.kind != "static"}
     if given.led is not None:
-        changes |= {"follows": _led_along(given.led, scene, k), "falls": False}
-    else:
-        falls = motion.kind in FALLING_KINDS or not flies(mover, motion)
-        changes |= {"falls": falls, "glides": motion.kind == "linear"}
-    if mover.elongated and float(np.hypot(velocity[0], velocity[2])) > 0:
-        changes |= _as_vehicle(scene, k, body, velocity)
-    return replace(body, **changes)
+        changes: dict[str, Any] = {"follows": _led_along(given.led, scene, k), "falls": False}
+        changes |= {"velocity": tuple(scene.velocity[k].tolist()), "starts": given.motion.kind != "static"}
+        return replace(body, **changes | _turned(given.bodies[0], scene.bodies[0], k, scene.velocity[k]))
+    velocities = (scene.velocity[k], *(further[k] for further in scene.further))
+    factor = float(speed_factors(given.motion, draws[k : k + 1])[0])
+    return replace(body, **_moving(given, scene, k, 0, given.motion, velocities, factor, body))
+
+
+def _moving(
+    given: WorldInput,
+    scene: PlacedScene,
+    k: int,
+    index: int,
+    motion: Motion,
+    velocities: Sequence[Floats],
+    factor: float,
+    body: RigidShape,
+) -> dict[str, Any]:
+    """What sets a body going: the velocities [3] of its legs, and whether it falls or glides."""
+    seen, velocity = given.bodies[index], velocities[0]
+    glides = motion.kind == "linear"
+    changes: dict[str, Any] = {
+        "velocity": tuple(velocity.tolist()),
+        "starts": motion.kind != "static",
+        "falls": motion.kind in FALLING_KINDS or not flies(seen, motion),
+        "glides": glides,
+    }
+    if glides:
+        changes["course"] = course_of(motion, velocities, motion.speed * factor, given.num_frames / given.fps)
+    return changes | _turned(seen, scene.bodies[index], k, velocity)
 
 
 def _led_along(led: Led, scene: PlacedScene, k: int) -> Floats:
@@ -169,9 +199,10 @@ def _led_along(led: Led, scene: PlacedScene, k: int) -> Floats:
     return np.stack([middle[:, 0], np.full(count, mover.centre[k, 1]), middle[:, 1]], axis=1)
 
 
-def _as_vehicle(scene: PlacedScene, k: int, body: RigidShape, velocity: Floats) -> dict[str, Any]:
-    """A box, longer along its heading than across, as wide as it is seen."""
-    placed = scene.bodies[0]
+def _turned(seen: SeenBody, placed: Placed, k: int, velocity: Floats) -> dict[str, Any]:
+    """A vehicle is a box, longer along its heading than across, as wide as it is seen; the rest is not turned."""
+    if not seen.elongated or float(np.hypot(velocity[0], velocity[2])) == 0:
+        return {}
     sight = placed.centre[k, [0, 2]] / np.linalg.norm(placed.centre[k, [0, 2]])
     along = abs(float(velocity[[0, 2]] @ sight)) / float(np.hypot(velocity[0], velocity[2]))
     across = math.sqrt(max(0.0, 1 - along**2))

@@ -1,7 +1,13 @@
 """What a caller may ask: the bodies of `POST /simulate` and `POST /answer`. Checked once, here, then trusted."""
 
 from cow_service.requests.interventions import InterventionRequest
-from cow_service.requests.motion import CameraRequest, MotionRequest, TrajectoryRequest
+from cow_service.requests.motion import (
+    CameraRequest,
+    MotionRequest,
+    MotionStepRequest,
+    OtherMotionRequest,
+    TrajectoryRequest,
+)
 from cow_service.requests.places import GroundingRequest, ObjectRequest, PlaceRequest
 from cow_service.requests.simulation import AnswerRequest, FramesRequest, SimulateRequest, Stage
 from cow_service.requests.values import Finite, Flag, ImageArtifact, ImageRef, ImageUrl, MaskRef, Whole
@@ -19,7 +25,9 @@ __all__ = [
     "InterventionRequest",
     "MaskRef",
     "MotionRequest",
+    "MotionStepRequest",
     "ObjectRequest",
+    "OtherMotionRequest",
     "PlaceRequest",
     "SimulateRequest",
     "Stage",

@@ -3,27 +3,75 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cow_service.records import (
-    DIRECTED_KINDS,
-    Law,
-    MotionKind,
-    Point,
-    Record,
-    Vector,
-)
+from cow_service.records import DIRECTED_KINDS, Law, MotionKind, Point, Record, Until, Vector
+from cow_service.requests.places import ObjectWords
 from cow_service.requests.values import Finite, Flags, Points
 
 MAX_TRACKS = 1024
 MAX_TRACK_POINTS = 262_144  # of all tracks together
-_ONLY_WITH_A_MOTION = ("speed", "metres_per_pixel", "depth_deviation", "speed_deviation")
+MAX_STEPS = 16
+_OF_A_LINE = ("distance", "duration", "until", "steps")
+Length = Annotated[Finite, Field(gt=0, le=1_000_000)]
+Seconds = Annotated[Finite, Field(gt=0, le=3600)]
+Speed = Annotated[Finite, Field(ge=0, le=100_000)]
+
+
+class MotionStepRequest(Record):
+    """A further leg of a motion, after the one before has ended."""
+
+    direction: tuple[Finite, Finite] = Field(description="[dx, dy] in the image, any length but zero.")
+    depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
+    distance: Length | None = Field(default=None, description="px at the depth of the first frame.")
+    duration: Seconds | None = Field(default=None, description="s.")
+
+    @field_validator("direction")
+    @classmethod
+    def _has_length(cls, direction: Vector) -> Vector:
+        return _checked(direction)
+
+
+class OtherMotionRequest(Record):
+    """Another object that is set moving at the first frame."""
+
+    object: ObjectWords = Field(description="As it is named in `objects`.")
+    kind: Literal["linear", "projectile", "fall"] | None = Field(
+        default=None, description="By default linear; a fall takes no `direction`."
+    )
+    direction: tuple[Finite, Finite] | None = Field(default=None, description="[dx, dy] in the image.")
+    depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
+    speed: Speed | None = Field(default=None, description="px/s; by default as for the mover.")
+
+    @property
+    def stated_kind(self) -> MotionKind:
+        """The kind of motion."""
+        return self.kind or "linear"
+
+    @field_validator("direction")
+    @classmethod
+    def _has_length(cls, direction: Vector | None) -> Vector | None:
+        return None if direction is None else _checked(direction)
+
+    @model_validator(mode="after")
+    def _goes_somewhere(self) -> OtherMotionRequest:
+        if (self.direction is None) != (self.stated_kind == "fall"):
+            needs = "takes no" if self.kind == "fall" else "needs a"
+            raise ValueError(f"a {self.stated_kind} motion {needs} `direction`")
+        return self
+
+
+def _checked(direction: Vector) -> Vector:
+    """A direction that has a length."""
+    if not 1e-9 < math.hypot(*direction) < 1e12:
+        raise ValueError(f"[dx, dy] must have a length, got {list(direction)}")
+    return direction
 
 
 class MotionRequest(Record):
-    """Skips stage 2: how the object moves. With `law` alone the motion is read from the question all the same."""
+    """Skips stage 2: how the object moves. Without `kind` and `direction` these are read from the question."""
 
     kind: MotionKind | None = Field(
         default=None, description="By default linear where there is a `direction`; else it is read from the question."
@@ -34,10 +82,21 @@ class MotionRequest(Record):
         description="[dx, dy] in the image, any length but zero; not needed for a fall or a static object.",
     )
     depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
-    speed: Annotated[Finite, Field(ge=0, le=100_000)] | None = Field(
+    speed: Speed | None = Field(
         default=None,
         description="px/s; by default 0.26 image widths per second, and of a throw under the contact law that of a "
         "toy thrown at 1.8 m/s.",
+    )
+    distance: Length | None = Field(
+        default=None, description="px at the depth of the first frame, after which it is stopped."
+    )
+    duration: Seconds | None = Field(default=None, description="s, after which it is stopped.")
+    until: Until | None = Field(default=None, description="See `Motion.until`.")
+    steps: tuple[MotionStepRequest, ...] = Field(
+        default=(), max_length=MAX_STEPS, description="Further legs, after this one."
+    )
+    others: tuple[OtherMotionRequest, ...] = Field(
+        default=(), max_length=MAX_STEPS, description="What is set moving at the same time."
     )
     metres_per_pixel: Annotated[Finite, Field(ge=1e-6, le=1000)] | None = Field(
         default=None, description="By default the image is taken to be 3 m wide at the object."
@@ -57,21 +116,22 @@ class MotionRequest(Record):
     @model_validator(mode="after")
     def _goes_somewhere(self) -> MotionRequest:
         kind = self.stated_kind
-        if kind is None and (self.depth or any(getattr(self, name) is not None for name in _ONLY_WITH_A_MOTION)):
-            raise ValueError("a linear motion needs a `direction` [dx, dy]; without one, only `law` can be given")
+        if kind is None and (self.depth or self.depth_deviation is not None):
+            raise ValueError("`depth` and `depth_deviation` need a `direction` [dx, dy]")
         if kind in DIRECTED_KINDS and self.direction is None:
             raise ValueError(f"a {kind} motion needs a `direction` [dx, dy]")
         speeds = self.direction is not None or self.speed is not None or self.speed_deviation is not None
         if kind not in (None, *DIRECTED_KINDS) and (speeds or self.depth or self.depth_deviation is not None):
             raise ValueError(f"a {kind} motion takes no `direction`, `speed` or `depth`; a throw is a `projectile`")
+        lengths = [name for name in _OF_A_LINE if getattr(self, name) not in (None, ())]
+        if kind not in (None, "linear") and lengths:
+            raise ValueError(f"a {kind} motion takes no `{lengths[0]}`: it ends by what it meets")
         return self
 
     @field_validator("direction")
     @classmethod
     def _has_length(cls, direction: Vector | None) -> Vector | None:
-        if direction is not None and not 1e-9 < math.hypot(*direction) < 1e12:
-            raise ValueError(f"[dx, dy] must have a length, got {list(direction)}")
-        return direction
+        return None if direction is None else _checked(direction)
 
 
 class TrajectoryRequest(Record):

@@ -35,6 +35,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         with run.cpu():
             reading = _given(run, place)
     with run.cpu():
+        run.place_mover(reading.bbox)
         mask = _store_mask(run, reading.bbox)
         given, warnings = _given_objects(run, reading.bbox)
     read = (other.model_copy(update={"source": other.source or source}) for other in reading.others)
@@ -58,6 +59,7 @@ def use_stored_masks(run: Run[SimulateRequest], grounding: Grounding) -> None:
 
     A mask cut again from its box may differ from one that was cut around a point, or given.
     """
+    run.place_mover(grounding.bbox)
     for placed in (grounding, *grounding.others):
         if placed.mask is not None:
             run.scene.preset_mask(placed.bbox, partial(_stored, run, placed.mask))

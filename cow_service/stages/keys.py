@@ -49,7 +49,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
         READER_FIELDS,
         "reader",
         set_by_request=("stated_motion", "trajectory"),
-        always=("law",),
+        always=("law", "motion"),
         prompt="motion-sentence",
     ),
     "trajectory": KeyFields(TRAJECTORY_FIELDS),

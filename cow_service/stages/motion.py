@@ -4,80 +4,110 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
-from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
-from cow_service.readers.base import MotionHints, MotionReading
-from cow_service.readers.question.wording import motion_sentence
+from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, GRAVITY
+from cow_service.readers.base import MotionHints, MotionReading, Quantity
+from cow_service.readers.question.wording import direction_words, motion_sentence
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
-    BBox,
     Grounding,
     Law,
     MetresPerPixel,
     Motion,
-    MotionKind,
     Source,
     Vector,
 )
 from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
+from cow_service.stages.legs import also_moving, given_others, other_words, step_of, step_reading, unit
 from cow_service.stages.placing import placed_mover, placing_sentence
+from cow_service.stages.quantities import Measures
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
+from cow_service.stages.trails import along_trail
 
-THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
 THROW_DEPTH_DEVIATION = 15.0  # degrees: words and arrows tell a throw's heading in the image alone
-SPEED_DEVIATIONS: dict[MotionKind, float] = {"linear": 0.25, "projectile": 0.28}  # of the logarithm of a default speed
-SPEED_FACTORS = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
+_GLIDING_ONLY = ("distance", "duration", "until", "steps")  # what only a motion along a line can have
 
 
 def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHints | None) -> StageResult[Motion]:
     """The motion, from the request where it gives one or a whole path, else from the reader, which gave the `hints`.
 
-    Raises what the reader raises.
+    What the request says of speed and length goes before what the reader says. Raises what the reader raises, and
+    `InvalidRequest` for a second mover that is none of the `objects`.
     """
     given, path = run.request.stated_motion, run.request.trajectory
     placed = placed_mover(grounding)
-    speed: float | None = None
     source: Source = "request"
     if given is not None:
-        reading, speed = _given(given), given.speed
+        reading = _given(given)
     elif path is not None:
-        reading, speed = _along(path)
+        reading = _along(path)
     elif placed is not None and grounding.source == "request":
         reading = MotionReading("place", None, "request")
     else:
         reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, hints), run.reader.source
+        if run.request.motion is not None:
+            reading = _with_lengths(reading, run.request.motion)
+    if run.request.motion is not None and run.request.motion.others:
+        reading = replace(reading, others=given_others(run.request.motion.others, grounding))
     if placed is not None and reading.kind == "place":
         reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
-    motion = _complete(run.scene.width, grounding, reading, speed, source, run.request.law)
-    return StageResult(value=motion, warnings=(*reading.warnings, *_assumed(motion, speed)))
+    reading, unused = _fitting(reading)
+    motion = _complete(run.scene.width, grounding, reading, source, run.request.law)
+    if motion.cue == "trail":
+        with run.cpu():
+            motion = along_trail(run.scene, grounding, motion, run.request.camera, reading.speed is not None)
+    return StageResult(value=motion, warnings=(*reading.warnings, *unused, *_assumed(motion, reading)))
 
 
 def _given(motion: MotionRequest) -> MotionReading:
-    metres = motion.metres_per_pixel
-    return MotionReading(
+    reading = MotionReading(
         motion.stated_kind or "linear",
         motion.direction,
         "request",
         depth=motion.depth,
         depth_deviation=motion.depth_deviation or 0.0,
-        speed_deviation=motion.speed_deviation,
-        metres_per_pixel=None if metres is None else MetresPerPixel(value=metres, source="request"),
     )
+    return _with_lengths(reading, motion)
 
 
-def _complete(
-    image_width: int, grounding: Grounding, reading: MotionReading, speed: float | None, source: Source, law: Law
-) -> Motion:
+def _with_lengths(reading: MotionReading, given: MotionRequest) -> MotionReading:
+    """The reading with what a request says of speed, length and scale."""
+    said: dict[str, Any] = {
+        "speed": None if given.speed is None else Quantity(given.speed, "px/s"),
+        "speed_deviation": given.speed_deviation,
+        "distance": None if given.distance is None else Quantity(given.distance, "px"),
+        "duration": given.duration,
+        "until": given.until,
+        "steps": tuple(step_reading(step) for step in given.steps),
+        "metres_per_pixel": None
+        if given.metres_per_pixel is None
+        else MetresPerPixel(value=given.metres_per_pixel, source="request"),
+    }
+    return replace(reading, **{name: value for name, value in said.items() if value not in (None, ())})
+
+
+def _fitting(reading: MotionReading) -> tuple[MotionReading, tuple[str, ...]]:
+    """The reading without lengths that its kind of motion cannot have, and a warning for them."""
+    unused = [name for name in _GLIDING_ONLY if getattr(reading, name) not in (None, ())]
+    if reading.kind == "linear" or not unused:
+        return reading, ()
+    cleared = replace(reading, distance=None, duration=None, until=None, steps=())
+    return cleared, (f"The {' and '.join(unused)} of the motion was not used: a {reading.kind} ends by what it meets.",)
+
+
+def _complete(image_width: int, grounding: Grounding, reading: MotionReading, source: Source, law: Law) -> Motion:
     """Adds what a reading leaves open: scale, speed, deviations, gravity and the sentence."""
     scale = reading.metres_per_pixel or MetresPerPixel(
         value=DEFAULT_SCENE_WIDTH / image_width,
         source="default",
         note=f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object",
     )
+    measures = Measures(image_width, scale, law)
     moves = reading.kind in DIRECTED_KINDS
-    direction = _unit(reading.direction) if moves and reading.direction is not None else None
+    direction = unit(reading.direction) if moves and reading.direction is not None else None
     depth = reading.depth if moves else 0.0
     return Motion(
         kind=reading.kind,
@@ -87,35 +117,34 @@ def _complete(
         depth_deviation=_depth_deviation(reading),
         cue=reading.cue,
         along_arrow=reading.along_arrow,
-        speed=(_default_speed(image_width, grounding, reading, scale, law) if speed is None else speed)
-        if moves
-        else 0.0,
-        speed_deviation=_speed_deviation(reading, speed),
+        speed=measures.speed(reading.kind, grounding.bbox, reading.speed),
+        speed_deviation=_speed_deviation(measures, reading),
+        distance=None if reading.distance is None else measures.pixels(reading.distance),
+        duration=reading.duration,
+        until=reading.until,
+        steps=tuple(step_of(step, measures) for step in reading.steps),
+        trail=reading.trail,
+        others=tuple(also_moving(other, measures) for other in reading.others),
         gravity=_gravity(reading.down, scale) if reading.kind in FALLING_KINDS else (0.0, 0.0),
         down=reading.down,
         metres_per_pixel=scale,
-        sentence=motion_sentence(grounding.object, reading.kind, direction, depth, reading.sentence),
+        sentence=_sentence(grounding, reading, direction, depth),
         source=source,
     )
 
 
-def _default_speed(
-    image_width: int, grounding: Grounding, reading: MotionReading, scale: MetresPerPixel, law: Law
-) -> float:
-    """px/s of a motion whose speed nobody gave as a number."""
-    thrown = reading.kind == "projectile" and law == "contact"
-    speed = throw_speed(grounding.bbox, scale) if thrown else DEFAULT_SPEED * image_width
-    return speed if reading.speed is None else SPEED_FACTORS[reading.speed] * speed
-
-
-def throw_speed(bbox: BBox, scale: MetresPerPixel) -> float:
-    """px/s of a throw whose speed nobody gave: v^2 / (g R) as of a toy of radius 0.15 m thrown at 1.8 m/s.
-
-    How far it gets in the image, in its own radii, does then not depend on the scale, which is uncertain.
-    """
-    x0, y0, x1, y1 = bbox
-    radius = (x1 - x0 + y1 - y0) / 4  # px
-    return math.sqrt(THROW_SPEED**2 / (GRAVITY * THROW_RADIUS) * (GRAVITY / scale.value) * radius)
+def _sentence(grounding: Grounding, reading: MotionReading, direction: Vector | None, depth: float) -> str:
+    """The whole motion in words."""
+    return motion_sentence(
+        grounding.object,
+        reading.kind,
+        direction,
+        depth,
+        reading.sentence,
+        further=[direction_words(step.direction, step.depth) for step in reading.steps],
+        stops=any(value is not None for value in (reading.distance, reading.duration, reading.until)),
+        also=[other_words(other) for other in reading.others],
+    )
 
 
 def _depth_deviation(reading: MotionReading) -> float:
@@ -125,13 +154,13 @@ def _depth_deviation(reading: MotionReading) -> float:
     return THROW_DEPTH_DEVIATION if reading.kind == "projectile" else 0.0
 
 
-def _speed_deviation(reading: MotionReading, speed: float | None) -> float:
-    """Of the speed's natural logarithm; 0 for a speed that was given."""
+def _speed_deviation(measures: Measures, reading: MotionReading) -> float:
+    """Of the speed's natural logarithm."""
     if reading.kind not in DIRECTED_KINDS:
         return 0.0
     if reading.speed_deviation is not None:
         return reading.speed_deviation
-    return SPEED_DEVIATIONS[reading.kind] if speed is None else 0.0
+    return measures.speed_deviation(reading.kind, reading.speed)
 
 
 def _gravity(down: Vector, scale: MetresPerPixel) -> Vector:
@@ -140,31 +169,35 @@ def _gravity(down: Vector, scale: MetresPerPixel) -> Vector:
     return down[0] * strength, down[1] * strength
 
 
-def _assumed(motion: Motion, speed: float | None) -> tuple[str, ...]:
-    """A warning for a throw, whose reach depends on a speed that nobody gave."""
-    if motion.kind != "projectile" or speed is not None:
-        return ()
-    return (
-        f"How far a throw reaches depends on its speed: {motion.speed:.0f} px/s was assumed; `motion.speed` sets it.",
-    )
+def _assumed(motion: Motion, reading: MotionReading) -> tuple[str, ...]:
+    """Warnings for what nobody said: how fast a throw is, and the scale of lengths in metres."""
+    told: list[str] = []
+    if motion.kind == "projectile" and not isinstance(reading.speed, Quantity) and not motion.trail:
+        told.append(
+            f"How far a throw reaches depends on its speed: {motion.speed:.0f} px/s was assumed; "
+            "`motion.speed` sets it."
+        )
+    lengths = [each for each in (reading.speed, reading.distance) if isinstance(each, Quantity)]
+    if motion.metres_per_pixel.source == "default" and any(each.unit in ("m", "m/s") for each in lengths):
+        told.append(
+            f"Lengths in metres were taken at {motion.metres_per_pixel.value:.4f} m per pixel, which was assumed; "
+            "`motion.metres_per_pixel` sets it."
+        )
+    return tuple(told)
 
 
-def _along(path: TrajectoryRequest) -> tuple[MotionReading, float]:
+def _along(path: TrajectoryRequest) -> MotionReading:
     """The motion that a given path amounts to: from its first point towards its last, at its mean speed (px/s)."""
     (x0, y0), (x1, y1) = path.points[0], path.points[-1]
     way = sum(math.dist(a, b) for a, b in zip(path.points, path.points[1:], strict=False))
     if way < 1e-6:
-        return MotionReading("static", None, "request"), 0.0
+        return MotionReading("static", None, "request")
     direction = (x1 - x0, y1 - y0) if math.hypot(x1 - x0, y1 - y0) > 1e-6 else _first_step(path)
-    return MotionReading("linear", direction, "request"), way * path.fps / (len(path.points) - 1)
+    speed = Quantity(way * path.fps / (len(path.points) - 1), "px/s")
+    return MotionReading("linear", direction, "request", speed=speed)
 
 
 def _first_step(path: TrajectoryRequest) -> Vector:
     """The first move of a path that ends where it began."""
     x0, y0 = path.points[0]
     return next((x - x0, y - y0) for x, y in path.points if math.hypot(x - x0, y - y0) > 1e-6)
-
-
-def _unit(vector: Vector) -> Vector:
-    length = math.hypot(*vector)
-    return vector[0] / length, vector[1] / length

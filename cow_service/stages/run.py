@@ -18,7 +18,8 @@ from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import DecodedImage
 from cow_service.observability.timestamps import rfc3339
 from cow_service.readers.base import CallLog, MotionHints, Reader, ReaderInput
-from cow_service.records import Grounding, ReaderInfo, Record, Usage
+from cow_service.readers.question.sentences import parse
+from cow_service.records import BBox, Grounding, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.checks import check_request
 from cow_service.stages.keys import BackendRole, StageKey, key_of
@@ -90,7 +91,11 @@ class Run(Generic[Request_co]):
     @cached_property
     def scene(self) -> Scene:
         """The image, and what is measured in it when first asked for."""
-        return Scene(self.image.pixels)
+        return Scene(self.image.pixels, trail_named=parse(self.request.question).motion.trail is not None)
+
+    def place_mover(self, bbox: BBox) -> None:
+        """Has the scene know where what moves is: which end of a trail it is, the other positions are taken out."""
+        self.scene = self.scene.with_mover(bbox)
 
     @property
     def reader(self) -> Reader:

@@ -42,6 +42,8 @@ from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Floats
 
+_OWN = ("kind", "direction", "depth", "speed", "speed_deviation")  # of each mover
+
 
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
     """The world over the whole clip; a path from the request is followed through everything."""
@@ -99,7 +101,19 @@ def _world(
     in_air = flies(bodies[0], motion) and bodies[0].shape == "sphere"
     fit = camera_of(scene, motion, request.camera, bodies[0].bbox if in_air else None, fixed_focal=led is not None)
     size = scene.width, scene.height
-    return WorldInput(bodies, motion, fit, size, request.num_frames, request.fps, asked, led)
+    others = {} if led is not None else _others(bodies, motion)
+    return WorldInput(bodies, motion, fit, size, request.num_frames, request.fps, asked, led, others)
+
+
+def _others(bodies: Sequence[SeenBody], motion: Motion) -> dict[int, Motion]:
+    """The motions of other bodies that are set moving, by their places among the bodies."""
+    alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": ()}
+    return {
+        i: motion.model_copy(update=alone | {name: getattr(other, name) for name in _OWN})
+        for other in motion.others
+        for i, body in enumerate(bodies)
+        if i and body.bbox == other.object.bbox
+    }
 
 
 def _record(

@@ -10,7 +10,7 @@ import numpy as np
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats, Floats32, Image
 
-FLATTEST, ROUNDEST = 0.04, 0.7  # of the ellipse's width: its height
+FLATTEST, ROUNDEST = 0.12, 0.7  # of the ellipse's width: its height
 LEAST_RIM = 0.75  # of half the width of the mask: a narrower rim beside a handle is not looked for
 ARC = 0.9  # of its half width: so far to either side its upper half is compared with the outline
 FITS = 0.035  # of its half width, mean distance of the two: a worse one is no ellipse

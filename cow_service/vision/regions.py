@@ -121,6 +121,13 @@ def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
     return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT_IOU else None
 
 
+def disc_region(image: Image, disc: Mask) -> Region:
+    """A ball of an RGB image [H, W, 3] whose mask [H, W] is known."""
+    pixels = image[disc][None].astype(np.float32) / 255
+    lab = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB), np.float32)[0]
+    return Region(CroppedMask.of(disc), *_names(lab), roundness=1.0, confidence=1.0, is_disc=True)
+
+
 def _window(stats: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of a component with a little around it."""
     x, y, w, h = (int(v) for v in stats[:4])
@@ -290,11 +297,15 @@ def _region(found: _Found, size: tuple[int, int]) -> Region:
     if near is not None:
         soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
     mask = enlarged(soft, size)
-    chroma = np.hypot(found.lab[:, 1], found.lab[:, 2])
-    sample = found.lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else found.lab
+    return Region(mask, *_names(found.lab), _roundness(mask.patch), found.confidence, found.is_disc)
+
+
+def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
+    """The name of the colour of pixels [N, 3] (Lab), and all that people may use for it."""
+    chroma = np.hypot(lab[:, 1], lab[:, 2])
+    sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
     seen = [float(v) for v in np.median(sample, axis=0)]
-    names = colour_name(*seen), colour_names(*seen)
-    return Region(mask, *names, _roundness(mask.patch), found.confidence, found.is_disc)
+    return colour_name(*seen), colour_names(*seen)
 
 
 def _roundness(mask: Mask) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -12,12 +12,15 @@ import numpy as np
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.arrows import Arrow, find_arrows
 from cow_service.vision.boxes import DrawnBox, find_boxes
+from cow_service.vision.ghost_shadows import without_ghost_shadows
+from cow_service.vision.ghosts import without_ghosts
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import bbox_of
 from cow_service.vision.obstacles import Obstacle, find_obstacles
-from cow_service.vision.regions import Region, find_regions, region_of
+from cow_service.vision.regions import Region, disc_region, find_regions, region_of
 from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
+from cow_service.vision.trails import Trail, find_trails, trail_ending_at
 from cow_service.vision.types import Image, Mask
 
 Found = TypeVar("Found")
@@ -31,6 +34,8 @@ class Scene:
     """
 
     image: Image
+    mover: BBox | None = None  # the present position of what moves, once it is known: it tells which end of a trail is
+    trail_named: bool = False  # the question speaks of a trail: balls that look alike, one after another, are one
     _masks: dict[BBox, Mask] = field(default_factory=dict, repr=False)
     _found: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any], repr=False)
     _preset: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
@@ -78,14 +83,48 @@ class Scene:
         return mask
 
     @cached_property
-    def clean(self) -> Image:
-        """The image [H, W, 3] without its cues."""
+    def _undrawn(self) -> Image:
+        """The image [H, W, 3] without arrows and boxes."""
         return erase_drawing(self.image, self.cues)
+
+    @cached_property
+    def trails(self) -> tuple[Trail, ...]:
+        """Several positions of one ball each, the present one last: at the mover, or as it shows, or as a guess."""
+        found = [trail for trail in find_trails(self._undrawn) if trail.evident or self.trail_named]
+        own = None if self.mover is None else trail_ending_at(found, self.mover)
+        if own is None:
+            return tuple(found)
+        return (own, *(trail for trail in found if set(trail.positions) != set(own.positions)))
+
+    @cached_property
+    def clean(self) -> Image:
+        """The image [H, W, 3] without its cues: neither drawings nor earlier positions of a trail and their shadows."""
+        image = self._undrawn
+        for trail in self.trails:
+            image = without_ghosts(image, trail)
+            objects = np.zeros((self.height, self.width), bool)
+            for region in find_regions(image):
+                region.mask.add_to(objects)
+            image = without_ghost_shadows(image, trail, objects)
+        return image
 
     @cached_property
     def regions(self) -> tuple[Region, ...]:
         """Objects of the image, largest first; empty where it is too cluttered to tell."""
-        return find_regions(self.clean)
+        found = find_regions(self.clean)
+        for trail in self.trails:
+            if region_of(found, trail.present.bbox) is None:
+                found = (*found, disc_region(self.clean, trail.present.disc((self.height, self.width))))
+        return tuple(sorted(found, key=lambda region: -region.mask.area))
+
+    def with_mover(self, bbox: BBox) -> Scene:
+        """This scene where its trails end as they are, else the scene in which the one in a box ends there."""
+        trail = trail_ending_at(self.trails, bbox)
+        if trail is None or any(trail.positions == other.positions for other in self.trails):
+            return self
+        other = replace(self, mover=bbox, _masks={}, _found={}, _obstacles={})
+        other.__dict__.update({key: self.__dict__[key] for key in ("_undrawn", "cues") if key in self.__dict__})
+        return other
 
     def region_of(self, bbox: BBox) -> Region | None:
         """The region that a box [x0, y0, x1, y1] is about, if there is one."""

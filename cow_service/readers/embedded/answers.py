@@ -100,7 +100,7 @@ def _happens(outcome: Outcome) -> bool:
 def _in_words(outcome: Outcome) -> str:
     """The answer to an open question."""
     match outcome.asked.form:
-        case "whether":
+        case "whether" | "changes":
             return "Yes" if _happens(outcome) else "No"
         case "which-first":
             return outcome.first or "Nothing"
@@ -108,12 +108,14 @@ def _in_words(outcome: Outcome) -> str:
             return "Never" if outcome.time is None else f"After about {outcome.time:.1f} s"
         case "how-many":
             return str(outcome.count)
+        case "where" | "what-happens":
+            return outcome.facts
 
 
 def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
     """The options that say what the world says."""
     match outcome.asked.form:
-        case "whether":
+        case "whether" | "changes":
             happens = _happens(outcome)
             return [option for option in options if says_it_happens(option.text, outcome.asked) is happens]
         case "which-first":
@@ -122,6 +124,8 @@ def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOp
             return _at_time(options, outcome)
         case "how-many":
             return [option for option in options if outcome.count in (count_of(option.text) or range(0))]
+        case "where" | "what-happens":
+            return []
 
 
 def _naming(options: Sequence[AnswerOption], first: str | None) -> list[AnswerOption]:

@@ -10,7 +10,10 @@ from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.embedded.answers import answer_from
+from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, without
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
+from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
+from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked
@@ -20,7 +23,7 @@ from cow_service.records import DIRECTED_KINDS, AnswerOption, BBox, Grounding, L
 from cow_service.settings import Settings
 from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
 from cow_service.vision.masks import iou
-from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.regions import SAME_OBJECT_IOU, Region
 from cow_service.vision.scene import Scene
 
 
@@ -40,11 +43,18 @@ class EmbeddedReader:
                 f'will it hit the vase?". {GIVE_PLACE}'
             )
         with given.cpu():
-            bbox = _mover(scene, question, question.mover)
-            others = _others(scene, question, bbox)
+            check_changes(question)
+            scene = scene_of_mover(scene, question)
+            removed = find_removed(scene, question)
+            regions = without(scene.regions, removed)
+            bbox = _mover(scene, regions, question, question.mover)
+            placed = find_placed(scene, regions, question, (question.mover, bbox))
+            others = _others(regions, question, bbox)
             found = {other.object for other in others}
             missing = [_not_found(scene, phrase.text) for phrase in question.others if phrase.text not in found]
-        return GroundingReading(question.mover.text, bbox, others=others, warnings=tuple(missing))
+        return GroundingReading(
+            question.mover.text, bbox, others=others, warnings=tuple(missing), interventions=(*removed, *placed)
+        )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
         """Kind and direction from the words, and from the arrow where the words speak of one.
@@ -52,7 +62,9 @@ class EmbeddedReader:
         Raises `CannotReadDirection`.
         """
         with given.cpu():
-            return _read_motion(given.scene, parse(given.question), grounding)
+            question = parse(given.question)
+            reading = _read_motion(given.scene, question, grounding)
+            return _with_quantities(given.scene, question, grounding, reading)
 
     def answer(
         self,
@@ -80,11 +92,11 @@ def create(settings: Settings) -> EmbeddedReader:
 
 def _names_motion(words: MotionWords) -> bool:
     """Whether the question says at all that something moves."""
-    parts = (words.kind, words.arrow, words.direction, words.forward, words.towards)
+    parts = (words.kind, words.arrow, words.direction, words.forward, words.towards, words.trail)
     return bool(words.verb or words.depth) or any(part is not None for part in parts)
 
 
-def _mover(scene: Scene, question: Question, phrase: ObjectPhrase) -> BBox:
+def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: ObjectPhrase) -> BBox:
     if phrase.inside_box:
         return inside_drawn_box(scene, phrase, GIVE_PLACE)
     if not scene.regions:
@@ -92,7 +104,7 @@ def _mover(scene: Scene, question: Question, phrase: ObjectPhrase) -> BBox:
             f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to "
             f"tell its objects apart. {GIVE_PLACE}"
         )
-    fitting = best_matches(scene.regions, phrase, question.others)
+    fitting = best_matches(regions, phrase, question.others)
     if len(fitting) > 1 and question.mentions_arrow:
         fitting = at_arrow(scene, fitting) or fitting
     seen = describe(scene.regions)
@@ -111,19 +123,19 @@ def _mover(scene: Scene, question: Question, phrase: ObjectPhrase) -> BBox:
     return fitting[0].bbox
 
 
-def _others(scene: Scene, question: Question, mover: BBox) -> tuple[LocatedObject, ...]:
+def _others(regions: Sequence[Region], question: Question, mover: BBox) -> tuple[LocatedObject, ...]:
     """The other things that the question names, where exactly one region fits; the rest stay unnamed."""
     found: dict[BBox, LocatedObject] = {}
     for phrase in question.others:
-        bbox = _bbox_of(scene, phrase, mover)
+        bbox = _bbox_of(regions, phrase, mover)
         if bbox is not None:
             found.setdefault(bbox, LocatedObject(object=phrase.text, bbox=bbox))
     return tuple(found.values())
 
 
-def _bbox_of(scene: Scene, phrase: ObjectPhrase, mover: BBox) -> BBox | None:
+def _bbox_of(regions: Sequence[Region], phrase: ObjectPhrase, mover: BBox) -> BBox | None:
     """The box of the one region, besides the mover, that fits a phrase."""
-    region = match_one([region for region in scene.regions if iou(region.bbox, mover) < SAME_OBJECT_IOU], phrase)
+    region = match_one([region for region in regions if iou(region.bbox, mover) < SAME_OBJECT_IOU], phrase)
     return None if region is None else region.bbox
 
 
@@ -142,8 +154,10 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
+    if words.trail is not None and (on := along_trail(scene, grounding, words)) is not None:
+        return on
     if kind not in DIRECTED_KINDS:
-        return MotionReading(kind, None, "text" if kind == "static" else "gravity")
+        return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
     if words.arrow is not None:
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
         along = words.arrow == "along"
@@ -161,6 +175,9 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
             f"up. {GIVE_DIRECTION}"
         )
+    on = along_trail(scene, grounding, words)
+    if on is not None:
+        return on
     near = arrows_near(scene, grounding.bbox)
     if near and question.names_direction:
         raise CannotReadDirection(
@@ -177,10 +194,19 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
     return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
 
 
+def _with_quantities(scene: Scene, question: Question, grounding: Grounding, reading: MotionReading) -> MotionReading:
+    """How fast, how far and how long, the further legs, and what else moves."""
+    words = question.motion
+    parted = any(each.share is not None for each in words.quantities)
+    way = length(_towards(scene, words.towards, grounding)) if parted and words.towards is not None else None
+    steps, others = step_readings(words.steps), other_readings(words.others, grounding)
+    return replace(reading, **quantities(words.quantities, way), steps=steps, others=others)
+
+
 def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:
     """From the mover to the thing that it moves towards."""
     goal = next((other.bbox for other in grounding.others if other.object == phrase.text), None)
-    bbox = goal or _bbox_of(scene, phrase, grounding.bbox)
+    bbox = goal or _bbox_of(scene.regions, phrase, grounding.bbox)
     if bbox is None:
         raise CannotReadDirection(
             f"The {grounding.object} moves towards '{phrase.text}', which was not found. "

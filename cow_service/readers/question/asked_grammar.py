@@ -135,6 +135,7 @@ def _whether() -> Iterator[tuple[AskedRelation, bool, str]]:
         yield relation, True, f"{yes}{_passing()}without (?:ever )?{ing}"
         again = _doing(relation, _AGAIN, "-ing")
         yield relation, True, f"{yes}{_passing()}{_THING} without (?:ever )?{again}"
+    yield "inside", False, f"{yes}fit(?: (?:in|into|inside|within))?(?: {_THING})?"
     yield "touches", False, f"{_asking('(?:M|it)')}{_ADVERBS}(?:collide|crash)"
     yield "touches", True, f"{yes}(?:miss|avoid) (?:{_THING}|{_ALL})|{yes}avoid {_ANY}"
     yield "touches", True, f"{yes}(?:avoid|{_passing()}without) (?:{_CONTACT}|collide-ing)(?: with {_OBJECT})?"

@@ -12,6 +12,7 @@ from itertools import takewhile
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.phrases import PUNCTUATION, Item, is_count, key_at, object_phrase, tokens
+from cow_service.readers.question.quantities import with_quantities
 
 MAX_WORDS = 12  # of one phrase; what is longer is no phrase
 _LINKS = lex.words(
@@ -26,7 +27,7 @@ _FINITE_BE = lex.words("be is are was were 's")
 
 def items(text: str) -> list[Item]:
     """Noun phrases and the words between them, in order."""
-    found = tokens(text)
+    found = with_quantities(tokens(text))
     return list(_with_marks(text, list(_chunked(text, found))))
 
 

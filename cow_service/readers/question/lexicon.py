@@ -50,7 +50,7 @@ ADJECTIVES = words(
     "glass rubber paper ceramic stone leather steel cardboard soft hard smooth rough old new other same different",
     "nearest closest farthest furthest nearby leftmost rightmost topmost first second third last single main",
     "whole entire own current original constant lone fuzzy larger smaller bigger taller shorter largest smallest",
-    "biggest tallest shortest fast slow central front rear distant",
+    "biggest tallest shortest latest newest oldest earliest fast slow central front rear distant",
 )
 # Nouns that stand before a noun: they stay in a compound, but do not yet make it whole ("toy racing car").
 NOUN_MODIFIERS = words("toy model billiard pool snooker tennis")
@@ -106,7 +106,7 @@ FUNCTION_WORDS = (
         "whom in inside within on onto upon into at to toward towards from of off over under below above beneath",
         "beside near by with along across through around past behind before between among against via per about",
         "as like than during until till for out outside and or but then so because whether since though how where",
-        "why next close now still think believe predict expect tell know suppose also ever just straight already",
+        "why ~ next close now still think believe predict expect tell know suppose also ever just straight already",
         "always instead soon again away closer nearer farther further far together too very much only even",
         "perhaps maybe else finally opposite according due parallel perpendicular ahead forward forwards backward",
         "backwards onward onwards sideways yes no please ok has have had having following contrary",
@@ -134,6 +134,7 @@ ABSTRACT = (
         "horizon collision contact impact turn push kick shove nudge throw chance possibility order bit state",
         "part area region space height angle air air's depth reverse motionless stationary number label influence",
         "choice choices yes no forth freefall place front manner fashion pace future scenario situation half",
+        "absence trail trails positions ghosts copies outcome",
         "border force fall toss possible likely true sure going visible untouched rest unison parabola arc",
     )
 )
@@ -161,7 +162,10 @@ _KINDS: dict[MotionKind, frozenset[str]] = {
 TOUCH = words("hit touch collide bump strike reach knock crash contact smash meet impact ram graze intersect scrape")
 OCCLUDE = words("occlude hide block cover obscure conceal overlap eclipse obstruct disappear vanish")
 LAND = words("land settle")
-_OTHER = words("happen become end stop appear look fit affect break point show indicate lie hang face miss avoid fail")
+_OTHER = words(
+    "happen become end stop appear look fit affect break point show indicate lie hang face miss avoid fail",
+    "remove delete erase eliminate exclude withdraw discard take put place insert set exist stick protrude overflow",
+)
 # Acting on something else with these makes that thing the mover ("someone pushes the cube").
 TRANSITIVE = words(
     "move roll slide push pull drag blow shove kick nudge flick tap knock shift propel carry bring transport lift",
@@ -171,7 +175,7 @@ TRANSITIVE = words(
 # They only say that a motion goes on or begins: a stronger verb close behind them is the motion.
 WEAK = words("keep continue start begin go come send give follow pass cross approach head return stay remain rest get")
 
-_DOUBLED = words("drag skid drop slip tap hop run swim tip step ram lob spin sit hit fit stop get let")
+_DOUBLED = words("drag skid drop slip tap hop run swim tip step ram lob spin sit hit fit stop get let put set")
 _IRREGULAR = {
     "go": "went gone", "drive": "drove driven", "run": "ran", "ride": "rode ridden", "swim": "swam swum",
     "spin": "spun", "swing": "swung", "bring": "brought", "rise": "risen", "sink": "sank sunk", "begin": "began begun",
@@ -180,7 +184,7 @@ _IRREGULAR = {
     "cast": "cast", "sling": "slung",
     "leap": "leapt", "fall": "fell fallen", "stand": "stood", "sit": "sat", "hit": "hit", "strike": "struck stricken",
     "meet": "met", "hide": "hid hidden", "slide": "slid", "become": "became", "break": "broke broken", "show": "shown",
-    "lie": "lay lain", "hang": "hung",
+    "lie": "lay lain", "hang": "hung", "take": "took taken", "put": "put", "set": "set", "stick": "stuck",
 }  # fmt: skip
 _PARTICIPLES = words(
     "labeled labelled marked numbered highlighted circled boxed surrounded enclosed bounded outlined encircled drawn",

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.arrow_words import ArrowSense, has_opposite, is_arrow
-from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, phrase_at
+from cow_service.readers.question.phrases import Item, ObjectPhrase, QuantityWords, flatten, key_at, phrase_at
+from cow_service.readers.question.trail_words import TrailWords
 from cow_service.records import MotionKind, Vector
 
 SLIGHTLY = math.tan(math.pi / 8)  # "slightly up": half of a diagonal's 45 degrees
@@ -33,6 +34,23 @@ _BACKWARD = lex.words("backward backwards back")
 
 
 @dataclass(frozen=True)
+class StepWords:
+    """A further leg of a motion, behind "then"; as in `MotionWords`."""
+
+    direction: Vector | None
+    depth: float
+    quantities: tuple[QuantityWords, ...] = ()
+
+
+@dataclass(frozen=True)
+class OtherWords:
+    """Another thing that moves at the same time."""
+
+    object: ObjectPhrase
+    motion: MotionWords
+
+
+@dataclass(frozen=True)
 class MotionWords:
     """How the question says that the mover moves; None and 0 where it does not say.
 
@@ -40,7 +58,8 @@ class MotionWords:
     ("falls to the left"): its kind stays "fall". `depth` is the sine of the angle out of the image plane: -1 towards
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
     form, empty where no known verb of motion stands in the question. `towards` is the object that the motion aims at;
-    the direction to it is for the caller to measure.
+    the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
+    `steps` are the legs behind the first, `others` what moves at the same time.
     """
 
     kind: MotionKind | None
@@ -50,6 +69,10 @@ class MotionWords:
     forward: bool | None
     verb: str
     towards: ObjectPhrase | None = None
+    trail: TrailWords | None = None
+    quantities: tuple[QuantityWords, ...] = ()
+    steps: tuple[StepWords, ...] = ()
+    others: tuple[OtherWords, ...] = ()
 
 
 def read_motion(
@@ -67,12 +90,34 @@ def read_motion(
     kind = _kind(found, verb, kind)
     if arrow == "along" and _turns_around(found):
         arrow = "against"
-    direction = _direction(found, verb, kind)
-    depth = _depth(found)
-    if direction is not None:
-        depth *= math.sqrt(0.5)
+    legs = _legs(found, verb)
+    direction, depth = _way(legs[0], verb, kind)
+    steps = [StepWords(*_way(leg, "", None), _quantities(leg)) for leg in legs[1:]]
     forward = _forward(found, verb, arrow)
-    return MotionWords(kind, arrow, direction, depth, forward, verb, _towards(found, asked or kind == "fall", mover))
+    towards = _towards(found, asked or kind == "fall", mover)
+    return MotionWords(
+        kind, arrow, direction, depth, forward, verb, towards, quantities=_quantities(legs[0]), steps=tuple(steps)
+    )
+
+
+def _legs(found: Sequence[Item], verb: str) -> list[Sequence[Item]]:
+    """The words of a motion cut at each "then" that a way to go follows."""
+    legs: list[Sequence[Item]] = [found]
+    for at in range(len(found) - 1, 0, -1):
+        if found[at].key in {"then", "afterwards"} and _way(found[at:], "", None) != (None, 0.0):
+            first = legs.pop(0)
+            legs = [first[:at], first[at:], *legs]
+    return legs if _way(legs[0], verb, None) != (None, 0.0) else [found]
+
+
+def _way(found: Sequence[Item], verb: str, kind: MotionKind | None) -> tuple[Vector | None, float]:
+    """The direction in the image and the depth of a leg."""
+    direction, depth = _direction(found, verb, kind), _depth(found)
+    return direction, depth * math.sqrt(0.5) if direction is not None else depth
+
+
+def _quantities(found: Sequence[Item]) -> tuple[QuantityWords, ...]:
+    return tuple(item.quantity for item in found if item.quantity is not None)
 
 
 def _kind(found: Sequence[Item], verb: str, kind: MotionKind | None) -> MotionKind | None:

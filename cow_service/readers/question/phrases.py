@@ -6,10 +6,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from cow_service.readers.base import Quantity, SpeedWord
 from cow_service.readers.question import lexicon as lex
+from cow_service.records import Until
 
+QUANTITY = "~"
 PUNCTUATION = frozenset(".,;:?!()—–")
-_TOKEN = re.compile(r"no\.(?=\s{0,3}\d)|n't\b|'s\b|#\d+|\w+?(?=n't\b)|\w+|[.,;:?!()—–]", re.IGNORECASE)
+_TOKEN = re.compile(r"\d+\.\d+|no\.(?=\s{0,3}\d)|n't\b|'s\b|#\d+|\w+?(?=n't\b)|\w+|[.,;:?!()—–]", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -37,14 +40,29 @@ class ObjectPhrase:
 
 
 @dataclass(frozen=True)
+class QuantityWords:
+    """How fast, how far or how long something moves, as some words say it; one field is set."""
+
+    speed: SpeedWord | Quantity | None = None
+    distance: Quantity | None = None
+    share: float | None = None  # of the way to what it moves towards
+    duration: float | None = None  # s
+    until: Until | None = None
+
+
+@dataclass(frozen=True)
 class Item:
-    """A word (`key`, lower case) or a whole noun phrase (`phrase`; then `words` are its words, determiner first)."""
+    """A word (`key`, lower case), a noun phrase (`phrase`; then `words` are its words, determiner first) or a quantity.
+
+    The key of a quantity is `QUANTITY`, and `words` are its words.
+    """
 
     key: str
     start: int
     end: int
     phrase: ObjectPhrase | None = None
     words: tuple[str, ...] = ()
+    quantity: QuantityWords | None = None
 
 
 def tokens(text: str) -> list[Item]:

@@ -51,6 +51,7 @@ class _Reading:
     pattern: Pattern
     named: tuple[ObjectPhrase, ...]
     covered: frozenset[int]
+    subject: ObjectPhrase | None = None
 
 
 def read_asked(question: Question) -> Asked | None:
@@ -66,7 +67,10 @@ def read_asked(question: Question) -> Asked | None:
     if len(reading.named) > 1 and not several:
         return None
     target = None if several or not reading.named else _as_named(reading.named[0], question)
-    return Asked(form=pattern.form, relation=pattern.relation, target=target, negated=pattern.negated)
+    subject = None if reading.subject is None else _as_named(reading.subject, question)
+    if pattern.relation == "inside" and target is None:
+        target = next((_as_named(put.targets[0], question) for put in question.interventions if put.targets), None)
+    return Asked(form=pattern.form, relation=pattern.relation, subject=subject, target=target, negated=pattern.negated)
 
 
 def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
@@ -121,13 +125,29 @@ def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]
 
 
 def _match(sentence: Sentence, places: Sequence[int]) -> _Reading | None:
-    clause = " ".join(sentence.tokens[at] for at in places)
+    tokens = [sentence.tokens[at] for at in places]
+    return _match_tokens(sentence, places, tokens, None) or _match_with_subject(sentence, places, tokens)
+
+
+def _match_with_subject(sentence: Sentence, places: Sequence[int], tokens: list[str]) -> _Reading | None:
+    """Another thing than the mover as the one who does it: "will the cyan ball hit the white ball?"."""
+    at = next((at for at, token in enumerate(tokens) if token in sentence.phrases and token[0] == "T"), None)
+    if at is None or at > 3 or "M" in tokens:
+        return None
+    subject = sentence.phrases[tokens[at]]
+    return _match_tokens(sentence, places, [*tokens[:at], "M", *tokens[at + 1 :]], subject)
+
+
+def _match_tokens(
+    sentence: Sentence, places: Sequence[int], tokens: Sequence[str], subject: ObjectPhrase | None
+) -> _Reading | None:
+    clause = " ".join(tokens)
     for pattern in PATTERNS:
         match = pattern.regex.fullmatch(clause)
         if match is not None:
             names = dict.fromkeys(group for group in match.groups() if group is not None)
             named = tuple(sentence.phrases[name] for name in names)
-            return None if _is_into_hollow(clause, named) else _Reading(pattern, named, frozenset(places))
+            return None if _is_into_hollow(clause, named) else _Reading(pattern, named, frozenset(places), subject)
     return None
 
 

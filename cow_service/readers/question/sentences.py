@@ -13,10 +13,20 @@ from functools import lru_cache
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.arrow_words import read_arrow
 from cow_service.readers.question.chunks import items
-from cow_service.readers.question.clauses import SENTENCE_END, Clauses, clause_end, is_passive, is_vague, read_clauses
+from cow_service.readers.question.clauses import (
+    SENTENCE_END,
+    Clauses,
+    MotionCandidate,
+    clause_end,
+    is_passive,
+    is_vague,
+    read_clauses,
+)
+from cow_service.readers.question.interventions import InterventionWords, split_interventions
 from cow_service.readers.question.listed_options import split_options
-from cow_service.readers.question.motion_words import MotionWords, read_motion
+from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
+from cow_service.readers.question.trail_words import TrailWords, split_trail
 
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
@@ -33,14 +43,16 @@ _DIRECTION_WORDS = re.compile(
 class Question:
     """A what-if question taken apart.
 
-    `others` are the further objects it names, in order, without the mover; `items`, all its words and noun phrases, but
-    for the options that it lists. `names_direction`: some word says which way, whether or not it was understood.
+    `others` are the further objects it names, in order, without the mover and without what is taken away; `items`, all
+    its words and noun phrases, but for the options that it lists, its `interventions` and its trail.
+    `names_direction`: some word says which way, whether or not it was understood.
     """
 
     mover: ObjectPhrase | None
     motion: MotionWords
     others: tuple[ObjectPhrase, ...]
     items: tuple[Item, ...]
+    interventions: tuple[InterventionWords, ...]
     mentions_arrow: bool
     names_direction: bool
 
@@ -48,7 +60,8 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    everything = items(split_options(question)[1])
+    interventions, everything = split_interventions(items(split_options(question)[1]))
+    trail, everything = split_trail(everything)
     found = _without_instructions(everything)
     clauses = read_clauses(found)
     best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
@@ -57,14 +70,23 @@ def parse(question: str) -> Question:
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
     verb, kind = (best.verb, best.kind) if best else ("", None)
-    motion = read_motion(found[at:end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked)
+    end = min([end, *(other.start for other in _movers_beside(clauses, best))])
+    shared = _sharing(found, at, end)
+    motion = read_motion(
+        found[at : shared or end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked
+    )
+    motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
+    put = next((change for change in interventions if change.kind == "place"), None)
+    if put is not None and (best is None or best.asked):
+        mover, motion = put.object, replace(motion, kind="place", verb="put")
     clause = range(best.start if best else at, end)
     words = {token.key for token in tokens(question)}
     return Question(
         mover=mover,
         motion=motion,
-        others=_others(found, mover, clause),
+        others=_others(found, mover, clause, interventions, trail),
         items=tuple(everything),
+        interventions=interventions,
         mentions_arrow=any(word.startswith("arrow") for word in words),
         names_direction=_DIRECTION_WORDS.search(question) is not None,
     )
@@ -92,6 +114,44 @@ def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhras
     return next(iter(before + [phrase for _, phrase in asked + named]), None)
 
 
+def _movers_beside(clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
+    """Motions of other things than the mover's, said in the same way: "the ball moves left and the car goes right"."""
+    if best is None or best.asked or best.subject is None or best.subject.head in lex.AGENTS:
+        return []
+    return [
+        each
+        for each in clauses.candidates
+        if each.rank == best.rank and each.at > best.at and each.kind not in {None, "static"}
+        and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
+    ]  # fmt: skip
+
+
+def _sharing(found: Sequence[Item], at: int, end: int) -> int | None:
+    """Where a second mover shares the verb: "the ball moves left and the car to the right"."""
+    for place in range(at + 1, end - 2):
+        phrase = found[place + 1].phrase
+        if found[place].key in {"and", "while"} and phrase is not None and phrase.is_thing:
+            way = read_motion(found[place + 1 : end], "", None, None, None)
+            if way.direction is not None or way.depth:
+                return place
+    return None
+
+
+def _other_motions(
+    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, shared: int | None, end: int
+) -> tuple[OtherWords, ...]:
+    """What else moves at the same time, and how."""
+    others: list[OtherWords] = []
+    if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
+        motion = read_motion(found[shared + 1 : end], best.verb, best.kind, None, thing)
+        others.append(OtherWords(thing, motion))
+    for each in _movers_beside(clauses, best):
+        if each.subject is not None and all(each.subject != other.object for other in others):
+            words = found[each.at : clause_end(found, each.at)]
+            others.append(OtherWords(each.subject, read_motion(words, each.verb, each.kind, None, each.subject)))
+    return tuple(others)
+
+
 def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:
     """The first mention of the mover where it is worded more fully: "the white pawn ... if the pawn moves"."""
     fuller = {item.phrase for item in before if item.phrase and item.phrase != mover and _repeats(mover, item.phrase)}
@@ -111,15 +171,25 @@ def _without_instructions(found: list[Item]) -> list[Item]:
     return kept
 
 
-def _others(found: Sequence[Item], mover: ObjectPhrase | None, clause: range) -> tuple[ObjectPhrase, ...]:
-    named: list[ObjectPhrase] = []
+def _others(
+    found: Sequence[Item],
+    mover: ObjectPhrase | None,
+    clause: range,
+    interventions: Sequence[InterventionWords],
+    trail: TrailWords | None,
+) -> tuple[ObjectPhrase, ...]:
+    removed = [change.object for change in interventions if change.kind == "remove"]
+    named = [phrase for change in interventions for phrase in change.targets]
+    named += [] if trail is None or trail.near is None else [trail.near]
     for at, item in enumerate(found):
         phrase = item.phrase
         if phrase is None or is_vague(item) or not _is_object(phrase) or (at in clause and phrase.head in lex.AGENTS):
             continue
         if phrase.noun in lex.ADJECTIVES and item.words[0] not in lex.DETERMINERS:
             continue  # "which ball will it hit first?"
-        again = item.words[0] != "another" and any(_repeats(phrase, known) for known in (mover, *named) if known)
+        again = item.words[0] != "another" and any(
+            _repeats(phrase, known) for known in (mover, *named, *removed) if known
+        )
         if not again:
             named.append(phrase)
     return tuple(named)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import MotionKind, Vector
@@ -37,13 +38,34 @@ def _flat_words(direction: Vector | None) -> str:
 
 
 def motion_sentence(
-    object: str, kind: MotionKind, direction: Vector | None, depth: float, sentence: str | None = None
+    object: str,
+    kind: MotionKind,
+    direction: Vector | None,
+    depth: float,
+    sentence: str | None = None,
+    further: Sequence[str] = (),
+    stops: bool = False,
+    also: Sequence[str] = (),
 ) -> str:
-    """The motion in one line: a declarative `sentence` of a reader, or one made here; and that the camera stays."""
+    """The motion in one line: a declarative `sentence` of a reader, or one made here; and that the camera stays.
+
+    `further` are the directions of more legs in words, `also` what else moves, such as "car moves to the left".
+    """
+    prompt = load_prompt("motion-sentence")
+    text = prompt.render(
+        object=bare_name(object),
+        kind=kind,
+        words=direction_words(direction, depth),
+        sentence="" if sentence is None else sentence.strip().rstrip(".") + ".",
+        further=further,
+        stops=stops,
+        also=also,
+    )
+    return " ".join(text.split())
+
+
+def bare_name(object: str) -> str:
+    """An object's name in one line, without its determiner."""
     name = " ".join(object.split())[:MAX_OBJECT].rstrip()
     determiner = next((word for word in _DETERMINERS if name.lower().startswith(word)), "")
-    words = direction_words(direction, depth)
-    declared = "" if sentence is None else sentence.strip().rstrip(".") + "."
-    prompt = load_prompt("motion-sentence")
-    text = prompt.render(object=name[len(determiner) :], kind=kind, words=words, sentence=declared)
-    return " ".join(text.split())
+    return name[len(determiner) :]

@@ -1,0 +1,107 @@
+"""How a thing moves by the words of a question: its direction in the image, and what they say of speed and distance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypedDict, TypeVar
+
+from cow_service.errors import CannotReadDirection
+from cow_service.physics.camera import depth_motion
+from cow_service.readers.base import OtherMotionReading, Quantity, SpeedWord, StepReading
+from cow_service.readers.question.motion_words import OtherWords, StepWords
+from cow_service.readers.question.phrases import QuantityWords
+from cow_service.readers.remedies import GIVE_DIRECTION
+from cow_service.records import DIRECTED_KINDS, Grounding, Until, Vector
+
+_T = TypeVar("_T")
+
+
+class Said(TypedDict):
+    """What the words say of how fast, how far and how long; fields of `MotionReading`."""
+
+    speed: SpeedWord | Quantity | None
+    distance: Quantity | None
+    duration: float | None
+    until: Until | None
+
+
+def quantities(words: Sequence[QuantityWords], way: float | None) -> Said:
+    """The quantities of one leg; `way`, px, is how far it is to what it moves towards. Raises `CannotReadDirection`."""
+    distances = [each.distance for each in words if each.distance is not None]
+    shares = [each.share for each in words if each.share is not None]
+    if shares and way is None:
+        raise CannotReadDirection(
+            f"The question says that it moves a part of the way, but not to what. {GIVE_DIRECTION} Or give "
+            "`motion.distance`."
+        )
+    distances += [Quantity(share * (way or 0.0), "px") for share in shares]
+    speeds: list[SpeedWord | Quantity] = [each.speed for each in words if each.speed is not None]
+    ends: list[Until] = [each.until for each in words if each.until is not None]
+    return Said(
+        speed=_one("speed", speeds),
+        distance=_one("distance", distances),
+        duration=_one("duration", [each.duration for each in words if each.duration is not None]),
+        until=_one("end", ends),
+    )
+
+
+def _one(name: str, values: list[_T]) -> _T | None:
+    if len(set(values)) > 1:
+        raise CannotReadDirection(f"The question names more than one {name} of the motion. {GIVE_DIRECTION}")
+    return values[0] if values else None
+
+
+def step_readings(steps: Sequence[StepWords]) -> tuple[StepReading, ...]:
+    """The legs behind the first."""
+    readings: list[StepReading] = []
+    for step in steps:
+        direction, depth = _way(step.direction, step.depth)
+        said = quantities(step.quantities, None)
+        readings.append(StepReading(direction, depth, said["distance"], said["duration"]))
+    return tuple(readings)
+
+
+def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
+    """What else is set moving. Raises `CannotReadDirection` where it was not found, or which way is not said."""
+    readings: list[OtherMotionReading] = []
+    for other in others:
+        found = next((each for each in grounding.others if each.object == other.object.text), None)
+        kind, motion = other.motion.kind or "linear", other.motion
+        if found is None:
+            raise CannotReadDirection(f"'{other.object.text}' moves, too, and was not found. {GIVE_DIRECTION}")
+        way = (None, 0.0) if kind not in DIRECTED_KINDS else _way(_aimed(other, grounding), motion.depth)
+        if way[0] is None and kind in DIRECTED_KINDS:
+            raise CannotReadDirection(f"Which way '{other.object.text}' moves was not understood. {GIVE_DIRECTION}")
+        speed = quantities(motion.quantities, None)["speed"]
+        readings.append(OtherMotionReading(found, kind, way[0], way[1], speed))
+    return tuple(readings)
+
+
+def _aimed(other: OtherWords, grounding: Grounding) -> Vector | None:
+    """The direction of a second mover: as said, or towards a thing that was found."""
+    if other.motion.direction is not None or other.motion.towards is None:
+        return other.motion.direction
+    goal = other.motion.towards.text
+    things = [(each.object, each.bbox) for each in grounding.others] + [(grounding.object, grounding.bbox)]
+    boxes = [bbox for name, bbox in things if name == goal]
+    own = next(bbox for name, bbox in things if name == other.object.text)
+    return None if not boxes else difference(own, boxes[0])
+
+
+def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
+    if direction is None and depth:
+        return depth_motion(depth)
+    if direction is None:
+        raise CannotReadDirection(f"Which way a part of the motion goes was not understood. {GIVE_DIRECTION}")
+    return direction, depth
+
+
+def difference(start: Sequence[float], end: Sequence[float]) -> Vector:
+    """From the centre of one box to that of another, px."""
+    return ((end[0] + end[2] - start[0] - start[2]) / 2, (end[1] + end[3] - start[1] - start[3]) / 2)
+
+
+def length(vector: Vector) -> float:
+    """px."""
+    return math.hypot(*vector)

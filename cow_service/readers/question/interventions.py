@@ -1,0 +1,118 @@
+"""Finds what a question takes away or puts somewhere before anything moves, and the question without those words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from lark import Token, Tree
+
+from cow_service.readers.question import lexicon as lex
+from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
+from cow_service.readers.question.words import Word, words_of
+from cow_service.records import InterventionKind, PlaceRelation
+
+MAX_INTERVENTIONS = 6  # of one question; what comes after them is not looked for
+_WINDOW = 24  # words that one may have
+_BEFORE = lex.CONDITIONALS | lex.words(". ! ? ; : , and but then also that with")
+_ANYWHERE = lex.words("without with remove taking in")
+_TELLING = lex.words(
+    "remove take get be do did disappear vanish there without absence put place insert set position drop lower throw",
+    "release with",
+)
+_RELATIONS: dict[str, PlaceRelation] = {
+    "into": "into", "onto": "onto", "between": "between", "in_front_of": "in-front-of", "behind": "behind",
+    "next_to": "next-to", "left_of": "left-of", "right_of": "right-of",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class InterventionWords:
+    """A change of the scene in the words of the question. `relation` and `targets` are those of `place`."""
+
+    kind: InterventionKind
+    object: ObjectPhrase
+    relation: PlaceRelation | None = None
+    targets: tuple[ObjectPhrase, ...] = ()
+
+
+def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords, ...], list[Item]]:
+    """The interventions of a question, and its items without them and without the conditions they leave empty."""
+    changes: list[InterventionWords] = []
+    gone: set[int] = set()
+    words = words_of(found)
+    begins = {word.at: place for place, word in reversed(list(enumerate(words)))}
+    for at in _starts(found):
+        if at in gone or len(changes) >= MAX_INTERVENTIONS:
+            continue
+        read = _read(found, words[begins[at] : begins[at] + _WINDOW]) if at in begins else None
+        if read is not None:
+            said, end = read
+            changes += said
+            gone |= _emptied(found, at, end, gone)
+    return tuple(changes), [item for at, item in enumerate(found) if at not in gone]
+
+
+def _starts(found: Sequence[Item]) -> Iterator[int]:
+    """Where a clause may begin that takes something away or puts it somewhere."""
+    for at, item in enumerate(found):
+        if item.key in _ANYWHERE or (key_at(found, at - 1) in _BEFORE and item.key not in _BEFORE):
+            yield at
+
+
+def _read(found: Sequence[Item], words: Sequence[Word]) -> tuple[list[InterventionWords], int] | None:
+    """The interventions at some words, and the place of the first item behind them."""
+    if not any(word.text in _TELLING for word in words[:8]):
+        return None
+    parsed = parse_from("intervention", words)
+    while parsed is not None and _begins_clause(words, parsed[1]):
+        parsed = parse_from("intervention", words[: parsed[1] - 1])
+    if parsed is None:
+        return None
+    tree, length = parsed
+    phrases = {place: _phrase(found, word.at) for place, word in enumerate(words) if word.kind}
+    named = [phrase for token in named_in(tree) if (phrase := phrases.get(token.start_pos or 0))]
+    end = words[length].at if length < len(words) else words[-1].at + 1
+    if not named:
+        return None
+    if next(tree.find_data("removal"), None) is not None:
+        return [InterventionWords("remove", phrase) for phrase in named], end
+    relation: PlaceRelation = next(
+        _RELATIONS[str(node.data)] for node in tree.iter_subtrees() if node.data in _RELATIONS
+    )
+    return [InterventionWords("place", named[0], relation, tuple(named[1:]))], end
+
+
+def _begins_clause(words: Sequence[Word], end: int) -> bool:
+    """Whether the last thing of some words is the subject of what follows: "without the vase, the ball rolls"."""
+    return bool(words[end - 1].kind) and end < len(words) and (words[end].text in lex.VERBS or words[end].text == "be")
+
+
+def named_in(tree: Tree[Token]) -> Iterator[Token]:
+    """The noun phrases of a tree, in order."""
+    return (token for token in tree.scan_values(lambda value: isinstance(value, Token) and bool(value.type)))
+
+
+def _phrase(found: Sequence[Item], at: int) -> ObjectPhrase | None:
+    """The noun phrase at a place; for a pronoun, the thing that was named before it."""
+    before = [item.phrase for item in found[: at + 1] if item.phrase is not None and item.phrase.is_thing]
+    return found[at].phrase or (before[-1] if before else None)
+
+
+def _emptied(found: Sequence[Item], start: int, end: int, gone: set[int]) -> set[int]:
+    """The places of an intervention, with the "and" or the condition that it leaves without a clause."""
+    places = set(range(start, end))
+    before, after = start - 1, end
+    while before >= 0 and (before in gone or found[before].key in {"then", "also"}):
+        before -= 1
+    opened = before >= 0 and found[before].key in lex.CONDITIONALS
+    if key_at(found, after) == "," and key_at(found, after + 1) in {"and", "then"}:
+        after += 1
+    if key_at(found, after) in {"and", "then"} and (opened or before < 0 or key_at(found, before) in ".,;"):
+        return places | {after} | ({after - 1} if found[after - 1].key == "," else set())
+    if before >= 0 and found[before].key in {"and", "but"}:
+        return places | {before}
+    if opened:
+        return places | {before} | ({after} if key_at(found, after) == "," else set())
+    return places

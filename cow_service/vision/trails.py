@@ -1,0 +1,378 @@
+"""Finds trails: three or more positions of one ball in one image, faded, or as opaque as a multiple exposure shows them.
+
+Two circles that look alike are the start; others that look like them are sought between and beyond them, on a path
+along which place and size change smoothly. Balls that merely look alike are no trail by themselves: see
+`Trail.evident`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cow_service.records import BBox, Point, Vector
+from cow_service.vision.circles import BINS, Circle, Edges
+from cow_service.vision.masks import iou
+from cow_service.vision.types import Floats, Floats32, Image, Mask
+
+END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
+SEEN_SUPPORT = 0.75  # of what the other positions leave to be seen of a circumference, on edges
+SIZES = 1.35  # between the radii of neighbours, at most
+LOOKS, LEAST_CONTRAST = 0.3, 12.0  # difference of the looks over the contrast, at most; grey levels of that contrast
+FADED = 0.85  # of the opacity of the most opaque: with less, a position was faded
+LEAST_OPACITY = 0.08
+SPACING = 0.5, 2.0  # between neighbouring gaps
+BEND = math.radians(65)  # between neighbouring legs, at most
+LEAST_GAP, MOST_GAP = 0.35, 5.0  # radii between neighbours
+MOST_SAG = 0.3  # of the distance of two positions: how far those between may lie off the line
+MAX_POSITIONS = 12
+SAME_POSITION_IOU = 0.4
+OFFSETS = np.array([(r * math.cos(t), r * math.sin(t)) for r in (0.25, 0.5, 0.7, 0.85)
+                    for t in np.linspace(0, 2 * math.pi, 24, endpoint=False)])  # radii: where looks are compared  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Position:
+    """A ball where it was, or is."""
+
+    x: float  # px
+    y: float
+    radius: float  # px
+    opacity: float  # 0..1, against the most opaque position of its trail
+
+    @property
+    def centre(self) -> Point:
+        """px."""
+        return self.x, self.y
+
+    @property
+    def bbox(self) -> BBox:
+        """[x0, y0, x1, y1], px."""
+        return self.x - self.radius, self.y - self.radius, self.x + self.radius, self.y + self.radius
+
+    def disc(self, shape: tuple[int, int], grown: float = 0.0) -> Mask:
+        """Mask [H, W], its radius larger by so many px."""
+        ys, xs = np.ogrid[: shape[0], : shape[1]]
+        return np.hypot(xs + 0.5 - self.x, ys + 0.5 - self.y) <= self.radius + grown
+
+
+@dataclass(frozen=True)
+class Trail:
+    """Positions of one ball along its path, the oldest first and the present one last."""
+
+    positions: tuple[Position, ...]
+    evident: bool  # it shows by itself: its positions overlap or fade. Else they may be several balls that look alike
+    end_known: bool  # which end is the present one: told by their opacity, or named
+
+    @property
+    def present(self) -> Position:
+        """Where the ball is now."""
+        return self.positions[-1]
+
+    @property
+    def older(self) -> tuple[Position, ...]:
+        """Where it was, the oldest first."""
+        return self.positions[:-1]
+
+    @property
+    def heading(self) -> Vector:
+        """Image velocity at the present position, px per interval between positions."""
+        c, b, a = (position.centre for position in self.positions[-1:-4:-1])
+        return (3 * c[0] - 4 * b[0] + a[0]) / 2, (3 * c[1] - 4 * b[1] + a[1]) / 2
+
+    def ending(self, end: TrailEnd) -> Trail:
+        """The same positions with the present one at an end."""
+        ends = self.positions[0], self.positions[-1]
+        if end.near is not None:
+            gaps = [_gap(position, end.near) for position in ends]
+        elif end.side is not None:
+            gaps = [-position.x * end.side[0] - position.y * end.side[1] for position in ends]
+        else:
+            return self
+        is_last = (gaps[1] <= gaps[0]) != end.is_oldest
+        return Trail(self.positions if is_last else self.positions[::-1], self.evident, True)
+
+
+@dataclass(frozen=True)
+class TrailEnd:
+    """Which end of a trail is the present position: that nearest to a box, or farthest to a side, else as it shows."""
+
+    near: BBox | None = None  # of another object
+    side: Vector | None = None  # in the image: (-1, 0) for the leftmost
+    is_oldest: bool = False  # that end is the oldest position, the other one the present
+
+
+def trail_of(trails: Sequence[Trail], bbox: BBox, end: TrailEnd | None = None) -> Trail | None:
+    """The trail that has a position in a box [x0, y0, x1, y1], with its present position at an end that is named."""
+    for trail in trails:
+        if any(iou(position.bbox, bbox) >= SAME_POSITION_IOU for position in trail.positions):
+            return trail if end is None else trail.ending(end)
+    return None
+
+
+def trail_ending_at(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
+    """The trail whose present position lies in a box, turned round where its first position does."""
+    for trail in trails:
+        for positions in (trail.positions, trail.positions[::-1]):
+            if iou(positions[-1].bbox, bbox) >= SAME_POSITION_IOU:
+                return Trail(positions, trail.evident, True)
+    return None
+
+
+def find_trails(image: Image) -> tuple[Trail, ...]:
+    """Trails of balls in an RGB image [H, W, 3] without drawings on it, the longest first."""
+    edges = Edges.of(image)
+    if edges is None:
+        return ()
+    looks = _Looks(image.astype(np.float32))
+    ends = [circle for circle in edges.circles() if circle.support >= END_SUPPORT]
+    ends = [circle for circle in ends if looks.contrast(circle) >= LEAST_CONTRAST]
+    trails: list[Trail] = []
+    for i, a in enumerate(ends):
+        for b in ends[i + 1 :]:
+            if any(_is_part(circle, trail) for circle in (a, b) for trail in trails):
+                continue
+            if _may_be_one(a, b) and looks.alike((a, b)):
+                chain = _chain(edges, looks, a, b)
+                trail = None if chain is None else _trail(looks, chain)
+                if trail is not None:
+                    trails.append(trail)
+    whole: list[Trail] = []
+    for trail in sorted(trails, key=lambda trail: -len(trail.positions)):
+        if not any(_share_positions(trail, other) for other in whole):
+            whole.append(trail)
+    return tuple(whole)
+
+
+def _share_positions(a: Trail, b: Trail) -> bool:
+    return any(math.dist(p.centre, q.centre) < 0.6 * max(p.radius, q.radius) for p in a.positions for q in b.positions)
+
+
+def _may_be_one(a: Circle, b: Circle) -> bool:
+    """Whether two circles may be positions of one ball with others between or beyond them."""
+    apart, mean = math.dist((a.x, a.y), (b.x, b.y)), (a.radius + b.radius) / 2
+    return 0.25 * mean < apart < MOST_GAP * 3 * mean and max(a.radius, b.radius) < SIZES**3 * min(a.radius, b.radius)
+
+
+def _chain(edges: Edges, looks: _Looks, a: Circle, b: Circle) -> tuple[Circle, ...] | None:
+    """The circles along the path through two of them, in order; None where they are fewer than three, or no path."""
+    best: tuple[Circle, ...] = ()
+    reach = 0.5 * math.dist((a.x, a.y), (b.x, b.y)) + 1.6 * max(a.radius, b.radius)
+    low, high = (min(a.x, b.x) - reach, min(a.y, b.y) - reach), (max(a.x, b.x) + reach, max(a.y, b.y) + reach)
+    near = edges.within((*low, *high))
+    for inner in range(3 * MAX_POSITIONS // 4):
+        chain = _between(near, looks, a, b, inner)
+        if chain is None:
+            continue
+        chain = _beyond(edges, looks, _beyond(edges, looks, chain)[::-1])
+        if len(chain) > max(2, len(best)) and _is_path(chain) and looks.alike(chain) and _is_outlined(chain):
+            best = chain
+    return best or None
+
+
+def _between(edges: Edges, looks: _Looks, a: Circle, b: Circle, inner: int) -> tuple[Circle, ...] | None:
+    """Two circles with so many others between them, evenly along an arc that bulges to one side or the other."""
+    apart = math.dist((a.x, a.y), (b.x, b.y))
+    gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
+    if not LEAST_GAP * mean < gap < MOST_GAP * mean:
+        return None
+    across = np.array([a.y - b.y, b.x - a.x]) / apart
+    shares = np.arange(1, inner + 1) / (inner + 1)
+    most = MOST_SAG * apart if inner else 0.0
+    for bulge in sorted(np.arange(-most, most + 1e-9, 0.35 * mean).tolist() + [0.0], key=abs):
+        chain, seeds = [a], []
+        for t in shares:
+            middle = np.array([a.x, a.y]) * (1 - t) + np.array([b.x, b.y]) * t + 4 * t * (1 - t) * bulge * across
+            seeds.append((float(middle[0]), float(middle[1]), a.radius ** (1 - t) * b.radius**t))
+        for seed in seeds:
+            found = _fit_near(edges, *seed)
+            if found is None or any(found.is_same(other) for other in (*chain, b)):
+                break
+            chain.append(found)
+        if len(chain) == inner + 1 and _is_path((*chain, b)) and looks.alike((*chain, b)):
+            return (*chain, b)
+    return None
+
+
+def _beyond(edges: Edges, looks: _Looks, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
+    """A chain with what goes on after its last circle."""
+    while len(chain) < MAX_POSITIONS:
+        last, before = chain[-1], chain[-2]
+        seeds = [(2 * last.x - before.x, 2 * last.y - before.y)]
+        if len(chain) > 2:
+            seeds.insert(0, (3 * last.x - 3 * before.x + chain[-3].x, 3 * last.y - 3 * before.y + chain[-3].y))
+        else:
+            turned = [_turned(before, last, angle) for angle in (-0.35, 0.35, -0.7, 0.7)]
+            seeds += turned
+        longer = None
+        for x, y in seeds:
+            found = _fit_near(edges, x, y, last.radius**2 / before.radius)
+            if found is not None and not any(found.is_same(other) for other in chain):
+                longer = (*chain, found)
+                if _is_path(longer) and looks.alike(longer):
+                    break
+                longer = None
+        if longer is None:
+            return chain
+        chain = longer
+    return chain
+
+
+def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
+    """The circle with most edges on it within half a radius of a place."""
+    tried = [edges.fit(x + dx * radius, y + dy * radius, radius) for dx, dy in
+             ((0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25))]  # fmt: skip
+    near = [c for c in tried if c is not None and math.dist((c.x, c.y), (x, y)) < 0.6 * radius
+            and 1 / SIZES < c.radius / radius < SIZES]  # fmt: skip
+    return max(near, key=lambda circle: circle.support, default=None)
+
+
+def _turned(before: Circle, last: Circle, angle: float) -> tuple[float, float]:
+    dx, dy = last.x - before.x, last.y - before.y
+    return (last.x + dx * math.cos(angle) - dy * math.sin(angle), last.y + dx * math.sin(angle) + dy * math.cos(angle))
+
+
+def _is_path(chain: Sequence[Circle]) -> bool:
+    """Whether place and size change smoothly along circles."""
+    places = np.array([(c.x, c.y) for c in chain])
+    legs = np.diff(places, axis=0)
+    gaps = np.linalg.norm(legs, axis=1)
+    radii = np.array([c.radius for c in chain])
+    ratio = radii[1:] / radii[:-1]
+    if (ratio > SIZES).any() or (ratio < 1 / SIZES).any() or (gaps < LEAST_GAP * radii[1:]).any():
+        return False
+    if len(chain) < 3:
+        return True
+    turns = np.arctan2(legs[:-1, 0] * legs[1:, 1] - legs[:-1, 1] * legs[1:, 0], (legs[:-1] * legs[1:]).sum(axis=1))
+    if (np.abs(turns) > BEND).any() or ((turns > 0.15).any() and (turns < -0.15).any()):
+        return False
+    uneven = np.abs(np.diff(np.log(radii), 2)).max()
+    spread = gaps[1:] / gaps[:-1]
+    return bool(uneven < 0.12 and (spread > SPACING[0]).all() and (spread < SPACING[1]).all())
+
+
+def _is_outlined(chain: Sequence[Circle]) -> bool:
+    """Whether edges show as much of each circle as the others leave to be seen: circles fitted into a bottle do not."""
+    turns = (np.arange(BINS) + 0.5) * 2 * math.pi / BINS
+    for i, circle in enumerate(chain):
+        rim = np.stack([circle.x + circle.radius * np.cos(turns), circle.y + circle.radius * np.sin(turns)], axis=1)
+        seen = ~_inside(rim, [other for j, other in enumerate(chain) if j != i], 1.0)
+        on = np.isin(np.arange(BINS), list(circle.on_edges))
+        if np.count_nonzero(on & seen) < SEEN_SUPPORT * max(1, np.count_nonzero(seen)):
+            return False
+        if i in (0, len(chain) - 1) and circle.support < END_SUPPORT:
+            return False
+    return True
+
+
+def _inside(points: Floats, circles: Sequence[Circle], factor: float) -> Mask:
+    """Which points [N, 2] (px) lie inside any of circles, their radii multiplied."""
+    inside = np.zeros(len(points), bool)
+    for circle in circles:
+        inside |= np.hypot(points[:, 0] - circle.x, points[:, 1] - circle.y) < factor * circle.radius
+    return inside
+
+
+def _trail(looks: _Looks, chain: tuple[Circle, ...]) -> Trail | None:
+    """The trail of a chain, its more opaque end last; where they are alike, that of which more is seen."""
+    shares = looks.opacities(chain)
+    if shares is None:
+        return None
+    opacity = np.clip(shares / shares.max(), 0, 1)
+    positions = tuple(Position(c.x, c.y, c.radius, float(o)) for c, o in zip(chain, opacity, strict=True))
+    neighbours = itertools.pairwise(positions)
+    overlap = all(math.dist(a.centre, b.centre) < 0.95 * (a.radius + b.radius) for a, b in neighbours)
+    known = abs(float(opacity[0] - opacity[-1])) > 1 - FADED
+    faded = float(np.sort(opacity)[:-1].max()) < FADED if known else False
+    rank = (opacity[0], opacity[-1]) if known else (chain[0].support, chain[-1].support)
+    ordered = positions if rank[1] >= rank[0] else positions[::-1]
+    return Trail(ordered, overlap or faded or (known and len(chain) > 3), known)
+
+
+def _is_part(circle: Circle, trail: Trail) -> bool:
+    return any(math.dist((circle.x, circle.y), p.centre) < 0.6 * p.radius for p in trail.positions)
+
+
+def _gap(position: Position, bbox: BBox) -> float:
+    """px from the centre of a position to that of a box."""
+    return math.dist(position.centre, ((bbox[0] + bbox[2]) / 2, (bbox[1] + bbox[3]) / 2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Looks:
+    """How circles of an image [H, W, 3] look inside and about them, in grey levels."""
+
+    image: Floats32
+
+    def contrast(self, circle: Circle) -> float:
+        """Lower quartile of the steps from inside to outside over the edges on a circle."""
+        turns = (np.array(sorted(circle.on_edges)) + 0.5) * 2 * math.pi / BINS
+        rim = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        inside, outside = (self._at(circle, factor * rim) for factor in (0.85, 1.15))
+        return float(np.percentile(np.linalg.norm(inside - outside, axis=1), 25))
+
+    def alike(self, chain: Sequence[Circle]) -> bool:
+        """Whether all look like the first or the last, faded or not."""
+        return self.opacities(chain) is not None
+
+    def opacities(self, chain: Sequence[Circle]) -> Floats | None:
+        """Opacity [N] of each circle against one that is the most opaque; None where they do not look alike."""
+        about = [self._about(i, chain) for i in range(len(chain))]
+        inner = [self._at(circle, OFFSETS) for circle in chain]
+        free = [self._free(i, chain) for i in range(len(chain))]
+        strength = [float(np.abs(v[f] - b).mean()) if f.any() else 0.0
+                    for v, b, f in zip(inner, about, free, strict=True)]  # fmt: skip
+        model = max((0, len(chain) - 1), key=lambda i: strength[i])
+        shares: list[float] = []
+        for i in range(len(chain)):
+            both = free[i] & free[model]
+            if np.count_nonzero(both) < 6:
+                both = free[i] | free[model]
+            seen, wanted = inner[i][both], inner[model][both]
+            share = _opacity(seen - about[i], wanted - about[model], seen - wanted)
+            if share is None:
+                return None
+            shares.append(share)
+        return np.array(shares)
+
+    def _at(self, circle: Circle, offsets: Floats) -> Floats:
+        """Colours [N, 3] at offsets [N, 2] (radii) from a circle's centre."""
+        xs = np.clip(circle.x + circle.radius * offsets[:, 0], 0, self.image.shape[1] - 1).astype(int)
+        ys = np.clip(circle.y + circle.radius * offsets[:, 1], 0, self.image.shape[0] - 1).astype(int)
+        return self.image[ys, xs].astype(np.float64)
+
+    def _free(self, i: int, chain: Sequence[Circle]) -> Mask:
+        """Which of `OFFSETS` of a circle lie in no other."""
+        circle = chain[i]
+        points = np.array([circle.x, circle.y]) + circle.radius * OFFSETS
+        return ~_inside(points, [other for j, other in enumerate(chain) if j != i], 1.05)
+
+    def _about(self, i: int, chain: Sequence[Circle]) -> Floats:
+        """Median colour [3] around a circle, others left out."""
+        circle = chain[i]
+        turns = np.linspace(0, 2 * math.pi, 48, endpoint=False)
+        ring = np.concatenate([f * np.stack([np.cos(turns), np.sin(turns)], axis=1) for f in (1.15, 1.3)])
+        points = np.array([circle.x, circle.y]) + circle.radius * ring
+        free = ~_inside(points, [other for j, other in enumerate(chain) if j != i], 1.1)
+        return np.median(self._at(circle, ring[free] if free.sum() > 8 else ring), axis=0)
+
+
+def _opacity(seen: Floats, model: Floats, plain: Floats) -> float | None:
+    """The share of a model's contrast [N, 3] that is seen [N, 3]; None where what is seen is no share of it.
+
+    `plain` [N, 3] are the differences of the colours themselves, which do not depend on the background.
+    """
+    contrast = float(np.median(np.linalg.norm(model, axis=1)))
+    if contrast < LEAST_CONTRAST:
+        return None
+    if float(np.median(np.linalg.norm(plain, axis=1))) < LOOKS * contrast / 2:
+        return 1.0
+    share = float((seen * model).sum() / (model**2).sum())
+    rest = float(np.median(np.linalg.norm(seen - share * model, axis=1)))
+    if not LEAST_OPACITY < share < 1.15 or rest > LOOKS * contrast * max(share, 0.15):
+        return None
+    return min(share, 1.0)
