@@ -35,6 +35,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
         motion=motion,
         trajectory=trajectory,
         frames=clip.frames,
+        factual_frames=clip.factual_frames,
         video=clip.video,
         overlay=clip.overlay,
         generator=clip.generator,

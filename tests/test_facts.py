@@ -25,7 +25,7 @@ def path(
         points=points,
         visible=(*([True] * (FRAMES - 5)), *([not leaves] * 5)),
         scale=(1.0,) * FRAMES,
-        rotation=tuple(turned * s for s in steps),
+        tipped_at=1.2 if turned > 45 else None,
         tracks=(points,),
     )
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.physics.occlusion import shares
+from cow_service.physics.occlusion import Shares
+from cow_service.physics.occlusion import shares as shares_of
 from cow_service.physics.projection import SeenPaths
 from cow_service.vision.masks import CroppedMask
 
@@ -24,6 +25,18 @@ def path(points, depth, scale=None) -> SeenPaths:
     grown = np.ones(frames) if scale is None else np.array(scale, float)
     depths = np.full(frames, depth) if scale is None else depth / grown
     return SeenPaths(np.array([points], float), depths[None], grown[None], np.zeros((1, frames), bool))
+
+
+def shares(mover: CroppedMask, seen: SeenPaths, other: CroppedMask, depths) -> Shares:
+    """Of another body that stays where it is, at depths [K]."""
+    frames = seen.depth.shape
+    there = SeenPaths(
+        np.full((*frames, 2), 100.0),
+        np.broadcast_to(depths[:, None], frames),
+        np.ones(frames),
+        np.zeros(frames, bool),
+    )
+    return shares_of(mover, seen, other, there)
 
 
 MOVER = block(20, 80, 60, 120)  # its middle at (40, 100)

@@ -10,7 +10,7 @@ from floors import TrueCamera, known, outline
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.events import Events, encounters, find_events
+from cow_service.physics.events import Events, encounters, find_events, find_world_events
 from cow_service.physics.projection import rotation, seen_paths, states
 from cow_service.physics.world import WorldInput, Worlds, run_world
 from cow_service.records import MetresPerPixel, Motion
@@ -70,9 +70,9 @@ class TestRolling:
         assert "touches" in kinds(events)
         assert events.times["touches"][0, 1] == pytest.approx((1.4 - 0.24) / SPEED, abs=0.1)
         assert 1 in worlds.runs[0].moved
-        (met,) = (
-            e for e in encounters(events, None, [ball(-1.2, 3.0), post(0.2, 3.0)], FPS, FRAMES) if e.kind == "touches"
-        )
+        bodies = [ball(-1.2, 3.0), post(0.2, 3.0)]
+        found = find_world_events(worlds, bodies, FPS, likeliest(), CAMERA.size)
+        (met,) = (each for each in encounters(found, None, bodies, FPS, FRAMES) if each.kind == "touches")
         assert met.first_frame == math.ceil(events.times["touches"][0, 1] * FPS)
 
     def test_before_it_it_covers_and_behind_it_it_is_covered(self) -> None:

@@ -15,6 +15,8 @@ from cow_service.records.world import MEETINGS
 OUTLINE, PATH, ARROW, LIGHT, DARK = (255, 196, 0), (0, 229, 255), (255, 64, 129), (255, 255, 255), (20, 20, 20)
 PUSHED = (255, 150, 60)  # the paths of other bodies
 ENCOUNTERS = {"touches": (255, 82, 82), "occludes": (190, 120, 255), "occluded-by": (120, 200, 255)}  # RGB
+REMOVED = (255, 120, 120)  # what is taken away
+HATCH, DASH = 9, 6  # line widths from one line of a hatching to the next, and of a dash
 BAND_OPACITY = 0.3
 AT_REST = 0.25  # px per frame: what moves less rests
 SUBPIXEL = 4  # binary places of the coordinates handed to OpenCV
@@ -26,15 +28,23 @@ Colour = tuple[int, int, int]
 
 
 def draw_overlay(
-    image: Image, grounding: Grounding, motion: Motion, trajectory: Trajectory, mask: Mask | None = None
+    image: Image,
+    grounding: Grounding,
+    motion: Motion,
+    trajectory: Trajectory,
+    mask: Mask | None = None,
+    removed: Sequence[tuple[str, BBox, Mask]] = (),
 ) -> Image:
     """A copy of the RGB image [H, W, 3] with the records drawn on it; sizes follow the image's.
 
-    `mask` [H, W] is the mover's: its outline is drawn, and its box where there is none.
+    `mask` [H, W] is the mover's: its outline is drawn, and its box where there is none. What is `removed`, by name, box
+    and mask, is hatched.
     """
     canvas = np.ascontiguousarray(image).copy()
     unit = max(1.0, max(canvas.shape[:2]) / 640)
     thin = max(1, round(unit))
+    for _, _, gone in removed:
+        _draw_removed(canvas, gone, thin)
     for number, path in reversed(list(enumerate(trajectory.paths))):
         _draw_band(canvas, path, PUSHED if number else PATH)
     for encounter in trajectory.encounters:
@@ -59,11 +69,27 @@ def draw_overlay(
         Label(_words(encounter, trajectory.fps), encounter.bbox, ENCOUNTERS[encounter.kind], below=True)
         for encounter in trajectory.encounters
     ]
+    labels += [Label(f"{name}, taken away", bbox, REMOVED, below=False) for name, bbox, _ in removed]
     points = [grounding.point, *(contact.point for contact in trajectory.contacts)]
     for path in trajectory.paths:
         points += [point for point, visible in zip(path.points, path.visible, strict=True) if visible]
     draw_labels(canvas, labels, unit, DARK, points)
     return canvas
+
+
+def _draw_removed(canvas: Image, mask: Mask, thin: int) -> None:
+    """Hatches a mask, with a dashed outline."""
+    if not mask.any():
+        return
+    rows, columns = np.indices(mask.shape, np.int32)
+    lines = mask & ((rows + columns) % (HATCH * thin) < thin)
+    canvas[lines] = REMOVED
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    edge = np.zeros(mask.shape, np.uint8)
+    cv2.drawContours(edge, outlines, -1, 1, 2 * thin, cv2.LINE_8)
+    dashed = (edge > 0) & ((rows // (DASH * thin) + columns // (DASH * thin)) % 2 == 0)
+    canvas[edge > 0] = DARK
+    canvas[dashed] = REMOVED
 
 
 def _words(encounter: Encounter, fps: float) -> str:

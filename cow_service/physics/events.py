@@ -1,25 +1,27 @@
-"""What the mover meets in worlds that were run: when it first touches, covers or is covered by each other body."""
+"""What bodies that move meet in worlds that were run: when one first touches, hides or is hidden by each other."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody
+from cow_service.physics.chains import NEVER, set_off, times_gone, times_moved, times_tipped
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.occlusion import shares
-from cow_service.physics.projection import seen_paths
+from cow_service.physics.projection import SeenPaths, seen_paths
 from cow_service.physics.world import Worlds
 from cow_service.records import Encounter, EncounterKind
 from cow_service.vision.types import Floats, Mask
 
+__all__ = ["COVERED", "KINDS", "NEVER", "Events", "WorldEvents", "encounters", "find_events", "find_world_events"]
+
 COVERED = 0.3  # share of a silhouette from which it counts as covered
 COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
-NEVER = math.inf
 PerKind = dict[EncounterKind, Floats]  # [K, B] each
 
 
@@ -29,58 +31,128 @@ class Events:
 
     times: PerKind
     shares: PerKind  # 0 for touches
-    eligible: Mask  # [B]: neither the mover nor what it stands on
-    placed: Floats | None = None  # [K] s: when the mover is where it was to be put; infinite where it does not fit
+    eligible: Mask  # [B]: neither the subject, nor the mover, nor what the subject stands on
+    subject: int = 0  # the body that meets the others
 
     def happens(self, kind: EncounterKind) -> Mask:
         """[K, B]."""
         return np.isfinite(self.times[kind])
 
 
-def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats) -> Events:
-    """The events of every draw [K, P]. What the mover stands on at the start is no encounter."""
+class PerSubject(dict[int, Events]):
+    """The events of each body, found when first asked for."""
+
+    def __init__(self, find: Callable[[int], Events]) -> None:
+        super().__init__()
+        self._find = find
+
+    def __missing__(self, subject: int) -> Events:
+        self[subject] = self._find(subject)
+        return self[subject]
+
+
+@dataclass(frozen=True)
+class WorldEvents:
+    """What happens in worlds: the encounters of every body that moves, and what becomes of each body."""
+
+    of: Mapping[int, Events]  # by subject
+    moved: Floats  # [K, B] s: when it is set in motion
+    tipped: Floats  # [K, B] s: when it is knocked over; infinite where that was not looked for
+    gone: Floats  # [K, B] s: when it leaves the image
+    placed: Floats | None = (
+        None  # [K] s: when the mover is let go where it was to be put; infinite if it ends elsewhere
+    )
+    order: tuple[int, ...] = (0,)  # of the first draw: what moves, in the order in which it is set in motion
+
+
+def find_world_events(
+    worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, size: tuple[int, int]
+) -> WorldEvents:
+    """The events of every draw [K, P] in an image of a size (width, height; px)."""
+    started = set_off(worlds.shapes[0], worlds.runs[0])
+    order = tuple(sorted(started, key=lambda body: (body != 0, started[body])))
+    paths = [seen_paths(worlds, body) for body in range(len(bodies))]
+    return WorldEvents(
+        of=PerSubject(lambda subject: _events_of(subject, worlds, bodies, fps, draws, paths)),
+        moved=times_moved(worlds),
+        tipped=times_tipped(worlds),
+        gone=times_gone(paths, size, worlds),
+        placed=None if worlds.placements is None else worlds.placements.times,
+        order=order,
+    )
+
+
+def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, subject: int = 0) -> Events:
+    """The events of one body in every draw [K, P]. What it stands on at the start is no encounter."""
+    return _events_of(subject, worlds, bodies, fps, draws, [seen_paths(worlds, body) for body in range(len(bodies))])
+
+
+def _events_of(
+    subject: int, worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, paths: Sequence[SeenPaths]
+) -> Events:
     enough = COVERED * np.exp(COVERED_SIGMA * draws[:, COLUMN["outline"]])[:, None]
-    count = len(bodies)
-    eligible = np.ones(count, bool)
-    eligible[[0, *(on for on in worlds.scene.supports[:1] if on is not None)]] = False
+    eligible, count = np.ones(len(bodies), bool), len(bodies)
+    on = worlds.scene.supports[subject]
+    eligible[[0, subject, *([] if on is None else [on])]] = False
     times: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
     most: PerKind = {kind: np.zeros((len(draws), count)) for kind in KINDS}
-    for k, run in enumerate(worlds.runs):
-        for meeting in run.meetings:
-            if meeting.a == 0 and meeting.b is not None and eligible[meeting.b]:
-                times["touches"][k, meeting.b] = min(times["touches"][k, meeting.b], meeting.time)
-    path, step = seen_paths(worlds, 0), worlds.every / fps
+    times["touches"] = _touches(subject, worlds, count, on)
+    path, step = paths[subject], worlds.every / fps
     clock = np.arange(path.depth.shape[1]) * step
-    for other in np.nonzero(eligible)[0].tolist():
-        depth = worlds.scene.cameras.depth(worlds.scene.bodies[other].centre)
-        found = shares(bodies[0].mask, path, bodies[other].mask, depth)
+    for other in range(count):
+        if other in (subject, on):
+            continue
+        found = shares(bodies[subject].mask, path, bodies[other].mask, paths[other])
         before = clock[None] <= times["touches"][:, other : other + 1] + step
         for kind, values in zip(KINDS[1:], (found.covers, found.covered), strict=True):
             seen = np.where(before, values, 0.0)
             most[kind][:, other] = seen.max(axis=1)
             times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)
-    return Events(times, most, eligible, None if worlds.placements is None else worlds.placements.times)
+    return Events(times, most, eligible, subject)
+
+
+def _touches(subject: int, worlds: Worlds, count: int, on: int | None) -> Floats:
+    """[K, B]: when a body first touches each other one, once it moves itself."""
+    times = np.full((len(worlds.runs), count), NEVER)
+    for k, (shapes, run) in enumerate(zip(worlds.shapes, worlds.runs, strict=True)):
+        since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
+        for meeting in run.meetings:
+            if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
+                other = meeting.b if meeting.a == subject else meeting.a
+                if other != on:
+                    times[k, other] = min(times[k, other], meeting.time)
+    return times
 
 
 def encounters(
-    likeliest: Events, ensemble: Events | None, bodies: Sequence[SeenBody], fps: float, num_frames: int
+    likeliest: WorldEvents, ensemble: WorldEvents | None, bodies: Sequence[SeenBody], fps: float, num_frames: int
 ) -> tuple[Encounter, ...]:
-    """Those of the likeliest world, in the order of their first frame, with their share of the ensemble's worlds."""
+    """Those of the likeliest world, in the order of their first frame, with their share of the ensemble's worlds.
+
+    Of two that both move, the one that was set in motion first is the subject.
+    """
     found: list[Encounter] = []
-    for kind in KINDS:
-        for body in np.nonzero(likeliest.happens(kind)[0])[0].tolist():
-            frame = math.ceil(likeliest.times[kind][0, body] * fps - 1e-6)
-            share = None if kind == "touches" else float(likeliest.shares[kind][0, body])
-            likely = None if ensemble is None else float(ensemble.happens(kind)[:, body].mean())
-            found.append(
-                Encounter(
-                    object=bodies[body].name,
-                    bbox=bodies[body].bbox,
-                    body=body,
-                    kind=kind,
-                    first_frame=min(frame, num_frames - 1),
-                    share=share,
-                    probability=likely,
+    for place, subject in enumerate(likeliest.order):
+        events, before = likeliest.of[subject], likeliest.order[:place]
+        for kind in KINDS:
+            for body in np.nonzero(events.happens(kind)[0])[0].tolist():
+                if body in before:
+                    continue
+                frame = math.ceil(events.times[kind][0, body] * fps - 1e-6)
+                found.append(
+                    Encounter(
+                        object=bodies[body].name,
+                        bbox=bodies[body].bbox,
+                        body=body,
+                        subject=subject,
+                        kind=kind,
+                        first_frame=min(frame, num_frames - 1),
+                        share=None if kind == "touches" else float(events.shares[kind][0, body]),
+                        probability=_probability(ensemble, subject, kind, body),
+                    )
                 )
-            )
     return tuple(sorted(found, key=lambda encounter: encounter.first_frame))
+
+
+def _probability(ensemble: WorldEvents | None, subject: int, kind: EncounterKind, body: int) -> float | None:
+    return None if ensemble is None else float(ensemble.of[subject].happens(kind)[:, body].mean())

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cow_service.physics.projection import SeenPaths
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats, Mask
+
+Indices = NDArray[np.int64]
 
 SAMPLES = 96  # points of a silhouette that are looked up in the other
 CHUNK = 2048  # draws and frames at a time, to bound the memory
@@ -16,36 +19,52 @@ CHUNK = 2048  # draws and frames at a time, to bound the memory
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares [K, F] of a still body that the mover covers, and of the mover that the still body covers."""
+    """Shares [K, F] of another body that the subject covers, and of the subject that the other body covers."""
 
     covers: Floats
     covered: Floats
 
 
-def shares(mover: CroppedMask, path: SeenPaths, other: CroppedMask, other_depth: Floats) -> Shares:
-    """By the silhouettes of the first frame. `other_depth` [K] m: what is nearer covers what is farther."""
+def shares(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path: SeenPaths) -> Shares:
+    """By the silhouettes of the first frame; what is nearer covers what is farther."""
     covers, covered = np.zeros(path.depth.shape), np.zeros(path.depth.shape)
-    draws, frames = np.nonzero(_boxes_meet(mover, path, other) & ~path.passed)
-    of_other, of_mover = _sample(other), _sample(mover)
+    seen = ~path.passed & ~other_path.passed
+    draws, frames = np.nonzero(_boxes_meet(subject, path, other, other_path) & seen)
+    of_other, of_subject = _sample(other), _sample(subject)
     for start in range(0, len(draws), CHUNK):
         k, f = draws[start : start + CHUNK], frames[start : start + CHUNK]
-        first, now, scale = path.points[k, 0], path.points[k, f], path.scale[k, f][:, None, None]
-        nearer = path.depth[k, f] < other_depth[k]
-        looked = first[:, None] + (of_other[None] - now[:, None]) / scale
-        covers[k, f] = np.where(nearer, _inside(mover, looked), 0.0)
-        moved = now[:, None] + (of_mover[None] - first[:, None]) * scale
-        covered[k, f] = np.where(nearer, 0.0, _inside(other, moved))
+        nearer = path.depth[k, f] < other_path.depth[k, f]
+        there, here = _moved(of_other, other_path, k, f), _moved(of_subject, path, k, f)
+        covers[k, f] = np.where(nearer, _inside(subject, _moved_back(there, path, k, f)), 0.0)
+        covered[k, f] = np.where(nearer, 0.0, _inside(other, _moved_back(here, other_path, k, f)))
     return Shares(covers, covered)
 
 
-def _boxes_meet(mover: CroppedMask, path: SeenPaths, other: CroppedMask) -> Mask:
-    """[K, F]: the box of the moved silhouette meets that of the other."""
-    corners = np.array(mover.bbox).reshape(2, 2)
+def _moved(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:
+    """Points [S, 2] of the first frame, where a path has them [N, S, 2] in draws and frames [N]."""
+    first, now, scale = path.points[k, 0], path.points[k, f], path.scale[k, f][:, None, None]
+    return now[:, None] + (points[None] - first[:, None]) * scale
+
+
+def _moved_back(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:
+    """Where points [N, S, 2] of draws and frames [N] were at the first frame."""
+    first, now, scale = path.points[k, 0], path.points[k, f], path.scale[k, f][:, None, None]
+    return first[:, None] + (points - now[:, None]) / scale
+
+
+def _boxes_meet(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path: SeenPaths) -> Mask:
+    """[K, F]: the boxes of the moved silhouettes meet."""
+    (low, high), (other_low, other_high) = _corners(subject, path), _corners(other, other_path)
+    return np.all((low < other_high) & (high > other_low), axis=2)
+
+
+def _corners(mask: CroppedMask, path: SeenPaths) -> tuple[Floats, Floats]:
+    """Upper left and lower right corners [K, F, 2] of the box of a moved silhouette."""
+    x0, y0, x1, y1 = mask.bbox
     low, high = (
-        path.points + (corner - path.points[:, :1]) * path.scale[..., None] for corner in (corners[0], corners[1])
+        path.points + (np.array(corner) - path.points[:, :1]) * path.scale[..., None] for corner in ((x0, y0), (x1, y1))
     )
-    x0, y0, x1, y1 = other.bbox
-    return (low[..., 0] < x1) & (low[..., 1] < y1) & (high[..., 0] > x0) & (high[..., 1] > y0)
+    return low, high
 
 
 def _sample(mask: CroppedMask) -> Floats:

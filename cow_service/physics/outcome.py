@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cow_service.physics.draws import NAMES, PARAMETERS
-from cow_service.physics.events import Events
-from cow_service.records import Asked, AskedRelation, Doubt, EncounterKind
+from cow_service.physics.events import NEVER, WorldEvents
+from cow_service.records import Asked, AskedForm, AskedRelation, Doubt, EncounterKind
 from cow_service.vision.types import Floats, Mask
 
 SURE = 0.7  # share of the worlds from which an answer is given
@@ -23,6 +23,17 @@ MATTERS = 0.2  # correlation with the outcome from which a parameter is named
 MOST_NAMED = 3
 
 KIND_OF: dict[AskedRelation, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
+FIRST_MET: tuple[AskedForm, ...] = ("which-first", "where", "what-happens")  # told apart by what is met first
+
+
+@dataclass(frozen=True)
+class Query:
+    """What is asked, with the bodies that it is about."""
+
+    asked: Asked
+    target: int | None = None  # None: any
+    subject: int = 0  # who does it
+    among: tuple[int, ...] = ()  # of `which-first`: the alternatives; empty: any
 
 
 @dataclass(frozen=True)
@@ -39,13 +50,11 @@ class Decided:
     time_band: tuple[float, float] | None = None
 
 
-def decide(asked: Asked, target: int | None, ensemble: Events, draws: Floats) -> Decided:
+def decide(query: Query, ensemble: WorldEvents, draws: Floats) -> Decided:
     """The answer of an ensemble with draws [K, P]."""
-    answers = _answers(asked, target, ensemble)
-    counted = Counter(answers)
-    answer, most = max(counted.items(), key=lambda item: (item[1], item[0]))
-    probability = most / len(answers)
-    times = _times(asked, target, ensemble)
+    asked, answers = query.asked, answers_of(query, ensemble)
+    answer, probability = _most(answers)
+    times = _per_body(query, ensemble).min(axis=1)
     times = times[np.isfinite(times)]
     shown = asked.form in ("whether", "when")
     return Decided(
@@ -53,18 +62,50 @@ def decide(asked: Asked, target: int | None, ensemble: Events, draws: Floats) ->
         sure=probability >= SURE,
         robust=probability >= ROBUST,
         depends_on=_depends_on(np.array([found == answer for found in answers]), draws),
-        first=answer if asked.form == "which-first" and answer >= 0 else None,
+        first=answer if asked.form in FIRST_MET and answer >= 0 else None,
         count=answer if asked.form == "how-many" else None,
         time=float(np.median(times)) if len(times) else None,
         time_band=(float(np.quantile(times, 0.1)), float(np.quantile(times, 0.9))) if len(times) else None,
     )
 
 
-def agrees(asked: Asked, target: int | None, likeliest: Events, ensemble: Events) -> Mask:
-    """[K]: which worlds of the ensemble answer as most do; and whether the likeliest one does, as the last [K + 1]."""
-    answers = _answers(asked, target, ensemble)
-    answer = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))[0]
-    return np.array([found == answer for found in (*answers, *_answers(asked, target, likeliest))])
+def decide_change(query: Query, changed: WorldEvents, factual: WorldEvents, draws: Floats) -> Decided:
+    """Whether the answer differs between two ensembles with the same draws [K, P]."""
+    pairs = zip(answers_of(query, changed), answers_of(query, factual), strict=True)
+    differs = np.array([one != other for one, other in pairs])
+    share = float(differs.mean())
+    probability = max(share, 1 - share)
+    return Decided(
+        probability=1 - share if query.asked.negated else share,
+        sure=probability >= SURE,
+        robust=probability >= ROBUST,
+        depends_on=_depends_on(differs == (share >= 0.5), draws),
+    )
+
+
+def majority(query: Query, ensemble: WorldEvents) -> int:
+    """What most worlds of an ensemble answer, as `answers_of`."""
+    return _most(answers_of(query, ensemble))[0]
+
+
+def answers_of(query: Query, events: WorldEvents) -> list[int]:
+    """Per draw: 1 or 0 for whether and when, the body that is met first or -1, or how many are met.
+
+    Of `changes` it is the answer whose change is asked about: whether the target is met, or what is met first.
+    """
+    asked, times = query.asked, _per_body(query, events)
+    if asked.form in FIRST_MET or (asked.form == "changes" and query.target is None):
+        first = times.argmin(axis=1)
+        return np.where(np.isfinite(times.min(axis=1)), first, -1).tolist()
+    if asked.form == "how-many":
+        return np.isfinite(times).sum(axis=1).tolist()
+    return np.isfinite(times).any(axis=1).astype(int).tolist()
+
+
+def _most(answers: Sequence[int]) -> tuple[int, float]:
+    """The most frequent answer, and its share."""
+    answer, count = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))
+    return answer, count / len(answers)
 
 
 def _said(asked: Asked, answer: int, probability: float) -> float:
@@ -73,31 +114,26 @@ def _said(asked: Asked, answer: int, probability: float) -> float:
     return 1 - happens if asked.negated else happens
 
 
-def _answers(asked: Asked, target: int | None, events: Events) -> list[int]:
-    """Per draw: 1 or 0 for whether and when, the body that is met first or -1, or how many are met."""
-    times = _per_body(asked, target, events)
-    if asked.form == "which-first":
-        first = times.argmin(axis=1)
-        return np.where(np.isfinite(times.min(axis=1)), first, -1).tolist()
-    if asked.form == "how-many":
-        return np.isfinite(times).sum(axis=1).tolist()
-    return np.isfinite(times).any(axis=1).astype(int).tolist()
+def _per_body(query: Query, events: WorldEvents) -> Floats:
+    """[K, B]: when it first happens with each body that is meant.
 
-
-def _times(asked: Asked, target: int | None, events: Events) -> Floats:
-    """[K]: when it first happens, s."""
-    return _per_body(asked, target, events).min(axis=1)
-
-
-def _per_body(asked: Asked, target: int | None, events: Events) -> Floats:
-    """[K, B]: when it first happens with each body that is meant."""
-    meant = events.eligible.copy()
-    if target is not None:
-        meant &= np.arange(len(meant)) == target
-    if asked.relation == "inside":
-        times = np.full((1, 1), np.inf) if events.placed is None else events.placed[:, None]
-        return np.where(meant[None], times, np.inf)
-    return np.where(meant[None], events.times[KIND_OF[asked.relation]], np.inf)
+    Raises `KeyError` for a relation that encounters do not decide.
+    """
+    relation, of_subject = query.asked.relation, events.of[query.subject]
+    bodies = np.arange(len(of_subject.eligible))
+    if relation == "leaves":
+        return np.where(bodies[None] == query.subject, events.gone, NEVER)
+    if relation == "inside" and events.placed is not None:
+        times = events.placed[:, None]
+    elif relation in ("tips", "moves"):
+        times = events.tipped if relation == "tips" else events.moved
+    else:
+        times = of_subject.times[KIND_OF[relation]]
+    if query.target is not None:
+        meant = bodies == query.target
+    else:
+        meant = np.isin(bodies, query.among) if query.among else of_subject.eligible
+    return np.where(meant[None], times, NEVER)
 
 
 def _depends_on(same: Mask, draws: Floats) -> tuple[Doubt, ...]:

@@ -42,6 +42,15 @@ class PlacedScene:
     further: tuple[Floats, ...]  # [K, 3] m/s, of the mover in each further leg
     others: dict[int, Floats]  # [K, 3] m/s, of other bodies that are set moving
     light: Floats  # [K, 2]: metres that a shadow lies to the right and ahead, per metre of height
+    unsupported: frozenset[int] = frozenset()  # bodies whose support was taken away
+
+    def first(self, count: int) -> PlacedScene:
+        """Without the bodies behind the first ones, which are taken away: what stood on them has no support."""
+        loose: set[int] = set()
+        for _ in range(count):  # what stands on something that falls falls, too
+            loose |= {i for i in range(count) if (on := self.supports[i]) is not None and (on >= count or on in loose)}
+        supports = tuple(None if on is None or on >= count else on for on in self.supports[:count])
+        return replace(self, bodies=self.bodies[:count], supports=supports, unsupported=frozenset(loose))
 
 
 def place(

@@ -54,7 +54,7 @@ def rotation(worlds: Worlds, body: int) -> Floats:
         return np.concatenate([[0.0], np.degrees(np.cumsum(about))])
     upright = np.tile(np.array([0.0, 1.0, 0.0]), (len(turns), 1))
     leaning, plumb = (
-        np.unwrap(_lean(worlds, run.positions[body], axis)) for axis in (_turned(turns, upright[0]), upright)
+        np.unwrap(_lean(worlds, run.positions[body], axis)) for axis in (turned(turns, upright[0]), upright)
     )
     angle = np.unwrap(leaning - plumb)
     # Verticals lean in the image as they come to its side; close to the camera they lean without bounds.
@@ -79,7 +79,7 @@ def _steps(turns: Floats) -> Floats:
     return axis * (2 * np.arctan2(length, np.abs(half)) / np.maximum(length, 1e-12))[:, None]
 
 
-def _turned(turns: Floats, vector: Floats) -> Floats:
+def turned(turns: Floats, vector: Floats) -> Floats:
     """A vector [3] turned by quaternions [F, 4]."""
     axis, w = turns[:, :3], turns[:, 3:]
     across = np.cross(axis, vector)

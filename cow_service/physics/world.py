@@ -51,7 +51,13 @@ class WorldInput:
     asked: int | None = None  # the body that the question is about
     led: Led | None = None  # the mover is led along a path, through everything
     others: Mapping[int, Motion] = field(default_factory=dict[int, Motion])  # of other bodies, by their places
+    taken: tuple[SeenBody, ...] = ()  # placed with the others, then taken away before anything moves
+    turns_wanted: bool = False  # how bodies turn is recorded of an ensemble, too
     put: Put | None = None  # the mover is carried somewhere and let go
+
+    def as_it_is(self) -> WorldInput:
+        """With nothing taken away: those things are then the last bodies."""
+        return replace(self, bodies=(*self.bodies, *self.taken), taken=())
 
 
 @dataclass(frozen=True)
@@ -68,16 +74,15 @@ class Worlds:
 
 def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""
-    scene = place(given.bodies, given.motion, given.fit, given.size, draws, given.asked, given.others)
+    bodies = (*given.bodies, *given.taken)
+    everything = place(bodies, given.motion, given.fit, given.size, draws, given.asked, given.others)
+    scene = everything.first(len(given.bodies))
     shapes = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
     if given.put is not None:
         return _run_put(given, given.put, scene, shapes, draws, every)
-    finished = (
-        None
-        if len(draws) == 1 or given.motion.steps or given.others
-        else partial(_has_left, scene.cameras, given.size[0])
-    )
-    runs = run_worlds(shapes, given.num_frames, given.fps, every, finished)
+    left = partial(_has_left, scene.cameras, given.size[0])
+    finished = None if len(draws) == 1 or given.motion.steps else left
+    runs = run_worlds(shapes, given.num_frames, given.fps, every, finished, given.turns_wanted)
     return Worlds(scene, shapes, tuple(runs), every, given.fps)
 
 
@@ -142,6 +147,8 @@ def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) 
             )
         )
     bodies[0] = _set_going(given, scene, draws, k, bodies[0])
+    for loose in scene.unsupported:
+        bodies[loose] = replace(bodies[loose], starts=True)
     for i, motion in given.others.items():
         factor = float(speed_factors(motion, draws[k : k + 1], "other_speed")[0])
         bodies[i] = replace(bodies[i], **_moving(given, scene, k, i, motion, (scene.others[i][k],), factor, bodies[i]))

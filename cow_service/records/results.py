@@ -77,6 +77,9 @@ class Clip(Record):
     """Stage 4: the frames chosen for reasoning, the whole clip as video where it is wanted, and the overlay."""
 
     frames: tuple[Frame, ...]
+    factual_frames: tuple[Frame, ...] = Field(
+        default=(), description="The same frames of the scene as it is, where something is taken away."
+    )
     video: Video | None = None
     overlay: Artifact
     generator: GeneratorInfo
@@ -94,6 +97,9 @@ class Simulation(Record):
     motion: Motion
     trajectory: Trajectory
     frames: tuple[Frame, ...] = Field(description="The frames chosen for reasoning.")
+    factual_frames: tuple[Frame, ...] = Field(
+        default=(), description="The same frames of the scene as it is, where something is taken away."
+    )
     video: Video | None = Field(description="Null where the request said `video: false`.")
     overlay: Artifact = Field(description="The input with box, point, arrow and path drawn.")
     generator: GeneratorInfo

@@ -71,6 +71,10 @@ class Path(Record):
         description="Per frame: [x0, y0, x1, y1], px, the 10th and 90th percentile of the point over the ensemble; "
         "empty without one.",
     )
+    moved_at: float | None = Field(default=None, ge=0, description="Seconds until it is set in motion; null: never.")
+    tipped_at: float | None = Field(
+        default=None, ge=0, description="Seconds until its upright axis leans by more than 45 degrees; null: never."
+    )
     tracks: tuple[tuple[Point, ...], ...] = Field(
         description="Several points inside the body's mask, each [x, y] per frame, px."
     )
@@ -112,6 +116,9 @@ class Outcome(Record):
     """What the question asks, as the world answers it."""
 
     asked: Asked
+    subject: str | None = Field(
+        default=None, description="The object whose encounter is asked about, where that is not the mover."
+    )
     object: str | None = Field(default=None, description="The object asked about, where it was found.")
     probability: float | None = Field(
         default=None,

@@ -32,6 +32,11 @@ class FramesRequest(Record):
     max_side: Annotated[Whole, Field(ge=16, le=8192)] | None = Field(
         default=512, description="Longest side of the pictures, px; null for the clip's own size."
     )
+    factual: Flag | None = Field(
+        default=None,
+        description="Where something is taken away: also the same frames of the scene as it is. By default only of a "
+        "generator on the CPU: a video model takes as long for them as for the clip.",
+    )
 
 
 class SimulateRequest(Record):

@@ -1,16 +1,20 @@
-"""The bodies of a scene, for the world: the mover and its obstacles, with their shapes."""
+"""The bodies of a scene, for the world: the mover, its obstacles and what is taken away, with their shapes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from cow_service.physics.bodies import SeenBody
+from cow_service.physics.outcome import Query
 from cow_service.readers.question.choices import plain
 from cow_service.readers.question.shapes import is_cube, is_vehicle, shape_of
 from cow_service.records import Asked, Grounding, LocatedObject, Shape
-from cow_service.vision.masks import CroppedMask
+from cow_service.vision.masks import CroppedMask, iou
 from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.regions import SAME_OBJECT_IOU
 from cow_service.vision.scene import Scene
+
+PART = 0.5  # of a region's area: with more of it inside a thing that is taken away, it is a part of that
 
 
 def seen_bodies(scene: Scene, grounding: Grounding, obstacles: Sequence[Obstacle]) -> tuple[SeenBody, ...]:
@@ -28,15 +32,59 @@ def seen_bodies(scene: Scene, grounding: Grounding, obstacles: Sequence[Obstacle
     return mover, *(_obstacle(scene, grounding, obstacle) for obstacle in obstacles)
 
 
-def target_of(asked: Asked, grounding: Grounding, bodies: Sequence[SeenBody]) -> int | None:
-    """Which body a question asks about, where it was found under that name."""
-    name = None if asked.target is None else plain(asked.target)
-    boxes = {other.bbox for other in grounding.others if plain(other.object) == name}
+def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ...], tuple[Obstacle, ...]]:
+    """What stands beside the mover, and what of it is taken away before the motion."""
+    removed = removed_objects(grounding)
+    found = scene.obstacles(grounding.bbox, (*others_of(grounding), *removed))
+    boxes = {each.bbox for each in removed}
+    taken = tuple(each for each in found if each.bbox in boxes)
+    masks = [each.mask.full() for each in taken]
+    # A part of what is taken away, such as its lit top, may have been found as a region of its own.
+    parts = {each.bbox for each in found if any(each.mask.shared_with(m) > PART * each.mask.area for m in masks)}
+    named = {other.bbox for other in others_of(grounding)}
+    kept = (each for each in found if each.bbox not in boxes and (each.bbox in named or each.bbox not in parts))
+    return tuple(kept), taken
+
+
+def others_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
+    """The other objects of a grounding, those that something is put to among them."""
+    found = list(grounding.others)
+    for each in grounding.interventions:
+        for target in each.targets:
+            if not any(iou(target.bbox, other.bbox) >= SAME_OBJECT_IOU for other in found):
+                found.append(target)
+    return tuple(found)
+
+
+def removed_objects(grounding: Grounding) -> tuple[LocatedObject, ...]:
+    """What is taken away before the motion."""
+    return tuple(each.object for each in grounding.interventions if each.kind == "remove")
+
+
+def query_of(asked: Asked, grounding: Grounding, bodies: Sequence[SeenBody]) -> Query | None:
+    """What a question asks of bodies; None where one that it names was not found under that name."""
+    subject = 0 if asked.subject is None else body_named(asked.subject, grounding, bodies)
+    target = None if asked.target is None else body_named(asked.target, grounding, bodies)
+    among = [body_named(name, grounding, bodies) for name in asked.among]
+    known = [body for body in among if body is not None]
+    if subject is None or (asked.target is not None and target is None) or len(known) < len(among):
+        return None
+    return Query(asked, target, subject, tuple(known))
+
+
+def body_named(words: str, grounding: Grounding, bodies: Sequence[SeenBody]) -> int | None:
+    """Which body was found under a name; the mover is the first."""
+    name = plain(words)
+    if name == plain(grounding.object):
+        return 0
+    placed = (*others_of(grounding), *removed_objects(grounding))
+    boxes = {other.bbox for other in placed if plain(other.object) == name}
     return next((i for i, body in enumerate(bodies) if i and body.bbox in boxes), None)
 
 
 def _obstacle(scene: Scene, grounding: Grounding, obstacle: Obstacle) -> SeenBody:
-    located = next((other for other in grounding.others if other.bbox == obstacle.bbox), None)
+    placed = (*others_of(grounding), *removed_objects(grounding))
+    located = next((other for other in placed if other.bbox == obstacle.bbox), None)
     located = located or LocatedObject(object=obstacle.name, bbox=obstacle.bbox)
     return SeenBody(
         name=obstacle.name,

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.generators.base import Generator, GeneratorInput
+from cow_service.generators.removal import without_removed
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import encode_png, fit_within
 from cow_service.media.overlay import draw_overlay
 from cow_service.media.video import write_mp4
 from cow_service.records import Clip, Frame, Grounding, Motion, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
-from cow_service.stages.placing import others_of
+from cow_service.stages.bodies import obstacles_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 
@@ -76,16 +77,59 @@ def generate(
     """
     request, scene, artifacts = run.request, run.scene, run.backends.artifacts
     with run.cpu():
-        obstacles = scene.obstacles(grounding.bbox, others_of(grounding))
-    given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, request.seed, run.generator_options)
+        given, as_it_is = _inputs(run, grounding, motion, trajectory)
     with run.device():
         frames, video = _render(given, run.generator, request, artifacts, run.report_share)
+        factual = _factual_frames(as_it_is, frames, run.generator, request, artifacts, run.report_share)
     with run.cpu():
-        drawn = draw_overlay(scene.image, grounding, motion, trajectory, scene.silhouette(grounding.bbox))
+        mover, factual_given = scene.silhouette(grounding.bbox), as_it_is or given
+        gone = factual_given.obstacles[len(given.obstacles) :]
+        removed = [(each.name, each.bbox, each.mask.full()) for each in gone]
+        drawn = draw_overlay(scene.image, grounding, motion, trajectory, mover, removed)
         overlay = artifacts.put(encode_png(drawn), "image/png")
-    clip = Clip(frames=frames, video=video, overlay=overlay, generator=run.generator.describe(given))
-    stored = (*(frame.sha256 for frame in frames), *([] if video is None else [video.sha256]), overlay.sha256)
-    return StageResult(value=clip, artifacts=stored)
+    clip = Clip(
+        frames=frames,
+        factual_frames=factual,
+        video=video,
+        overlay=overlay,
+        generator=run.generator.describe(given),
+    )
+    pictures = (*(frame.sha256 for frame in (*frames, *factual)), *([] if video is None else [video.sha256]))
+    return StageResult(value=clip, artifacts=(*pictures, overlay.sha256))
+
+
+def _inputs(
+    run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory
+) -> tuple[GeneratorInput, GeneratorInput | None]:
+    """What the generator is given and, where something is taken away, what it is given for the scene as it is."""
+    obstacles, taken = obstacles_of(run.scene, grounding)
+    options, seed = run.generator_options, run.request.seed
+    if trajectory.factual is None or not taken:
+        return GeneratorInput(run.scene, grounding, motion, trajectory, obstacles, seed, options), None
+    everything = (*obstacles, *taken)
+    as_it_is = GeneratorInput(run.scene, grounding, motion, trajectory.factual, everything, seed, options)
+    removed = range(len(obstacles) + 1, len(everything) + 1)
+    return without_removed(as_it_is, removed, trajectory), as_it_is
+
+
+def _factual_frames(
+    given: GeneratorInput | None,
+    frames: Sequence[Frame],
+    generator: Generator,
+    request: SimulateRequest,
+    artifacts: ArtifactStore,
+    progress: Callable[[float], None],
+) -> tuple[Frame, ...]:
+    """The chosen frames of the scene as it is; a generator on a device of its own makes them only where they are
+    asked for, because they cost as much as the clip."""
+    wanted = request.frames.factual
+    if given is None or not (generator.concurrency is None if wanted is None else wanted):
+        return ()
+    indices = [frame.index for frame in frames]
+    return tuple(
+        _store_frame(pixels, index, given.trajectory.fps, request.frames.max_side, artifacts)
+        for index, pixels in zip(indices, generator.render(given, indices, progress), strict=True)
+    )
 
 
 def _render(

@@ -10,6 +10,7 @@ from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import GroundingReading
 from cow_service.records import Artifact, BBox, Grounding, LocatedObject, Point, Source
 from cow_service.requests import GroundingRequest, SimulateRequest
+from cow_service.stages.interventions import locate_interventions, without_removed
 from cow_service.stages.places import place_of, prior_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
@@ -24,8 +25,9 @@ SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     """The mover, from the request where it says so, else from the reader; its mask [H, W] is stored as PNG.
 
-    The others are those of the request, then those of the reader that are not among them. Raises `InvalidRequest` and
-    `CannotGround` for what the request says of places (`place_of`), and what the reader raises.
+    The others are those of the request, then those of the reader that are not among them, without what is taken away.
+    Raises `InvalidRequest` and `CannotGround` for what the request says of places (`place_of`) and for interventions
+    that cannot be made (`locate_interventions`), and what the reader raises.
     """
     place = run.request.place
     source: Source = "request"
@@ -39,13 +41,16 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         mask = _store_mask(run, reading.bbox)
         given, warnings = _given_objects(run, reading.bbox)
     read = (other.model_copy(update={"source": other.source or source}) for other in reading.others)
-    others = (*given, *(other for other in read if not any(_same(other.bbox, one.bbox) for one in given)))
+    seen = [other for other in read if not any(_same(other.bbox, one.bbox) for one in given)]
+    mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
+    interventions = locate_interventions(run.request.interventions, reading.interventions, mover, given, seen)
     grounding = Grounding(
         object=reading.object,
         point=reading.point or _centre(reading.bbox),
         bbox=reading.bbox,
         mask=mask,
-        others=others,
+        others=without_removed((*given, *seen), interventions),
+        interventions=interventions,
         prior=reading.prior,
         source=source,
     )
@@ -60,7 +65,8 @@ def use_stored_masks(run: Run[SimulateRequest], grounding: Grounding) -> None:
     A mask cut again from its box may differ from one that was cut around a point, or given.
     """
     run.place_mover(grounding.bbox)
-    for placed in (grounding, *grounding.others):
+    changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
+    for placed in (grounding, *grounding.others, *changed):
         if placed.mask is not None:
             run.scene.preset_mask(placed.bbox, partial(_stored, run, placed.mask))
 

@@ -1,16 +1,17 @@
-"""Runs the world of a scene: the ensemble, what the question comes to in it, and the world that is shown."""
+"""Runs the worlds of a scene: the ensemble, what the question comes to in it, and the world that is shown."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.events import Events, find_events
-from cow_service.physics.outcome import Decided, agrees, decide
+from cow_service.physics.events import WorldEvents, find_world_events
+from cow_service.physics.outcome import Decided, Query, answers_of, decide, decide_change
 from cow_service.physics.world import WorldInput, Worlds, run_world
-from cow_service.records import Asked
 from cow_service.vision.types import Floats
 
 EVERY = 2  # frames between those that are recorded of the ensemble
@@ -18,50 +19,103 @@ TRIES = 4  # worlds that are tried for one that shows what most of the ensemble 
 
 
 @dataclass(frozen=True)
+class Ran:
+    """Worlds with what happens in them."""
+
+    worlds: Worlds
+    events: WorldEvents
+
+
+@dataclass(frozen=True)
 class Imagined:
     """The world that is shown, and what an ensemble around it says."""
 
+    given: WorldInput
     shown: Worlds
-    events: Events  # of the shown world
+    events: WorldEvents  # of the shown world
     around: Worlds | None  # the ensemble's
-    around_events: Events | None
+    around_events: WorldEvents | None
+    query: Query | None
     decided: Decided | None  # null where nothing is asked, or there is no ensemble
 
 
-def imagine(world: WorldInput, asked: Asked | None, target: int | None, size: int) -> Imagined:
-    """Runs the likeliest world and an ensemble of `size` worlds around it.
+def imagine(world: WorldInput, query: Query | None, size: int) -> tuple[Imagined, ...]:
+    """Runs the likeliest world and an ensemble of `size` worlds around it; where something is taken away, also the
+    world as it is, with the same draws, as the second.
 
-    What is shown must not contradict what is answered: where the answer is sure and the likeliest world differs from
+    What is shown must not contradict what is answered: where an answer is sure and the likeliest world differs from
     it, the likeliest world of those that agree is shown.
     """
-    shown, events = _run(world, likeliest())
+    given = (world, world.as_it_is()) if world.taken else (world,)
+    shown = [_run(each, likeliest()) for each in given]
+    queries = [query if len(given) == 1 else _as_it_is(query, place) for place in range(len(given))]
     if size == 0:
-        return Imagined(shown, events, None, None, None)
+        return tuple(
+            Imagined(each, ran.worlds, ran.events, None, None, asked, None)
+            for each, ran, asked in zip(given, shown, queries, strict=True)
+        )
     rows = ensemble(size)
-    around, around_events = _run(world, rows, EVERY)
-    if asked is None:
-        return Imagined(shown, events, around, around_events, None)
-    decided = decide(asked, target, around_events, rows)
-    if decided.sure:
-        shown, events = _agreeing(world, asked, target, rows, around_events, shown, events)
-    return Imagined(shown, events, around, around_events, decided)
+    around = [_run(each, rows, EVERY) for each in given]
+    decided = _decided(queries, around, rows)
+    if query is not None and any(each is not None and each.sure for each in decided):
+        shown = _agreeing(given, query, decided, rows, around, shown)
+    return tuple(
+        Imagined(each, one.worlds, one.events, many.worlds, many.events, asked, said)
+        for each, one, many, asked, said in zip(given, shown, around, queries, decided, strict=True)
+    )
+
+
+def _as_it_is(query: Query | None, place: int) -> Query | None:
+    """What is asked of the world as it is, the second, where a change is asked about: what it is that would change."""
+    if query is None or place == 0 or query.asked.form != "changes":
+        return query
+    form = "what-happens" if query.target is None else "whether"
+    return replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
+
+
+def _decided(queries: Sequence[Query | None], around: Sequence[Ran], rows: Floats) -> list[Decided | None]:
+    found: list[Decided | None] = []
+    for query, ran in zip(queries, around, strict=True):
+        if query is None:
+            found.append(None)
+        elif query.asked.form != "changes":
+            found.append(decide(query, ran.events, rows))
+        else:
+            found.append(decide_change(query, ran.events, around[1].events, rows) if len(around) > 1 else None)
+    return found
 
 
 def _agreeing(
-    world: WorldInput, asked: Asked, target: int | None, rows: Floats, around: Events, shown: Worlds, events: Events
-) -> tuple[Worlds, Events]:
-    """The likeliest world that shows what most of the ensemble does."""
-    same = agrees(asked, target, events, around)
-    if same[-1]:
-        return shown, events
+    given: Sequence[WorldInput],
+    query: Query,
+    decided: Sequence[Decided | None],
+    rows: Floats,
+    around: Sequence[Ran],
+    shown: list[Ran],
+) -> list[Ran]:
+    """The likeliest world, with its counterpart, that shows what most of the ensemble does."""
+    sure = [each is not None and each.sure for each in decided]
+    found = _verdicts(query, sure, around)
+    wanted = tuple(Counter(column).most_common(1)[0][0] for column in zip(*found, strict=True))
+    if _verdicts(query, sure, shown)[0] == wanted:
+        return shown
     nearest = np.argsort(np.linalg.norm(rows, axis=1))
-    for row in [int(k) for k in nearest if same[k]][:TRIES]:
-        tried, tried_events = _run(world, rows[row : row + 1])
-        if agrees(asked, target, tried_events, around)[-1]:
-            return tried, tried_events
-    return shown, events
+    for row in [int(k) for k in nearest if found[k] == wanted][:TRIES]:
+        tried = [_run(each, rows[row : row + 1]) for each in given]
+        if _verdicts(query, sure, tried)[0] == wanted:
+            return tried
+    return shown
 
 
-def _run(world: WorldInput, draws: Floats, every: int = 1) -> tuple[Worlds, Events]:
+def _verdicts(query: Query, sure: Sequence[bool], ran: Sequence[Ran]) -> list[tuple[int, ...]]:
+    """Per draw, the answers that are sure: of each world, or whether they differ where that is asked."""
+    answers = [answers_of(query, each.events) for each in ran]
+    if query.asked.form == "changes":
+        return [(int(one != other),) for one, other in zip(*answers, strict=True)]
+    told = [each for each, is_sure in zip(answers, sure, strict=True) if is_sure]
+    return list(zip(*told, strict=True))
+
+
+def _run(world: WorldInput, draws: Floats, every: int = 1) -> Ran:
     worlds = run_world(world, draws, every)
-    return worlds, find_events(worlds, world.bodies, world.fps, draws)
+    return Ran(worlds, find_world_events(worlds, world.bodies, world.fps, draws, world.size))

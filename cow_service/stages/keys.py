@@ -19,7 +19,7 @@ from cow_service.requests import SimulateRequest, Stage
 from cow_service.stages.results import digest_of
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 3  # of stored results; raised where what a stage means or stores changes
+FORMAT = 4  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class KeyFields:
 READER_FIELDS = ("question", "seed", "left_to_reader")
 TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "ensemble", "question", "num_frames", "fps")
 KEY_FIELDS: dict[Stage, KeyFields] = {
-    "grounding": KeyFields(READER_FIELDS, "reader", set_by_request=("place",), always=("objects",)),
+    "grounding": KeyFields(READER_FIELDS, "reader", set_by_request=("place",), always=("objects", "interventions")),
     "motion": KeyFields(
         READER_FIELDS,
         "reader",

@@ -10,6 +10,7 @@ import numpy as np
 from cow_service.physics.anchors import points_inside
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera_fit import CameraFit
+from cow_service.physics.events import WorldEvents
 from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.projection import SeenPaths, rotation, seen_paths, states
 from cow_service.physics.world import Worlds
@@ -51,7 +52,8 @@ def body_records(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[Body, ...]
     ):
         centre = np.array(shape.position) - np.array([0.0, cameras.height[0], 0.0])
         x, y, z = (float(v) for v in centre @ cameras.axes[0])
-        support = bodies[on].name if on is not None else "floor" if placed.stands else "air"
+        stands = placed.stands and len(records) not in worlds.scene.unsupported
+        support = bodies[on].name if on is not None else "floor" if stands else "air"
         records.append(
             Body(
                 object=seen.name,
@@ -79,6 +81,16 @@ def path_records(
             at = start_of(bodies, body, start)
             records.append(_path(bodies[body], body, np.array(at), worlds, seen, size, around))
     return tuple(records)
+
+
+def with_times(paths: Sequence[Path], events: WorldEvents) -> tuple[Path, ...]:
+    """The paths with the times at which their bodies are set in motion and knocked over in the first draw."""
+    found: list[Path] = []
+    for path in paths:
+        moved, tipped = (float(times[0, path.body]) for times in (events.moved, events.tipped))
+        times = {name: time for name, time in (("moved_at", moved), ("tipped_at", tipped)) if math.isfinite(time)}
+        found.append(path.model_copy(update=times))
+    return tuple(found)
 
 
 def _path(

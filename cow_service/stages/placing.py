@@ -37,16 +37,6 @@ def placed_mover(grounding: Grounding) -> Intervention | None:
     return None
 
 
-def others_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
-    """The other objects of a grounding, those that something is put to among them."""
-    found = list(grounding.others)
-    for each in grounding.interventions:
-        for target in each.targets:
-            if not any(iou(target.bbox, other.bbox) >= SAME_OBJECT_IOU for other in found):
-                found.append(target)
-    return tuple(found)
-
-
 def placing_sentence(grounding: Grounding, placed: Intervention) -> str:
     """In one line, for a video generator."""
     to = " and ".join(f"the {bare_name(target.object)}" for target in placed.targets)

@@ -13,17 +13,18 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import Camera
 from cow_service.physics.events import encounters
 from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.outcome import Query
 from cow_service.physics.placing import flies
 from cow_service.physics.sweeping import swept
 from cow_service.physics.world import Led, WorldInput
-from cow_service.readers.question.facts import facts_of
 from cow_service.readers.question.relations import read_asked
 from cow_service.readers.question.sentences import parse
-from cow_service.records import Asked, Grounding, Motion, Outcome, Path, Trajectory
+from cow_service.records import Asked, Grounding, Motion, Path, Trajectory
 from cow_service.requests import SimulateRequest, TrajectoryRequest
-from cow_service.stages.bodies import seen_bodies, target_of
+from cow_service.stages.bodies import obstacles_of, query_of, seen_bodies
 from cow_service.stages.camera import camera_of
 from cow_service.stages.imagining import Imagined, imagine
+from cow_service.stages.outcomes import can_tell, with_outcomes
 from cow_service.stages.paths import (
     body_records,
     camera_record,
@@ -33,8 +34,9 @@ from cow_service.stages.paths import (
     path_records,
     start_of,
     tracks,
+    with_times,
 )
-from cow_service.stages.placing import others_of, placement_of, put_of
+from cow_service.stages.placing import placement_of, put_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.warnings import warnings_of
@@ -48,31 +50,37 @@ _OWN = ("kind", "direction", "depth", "speed", "speed_deviation")  # of each mov
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
-        obstacles = run.scene.obstacles(grounding.bbox, others_of(grounding))
-        trajectory = trajectory_of(run.scene, grounding, motion, obstacles, run.request)
+        obstacles, taken = obstacles_of(run.scene, grounding)
+        trajectory = trajectory_of(run.scene, grounding, motion, obstacles, run.request, taken)
         return StageResult(value=trajectory, warnings=warnings_of(run.scene, run.request, grounding, trajectory))
 
 
 def trajectory_of(
-    scene: Scene, grounding: Grounding, motion: Motion, obstacles: Sequence[Obstacle], request: SimulateRequest
+    scene: Scene,
+    grounding: Grounding,
+    motion: Motion,
+    obstacles: Sequence[Obstacle],
+    request: SimulateRequest,
+    taken: Sequence[Obstacle] = (),
 ) -> Trajectory:
-    """What happens in the scene over the frames of a request's clip."""
-    bodies = seen_bodies(scene, grounding, obstacles)
+    """What happens in the scene over the frames of a request's clip, without the obstacles that are taken away."""
+    bodies = seen_bodies(scene, grounding, (*obstacles, *taken))
     free = _free_path(scene, grounding, motion, request)
-    known = bool(scene.regions or obstacles)
+    known = bool(scene.regions or obstacles or taken)
     asked = read_asked(parse(request.question))
-    target = None if asked is None else target_of(asked, grounding, bodies)
-    world = _world(scene, bodies, motion, request, free, grounding, target)
-    put = put_of(scene, grounding, motion, bodies)
+    query = None if asked is None else query_of(asked, grounding, bodies)
+    kept = len(bodies) - len(taken)
+    world = _world(scene, (bodies[:kept], bodies[kept:]), motion, request, free, grounding, query)
+    put = put_of(scene, grounding, motion, bodies[:kept])
     world = replace(world, put=put)
-    tellable = asked is not None and known and (asked.target is None or target is not None)
-    if put is not None and not tellable:  # what is shown is what most worlds do
-        imagined = imagine(world, Asked(relation="inside"), put.targets[0], request.ensemble)
-    else:
-        imagined = imagine(world, asked if tellable else None, target, request.ensemble)
-    trajectory = _record(scene, grounding, motion, request, world, imagined, free, known)
-    outcome = None if asked is None else _outcome(asked, target, bodies, imagined)
-    return trajectory if outcome is None else _with_facts(trajectory, outcome, grounding)
+    tellable = query if known and query is not None and can_tell(query, kept, put is not None) else None
+    if put is not None and asked is None:  # what is shown is what most worlds do
+        tellable = Query(Asked(relation="inside"), put.targets[0])
+    imagined = imagine(world, tellable, request.ensemble)
+    trajectories = [_record(scene, grounding, motion, request, each, free, known) for each in imagined]
+    told = with_outcomes(trajectories, imagined, asked, query, grounding)
+    factual = told[1].model_copy(update={"anchors": ()}) if len(told) > 1 else None
+    return told[0].model_copy(update={"factual": factual})
 
 
 def _free_path(scene: Scene, grounding: Grounding, motion: Motion, request: SimulateRequest) -> FreePath | None:
@@ -81,19 +89,20 @@ def _free_path(scene: Scene, grounding: Grounding, motion: Motion, request: Simu
     camera = Camera(scene.width, scene.height, motion.metres_per_pixel.value)
     if request.trajectory is not None:
         return given_path(camera, request.trajectory, times)
-    return ballistic_path(camera, grounding, motion, times) if motion.law == "ballistic" else None
+    free = motion.law == "ballistic" and motion.kind != "place"
+    return ballistic_path(camera, grounding, motion, times) if free else None
 
 
 def _world(
     scene: Scene,
-    bodies: tuple[SeenBody, ...],
+    present_and_taken: tuple[tuple[SeenBody, ...], tuple[SeenBody, ...]],
     motion: Motion,
     request: SimulateRequest,
     free: FreePath | None,
     grounding: Grounding,
-    asked: int | None,
+    query: Query | None,
 ) -> WorldInput:
-    led = None
+    (bodies, taken), led = present_and_taken, None
     if free is not None:
         x, y = grounding.point
         foot = np.array(bodies[0].foot) - np.array([x, y])
@@ -101,8 +110,19 @@ def _world(
     in_air = flies(bodies[0], motion) and bodies[0].shape == "sphere"
     fit = camera_of(scene, motion, request.camera, bodies[0].bbox if in_air else None, fixed_focal=led is not None)
     size = scene.width, scene.height
-    others = {} if led is not None else _others(bodies, motion)
-    return WorldInput(bodies, motion, fit, size, request.num_frames, request.fps, asked, led, others)
+    return WorldInput(
+        bodies=bodies,
+        motion=motion,
+        fit=fit,
+        size=size,
+        num_frames=request.num_frames,
+        fps=request.fps,
+        asked=None if query is None else query.target,
+        led=led,
+        others={} if led is not None else _others(bodies, motion),
+        taken=taken,
+        turns_wanted=query is not None and query.asked.relation == "tips",
+    )
 
 
 def _others(bodies: Sequence[SeenBody], motion: Motion) -> dict[int, Motion]:
@@ -121,17 +141,17 @@ def _record(
     grounding: Grounding,
     motion: Motion,
     request: SimulateRequest,
-    world: WorldInput,
     imagined: Imagined,
     free: FreePath | None,
     known: bool,
 ) -> Trajectory:
-    shown, size = imagined.shown, (scene.width, scene.height)
+    world, shown, size = imagined.given, imagined.shown, (scene.width, scene.height)
     camera = camera_record(world.fit, shown, imagined.around)
     if free is None:
         paths = path_records(world.bodies, grounding.point, shown, size, imagined.around)
     else:
         paths = (_free_record(world.bodies[0], grounding, request, free),)
+    paths = with_times(paths, imagined.events)
     given = request.trajectory
     anchors = _anchors(world.bodies, grounding, paths) if given is None or given.anchors is None else given.anchors
     return Trajectory(
@@ -190,30 +210,3 @@ def _anchors(
     for body in bodies:
         body.mask.add_to(movable)
     return spread_anchors(movable)
-
-
-def _outcome(asked: Asked, target: int | None, bodies: Sequence[SeenBody], imagined: Imagined) -> Outcome:
-    """What the worlds say to the question; without a probability where they cannot tell."""
-    name = None if target is None else bodies[target].name
-    decided = imagined.decided
-    if decided is None:
-        return Outcome(asked=asked, object=name, sure=False, robust=False)
-    return Outcome(
-        asked=asked,
-        object=name,
-        probability=decided.probability,
-        first=None if decided.first is None else bodies[decided.first].name,
-        count=decided.count,
-        time=decided.time,
-        time_band=decided.time_band,
-        sure=decided.sure,
-        robust=decided.robust,
-        depends_on=decided.depends_on,
-    )
-
-
-def _with_facts(trajectory: Trajectory, outcome: Outcome, grounding: Grounding) -> Trajectory:
-    """The trajectory with its outcome, and the facts of it all in a sentence."""
-    told = trajectory.model_copy(update={"outcome": outcome})
-    facts = facts_of(grounding.object, told)
-    return told.model_copy(update={"outcome": outcome.model_copy(update={"facts": facts})})

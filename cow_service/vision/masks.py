@@ -69,6 +69,15 @@ def outline_of(mask: Mask) -> Mask:
     return mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 
 
+def hull(mask: Mask) -> Mask:
+    """The convex hull [H, W] of a mask."""
+    filled = np.zeros(mask.shape, np.uint8)
+    ys, xs = np.nonzero(mask)
+    if len(xs):
+        cv2.fillConvexPoly(filled, cv2.convexHull(np.stack([xs, ys], axis=1).astype(np.int32)), 1)
+    return filled > 0
+
+
 @dataclass(frozen=True, eq=False)
 class CroppedMask:
     """A mask of an image, of which only the part that is not empty is stored."""

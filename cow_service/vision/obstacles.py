@@ -14,6 +14,7 @@ from cow_service.vision.regions import SAME_OBJECT_IOU, Region, region_of
 from cow_service.vision.types import Mask
 
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
+DOUBTFUL = 0.75  # confidence below which the same holds of a small region that touches another obstacle
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,15 @@ def find_obstacles(
             continue
         if area < OWN_SHARE * body.sum() and region.mask.shared_with(near):
             continue
-        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU for other in obstacles):
+        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU or _is_part(region, other) for other in obstacles):
             continue
         obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
     return tuple(obstacles)
+
+
+def _is_part(region: Region, other: Obstacle) -> bool:
+    """Whether a doubtful region is the shadow or a part of a larger obstacle that it touches."""
+    if region.confidence >= DOUBTFUL or region.mask.area >= OWN_SHARE * other.mask.area:
+        return False
+    near = cv2.dilate(other.mask.full().astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    return bool(region.mask.shared_with(near))

@@ -146,6 +146,19 @@ class Scene:
         """Gives the mask that an earlier run segmented for a box; it may have been segmented from a point instead."""
         self._preset[bbox] = mask
 
+    def changed(self, image: Image, clean: Image) -> Scene:
+        """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
+        other = Scene(image, dict(self._masks), dict(self._found), dict(self._preset), dict(self._obstacles))
+        known = {"cues": self.cues, "arrows": self.arrows, "boxes": self.boxes, "regions": self.regions}
+        other.__dict__.update(known, clean=clean)  # where cached properties are kept
+        return other
+
+    def with_mask(self, bbox: BBox, mask: Mask) -> Scene:
+        """The same with another mask [H, W] of the object in a box."""
+        other = self.changed(self.image, self.clean)
+        other._masks[bbox] = mask
+        return other
+
     def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
         """The objects beside the mover in a box, `named` ones by their name; found once for the same arguments."""
         key = mover, tuple(named)

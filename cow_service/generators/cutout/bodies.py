@@ -13,7 +13,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.ground import Ground, Placed
 from cow_service.generators.cutout.sprites import MARGIN, Window, soft
 from cow_service.records import FALLING_KINDS, BBox, Path
-from cow_service.vision.masks import resized_mask, window_of
+from cow_service.vision.masks import hull, resized_mask, window_of
 from cow_service.vision.types import Floats, Floats32, Mask
 
 UNMOVED = 0.3  # px
@@ -24,8 +24,15 @@ class StillBody:
     """Something that stays where it is, and hides what is farther away."""
 
     index: int  # of `Trajectory.bodies`
-    mask: Mask  # [h, w]
+    mask: Mask  # [h, w]: what is seen of it
     placed: Placed
+    whole: Mask | None = None  # [h, w]: what was said to be its silhouette, hidden parts included
+
+    @cached_property
+    def outline(self) -> Mask:
+        """What it covers [h, w], whatever hides a part of it."""
+        found = hull(self.mask)
+        return found if self.whole is None else found | self.whole
 
     @cached_property
     def alpha(self) -> tuple[Window, Floats32]:
@@ -111,5 +118,6 @@ def still_bodies(
             middle = ground.height(np.array(body.position))
             half = body.size[1] / 2
             placed = Placed(obstacle.bbox, False, body.position[2], middle - half, middle + half)
-        found.append(StillBody(index, obstacle.mask.at(size) & ~taken, placed))
+        whole = obstacle.mask.at(size)
+        found.append(StillBody(index, whole & ~taken, placed, whole))
     return tuple(found)

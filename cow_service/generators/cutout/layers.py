@@ -13,12 +13,12 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import MovingBody, StillBody, moving_body, still_bodies
 from cow_service.generators.cutout.containers import Container, container_of
 from cow_service.generators.cutout.ground import Ground
-from cow_service.generators.cutout.measuring import take_shadows
+from cow_service.generators.cutout.measuring import Lit, take_shadows
 from cow_service.generators.cutout.shadows import Shadow
 from cow_service.generators.cutout.sprites import Sprite, cut
 from cow_service.media.images import fit_within
 from cow_service.vision.inpainting import fill_hole
-from cow_service.vision.masks import resized_mask, window_of
+from cow_service.vision.masks import hull, resized_mask, window_of
 from cow_service.vision.types import Image, Mask
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
@@ -62,10 +62,7 @@ def take_apart(given: GeneratorInput) -> Layers:
     still = still_bodies(given, moving, size, ground)
     lit = take_shadows(given, image, moving, still, ground, factor)
     cues = resized_mask(scene.cues, size) if clean else None
-    background, sprites = lit.image, list[Sprite]()
-    for body in moving:
-        hole = _hole(body, lit.lost.get(body.path.body), cues)
-        background = _without(background, hole, body, moving, still, eye)
+    background, sprites = without_bodies(lit, moving, still, eye, cues), list[Sprite]()
     for body in moving:
         hidden = _hidden(body, moving, still, eye)
         shape = None if ground is None else ground.bodies[body.path.body].shape
@@ -73,6 +70,17 @@ def take_apart(given: GeneratorInput) -> Layers:
         sprites.append(cut(image, body.mask, hidden, start, shape))
     container = container_of(given, image, moving, still, ground)
     return Layers(image, background, moving, tuple(sprites), lit.shadows, still, container, eye, factor)
+
+
+def without_bodies(
+    lit: Lit, moving: tuple[MovingBody, ...], still: tuple[StillBody, ...], eye: float, cues: Mask | None
+) -> Image:
+    """A scene without shadows [h, w, 3], with the bodies that move taken out of it, too."""
+    image = lit.image
+    for body in moving:
+        hole = _hole(body, lit.lost.get(body.path.body), cues)
+        image = _without(image, hole, body, moving, still, eye)
+    return image
 
 
 def _hidden(body: MovingBody, moving: tuple[MovingBody, ...], still: tuple[StillBody, ...], eye: float) -> Mask | None:
@@ -86,7 +94,7 @@ def _hidden(body: MovingBody, moving: tuple[MovingBody, ...], still: tuple[Still
     nearer = [mask for mask, at in others if mask[window].any() and not placed.in_front_of(at, eye)]
     if not nearer:
         return None
-    hidden = (_hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
+    hidden = (hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
     return hidden if hidden.any() else None
 
 
@@ -121,7 +129,7 @@ def _without(
     for other in moving:
         objects |= other.mask & ~body.mask if other is not body else False
     for other in behind:
-        part = _hull(other.mask) & rest
+        part = other.outline & rest
         if part.any():
             image = fill_hole(image, part, ~other.mask)
             rest &= ~part
@@ -138,12 +146,3 @@ def _dilated(mask: Mask, width: int, iterations: int = 1) -> Mask:
     grown = np.zeros_like(mask)
     grown[window] = cv2.dilate(mask[window].astype(np.uint8), kernel, iterations=iterations) > 0
     return grown
-
-
-def _hull(mask: Mask) -> Mask:
-    """The convex hull [h, w] of a mask."""
-    filled = np.zeros(mask.shape, np.uint8)
-    ys, xs = np.nonzero(mask)
-    if len(xs):
-        cv2.fillConvexPoly(filled, cv2.convexHull(np.stack([xs, ys], axis=1).astype(np.int32)), 1)
-    return filled > 0

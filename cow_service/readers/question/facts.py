@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from cow_service.records import Contact, Encounter, EncounterKind, Outcome, Path, Trajectory
+from cow_service.records import Contact, Encounter, EncounterKind, Path, Trajectory
 
 MAX_NAME = 60  # characters
 BOUNCE = 0.15  # m/s of a meeting with the floor, from which it is a bounce
 MOVED = 0.01  # m that a body is displaced, from which it is said to move
 ROLLED_ON = 0.25  # s after its last bounce, from which it is said to have rolled on
-TIPPED = 60.0  # degrees turned, from which a body that is no sphere has tipped over
+AT_REST = 1e-3  # m from where it starts, within which a body has not set out
 COVERED = 0.3  # share of what is hidden, from which it counts as hidden
 MAX_MET = 2  # encounters that are told one by one
 _KINDS: dict[str, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
@@ -21,30 +21,65 @@ _NOT_MET: dict[str, str] = {
     "covered": "is not hidden by {}",
 }
 _NOTHING_MET: dict[str, str] = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
-
+_BECOMES: dict[str, tuple[str, str]] = {
+    "tips": ("is knocked over", "is not knocked over"),
+    "moves": ("is set in motion", "is not set in motion"),
+}
 SIDEWAYS = 0.7  # of the speed in depth: from that on something moves to the side
 
 
 def facts_of(mover: str, trajectory: Trajectory) -> str:
-    """One sentence: how the mover goes, what it meets, how it ends, and how many worlds agree with that.
+    """One sentence: how the mover goes, what it meets, how it ends, what it sets in motion, and how many worlds agree.
 
     It tells of the likeliest world; the share of the ensemble that agrees is that of the outcome, where there is one.
     """
-    met = _told(trajectory)
-    parts = [*_motion(trajectory, met), *(_meeting(each, trajectory) for each in met)]
-    missed = _missed(trajectory, met)
-    if missed:
-        parts.append(missed)
-    parts += _end(trajectory)
-    sentence = f"{_named(mover, 'The')} {_joined(parts)}"
-    share = _agreement(trajectory, met)
+    told, share = happening(mover, trajectory), _agreement(trajectory)
     if share is None or not trajectory.ensemble:
-        return f"{sentence}."
+        return f"{told}."
     agree = round(share * trajectory.ensemble)
-    return f"{sentence}; {agree} of {trajectory.ensemble} worlds agree."
+    return f"{told}; {agree} of {trajectory.ensemble} worlds agree."
 
 
-def _named(name: str, article: str) -> str:
+def happening(mover: str, trajectory: Trajectory) -> str:
+    """What happens in the likeliest world: a clause for the mover, then one for each other body that matters."""
+    clauses = [_clause(mover, 0, trajectory)]
+    clauses += [_clause(trajectory.bodies[body].object, body, trajectory) for body in _others_told(trajectory)]
+    became = _became(trajectory)
+    clauses += [became] if became else []
+    first, *rest = clauses
+    return "; ".join([first, *(clause[0].lower() + clause[1:] for clause in rest)])
+
+
+def _clause(name: str, body: int, trajectory: Trajectory) -> str:
+    """How one body goes, what it meets, and how it ends."""
+    met = _told(trajectory, body)
+    parts = [*_motion(trajectory, body, met), *(_meeting(each, trajectory) for each in met)]
+    missed = _missed(trajectory, body, met)
+    parts += [missed] if missed else []
+    parts += _end(trajectory, body)
+    return f"{named(name, 'The')} {_joined(parts)}"
+
+
+def _others_told(trajectory: Trajectory) -> list[int]:
+    """The bodies beside the mover that are told of: whose encounter is asked about, and those that touch others."""
+    asked = asked_body(trajectory)
+    moving = [path.body for path in trajectory.paths[1:]]
+    meeting = [each.subject for each in trajectory.encounters if each.subject and each.kind == "touches"]
+    chosen = list[int](dict.fromkeys([*([asked] if asked else []), *meeting]))
+    return [body for body in chosen if body in moving or body == asked][:MAX_MET]
+
+
+def asked_body(trajectory: Trajectory) -> int | None:
+    """Which body it is whose encounter is asked about; None where nothing is asked or that body is not there."""
+    if trajectory.outcome is None:
+        return None
+    name = trajectory.outcome.subject
+    if name is None:
+        return 0
+    return next((i for i, body in enumerate(trajectory.bodies) if i and body.object == name), None)
+
+
+def named(name: str, article: str) -> str:
     """A name behind an article, without its own."""
     words = name.split()
     if len(words) > 1 and words[0].lower() in {"the", "a", "an"}:
@@ -63,50 +98,84 @@ def _happened(encounter: Encounter) -> bool:
     return encounter.kind == "touches" or encounter.share is None or encounter.share >= COVERED
 
 
-def _told(trajectory: Trajectory) -> list[Encounter]:
-    """The encounters that the sentence tells of, in their order: what is asked about, then the first ones."""
-    outcome = trajectory.outcome
-    asked = None if outcome is None else _asked_about(outcome, trajectory.encounters)
-    touched = {each.object for each in trajectory.encounters if each.kind == "touches"}
-    rest = [each for each in trajectory.encounters if each.kind == "touches" or each.object not in touched]
+def _told(trajectory: Trajectory, body: int) -> list[Encounter]:
+    """The encounters of a body that are told, in their order: what is asked about, then the first ones."""
+    own = [each for each in trajectory.encounters if each.subject == body]
+    asked = _asked_about(trajectory) if body == asked_body(trajectory) else None
+    touched = {each.object for each in own if each.kind == "touches"}
+    rest = [each for each in own if each.kind == "touches" or each.object not in touched]
     ordered = sorted(rest, key=lambda each: (each.kind != "touches", each.first_frame))
     chosen = ([] if asked is None else [asked]) + [each for each in ordered if each is not asked]
     return sorted(chosen[:MAX_MET], key=lambda each: each.first_frame)
 
 
-def _asked_about(outcome: Outcome, encounters: Sequence[Encounter]) -> Encounter | None:
+def _asked_about(trajectory: Trajectory) -> Encounter | None:
     """The first encounter that the question asks for."""
-    fitting = [each for each in encounters if each.kind == _KINDS[outcome.asked.relation] and _happened(each)]
+    outcome, body = trajectory.outcome, asked_body(trajectory)
+    if outcome is None or body is None or outcome.asked.relation not in _KINDS:
+        return None
+    kind = _KINDS[outcome.asked.relation]
+    fitting = [each for each in trajectory.encounters if each.kind == kind and _happened(each)]
+    own = [each for each in fitting if each.subject == body]
     if outcome.asked.target is not None:
-        fitting = [each for each in fitting if each.object == outcome.object]
-    return min(fitting, key=lambda each: each.first_frame, default=None)
+        pair = {trajectory.bodies[body].object, outcome.object} if trajectory.bodies else set[str | None]()
+        # Of two that both move, either may be the subject of the encounter.
+        other = [each for each in fitting if kind == "touches" and {_name_of(each, trajectory), each.object} == pair]
+        own = [each for each in own if each.object == outcome.object] or other
+    return min(own, key=lambda each: each.first_frame, default=None)
 
 
-def _motion(trajectory: Trajectory, met: Sequence[Encounter]) -> list[str]:
-    """How it goes until it meets something."""
-    path, body = trajectory.path, trajectory.bodies[0] if trajectory.bodies else None
-    if _displaced(path) < MOVED:
+def _name_of(encounter: Encounter, trajectory: Trajectory) -> str:
+    return trajectory.bodies[encounter.subject].object if encounter.subject < len(trajectory.bodies) else ""
+
+
+def _path_of(trajectory: Trajectory, body: int) -> Path | None:
+    return next((path for path in trajectory.paths if path.body == body), None)
+
+
+def _became(trajectory: Trajectory) -> str:
+    """What becomes of the body whose fall or motion is asked about."""
+    outcome = trajectory.outcome
+    if outcome is None or outcome.asked.relation not in _BECOMES or (outcome.asked.target and not outcome.object):
+        return ""
+    does, does_not = _BECOMES[outcome.asked.relation]
+    by = "tipped_at" if outcome.asked.relation == "tips" else "moved_at"
+    found = [
+        (trajectory.bodies[path.body].object, getattr(path, by))
+        for path in trajectory.paths[1:]
+        if getattr(path, by) is not None and outcome.object in (None, trajectory.bodies[path.body].object)
+    ]
+    if not found:
+        return f"{named(outcome.object, 'the') if outcome.object else 'nothing'} {does_not if outcome.object else does}"
+    name, time = min(found, key=lambda each: each[1])
+    return f"{named(name, 'the')} {does} after {time:.1f} s"
+
+
+def _motion(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> list[str]:
+    """How a body goes until it meets something."""
+    path, record = _path_of(trajectory, body), trajectory.bodies[body] if trajectory.bodies else None
+    if path is None or _displaced(path) < MOVED:
         return ["stays where it is"]
-    round_body = body is not None and body.shape == "sphere"
+    round_body = record is not None and record.shape == "sphere"
     on = "rolls" if round_body else "slides"
     first_touch = min((_time(each, trajectory) for each in met if each.kind == "touches"), default=math.inf)
     bounces = [
         contact.time
         for contact in trajectory.contacts
-        if contact.a == 0 and contact.b is None and contact.impulse >= BOUNCE and 0 < contact.time < first_touch
+        if contact.a == body and contact.b is None and contact.impulse >= BOUNCE and 0 < contact.time < first_touch
     ]
-    if bounces:
+    if bounces and body == 0:
         times = {1: "once", 2: "twice"}.get(len(bounces), f"{len(bounces)} times")
         return [f"bounces {times}", *([f"{on} on"] if first_touch - bounces[-1] > ROLLED_ON else [])]
-    if body is None:
+    if record is None:
         verb = "moves"
-    elif body.support == "air":
+    elif record.support == "air":
         rises = path.states[-1][1] < path.states[0][1]
         still = _across(path) < MOVED
         return [("rises" if rises else "falls") if still else f"flies {_direction(path)}"]
     else:
         verb = on
-    if body is not None and not round_body and _tips(path):
+    if record is not None and not round_body and path.tipped_at is not None:
         verb = "tips over and moves"
     return [f"{verb} {_direction(path)}"]
 
@@ -123,8 +192,10 @@ def _across(path: Path) -> float:
 
 
 def _set_out(path: Path) -> int:
-    """The frame by which it has set out."""
-    return max(1, len(path.states) // 10)
+    """The frame by which it has set out: some time after the last one in which it is where it starts."""
+    last = len(path.states) - 1
+    still = next((i for i, state in enumerate(path.states) if math.dist(state[:3], path.states[0][:3]) > AT_REST), last)
+    return min(last, max(1, still - 1 + len(path.states) // 10))
 
 
 def _direction(path: Path) -> str:
@@ -139,12 +210,8 @@ def _direction(path: Path) -> str:
     return "away from the camera" if z > 0 else "towards the camera"
 
 
-def _tips(path: Path) -> bool:
-    return any(abs(angle) >= TIPPED for angle in path.rotation)
-
-
 def _contact_with(encounter: Encounter, trajectory: Trajectory) -> Contact | None:
-    pair = {0, encounter.body}
+    pair = {encounter.subject, encounter.body}
     return next((each for each in trajectory.contacts if each.b is not None and {each.a, each.b} == pair), None)
 
 
@@ -156,7 +223,7 @@ def _time(encounter: Encounter, trajectory: Trajectory) -> float:
 
 def _meeting(encounter: Encounter, trajectory: Trajectory) -> str:
     """What the mover does with another object, and when."""
-    name, time = _named(encounter.object, "the"), f"{_time(encounter, trajectory):.1f} s"
+    name, time = named(encounter.object, "the"), f"{_time(encounter, trajectory):.1f} s"
     share = "" if encounter.share is None else f"{round(100 * encounter.share)}%"
     if encounter.kind == "occludes":
         hidden = f" (hiding {share} of it)" if share else ""
@@ -172,51 +239,60 @@ def _effect(body: int | None, trajectory: Trajectory) -> str:
     path = next((each for each in trajectory.paths[1:] if each.body == body), None)
     if body is None or path is None:
         return ""
-    if body < len(trajectory.bodies) and trajectory.bodies[body].shape != "sphere" and _tips(path):
+    if path.tipped_at is not None:
         return "and tips over "
     return "and pushes " if _displaced(path) >= MOVED else ""
 
 
-def _missed(trajectory: Trajectory, met: Sequence[Encounter]) -> str:
+def _missed(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> str:
     """That what is asked about does not happen, or that nothing is touched; empty where either is not so."""
-    outcome = trajectory.outcome
+    outcome, asked = trajectory.outcome, asked_body(trajectory)
     if not trajectory.encounters_known:
         return ""
-    if outcome is not None and (outcome.asked.target is None or outcome.object is not None):
-        if _asked_about(outcome, trajectory.encounters) is not None:
-            return ""
-        if outcome.asked.target is None or outcome.object is None:
-            return _NOTHING_MET[outcome.asked.relation]
-        return _NOT_MET[outcome.asked.relation].format(_named(outcome.object, "the"))
-    return "" if any(each.kind == "touches" for each in met) else _NOTHING_MET["touches"]
+    touched = any(each.kind == "touches" for each in met)
+    if outcome is None or outcome.asked.relation not in _KINDS or (outcome.asked.target and not outcome.object):
+        return "" if body or touched else _NOTHING_MET["touches"]
+    if asked != body:
+        return ""
+    if _asked_about(trajectory) is not None:
+        return ""
+    if outcome.asked.target is None or outcome.object is None:
+        return _NOTHING_MET[outcome.asked.relation]
+    return _NOT_MET[outcome.asked.relation].format(named(outcome.object, "the"))
 
 
-def _end(trajectory: Trajectory) -> list[str]:
+def _end(trajectory: Trajectory, body: int) -> list[str]:
     """How it ends, where the clip shows it."""
-    until = trajectory.moving_until
-    if until is None or _displaced(trajectory.path) < MOVED:
+    path, until = _path_of(trajectory, body), trajectory.moving_until
+    if path is None or until is None or _displaced(path) < MOVED:
         return []
-    last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1)
-    if not trajectory.path.visible[last]:
+    last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1) if body == 0 else -1
+    if not path.visible[last]:
         return ["leaves the image"]
-    return [f"comes to rest after {until:.1f} s"] if last < trajectory.num_frames - 1 else []
+    return [f"comes to rest after {until:.1f} s"] if body == 0 and last < trajectory.num_frames - 1 else []
 
 
-def _agreement(trajectory: Trajectory, met: Sequence[Encounter]) -> float | None:
+def _agreement(trajectory: Trajectory) -> float | None:
     """The share of the worlds in which what the sentence says of the question, or of its first encounter, is so."""
     outcome = trajectory.outcome
     if outcome is None or outcome.probability is None:
+        met = _told(trajectory, 0)
         return met[0].probability if met else None
-    asked, first = outcome.asked, _asked_about(outcome, trajectory.encounters)
-    if asked.form == "whether":
-        happens = outcome.probability if not asked.negated else 1 - outcome.probability
-        return happens if first is not None else 1 - happens
-    if asked.form == "how-many":
-        kind = _KINDS[asked.relation]
-        count = len({each.object for each in trajectory.encounters if each.kind == kind and _happened(each)})
-        return outcome.probability if count == outcome.count else None
-    if asked.form == "which-first":
-        return outcome.probability if outcome.first == (None if first is None else first.object) else None
-    if first is None:
-        return outcome.probability if outcome.time is None else None
-    return first.probability
+    asked, first = outcome.asked, _asked_about(trajectory)
+    if asked.relation not in _KINDS:
+        return None
+    agreeing: dict[str, float | None] = {
+        "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,
+        "how-many": outcome.probability if _count(trajectory) == outcome.count else None,
+        "which-first": outcome.probability if outcome.first == (None if first is None else first.object) else None,
+        "when": (outcome.probability if outcome.time is None else None) if first is None else first.probability,
+    }
+    return agreeing.get(asked.form)
+
+
+def _count(trajectory: Trajectory) -> int:
+    """How many things the body asked about meets in the way asked about."""
+    outcome, body = trajectory.outcome, asked_body(trajectory)
+    kind = None if outcome is None else _KINDS[outcome.asked.relation]
+    own = [each for each in trajectory.encounters if each.subject == body and each.kind == kind]
+    return len({each.object for each in own if _happened(each)})
