@@ -118,7 +118,7 @@ class TestOpenings:
         assert seen.rim is not None
         assert seen.has_edge
         assert seen.rim[2] == pytest.approx(half, abs=max(2.0, 0.05 * half))
-        assert seen.inner == pytest.approx(0.9, abs=0.04)
+        assert seen.inner == pytest.approx(0.9, abs=max(0.04, 2 / half))
         assert seen.bottom == pytest.approx(base, abs=0.12)
 
     def test_a_handle_is_not_part_of_the_opening(self) -> None:
