@@ -35,7 +35,7 @@ from cow_service.service import Service
 from cow_service.settings import Settings
 
 LINEAR = ("linear", "slide", "slide-occlude", "car")
-LEFT_OUT = ("remove", "billiards", "place", "trail")
+LEFT_OUT: tuple[str, ...] = ()
 PUSHED = 5.0  # px: what truly moves less is not pushed
 TOUCHING = 1.15  # of the summed half extents: bodies of one path that come nearer than this are shown to touch
 

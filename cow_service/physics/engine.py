@@ -69,8 +69,8 @@ class RigidShape:
     glides: bool = False  # keeps its velocity, without friction, until it meets another body
     falls: bool = True  # gravity acts on it
     ghost: bool = False  # passes through everything; what it meets is told all the same
-    hollow: Hollow | None = None  # it is an open container
     course: Course | None = None  # of what glides: its legs, and where it stops
+    hollow: Hollow | None = None  # it is an open container
     follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
 
 

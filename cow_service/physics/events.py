@@ -59,9 +59,7 @@ class WorldEvents:
     moved: Floats  # [K, B] s: when it is set in motion
     tipped: Floats  # [K, B] s: when it is knocked over; infinite where that was not looked for
     gone: Floats  # [K, B] s: when it leaves the image
-    placed: Floats | None = (
-        None  # [K] s: when the mover is let go where it was to be put; infinite if it ends elsewhere
-    )
+    placed: Floats | None = None  # [K] s: when the mover is where it was to be put; infinite where it does not fit
     order: tuple[int, ...] = (0,)  # of the first draw: what moves, in the order in which it is set in motion
 
 

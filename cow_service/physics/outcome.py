@@ -123,8 +123,8 @@ def _per_body(query: Query, events: WorldEvents) -> Floats:
     bodies = np.arange(len(of_subject.eligible))
     if relation == "leaves":
         return np.where(bodies[None] == query.subject, events.gone, NEVER)
-    if relation == "inside" and events.placed is not None:
-        times = events.placed[:, None]
+    if relation == "inside":
+        times = np.full_like(events.moved, NEVER) if events.placed is None else events.placed[:, None]
     elif relation in ("tips", "moves"):
         times = events.tipped if relation == "tips" else events.moved
     else:

@@ -50,6 +50,8 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, hints), run.reader.source
         if run.request.motion is not None:
             reading = _with_lengths(reading, run.request.motion)
+    if placed is not None and reading.kind == "place":
+        reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
     if run.request.motion is not None and run.request.motion.others:
         reading = replace(reading, others=given_others(run.request.motion.others, grounding))
     if placed is not None and reading.kind == "place":

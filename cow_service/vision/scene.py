@@ -148,7 +148,14 @@ class Scene:
 
     def changed(self, image: Image, clean: Image) -> Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
-        other = Scene(image, dict(self._masks), dict(self._found), dict(self._preset), dict(self._obstacles))
+        other = replace(
+            self,
+            image=image,
+            _masks=dict(self._masks),
+            _found=dict(self._found),
+            _preset=dict(self._preset),
+            _obstacles=dict(self._obstacles),
+        )
         known = {"cues": self.cues, "arrows": self.arrows, "boxes": self.boxes, "regions": self.regions}
         other.__dict__.update(known, clean=clean)  # where cached properties are kept
         return other

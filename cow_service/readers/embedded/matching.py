@@ -8,6 +8,7 @@ import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.readers.embedded.outlines import clearest
+from cow_service.readers.embedded.singling import singled_out
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.records import BBox
 from cow_service.vision.regions import Region
@@ -40,7 +41,7 @@ def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequen
         fitting = exact or [region for region in near if _looks_like(region, phrase)]
     fitting = [region for region in fitting if _looks_like(region, phrase)] or fitting
     clear = clearest(fitting, phrase.head)
-    return fitting if clear is None else [clear]
+    return singled_out(fitting, phrase) if clear is None else [clear]
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:

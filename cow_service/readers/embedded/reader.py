@@ -11,15 +11,27 @@ from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, without
+from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
+from cow_service.readers.question.accounting import unread_warnings
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked
 from cow_service.readers.question.sentences import Question, parse
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import DIRECTED_KINDS, AnswerOption, BBox, Grounding, LocatedObject, ReaderInfo, Source, Vector
+from cow_service.records import (
+    DIRECTED_KINDS,
+    AnswerOption,
+    BBox,
+    Grounding,
+    LocatedObject,
+    MotionKind,
+    ReaderInfo,
+    Source,
+    Vector,
+)
 from cow_service.settings import Settings
 from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
 from cow_service.vision.masks import iou
@@ -52,8 +64,11 @@ class EmbeddedReader:
             others = _others(regions, question, bbox)
             found = {other.object for other in others}
             missing = [_not_found(scene, phrase.text) for phrase in question.others if phrase.text not in found]
+            boxes = {other.object: other.bbox for other in others} | {question.mover.text: bbox}
+            things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
+            doubts = [*noun_warnings(scene, things), *unread_warnings(question)]
         return GroundingReading(
-            question.mover.text, bbox, others=others, warnings=tuple(missing), interventions=(*removed, *placed)
+            question.mover.text, bbox, others=others, warnings=(*missing, *doubts), interventions=(*removed, *placed)
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
@@ -63,7 +78,8 @@ class EmbeddedReader:
         """
         with given.cpu():
             question = parse(given.question)
-            reading = _read_motion(given.scene, question, grounding)
+            on = along_trail(given.scene, grounding, question.motion) if question.motion.trail is not None else None
+            reading = on or _read_motion(given.scene, question, grounding)
             return _with_quantities(given.scene, question, grounding, reading)
 
     def answer(
@@ -154,8 +170,6 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
-    if words.trail is not None and (on := along_trail(scene, grounding, words)) is not None:
-        return on
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
     if words.arrow is not None:
@@ -175,9 +189,11 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
             f"up. {GIVE_DIRECTION}"
         )
-    on = along_trail(scene, grounding, words)
-    if on is not None:
-        return on
+    return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
+
+
+def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
+    """Along the only arrow drawn at the mover, where the question names no direction at all."""
     near = arrows_near(scene, grounding.bbox)
     if near and question.names_direction:
         raise CannotReadDirection(

@@ -13,13 +13,13 @@ from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
 from cow_service.readers.question.words import Word, words_of
 from cow_service.records import InterventionKind, PlaceRelation
 
-MAX_INTERVENTIONS = 6  # of one question; what comes after them is not looked for
-_WINDOW = 24  # words that one may have
+MAX_TRIES = 6  # of one question: each takes some ms; what comes after them is not looked for
+_WINDOW = 16  # words that one may have
 _BEFORE = lex.CONDITIONALS | lex.words(". ! ? ; : , and but then also that with")
 _ANYWHERE = lex.words("without with remove taking in")
 _TELLING = lex.words(
-    "remove take get be do did disappear vanish there without absence put place insert set position drop lower throw",
-    "release with",
+    "remove delete erase eliminate exclude withdraw discard take rid not gone go absent missing no disappear vanish",
+    "without absence put place insert set position drop lower throw release",
 )
 _RELATIONS: dict[str, PlaceRelation] = {
     "into": "into", "onto": "onto", "between": "between", "in_front_of": "in-front-of", "behind": "behind",
@@ -43,10 +43,13 @@ def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords,
     gone: set[int] = set()
     words = words_of(found)
     begins = {word.at: place for place, word in reversed(list(enumerate(words)))}
+    tries = 0
     for at in _starts(found):
-        if at in gone or len(changes) >= MAX_INTERVENTIONS:
+        ahead = words[begins[at] : begins[at] + _WINDOW] if at in begins else []
+        if at in gone or tries >= MAX_TRIES or _TELLING.isdisjoint(word.text for word in ahead[:8]):
             continue
-        read = _read(found, words[begins[at] : begins[at] + _WINDOW]) if at in begins else None
+        tries += 1
+        read = _read(found, ahead)
         if read is not None:
             said, end = read
             changes += said
@@ -63,8 +66,6 @@ def _starts(found: Sequence[Item]) -> Iterator[int]:
 
 def _read(found: Sequence[Item], words: Sequence[Word]) -> tuple[list[InterventionWords], int] | None:
     """The interventions at some words, and the place of the first item behind them."""
-    if not any(word.text in _TELLING for word in words[:8]):
-        return None
     parsed = parse_from("intervention", words)
     while parsed is not None and _begins_clause(words, parsed[1]):
         parsed = parse_from("intervention", words[: parsed[1] - 1])

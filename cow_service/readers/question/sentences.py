@@ -45,7 +45,8 @@ class Question:
 
     `others` are the further objects it names, in order, without the mover and without what is taken away; `items`, all
     its words and noun phrases, but for the options that it lists, its `interventions` and its trail.
-    `names_direction`: some word says which way, whether or not it was understood.
+    `clause` are the items that tell the motion. `names_direction`: some word says which way, whether or not it was
+    understood.
     """
 
     mover: ObjectPhrase | None
@@ -53,6 +54,7 @@ class Question:
     others: tuple[ObjectPhrase, ...]
     items: tuple[Item, ...]
     interventions: tuple[InterventionWords, ...]
+    clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
 
@@ -87,6 +89,7 @@ def parse(question: str) -> Question:
         others=_others(found, mover, clause, interventions, trail),
         items=tuple(everything),
         interventions=interventions,
+        clause=tuple(found[clause.start : clause.stop]),
         mentions_arrow=any(word.startswith("arrow") for word in words),
         names_direction=_DIRECTION_WORDS.search(question) is not None,
     )
