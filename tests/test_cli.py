@@ -85,6 +85,18 @@ def test_other_objects_a_law_and_no_ensemble(tmp_path: Path, picture: Path) -> N
     assert "--other takes NAME=X0,Y0,X1,Y1" in wrong.stderr
 
 
+def test_what_is_taken_away_and_how_far_it_goes(tmp_path: Path, picture: Path) -> None:
+    other = ["--other", "blue cube=430,160,510,250"]
+    told = cow(tmp_path, "simulate", str(picture), QUESTION, *other, "--remove", "blue cube", "--distance", "60",
+               "--ensemble", "0", "--no-video", "--json")  # fmt: skip
+    simulation = Simulation.model_validate_json(told.stdout)
+    assert [(each.kind, each.object.object) for each in simulation.grounding.interventions] == [("remove", "blue cube")]
+    assert simulation.trajectory.factual is not None
+    assert simulation.motion.distance == 60
+    wrong = cow(tmp_path, "simulate", str(picture), QUESTION, "--place", "the ball in the box")
+    assert "--place takes a thing, a relation (into, onto," in wrong.stderr
+
+
 def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
     result = cow(
         tmp_path, "simulate", str(picture), "?", "--box", "105,155,195,245", "--kind", "fall", "--json", "--no-video"
@@ -100,7 +112,7 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         (["If the red ball moves forward, what?"], 1, "Here: --direction DX,DY."),
         ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers with commas between"),
         ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),
-        ([QUESTION, "--kind", "projectile"], 1, "go with --direction"),
+        ([QUESTION, "--kind", "projectile"], 1, "goes with --direction"),
         ([QUESTION, "--object", "x"], 1, "goes with --point, --box or --trajectory"),
         ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: ati, cutout,"),
         ([QUESTION, "--option", "steps"], 1, "--option takes NAME=VALUE"),
