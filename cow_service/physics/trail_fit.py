@@ -65,7 +65,7 @@ def fit_throw(positions: Sequence[Position], camera: CameraFit, size: tuple[int,
     cost = float((rest**2).sum()) / max(1, 3 * len(positions) - FREE)
     if not np.isfinite(cost) or cost > MAX_COST:
         return None
-    covariance = np.linalg.inv(slopes.T @ slopes) * max(1.0, cost / GOOD_COST)
+    covariance = np.asarray(np.linalg.inv(slopes.T @ slopes), np.float64) * max(1.0, cost / GOOD_COST)
     return problem.told(parameters, covariance)
 
 

@@ -20,7 +20,7 @@ WORKING_SIDE = 512  # px: images are searched at this size
 EDGE = 1.0, 2.2  # Lab units per px, and times the median gradient; the larger counts
 MAX_EDGES = 12_000  # edge pixels: an image with more is too cluttered to be searched
 LEAST_RADIUS, MOST_RADIUS = 5.0, 80.0  # px at the working size
-RADIUS_STEP = 1.07  # between the radii that are voted for
+RADIUS_STEP = 1.08  # between the radii that are voted for
 CELL = 2  # px: side of a cell that votes are gathered in
 LEAST_VOTES = 0.2  # of the circumference
 LEAST_ARC = 0.1  # of the circumference that lies on edges
@@ -28,6 +28,9 @@ MAX_CIRCLES = 32
 NEAR = 0.035, 1.0  # of the radius, px: edges this close to a circle lie on it
 FACING = 0.93  # cosine of the angle between an edge's gradient and the radius
 BINS = 72  # of the circumference
+NOTCH_FACING = 0.7  # cosine of the angle between an edge's gradient and the line of two centres, at most, in a notch
+NOTCH_REACH = 1.5  # px beyond the notch's depth in which edges are of it
+LEAST_NOTCH = 4  # edges
 SAME = 0.15  # of the radius, by which centres and radii of one circle may differ
 
 
@@ -74,7 +77,7 @@ class Edges:
         """The circles that stand out, those with most edges on them first."""
         found: list[Circle] = []
         for x, y, radius in _voted(self.points, self.normals, self.shape):
-            fitted = _fitted(self.points, self.normals, x, y, radius)
+            fitted = self._fitted(x, y, radius)
             circle = None if fitted is None else self._enlarged(*fitted)
             if circle is not None and not any(circle.is_same(other) for other in found):
                 found.append(circle)
@@ -89,11 +92,40 @@ class Edges:
     def fit(self, x: float, y: float, radius: float) -> Circle | None:
         """The circle near one of the image (px), if edges lie on it."""
         fx, fy = self.stretch
-        x, y, radius = x / fx - 0.5, y / fy - 0.5, 2 * radius / (fx + fy)
-        away = np.abs(self.points - np.array([x, y]))
-        near = (away[:, 0] < 1.6 * radius) & (away[:, 1] < 1.6 * radius)
-        fitted = _fitted(self.points[near], self.normals[near], x, y, radius)
+        fitted = self._fitted(x / fx - 0.5, y / fy - 0.5, 2 * radius / (fx + fy))
         return None if fitted is None else self._enlarged(*fitted)
+
+    def notch(self, a: Circle, b: Circle) -> float | None:
+        """How deep the outline is notched where two circles overlap: 1 as theirs is, 0 as straight as a bottle's side.
+
+        None where no edges are seen there, or the circles lie apart.
+        """
+        stretch = np.array(self.stretch)
+        start, end = (np.array([c.x, c.y]) / stretch - 0.5 for c in (a, b))
+        first, last = (2 * c.radius / float(stretch.sum()) for c in (a, b))
+        gap = float(np.linalg.norm(end - start))
+        if gap > 1.9 * min(first, last):
+            return None
+        along = (end - start) / gap
+        way = (self.points - start) @ along / gap
+        aside = np.abs((self.points - start) @ np.array([-along[1], along[0]]))
+        radius = first + (last - first) * way
+        depth = radius - np.sqrt(np.maximum(radius**2 - (gap * np.minimum(np.abs(way), np.abs(1 - way))) ** 2, 0))
+        facing = np.abs(self.normals @ along) < NOTCH_FACING
+        facing &= np.abs(aside - radius + depth / 2) < depth / 2 + NOTCH_REACH
+        between = facing & (np.abs(way - 0.5) < 0.22)
+        beside = facing & (np.minimum(np.abs(way), np.abs(1 - way)) < 0.2)
+        if min(np.count_nonzero(between), np.count_nonzero(beside)) < LEAST_NOTCH:
+            return None
+        # Against the outline beside the centres: fitted radii are not exact to the notch's depth.
+        step = float((aside - radius)[beside].mean() - (aside - radius)[between].mean())
+        return step / max(float(depth[between].mean() - depth[beside].mean()), 1e-6)
+
+    def _fitted(self, x: float, y: float, radius: float) -> tuple[float, float, float, frozenset[int]] | None:
+        reach = 1.6 * radius
+        columns, rows = self.points[:, 0], self.points[:, 1]
+        near = (columns > x - reach) & (columns < x + reach) & (rows > y - reach) & (rows < y + reach)
+        return _fitted(self.points[near], self.normals[near], x, y, radius)
 
     def _enlarged(self, x: float, y: float, radius: float, on: frozenset[int]) -> Circle:
         fx, fy = self.stretch
@@ -105,27 +137,33 @@ def _edges(small: Image) -> tuple[Floats, Floats]:
     lab = np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
     blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
     dx, dy = (cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
-    strength = dx * dx + dy * dy
-    channel = strength.argmax(axis=2)[..., None]
-    gx, gy = (np.take_along_axis(values, channel, axis=2)[..., 0] for values in (dx, dy))
-    total = np.sqrt(strength.sum(axis=2))
-    length = np.maximum(np.hypot(gx, gy), 1e-6)
-    nx, ny = gx / length, gy / length
-    xs, ys = np.meshgrid(np.arange(total.shape[1], dtype=np.float32), np.arange(total.shape[0], dtype=np.float32))
-    ahead, behind = (_at(total, xs + side * nx, ys + side * ny) for side in (1, -1))
-    threshold = max(EDGE[0], EDGE[1] * float(np.median(total)))
-    peak = (total > threshold) & (total >= ahead) & (total > behind)
-    peak[:2] = peak[-2:] = False
-    peak[:, :2] = peak[:, -2:] = False
-    rows, columns = np.nonzero(peak)
-    t, a, b = (values[rows, columns].astype(np.float64) for values in (total, ahead, behind))
-    shift = np.clip(0.5 * (a - b) / np.maximum(2 * t - a - b, 1e-6), -0.5, 0.5)  # the vertex of a parabola
-    normals = np.stack([nx[rows, columns], ny[rows, columns]], axis=1).astype(np.float64)
-    return np.stack([columns, rows], axis=1) + shift[:, None] * normals, normals
+    total = np.asarray(cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3), np.float32))), np.float32)
+    strong = total > max(EDGE[0], EDGE[1] * float(np.median(total[::2, ::2])))
+    strong[:2] = strong[-2:] = False
+    strong[:, :2] = strong[:, -2:] = False
+    rows, columns = np.nonzero(strong)
+    gx, gy = dx[rows, columns], dy[rows, columns]
+    channel = (gx * gx + gy * gy).argmax(axis=1)
+    each = np.arange(len(rows))
+    normals = np.stack([gx[each, channel], gy[each, channel]], axis=1).astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+    points = np.stack([columns, rows], axis=1).astype(np.float64)
+    here = total[rows, columns].astype(np.float64)
+    ahead, behind = (_at(total, points + side * normals) for side in (1, -1))
+    peak = (here >= ahead) & (here > behind)
+    here, ahead, behind, points, normals = (values[peak] for values in (here, ahead, behind, points, normals))
+    bend = np.maximum(2 * here - ahead - behind, 1e-6)
+    shift = np.clip(0.5 * (ahead - behind) / bend, -0.5, 0.5)  # the vertex of a parabola
+    return points + shift[:, None] * normals, normals
 
 
-def _at(values: Floats32, xs: Floats32, ys: Floats32) -> Floats32:
-    return np.asarray(cv2.remap(values, xs, ys, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+def _at(values: Floats32, points: Floats) -> Floats:
+    """Values [N] between the pixels of [h, w]."""
+    x, y = points[:, 0], points[:, 1]
+    column, row = x.astype(np.int64), y.astype(np.int64)
+    u, v = x - column, y - row
+    top = (1 - u) * values[row, column] + u * values[row, column + 1]
+    return (1 - v) * top + v * ((1 - u) * values[row + 1, column] + u * values[row + 1, column + 1])
 
 
 def _voted(points: Floats, normals: Floats, shape: tuple[int, int]) -> list[tuple[float, float, float]]:
@@ -134,17 +172,18 @@ def _voted(points: Floats, normals: Floats, shape: tuple[int, int]) -> list[tupl
     radii = LEAST_RADIUS * RADIUS_STEP ** np.arange(int(np.log(most / LEAST_RADIUS) / np.log(RADIUS_STEP)) + 1)
     rows, columns = shape[0] // CELL + 1, shape[1] // CELL + 1
     scores = np.zeros((len(radii), rows, columns), np.float32)
-    for layer, radius in zip(scores, radii, strict=True):
-        shift = radius * normals
-        cells = (np.concatenate([points - shift, points + shift]) / CELL).round().astype(np.int64)
-        inside = (cells >= 0).all(axis=1) & (cells[:, 0] < columns) & (cells[:, 1] < rows)
-        index = cells[inside, 1] * columns + cells[inside, 0]
+    x, y = (np.concatenate([values, values]).astype(np.float32) / CELL + 0.5 for values in points.T)
+    nx, ny = (np.concatenate([values, -values]).astype(np.float32) / CELL for values in normals.T)
+    for i, radius in enumerate(radii.astype(np.float32)):
+        column, row = np.floor(x + radius * nx).astype(np.int32), np.floor(y + radius * ny).astype(np.int32)
+        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+        index = (row * columns + column)[inside]
         votes = np.bincount(index, minlength=rows * columns).reshape(rows, columns).astype(np.float32)
         # Chance votes grow with the circumference as true ones do: weighed by its root, long arcs of large circles
         # come before whole circles of a few pixels.
-        cv2.boxFilter(votes, -1, (3, 3), dst=layer, normalize=False)
-        layer[layer < LEAST_VOTES * 2 * np.pi * radius] = 0
-        layer /= np.float32(np.sqrt(2 * np.pi * radius))
+        gathered = np.asarray(cv2.boxFilter(votes, -1, (3, 3), normalize=False), np.float32)
+        gathered[gathered < LEAST_VOTES * 2 * np.pi * radius] = 0
+        scores[i] = gathered / np.sqrt(2 * np.pi * radius)
     found: list[tuple[float, float, float]] = []
     best = scores.max(axis=0)
     while len(found) < MAX_CIRCLES:

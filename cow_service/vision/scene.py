@@ -88,9 +88,13 @@ class Scene:
         return erase_drawing(self.image, self.cues)
 
     @cached_property
+    def _all_trails(self) -> tuple[Trail, ...]:
+        return find_trails(self._undrawn)
+
+    @cached_property
     def trails(self) -> tuple[Trail, ...]:
         """Several positions of one ball each, the present one last: at the mover, or as it shows, or as a guess."""
-        found = [trail for trail in find_trails(self._undrawn) if trail.evident or self.trail_named]
+        found = [trail for trail in self._all_trails if trail.evident or self.trail_named]
         own = None if self.mover is None else trail_ending_at(found, self.mover)
         if own is None:
             return tuple(found)
@@ -122,8 +126,12 @@ class Scene:
         trail = trail_ending_at(self.trails, bbox)
         if trail is None or any(trail.positions == other.positions for other in self.trails):
             return self
-        other = replace(self, mover=bbox, _masks={}, _found={}, _obstacles={})
-        other.__dict__.update({key: self.__dict__[key] for key in ("_undrawn", "cues") if key in self.__dict__})
+        return self.once(("mover", trail.positions), lambda: self._ending_at(bbox))
+
+    def _ending_at(self, bbox: BBox) -> Scene:
+        other = replace(self, mover=bbox, _masks={}, _found={}, _preset={}, _obstacles={})
+        kept = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "_all_trails")  # which an end of a trail changes not
+        other.__dict__.update({key: self.__dict__[key] for key in kept if key in self.__dict__})
         return other
 
     def region_of(self, bbox: BBox) -> Region | None:

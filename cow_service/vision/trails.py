@@ -1,4 +1,4 @@
-"""Finds trails: three or more positions of one ball in one image, faded, or as opaque as a multiple exposure shows them.
+"""Finds trails: three or more positions of one ball in one image, faded or as opaque as in a multiple exposure.
 
 Two circles that look alike are the start; others that look like them are sought between and beyond them, on a path
 along which place and size change smoothly. Balls that merely look alike are no trail by themselves: see
@@ -20,9 +20,12 @@ from cow_service.vision.masks import iou
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
+SURE_SUPPORT = 0.3  # of the circumference: with more, no better circle is sought nearby
 SEEN_SUPPORT = 0.75  # of what the other positions leave to be seen of a circumference, on edges
+NOTCHED = 0.35  # of the depth that the outline of two overlapping circles has between them: less is a straight side
 SIZES = 1.35  # between the radii of neighbours, at most
 LOOKS, LEAST_CONTRAST = 0.3, 12.0  # difference of the looks over the contrast, at most; grey levels of that contrast
+MOST_UNREST = 12.0  # grey levels of a background's variation that are allowed for
 FADED = 0.85  # of the opacity of the most opaque: with less, a position was faded
 LEAST_OPACITY = 0.08
 SPACING = 0.5, 2.0  # between neighbouring gaps
@@ -30,9 +33,11 @@ BEND = math.radians(65)  # between neighbouring legs, at most
 LEAST_GAP, MOST_GAP = 0.35, 5.0  # radii between neighbours
 MOST_SAG = 0.3  # of the distance of two positions: how far those between may lie off the line
 MAX_POSITIONS = 12
+MAX_PAIRS = 6  # circles that look alike, between and beyond which others are sought
 SAME_POSITION_IOU = 0.4
+# Radii: offsets from the centre at which looks are compared.
 OFFSETS = np.array([(r * math.cos(t), r * math.sin(t)) for r in (0.25, 0.5, 0.7, 0.85)
-                    for t in np.linspace(0, 2 * math.pi, 24, endpoint=False)])  # radii: where looks are compared  # fmt: skip
+                    for t in np.linspace(0, 2 * math.pi, 24, endpoint=False)])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -132,15 +137,15 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     ends = [circle for circle in edges.circles() if circle.support >= END_SUPPORT]
     ends = [circle for circle in ends if looks.contrast(circle) >= LEAST_CONTRAST]
     trails: list[Trail] = []
-    for i, a in enumerate(ends):
-        for b in ends[i + 1 :]:
-            if any(_is_part(circle, trail) for circle in (a, b) for trail in trails):
-                continue
-            if _may_be_one(a, b) and looks.alike((a, b)):
-                chain = _chain(edges, looks, a, b)
-                trail = None if chain is None else _trail(looks, chain)
-                if trail is not None:
-                    trails.append(trail)
+    tried = 0
+    for a, b in itertools.combinations(ends, 2):
+        known = any(_is_part(circle, trail) for circle in (a, b) for trail in trails)
+        if tried < MAX_PAIRS and not known and _may_be_one(a, b) and looks.alike((a, b)):
+            tried += 1
+            chain = _chain(edges, looks, a, b)
+            trail = None if chain is None else _trail(looks, chain)
+            if trail is not None:
+                trails.append(trail)
     whole: list[Trail] = []
     for trail in sorted(trails, key=lambda trail: -len(trail.positions)):
         if not any(_share_positions(trail, other) for other in whole):
@@ -169,7 +174,7 @@ def _chain(edges: Edges, looks: _Looks, a: Circle, b: Circle) -> tuple[Circle, .
         if chain is None:
             continue
         chain = _beyond(edges, looks, _beyond(edges, looks, chain)[::-1])
-        if len(chain) > max(2, len(best)) and _is_path(chain) and looks.alike(chain) and _is_outlined(chain):
+        if len(chain) > max(2, len(best)) and _is_path(chain) and looks.alike(chain) and _is_outlined(edges, chain):
             best = chain
     return best or None
 
@@ -183,7 +188,7 @@ def _between(edges: Edges, looks: _Looks, a: Circle, b: Circle, inner: int) -> t
     across = np.array([a.y - b.y, b.x - a.x]) / apart
     shares = np.arange(1, inner + 1) / (inner + 1)
     most = MOST_SAG * apart if inner else 0.0
-    for bulge in sorted(np.arange(-most, most + 1e-9, 0.35 * mean).tolist() + [0.0], key=abs):
+    for bulge in sorted([0.0, *np.arange(-most, most + 1e-9, 0.35 * mean).tolist()], key=abs):
         chain, seeds = [a], []
         for t in shares:
             middle = np.array([a.x, a.y]) * (1 - t) + np.array([b.x, b.y]) * t + 4 * t * (1 - t) * bulge * across
@@ -224,10 +229,14 @@ def _beyond(edges: Edges, looks: _Looks, chain: tuple[Circle, ...]) -> tuple[Cir
 
 def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
     """The circle with most edges on it within half a radius of a place."""
-    tried = [edges.fit(x + dx * radius, y + dy * radius, radius) for dx, dy in
-             ((0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25))]  # fmt: skip
-    near = [c for c in tried if c is not None and math.dist((c.x, c.y), (x, y)) < 0.6 * radius
-            and 1 / SIZES < c.radius / radius < SIZES]  # fmt: skip
+    near: list[Circle] = []
+    for dx, dy in ((0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25)):
+        circle = edges.fit(x + dx * radius, y + dy * radius, radius)
+        close = circle is not None and math.dist((circle.x, circle.y), (x, y)) < 0.6 * radius
+        if circle is not None and close and 1 / SIZES < circle.radius / radius < SIZES:
+            near.append(circle)
+            if circle.support > SURE_SUPPORT:
+                break
     return max(near, key=lambda circle: circle.support, default=None)
 
 
@@ -255,8 +264,15 @@ def _is_path(chain: Sequence[Circle]) -> bool:
     return bool(uneven < 0.12 and (spread > SPACING[0]).all() and (spread < SPACING[1]).all())
 
 
-def _is_outlined(chain: Sequence[Circle]) -> bool:
-    """Whether edges show as much of each circle as the others leave to be seen: circles fitted into a bottle do not."""
+def _is_outlined(edges: Edges, chain: Sequence[Circle]) -> bool:
+    """Whether edges show as much of each circle as the others leave to be seen, and the notches between them.
+
+    Circles that were fitted into a bottle do not pass.
+    """
+    notches = [edges.notch(a, b) for a, b in itertools.pairwise(chain)]
+    seen_notches = [notch for notch in notches if notch is not None]
+    if seen_notches and float(np.median(seen_notches)) < NOTCHED:
+        return False
     turns = (np.arange(BINS) + 0.5) * 2 * math.pi / BINS
     for i, circle in enumerate(chain):
         rim = np.stack([circle.x + circle.radius * np.cos(turns), circle.y + circle.radius * np.sin(turns)], axis=1)
@@ -321,7 +337,9 @@ class _Looks:
 
     def opacities(self, chain: Sequence[Circle]) -> Floats | None:
         """Opacity [N] of each circle against one that is the most opaque; None where they do not look alike."""
-        about = [self._about(i, chain) for i in range(len(chain))]
+        rings = [self._ring(i, chain) for i in range(len(chain))]
+        about = [np.median(ring, axis=0) for ring in rings]
+        unrest = [float(np.median(np.linalg.norm(r - a, axis=1))) for r, a in zip(rings, about, strict=True)]
         inner = [self._at(circle, OFFSETS) for circle in chain]
         free = [self._free(i, chain) for i in range(len(chain))]
         strength = [float(np.abs(v[f] - b).mean()) if f.any() else 0.0
@@ -333,7 +351,7 @@ class _Looks:
             if np.count_nonzero(both) < 6:
                 both = free[i] | free[model]
             seen, wanted = inner[i][both], inner[model][both]
-            share = _opacity(seen - about[i], wanted - about[model], seen - wanted)
+            share = _opacity(seen - about[i], wanted - about[model], seen - wanted, unrest[i])
             if share is None:
                 return None
             shares.append(share)
@@ -351,20 +369,21 @@ class _Looks:
         points = np.array([circle.x, circle.y]) + circle.radius * OFFSETS
         return ~_inside(points, [other for j, other in enumerate(chain) if j != i], 1.05)
 
-    def _about(self, i: int, chain: Sequence[Circle]) -> Floats:
-        """Median colour [3] around a circle, others left out."""
+    def _ring(self, i: int, chain: Sequence[Circle]) -> Floats:
+        """Colours [N, 3] around a circle, others left out."""
         circle = chain[i]
         turns = np.linspace(0, 2 * math.pi, 48, endpoint=False)
         ring = np.concatenate([f * np.stack([np.cos(turns), np.sin(turns)], axis=1) for f in (1.15, 1.3)])
         points = np.array([circle.x, circle.y]) + circle.radius * ring
         free = ~_inside(points, [other for j, other in enumerate(chain) if j != i], 1.1)
-        return np.median(self._at(circle, ring[free] if free.sum() > 8 else ring), axis=0)
+        return self._at(circle, ring[free] if free.sum() > 8 else ring)
 
 
-def _opacity(seen: Floats, model: Floats, plain: Floats) -> float | None:
+def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float | None:
     """The share of a model's contrast [N, 3] that is seen [N, 3]; None where what is seen is no share of it.
 
-    `plain` [N, 3] are the differences of the colours themselves, which do not depend on the background.
+    `plain` [N, 3] are the differences of the colours themselves, which do not depend on the background; `unrest`
+    is how much that varies (grey levels).
     """
     contrast = float(np.median(np.linalg.norm(model, axis=1)))
     if contrast < LEAST_CONTRAST:
@@ -373,6 +392,6 @@ def _opacity(seen: Floats, model: Floats, plain: Floats) -> float | None:
         return 1.0
     share = float((seen * model).sum() / (model**2).sum())
     rest = float(np.median(np.linalg.norm(seen - share * model, axis=1)))
-    if not LEAST_OPACITY < share < 1.15 or rest > LOOKS * contrast * max(share, 0.15):
+    if not LEAST_OPACITY < share < 1.15 or rest > LOOKS * contrast * share + min(unrest, MOST_UNREST):
         return None
     return min(share, 1.0)

@@ -78,7 +78,8 @@ class EmbeddedReader:
         """
         with given.cpu():
             question = parse(given.question)
-            reading = _read_motion(given.scene, question, grounding)
+            on = along_trail(given.scene, grounding, question.motion) if question.motion.trail is not None else None
+            reading = on or _read_motion(given.scene, question, grounding)
             return _with_quantities(given.scene, question, grounding, reading)
 
     def answer(
@@ -171,8 +172,6 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
-    if words.trail is not None and (on := along_trail(scene, grounding, words)) is not None:
-        return on
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
     return _as_said(scene, words, kind, grounding) or _as_shown(scene, question, kind, grounding)
@@ -203,9 +202,11 @@ def _as_shown(scene: Scene, question: Question, kind: MotionKind, grounding: Gro
             "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
             f"up. {GIVE_DIRECTION}"
         )
-    on = along_trail(scene, grounding, words)
-    if on is not None:
-        return on
+    return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
+
+
+def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
+    """Along the only arrow drawn at the mover, where the question names no direction at all."""
     near = arrows_near(scene, grounding.bbox)
     if near and question.names_direction:
         raise CannotReadDirection(
