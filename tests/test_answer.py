@@ -74,6 +74,14 @@ will it stay visible? | whether covered - not
 is it true that it hits the vase? | whether touches vase
 true or false: the red ball hits the vase | whether touches vase
 will it hit or miss the vase? | whether touches vase
+will it miss the vase, yes or no? | whether touches vase not
+will it stop before it reaches the vase? | whether touches vase not
+will it stop short of the vase? | whether touches vase not
+does the vase get in its way? | whether touches vase
+is there anything in its way? | whether touches -
+would the red ball rolling left collide with the vase? | whether touches vase
+how long does it take the ball to reach the vase? | when touches vase
+where does it come down? | where touches -
 where will it land? | where touches -
 where will the red ball stop? | where touches -
 what happens? | what-happens touches -
@@ -135,6 +143,7 @@ If the purple mug is removed and the black ball moves along the arrow, will it h
 If the red ball rolls left without the vase, will it hit the cube? | whether touches cube
 Suppose the vase were not there. If the red ball rolls left, will it hit the cube? | whether touches cube
 If I put the cyan cube into the pink bowl, will it fit inside? | whether inside pink bowl
+If I put the cyan cube into the pink bowl, will it stick out? | whether inside pink bowl not
 If the orange ball flies on along the trail of positions that is shown, will it hit the cube? | whether touches cube
 """
 

@@ -32,7 +32,7 @@ _PLURAL = lex.words("objects things items ones obstacles bodies")
 _PLAIN_WORDS = lex.words(
     "take takes taking long soon clear free untouched visible unobstructed unoccluded uncovered unhidden unblocked",
     "first elapse elapses pass passes seconds whole entire total overall altogether",
-    "number least all",
+    "number least all short",
 )
 _OF_GENERIC = lex.words("first other different all")
 _TRAILING = lex.words("hard fast slow alone anyway whatsoever second third last twice once again")  # more is asked

@@ -20,8 +20,10 @@ _FORMS: dict[str, AskedForm] = {
 _ACTS: dict[str, tuple[AskedRelation, bool]] = {
     "touches": ("touches", False), "what_touches": ("touches", False), "touched": ("touches", True),
     "hits_none": ("touches", False), "misses": ("touches", False), "missed": ("touches", True),
+    "gets_in_way": ("touches", True),
+    "stops_short": ("touches", False),
     "untouched": ("touches", True), "collides": ("touches", False), "contact_event": ("touches", False),
-    "together": ("touches", False), "list_hit": ("touches", False),
+    "together": ("touches", False),
     "hides": ("covers", False), "what_hides": ("covers", False), "hidden": ("covers", True), "stays": ("covers", True),
     "passes_behind": ("covered", False), "what_passes_behind": ("covered", False),
     "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False),
@@ -29,7 +31,7 @@ _ACTS: dict[str, tuple[AskedRelation, bool]] = {
     "moves_it": ("moves", False), "moves": ("moves", True), "moved": ("moves", True), "still": ("moves", True),
 }  # fmt: skip
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
-_NEGATIONS = frozenset({"no", "none", "misses", "missed", "avoids", "stays", "no_contact", "sticks_out"})
+_NEGATIONS = frozenset({"no", "none", "misses", "missed", "avoids", "stays", "no_contact", "sticks_out", "stops_short"})
 
 
 @dataclass(frozen=True)

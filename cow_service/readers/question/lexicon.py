@@ -106,7 +106,7 @@ FUNCTION_WORDS = (
         "whom in inside within on onto upon into at to toward towards from of off over under below above beneath",
         "beside near by with along across through around past behind before between among against via per about",
         "as like than during until till for out outside and or but then so because whether since though how where",
-        "why ~ true false",
+        "why ~ true false rid",
         "next close now still think believe predict expect tell know suppose also ever just straight already",
         "always instead soon again away closer nearer farther further far together too very much only even",
         "perhaps maybe else finally opposite according due parallel perpendicular ahead forward forwards backward",
