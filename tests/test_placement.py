@@ -12,6 +12,7 @@ from runs import run_of
 from cow_service.errors import CannotGround
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, CutoutOptions
+from cow_service.readers.question.facts import facts_of
 from cow_service.records import Grounding, Intervention, LocatedObject, Motion, Trajectory
 from cow_service.stages.bodies import obstacles_of
 from cow_service.stages.motion import read_motion
@@ -86,6 +87,12 @@ class TestInto:
         assert min(point[1] for point in told.path.points) < 200  # it comes from above
         touched = next(each for each in told.encounters if each.kind == "touches")
         assert touched.first_frame >= 15  # nothing is touched while it is carried
+
+    def test_it_is_told_in_a_sentence(self) -> None:
+        told = put(with_bowl(SMALL), "into", located("blue bowl", BOWL))[3]
+        facts = facts_of("red ball", told)
+        assert facts.startswith("The red ball is carried over, is let go and goes in and stays inside")
+        assert facts.endswith("; 20 of 20 worlds agree.")
 
     def test_a_large_one_does_not(self) -> None:
         _, _, _, told = put(with_bowl(BIG), "into", located("blue bowl", BOWL), mover=BIG)
@@ -197,6 +204,19 @@ class TestWhatCannotBe:
     def test_between_one_thing(self) -> None:
         with pytest.raises(CannotGround, match="at one place"):
             put(blocks(NEAR), "between", located("blue cube", NEAR), located("cube", NEAR))
+
+    def test_before_another_motion(self) -> None:
+        run = run_of(blocks(NEAR), motion={"kind": "linear", "direction": (1, 0)}, num_frames=FRAMES)
+        moved = Intervention(
+            kind="place", object=located("blue cube", NEAR), relation="behind", targets=(located("red ball", SMALL),)
+        )
+        grounding = Grounding(
+            object="red ball", point=(150, 290), bbox=SMALL, others=(located("blue cube", NEAR),),
+            interventions=(moved,), source="request",
+        )  # fmt: skip
+        motion = read_motion(run, grounding, None).value
+        with pytest.raises(CannotGround, match="'blue cube' is put somewhere before something else happens"):
+            compute_trajectory(run, grounding, motion)
 
     def test_nowhere(self) -> None:
         run = run_of(with_bowl(SMALL), motion={"kind": "place"}, num_frames=FRAMES)

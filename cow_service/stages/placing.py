@@ -47,11 +47,18 @@ def placing_sentence(grounding: Grounding, placed: Intervention) -> str:
 def put_of(scene: Scene, grounding: Grounding, motion: Motion, bodies: Sequence[SeenBody]) -> Put | None:
     """Where the mover is put; None where it is put nowhere.
 
-    Raises `CannotGround` where nothing says where to, a target was not found or is the mover, or has no opening.
+    Raises `CannotGround` where nothing says where to, a target was not found or is the mover, or has no opening, and
+    for what is put somewhere before another motion.
     """
+    placed = placed_mover(grounding) if motion.kind == "place" else None
+    unused = [each for each in grounding.interventions if each.kind == "place" and each is not placed]
+    if unused:
+        raise CannotGround(
+            f"'{unused[0].object.object}' is put somewhere before something else happens: one thing is put somewhere, "
+            "and nothing else moves by itself. Ask of one change at a time."
+        )
     if motion.kind != "place":
         return None
-    placed = placed_mover(grounding)
     if placed is None or placed.relation is None or not placed.targets:
         raise CannotGround(
             f"Nothing says where '{grounding.object}' is put: give an intervention of kind `place` with its `relation` "

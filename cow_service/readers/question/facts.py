@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from cow_service.readers.question.placement_facts import placement_parts, placement_share
 from cow_service.records import Contact, Encounter, EncounterKind, Path, Trajectory
 
 MAX_NAME = 60  # characters
@@ -52,6 +53,8 @@ def happening(mover: str, trajectory: Trajectory) -> str:
 
 def _clause(name: str, body: int, trajectory: Trajectory) -> str:
     """How one body goes, what it meets, and how it ends."""
+    if body == 0 and trajectory.placement is not None:
+        return f"{named(name, 'The')} {_joined(placement_parts(trajectory.placement))}"
     met = _told(trajectory, body)
     parts = [*_motion(trajectory, body, met), *(_meeting(each, trajectory) for each in met)]
     missed = _missed(trajectory, body, met)
@@ -275,6 +278,8 @@ def _end(trajectory: Trajectory, body: int) -> list[str]:
 def _agreement(trajectory: Trajectory) -> float | None:
     """The share of the worlds in which what the sentence says of the question, or of its first encounter, is so."""
     outcome = trajectory.outcome
+    if trajectory.placement is not None:
+        return placement_share(trajectory.placement)
     if outcome is None or outcome.probability is None:
         met = _told(trajectory, 0)
         return met[0].probability if met else None
