@@ -18,7 +18,7 @@ from cow_service.service import Service
 
 SEEN = ROOT / "tests" / "data" / "wordings" / "seen.json"
 _SAME = {"teal": "cyan", "gray": "grey", "beside": "next-to", "over": "onto"}
-_WORDLESS = {"the", "a", "one", "it", "thing", "of", "toy"}
+_WORDLESS = {"the", "a", "one", "it", "thing", "of", "toy", "object"}
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,7 @@ def _motion(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> list
     if record is None:
         verb = "moves"
     elif record.support == "air":
-        rises = path.states[-1][1] < path.states[0][1]
+        rises = path.states[_set_out(path)][1] < path.states[0][1]
         still = _across(path) < MOVED
         return [("rises" if rises else "falls") if still else f"flies {_direction(path)}"]
     else:
