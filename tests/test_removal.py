@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,8 @@ from floors import TrueCamera, known, outline
 from runs import run_of
 
 from cow_service.errors import InvalidRequest
-from cow_service.generators.cutout import create
+from cow_service.generators.base import GeneratorInput
+from cow_service.generators.cutout import CutoutGenerator, create
 from cow_service.media.images import decode_own
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
@@ -147,8 +149,12 @@ class TestLocating:
 
 
 class TestFrames:
-    def clip(self, **frames: Any) -> tuple[Run, Clip]:
-        wanted = run(generator=create(Settings()), video=False, frames={"indices": [0, 10], "max_side": None} | frames)
+    def clip(self, generator: Any = None, **frames: Any) -> tuple[Run, Clip]:
+        wanted = run(
+            generator=generator or create(Settings()),
+            video=False,
+            frames={"indices": [0, 10], "max_side": None} | frames,
+        )
         grounded = ground(wanted).value
         motion = read_motion(wanted, grounded, None).value
         told = compute_trajectory(wanted, grounded, motion).value
@@ -174,12 +180,38 @@ class TestFrames:
     def test_frames_of_the_scene_as_it_is_can_be_left_out(self) -> None:
         assert self.clip(factual=False)[1].factual_frames == ()
 
+    @pytest.mark.parametrize(("factual", "clips"), [(None, 1), (True, 2)])
+    def test_a_video_model_is_given_the_scene_without_it(self, factual: bool | None, clips: int) -> None:
+        model = VideoModel()
+        _, clip = self.clip(model, factual=factual)
+        assert len(model.given) == clips, "what it costs is doubled only where that is asked for"
+        assert len(clip.factual_frames) == (2 if factual else 0)
+        x0, y0, x1, y1 = BETWEEN
+        bare = picture(with_block=False)[y0:y1, x0:x1].astype(int)
+        first = model.given[0].scene
+        for image in (first.clean, first.image):
+            assert np.abs(image[y0:y1, x0:x1].astype(int) - bare).mean() < 5
+        assert first.silhouette(MOVER).any()
+
     def test_the_overlay_marks_it(self) -> None:
         wanted, clip = self.clip()
         drawn = decode_own(wanted.backends.artifacts.read(clip.overlay.sha256))
         x0, y0, x1, y1 = BETWEEN
         marked = (drawn[y0:y1, x0:x1] == (255, 120, 120)).all(axis=2)
         assert 0.05 < marked.mean() < 0.5
+
+
+class VideoModel(CutoutGenerator):
+    """A generator on a device of its own, which notes what it is given."""
+
+    concurrency = 1
+
+    def __init__(self) -> None:
+        self.given: list[GeneratorInput] = []
+
+    def render(self, given: GeneratorInput, indices: Sequence[int], progress: Any) -> Iterator[Image]:
+        self.given.append(given)
+        return super().render(given, indices, progress)
 
 
 def _drawn(name: str, shape: Any, bbox: Any) -> SeenBody:
