@@ -56,6 +56,29 @@ do you think it will strike the cube? | whether touches cube
 can you tell whether it will hit the cube? | whether touches cube
 will it hit the cube or not? | whether touches cube
 will the ball touch the cube at any point? | whether touches cube
+will it land in the bowl? | whether inside bowl
+will it roll into the bowl? | whether inside bowl
+will the vase be hit by the red ball? | whether touches vase
+will the vase be knocked over? | whether tips vase
+will it knock over the vase? | whether tips vase
+will it knock the vase over? | whether tips vase
+will the vase fall over? | whether tips vase
+will the vase topple? | whether tips vase
+will it tip over? | whether tips red ball
+will the vase move? | whether moves vase
+will the vase stay where it is? | whether moves vase not
+will it push the vase? | whether moves vase
+will it leave the image? | whether leaves -
+will it roll out of the picture? | whether leaves -
+will it stay visible? | whether covered - not
+is it true that it hits the vase? | whether touches vase
+true or false: the red ball hits the vase | whether touches vase
+will it hit or miss the vase? | whether touches vase
+where will it land? | where touches -
+where will the red ball stop? | where touches -
+what happens? | what-happens touches -
+what will happen to the vase? | what-happens touches vase
+does the red ball go behind the vase? | whether covered vase
 will it hit anything? | whether touches -
 will it collide with anything? | whether touches -
 will it collide? | whether touches -
@@ -127,13 +150,14 @@ def test_what_is_asked(row: str) -> None:
     expected = Asked.model_validate(
         {"form": form, "relation": relation, "target": None if name == "-" else name, "negated": negated}
     )
-    assert told == expected
+    assert told.model_copy(update={"among": ()}) == expected
 
 
 @pytest.mark.parametrize(
     ("question", "named"),
     [
         ("will it hit the red cube or the blue mug first?", ["red cube", "blue mug"]),
+        ("will it hit the red cube or the blue mug?", ["red cube", "blue mug"]),
         ("which will it hit first, the red cube or the blue mug?", ["red cube", "blue mug"]),
         ("Which of these will the red ball hit first if it moves left: a cube, a vase, or a mug?",
          ["cube", "vase", "mug"]),
@@ -150,7 +174,6 @@ def test_among_which_things_the_first_is_asked_for(question: str, named: list[st
 
 UNREAD = """
 will it hit the vase before it hits the cube?
-will it hit the vase or the cone?
 will it hit the vase and the cube?
 will it hit all the objects?
 will it hit every object?
@@ -170,7 +193,6 @@ will it still hit the vase?
 will it not miss the vase?
 won't it hit the vase?
 will it lose contact with the vase?
-will it knock over the vase?
 will it smash the vase?
 will it be blocked by the vase?
 will it cover the vase?
@@ -178,17 +200,13 @@ will it completely hide the vase?
 will the vase be hidden at the end?
 will the vase still be visible?
 will the vase remain fully visible?
-will it stay visible?
 will it disappear?
 will it stop behind the vase?
-will it land in the bowl?
 will it land behind the cube?
-will it roll into the bowl?
 will it come to rest on the cube?
 will it hit the floor?
 will it fall off the table?
 will it turn green?
-will the vase be hit by the cube?
 is it impossible for it to hit the vase?
 is it false that it hits the vase?
 is it likely to hit the vase?
@@ -200,15 +218,12 @@ at which speed will it hit the vase?
 when precisely will it miss the vase?
 will they collide?
 when will it stop?
-where will it stop?
-where will it land?
 how many times will it hit the vase?
 how many cubes will it hit?
 how many objects will it knock over?
 which objects will it hit?
 which object does it touch last?
 which object will it hit second?
-what happens?
 If the red ball rolls left, will the vase be hit? And will the cube be hit?
 If the red ball moves left and the blue ball moves right, will it hit the cube?
 If the red ball rolls left and hits the cube, will it hit the vase?
@@ -512,3 +527,29 @@ def test_the_folder_of_an_answer(tmp_path: Path) -> None:
     told = Answer.model_validate_json(said.stdout)
     assert (told.simulation, told.not_sure, told.votes) == (None, True, {"not sure": 2})
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == ["data", "out"]
+
+
+@pytest.mark.parametrize(
+    ("question", "told"),
+    [
+        ("If the ball moves left and the car moves right, will they collide?", Asked(relation="touches", target="car")),
+        (
+            "If the vase is removed and the ball rolls left, will it still hit the cup?",
+            Asked(relation="touches", target="cup"),
+        ),
+        (
+            "If the ball rolls left, would the outcome change if the vase were removed?",
+            Asked(form="changes", relation="touches"),
+        ),
+        (
+            "If the ball rolls left, will the cube be hidden by the cup?",
+            Asked(relation="covered", subject="cube", target="cup"),
+        ),
+        (
+            "If the ball rolls left, will the cube be hit by the cup?",
+            Asked(relation="touches", subject="cup", target="cube"),
+        ),
+    ],
+)
+def test_what_is_asked_of_others_than_the_mover(question: str, told: Asked) -> None:
+    assert asked_of(question) == told

@@ -30,6 +30,7 @@ If I put the apple into the bowl, will it fit? | place apple into bowl | apple p
 If the apple is placed on top of the red box, will it fall off? | place apple onto red box | apple put
 If I put the box between the vase and the cup, does it touch the cup? | place box between vase & cup | box put
 If the ball is put in front of the mug, will the mug be hidden? | place ball in-front-of mug | ball put
+Will the apple fit into the bowl? | place apple into bowl | apple put
 If the cup to the left of the vase is dropped, will it fall into the bowl? | | cup drop
 If the ball rolls left, will it hit the vase? | | ball roll
 """

@@ -9,9 +9,10 @@ import pytest
 
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.answer import answer_calls
+from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.prompts import load_prompt
 from cow_service.readers.question.choices import read_choices
-from cow_service.records import Simulation
+from cow_service.records import Intervention, LocatedObject, Simulation
 
 SHA = "0" * 64
 OPTIONS = read_choices("", ["Yes", "No", "Not sure"])
@@ -19,11 +20,11 @@ FACTS = "The ball bounces once and meets\nthe white cube after 1.1 s."
 MUG = {"object": "the blue mug", "bbox": (60, 20, 80, 40), "first_frame": 8}
 
 
-def prompt(**trajectory: Any) -> str:
-    """The text of the answer's prompt for a simulation with this trajectory."""
+def simulated(**trajectory: Any) -> Simulation:
+    """A simulation with this trajectory."""
     image = {"sha256": SHA, "url": f"/artifacts/{SHA}", "media_type": "image/png", "size": 1}
     path = {"states": [(0,) * 6] * 2, "points": [(1, 1)] * 2, "visible": [True] * 2, "scale": [1, 1], "tracks": []}
-    simulation = Simulation.model_validate(
+    return Simulation.model_validate(
         {
             "id": "x", "created_at": "", "question": "q", "frames": (), "video": None, "overlay": image,
             "image": {"sha256": SHA, "width": 96, "height": 64},
@@ -36,7 +37,16 @@ def prompt(**trajectory: Any) -> str:
             "generator": {"name": "cutout", "seed": 0}, "reader": {"name": "mllm"}, "timings": {},
         }
     )  # fmt: skip
-    imagined = Imagined(simulation, (np.zeros((4, 4, 3), np.uint8),))
+
+
+def prompt(removed: str | None = None, strips: bool = False, **trajectory: Any) -> str:
+    """The text of the answer's prompt for a simulation with this trajectory, with something removed."""
+    simulation, frames = simulated(**trajectory), (np.zeros((4, 4, 3), np.uint8),)
+    if removed is not None:
+        change = Intervention(kind="remove", object=LocatedObject(object=removed, bbox=(50, 20, 60, 40)))
+        grounding = simulation.grounding.model_copy(update={"interventions": (change,)})
+        simulation = simulation.model_copy(update={"grounding": grounding})
+    imagined = Imagined(simulation, frames, frames if strips else ())
     (call,) = answer_calls("Will it hit the cube?", OPTIONS, (b"", b""), imagined, 1, 100)
     return load_prompt(call.prompt).render(**call.inputs)
 
@@ -98,3 +108,33 @@ def test_encounters_are_told_where_there_is_no_outcome() -> None:
 def test_a_law_without_contacts_is_told() -> None:
     assert "move on through whatever they meet" in prompt(law="ballistic")
     assert "move on through whatever they meet" not in prompt()
+
+
+def test_both_worlds_of_a_removal_are_told_and_named() -> None:
+    path = {"states": [(0,) * 6] * 2, "points": [(1, 1)] * 2, "visible": [True] * 2, "scale": [1, 1], "tracks": []}
+    as_it_is = {"fps": 16, "paths": [path], "anchors": [], "ensemble": 200, "outcome": outcome(probability=0.02)}
+    given = {"outcome": outcome(probability=0.97), "factual": as_it_is}
+    text = prompt("The vase", strips=True, **given)
+    assert 'first strip, named "With the vase removed"' in text
+    assert 'named "As it is"' in text
+    lines = text.splitlines()
+    told = "in 97% of 200 computed worlds: the ball touches the white cube."
+    assert f"> With the vase removed, {told}" in lines
+    assert f"> As it is, {told.replace('97', '2')}" in lines
+    without_strips = prompt("The vase", **given)
+    assert "the scene is without the vase" in without_strips
+    assert "strip" not in without_strips
+    assert "without" not in prompt()
+
+
+def test_two_worlds_are_shown_as_two_strips_of_their_frames() -> None:
+    colours = np.array([(60, 0, 200), (120, 0, 200), (180, 0, 200), (240, 0, 200)], np.uint8)  # none is a grey
+    frames = tuple(np.tile(colour, (40, 60, 1)) for colour in colours)
+    simulation = simulated()
+    assert pictures(Imagined(simulation, frames)) == frames
+    changed, factual = pictures(Imagined(simulation, frames, frames[::-1]))
+    assert changed.shape == factual.shape
+    assert (changed == colours[0]).all(axis=2).sum() == 40 * 60, "all of a frame is seen"
+    first = np.argwhere((changed == colours[0]).all(axis=2))[0]
+    assert ((changed == colours[1]).all(axis=2).nonzero()[1] > first[1]).all(), "in their order, from left to right"
+    assert (factual[: first[0]] > 150).any(), "the name is written above"

@@ -57,6 +57,8 @@ SAMPLES: dict[str, object] = {
     "sentence": "The ball moves.",
     "times": "0.06 s",
     "law": "contact",
+    "removed": "the vase",
+    "as_it_is": "As it is",
     "facts": ("The ball touches the vase after 0.5 s.",),
     "encounters_known": True,
     "encounters": ("touches the vase, 0.5 s in",),

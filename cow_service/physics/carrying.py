@@ -21,7 +21,8 @@ SETTLES = 2.0  # s, at least, for which what is let go is followed, whatever the
 DROP = 0.06  # of its half width: from so high it is let go
 BESIDE_GAP = 0.5  # of its half width: between it and what it is put beside
 AIM_SIGMA = 0.03  # of its half width, along and across: where it is let go
-AIM_OFF = 0.01  # of its half width, to the right: nothing is put on top of a ball so exactly that it stays
+AIM_OFF = 0.01  # of its half width, to the right
+OFF_TOP = 0.1  # the same on a ball or a tip: nothing is put there so exactly that it stays
 HIDDEN_HEIGHT = 0.5  # of a container's width: its height at least, where its foot is hidden
 CLEARANCE = 0.5  # of its half width: so high it passes over what it is carried over
 LEAST_RISE = 0.3  # of the way that it is carried
@@ -60,7 +61,8 @@ def let_go(put: Put, shapes: Sequence[RigidShape], row: Floats) -> tuple[RigidSh
     mover = bodies[0]
     x, y, z = _end(put, bodies)
     aim = mover.half_width * AIM_SIGMA
-    x += mover.half_width * AIM_OFF + aim * float(row[COLUMN["let_go_right"]])
+    tip = put.relation == "onto" and bodies[put.targets[0]].shape in ("sphere", "cone")
+    x += mover.half_width * (OFF_TOP if tip else AIM_OFF) + aim * float(row[COLUMN["let_go_right"]])
     z += aim * float(row[COLUMN["let_go_ahead"]])
     still = (0.0, 0.0, 0.0)
     bodies[0] = replace(mover, position=(x, y, z), velocity=still, starts=True, falls=True, glides=False)

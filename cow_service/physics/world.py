@@ -81,7 +81,7 @@ def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     if given.put is not None:
         return _run_put(given, given.put, scene, shapes, draws, every)
     left = partial(_has_left, scene.cameras, given.size[0])
-    finished = None if len(draws) == 1 or given.motion.steps else left
+    finished = None if len(draws) == 1 or given.motion.steps or given.others else left
     runs = run_worlds(shapes, given.num_frames, given.fps, every, finished, given.turns_wanted)
     return Worlds(scene, shapes, tuple(runs), every, given.fps)
 
@@ -150,6 +150,8 @@ def _rigid_bodies(given: WorldInput, scene: PlacedScene, draws: Floats, k: int) 
     for loose in scene.unsupported:
         bodies[loose] = replace(bodies[loose], starts=True)
     for i, motion in given.others.items():
+        if i >= len(bodies):  # it is taken away
+            continue
         factor = float(speed_factors(motion, draws[k : k + 1], "other_speed")[0])
         bodies[i] = replace(bodies[i], **_moving(given, scene, k, i, motion, (scene.others[i][k],), factor, bodies[i]))
     return tuple(bodies)

@@ -154,6 +154,7 @@ class Imagined:
 
     simulation: Simulation
     frames: tuple[NDArray[np.uint8], ...]  # RGB [h, w, 3] of `simulation.frames`, in their order
+    factual_frames: tuple[NDArray[np.uint8], ...] = ()  # of `simulation.factual_frames`
 
 
 @dataclass(frozen=True)

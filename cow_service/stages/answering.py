@@ -71,7 +71,11 @@ def _answer(
 
 def _with_frames(simulation: Simulation, artifacts: ArtifactStore) -> Imagined:
     """A simulation with the pixels of its chosen frames."""
-    return Imagined(simulation, tuple(decode_own(artifacts.read(frame.sha256)) for frame in simulation.frames))
+    frames, factual = (
+        tuple(decode_own(artifacts.read(frame.sha256)) for frame in chosen)
+        for chosen in (simulation.frames, simulation.factual_frames)
+    )
+    return Imagined(simulation, frames, factual)
 
 
 def _split(verdict: Verdict, votes: int) -> tuple[str, ...]:

@@ -9,9 +9,9 @@ from cow_service.physics.outcome import Query
 from cow_service.readers.question.choices import plain
 from cow_service.readers.question.shapes import is_cube, is_vehicle, shape_of
 from cow_service.records import Asked, Grounding, LocatedObject, Shape
-from cow_service.stages.placing import others_of
-from cow_service.vision.masks import CroppedMask
+from cow_service.vision.masks import CroppedMask, iou
 from cow_service.vision.obstacles import Obstacle
+from cow_service.vision.regions import SAME_OBJECT_IOU
 from cow_service.vision.scene import Scene
 
 PART = 0.5  # of a region's area: with more of it inside a thing that is taken away, it is a part of that
@@ -44,6 +44,16 @@ def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ..
     named = {other.bbox for other in others_of(grounding)}
     kept = (each for each in found if each.bbox not in boxes and (each.bbox in named or each.bbox not in parts))
     return tuple(kept), taken
+
+
+def others_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
+    """The other objects of a grounding, those that something is put to among them."""
+    found = list(grounding.others)
+    for each in grounding.interventions:
+        for target in each.targets:
+            if not any(iou(target.bbox, other.bbox) >= SAME_OBJECT_IOU for other in found):
+                found.append(target)
+    return tuple(found)
 
 
 def removed_objects(grounding: Grounding) -> tuple[LocatedObject, ...]:

@@ -57,7 +57,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
     "answering": KeyFields(("question", "seed", "options", "votes", "baseline", "imagine"), "reader"),
 }
 # Of a simulation its id and times do not decide an answer.
-_SIMULATION_FIELDS = {"grounding", "motion", "trajectory", "frames"}
+_SIMULATION_FIELDS = {"grounding", "motion", "trajectory", "frames", "factual_frames"}
 
 
 def key_of(

@@ -54,6 +54,8 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
     if run.request.motion is not None and run.request.motion.others:
         reading = replace(reading, others=given_others(run.request.motion.others, grounding))
+    if placed is not None and reading.kind == "place":
+        reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
     reading, unused = _fitting(reading)
     motion = _complete(run.scene.width, grounding, reading, source, run.request.law)
     if motion.cue == "trail":

@@ -16,9 +16,11 @@ from cow_service.stages.imagining import Imagined
 BY_ENCOUNTERS = (*KIND_OF, "tips", "moves", "leaves")  # relations that encounters and paths decide
 
 
-def can_tell(query: Query, present: int) -> bool:
-    """Whether worlds can decide what is asked; what is taken away does nothing. `present` bodies are left."""
-    return query.asked.relation in BY_ENCOUNTERS and query.subject < present
+def can_tell(query: Query, present: int, placed: bool) -> bool:
+    """Whether worlds can decide what is asked; what is taken away does nothing. `present` bodies are left; `placed`
+    says whether something is put somewhere."""
+    by_paths = query.asked.relation in BY_ENCOUNTERS or (placed and query.asked.relation == "inside")
+    return by_paths and query.subject < present
 
 
 def with_outcomes(

@@ -14,6 +14,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.carrying import Put
 from cow_service.physics.placement import Placements
 from cow_service.readers.question.hollow import container_form
+from cow_service.readers.question.wording import bare_name
 from cow_service.records import BBox, Grounding, Intervention, LocatedObject, Motion, Placement
 from cow_service.vision.masks import iou
 from cow_service.vision.openings import SeenOpening, measure_opening
@@ -36,22 +37,11 @@ def placed_mover(grounding: Grounding) -> Intervention | None:
     return None
 
 
-def others_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
-    """The other objects of a grounding, those that something is put to among them."""
-    found = list(grounding.others)
-    for each in grounding.interventions:
-        for target in each.targets:
-            if not any(iou(target.bbox, other.bbox) >= SAME_OBJECT_IOU for other in found):
-                found.append(target)
-    return tuple(found)
-
-
 def placing_sentence(grounding: Grounding, placed: Intervention) -> str:
     """In one line, for a video generator."""
-    to = " and ".join(f"the {_bare(target.object)}" for target in placed.targets)
-    return (
-        f"The {_bare(grounding.object)} is lifted, carried over and put {PREPOSITIONS[placed.relation or 'into']} {to}"
-    )
+    to = " and ".join(f"the {bare_name(target.object)}" for target in placed.targets)
+    where = f"{PREPOSITIONS[placed.relation or 'into']} {to}"
+    return f"The {bare_name(grounding.object)} is lifted, carried over and put {where}"
 
 
 def put_of(scene: Scene, grounding: Grounding, motion: Motion, bodies: Sequence[SeenBody]) -> Put | None:
@@ -147,9 +137,3 @@ def _free_side(scene: Scene, bodies: Sequence[SeenBody], target: int) -> int:
         return outside + sum(iou(there, body.bbox) for i, body in enumerate(bodies) if i not in (0, target))
 
     return near if blocked(near) <= blocked(-near) else -near
-
-
-def _bare(name: str) -> str:
-    """A name without its article."""
-    first, _, rest = name.partition(" ")
-    return rest if rest and first.lower() in ("the", "a", "an", "this", "that") else name

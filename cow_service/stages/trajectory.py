@@ -71,11 +71,12 @@ def trajectory_of(
     query = None if asked is None else query_of(asked, grounding, bodies)
     kept = len(bodies) - len(taken)
     world = _world(scene, (bodies[:kept], bodies[kept:]), motion, request, free, grounding, query)
-    put = put_of(scene, grounding, motion, bodies)
-    tellable = query if known and query is not None and can_tell(query, kept) else None
-    if put is not None and tellable is None:  # what is shown is what most worlds do
+    put = put_of(scene, grounding, motion, bodies[:kept])
+    world = replace(world, put=put)
+    tellable = query if known and query is not None and can_tell(query, kept, put is not None) else None
+    if put is not None and asked is None:  # what is shown is what most worlds do
         tellable = Query(Asked(relation="inside"), put.targets[0])
-    imagined = imagine(replace(world, put=put), tellable, request.ensemble)
+    imagined = imagine(world, tellable, request.ensemble)
     trajectories = [_record(scene, grounding, motion, request, each, free, known) for each in imagined]
     told = with_outcomes(trajectories, imagined, asked, query, grounding)
     factual = told[1].model_copy(update={"anchors": ()}) if len(told) > 1 else None
@@ -88,7 +89,8 @@ def _free_path(scene: Scene, grounding: Grounding, motion: Motion, request: Simu
     camera = Camera(scene.width, scene.height, motion.metres_per_pixel.value)
     if request.trajectory is not None:
         return given_path(camera, request.trajectory, times)
-    return ballistic_path(camera, grounding, motion, times) if motion.law == "ballistic" else None
+    free = motion.law == "ballistic" and motion.kind != "place"
+    return ballistic_path(camera, grounding, motion, times) if free else None
 
 
 def _world(
@@ -117,7 +119,7 @@ def _world(
         fps=request.fps,
         asked=None if query is None else query.target,
         led=led,
-        others={} if led is not None else _others(bodies, motion),
+        others={} if led is not None else _others((*bodies, *taken), motion),
         taken=taken,
         turns_wanted=query is not None and query.asked.relation == "tips",
     )

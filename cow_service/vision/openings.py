@@ -10,12 +10,14 @@ import numpy as np
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats, Floats32, Image
 
-FLATTEST, ROUNDEST = 0.04, 0.7  # of the ellipse's width: its height
+FLATTEST, ROUNDEST = 0.12, 0.7  # of the ellipse's width: its height
 LEAST_RIM = 0.75  # of half the width of the mask: a narrower rim beside a handle is not looked for
 ARC = 0.9  # of its half width: so far to either side its upper half is compared with the outline
-FITS = 0.035  # of its half width, mean distance of the two: a worse one is no ellipse
+FITS = 0.12  # of its half height, mean distance of the two: a worse one is no ellipse
 SAME_WIDTH = 0.97  # of the widest rim: they differ by the outline's noise
 NARROWEST, WIDEST = 0.75, 0.975  # of the outer ellipse: where the inner one is looked for
+OUTLINE = 1.5  # px: how wide it is
+BESIDE = 30.0  # degrees of the ellipse up and down from its ends: its sides
 EDGE = 4.0  # Lab units across the inner edge of a rim, in the mean: less is no edge
 THICKNESS = 0.93  # inner of outer radius, where no inner edge is seen
 MEASURED_SIGMA, ASSUMED_SIGMA = 0.04, 0.06  # of the logarithm of the opening's width
@@ -62,9 +64,11 @@ def _outer_rim(mask: CroppedMask) -> tuple[float, float, float, float] | None:
             continue
         columns = np.arange(width)[np.abs(np.arange(width) + 0.5 - middle) < ARC * half]
         off = (columns + 0.5 - middle) / half
-        error = float(np.mean(np.abs(tops[columns] - tall * (1 - np.sqrt(1 - off**2))))) / half
-        if error < FITS:
-            found.append((error, (mask.columns.start + middle, mask.rows.start + tall, half, tall)))
+        lower = tops[columns] - tall * (1 - np.sqrt(1 - off**2))
+        shift = float(np.median(lower))
+        error = float(np.mean(np.abs(lower - shift)))
+        if error < FITS * tall:
+            found.append((error, (mask.columns.start + middle, mask.rows.start + tall + shift, half, tall)))
     if not found:
         return None
     # The upper arc of an ellipse fits smaller ones too.
@@ -73,23 +77,28 @@ def _outer_rim(mask: CroppedMask) -> tuple[float, float, float, float] | None:
 
 
 def _inner_share(image: Image, mask: CroppedMask, rim: tuple[float, float, float, float]) -> float | None:
-    """The inner ellipse's width, of the outer's: where the colours change most along its nearer half."""
+    """The inner ellipse's width, of the outer's: where the colours change most at both its sides.
+
+    There the height of the ellipse, which is known least, matters least.
+    """
     x, y, half, tall = rim
     shown = (image[mask.rows, mask.columns] / np.float32(255)).astype(np.float32)
     lab = np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2LAB), np.float32)
     step = max(0.015, 1.0 / half)
-    shares = np.arange(NARROWEST, WIDEST, 0.005)
+    shares = np.arange(NARROWEST, min(WIDEST, 1 - step - OUTLINE / half), 0.005)  # the outline is an edge, too
     profile = _along(lab, (x - mask.columns.start, y - mask.rows.start, half, tall), shares + step)
     inside = _along(lab, (x - mask.columns.start, y - mask.rows.start, half, tall), shares - step)
     change = np.linalg.norm(profile - inside, axis=2).mean(axis=1)
-    strongest = int(change.argmax())
-    return float(shares[strongest]) if change[strongest] > EDGE else None
+    if change.max() <= EDGE:
+        return None
+    edge = change > 0.9 * change.max()  # as wide as the step: its middle is taken
+    return float((shares * change)[edge].sum() / change[edge].sum())
 
 
 def _along(lab: Floats32, rim: tuple[float, float, float, float], shares: Floats) -> Floats:
-    """Colours [S, A, 3] along the nearer half of ellipses of so many shares of the rim."""
+    """Colours [S, A, 3] at the sides of ellipses of so many shares of the rim."""
     x, y, half, tall = rim
-    angles = np.radians(np.linspace(25, 155, 40))
+    angles = np.radians(np.concatenate([np.linspace(-BESIDE, BESIDE, 20), 180 + np.linspace(-BESIDE, BESIDE, 20)]))
     columns = (x + half * shares[:, None] * np.cos(angles) - 0.5).astype(np.float32)
     rows = (y + tall * shares[:, None] * np.sin(angles) - 0.5).astype(np.float32)
     found = cv2.remap(lab, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -23,6 +23,8 @@ NOT_ASKED = (
     "misses or is hidden by one thing or any, which thing it hits first, when, and how many. Set COW_MLLM to ask a "
     "multimodal LLM."
 )
+NOT_READ = " What it did not understand: '{words}'."
+MAX_UNREAD = 200  # characters
 NO_SIMULATION = "Not sure, because without a simulation there is nothing for the embedded reader to judge by."
 NO_OUTCOME = "Not sure, because the simulation does not tell what the question asks."
 NOT_FOUND = "Not sure, because what the question asks about was not found in the image under that name."
@@ -47,10 +49,17 @@ def answer_from(
     outcome: Outcome | None,
     simulated: bool,
     alternatives: Sequence[ObjectPhrase] = (),
+    unread: str = "",
 ) -> AnswerReading:
-    """The answer, and why it is not sure. `asked` and `alternatives` are read in the question."""
+    """The answer, and why it is not sure. `asked`, `alternatives` and the `unread` words are read in the question."""
     if asked is None or not simulated or outcome is None:
-        why = NOT_ASKED if asked is None else NO_OUTCOME if simulated else NO_SIMULATION
+        why = (
+            f"{NOT_ASKED}{NOT_READ.format(words=unread[:MAX_UNREAD]) if unread else ''}"
+            if asked is None
+            else NO_OUTCOME
+            if simulated
+            else NO_SIMULATION
+        )
         return _unsure(options, why)
     first = outcome.first
     if outcome.sure and first is not None and alternatives and not any(may_name(each, first) for each in alternatives):

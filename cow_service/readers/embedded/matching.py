@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from cow_service.errors import CannotGround
-from cow_service.readers.embedded.outlines import clearest
+from cow_service.readers.embedded.outlines import clearest, contradicts
+from cow_service.readers.embedded.singling import singled_out
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.records import BBox
 from cow_service.vision.regions import Region
@@ -40,13 +41,15 @@ def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequen
         fitting = exact or [region for region in near if _looks_like(region, phrase)]
     fitting = [region for region in fitting if _looks_like(region, phrase)] or fitting
     clear = clearest(fitting, phrase.head)
-    return fitting if clear is None else [clear]
+    return singled_out(fitting, phrase) if clear is None else [clear]
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:
-    """The one region that fits a phrase, or None where none or several do."""
+    """The one region that fits a phrase; None where none or several do, or where only its noun speaks against it."""
     fitting = best_matches(regions, phrase)
-    return fitting[0] if len(fitting) == 1 else None
+    if len(fitting) != 1 or (phrase.colour is None and contradicts(fitting[0], phrase.head)):
+        return None
+    return fitting[0]
 
 
 def inside_drawn_box(scene: Scene, phrase: ObjectPhrase, remedy: str) -> BBox:

@@ -19,6 +19,8 @@ Range = tuple[float, float]
 ASPECT_STEP, WIDTH_STEP = 0.2, 0.1  # natural logarithm, and share of the width: so far off counts as 1
 FITS, CLEARLY_WORSE = 0.5, 2.5  # misfits: up to the first it can be meant; the next must be worse by the second
 
+CONTRADICTS = 3.5  # misfit from which a thing is not what it is called; of things in their own name up to 2.4
+
 # Rows over which a width is taken, from the upper end, as shares of the height.
 BANDS = ((0.08, 0.2), (0.2, 0.35), (0.35, 0.5), (0.5, 0.8), (0.8, 0.95))
 ANY: Range = (0.0, 1.0)
@@ -43,6 +45,12 @@ def clearest(regions: Sequence[Region], noun: str | None) -> Region | None:
     if len(known) < max(2, len(regions)) or known[0][0] > FITS or known[1][0] < known[0][0] + CLEARLY_WORSE:
         return None
     return regions[known[0][1]]
+
+
+def contradicts(region: Region, noun: str | None) -> bool:
+    """Whether an outline is clearly not that of a noun."""
+    misfit = _misfit(region, noun) if noun in OUTLINES else None
+    return misfit is not None and misfit >= CONTRADICTS
 
 
 def _misfit(region: Region, noun: str | None) -> float | None:

@@ -11,12 +11,14 @@ from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, without
+from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
+from cow_service.readers.question.accounting import unread_warnings
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.relations import read_alternatives, read_asked
+from cow_service.readers.question.relations import read_alternatives, read_asked, unread_clause
 from cow_service.readers.question.sentences import Question, parse
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
@@ -62,8 +64,11 @@ class EmbeddedReader:
             others = _others(regions, question, bbox)
             found = {other.object for other in others}
             missing = [_not_found(scene, phrase.text) for phrase in question.others if phrase.text not in found]
+            boxes = {other.object: other.bbox for other in others} | {question.mover.text: bbox}
+            things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
+            doubts = [*noun_warnings(scene, things), *unread_warnings(question)]
         return GroundingReading(
-            question.mover.text, bbox, others=others, warnings=tuple(missing), interventions=(*removed, *placed)
+            question.mover.text, bbox, others=others, warnings=(*missing, *doubts), interventions=(*removed, *placed)
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
@@ -89,7 +94,9 @@ class EmbeddedReader:
         question = parse(given.question)
         outcome = None if imagined is None else imagined.simulation.trajectory.outcome
         alternatives = read_alternatives(question)
-        reading = answer_from(options, read_asked(question), outcome, imagined is not None, alternatives)
+        reading = answer_from(
+            options, read_asked(question), outcome, imagined is not None, alternatives, unread_clause(question)
+        )
         if votes > 1:
             again = "The embedded reader gives the same answer every time: more votes say no more."
             reading = replace(reading, notes=(*reading.notes, again))
@@ -167,6 +174,11 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         )
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
+    return _as_said(scene, words, kind, grounding) or _as_shown(scene, question, kind, grounding)
+
+
+def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grounding) -> MotionReading | None:
+    """The motion whose direction the words give; None where they give none."""
     if words.arrow is not None:
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
         along = words.arrow == "along"
@@ -178,6 +190,12 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         return MotionReading(kind, direction, "text", depth=depth)
     if words.towards is not None:
         return MotionReading(kind, _towards(scene, words.towards, grounding), "text")
+    return None
+
+
+def _as_shown(scene: Scene, question: Question, kind: MotionKind, grounding: Grounding) -> MotionReading:
+    """The motion whose direction the image shows, by a trail or an arrow. Raises `CannotReadDirection`."""
+    words = question.motion
     if words.forward is not None:
         raise CannotReadDirection(
             f"The question says that the {grounding.object} moves {'forward' if words.forward else 'backward'}. "

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from cow_service.readers.base import Imagined
-from cow_service.records import MEETINGS, AskedRelation, Doubt, Encounter, Outcome, Trajectory
+import numpy as np
+from numpy.typing import NDArray
 
+from cow_service.media.strips import named_strip
+from cow_service.readers.base import Imagined
+from cow_service.records import MEETINGS, AskedRelation, Doubt, Encounter, Grounding, Outcome, Trajectory
+
+AS_IT_IS = "As it is"  # the name of the frames with nothing taken away
 EVENTS: dict[AskedRelation, tuple[str, str]] = {
     "touches": ("touches", "touch"),
     "covers": ("hides", "hide"),
-    "covered": ("is hidden by", "be hidden by"),
-}  # what the mover does, and what follows "does not" or "will"
+    "covered": ("is hidden by", ""),
+    "inside": ("ends up in", "end up in"),
+    "tips": ("is knocked over", ""),
+    "moves": ("is set in motion", ""),
+    "leaves": ("leaves the image", "leave the image"),
+}  # what the subject does, and what follows "does not"
+OF_TARGET: tuple[AskedRelation, ...] = ("tips", "moves")  # what is asked about does these
 DOUBTS: dict[Doubt, str] = {
     "speed": "the speed",
     "heading": "the heading in depth",
@@ -20,19 +30,49 @@ DOUBTS: dict[Doubt, str] = {
 }
 
 
+def pictures(imagined: Imagined) -> tuple[NDArray[np.uint8], ...]:
+    """What is shown of a simulation: its frames or, of two worlds, a named strip of each."""
+    if not imagined.factual_frames:
+        return imagined.frames
+    name = f"With {_removed(imagined.simulation.grounding)} removed"
+    return named_strip(imagined.frames, name), named_strip(imagined.factual_frames, AS_IT_IS)
+
+
 def hypothesis(imagined: Imagined) -> dict[str, object]:
     """What the simulation found, as inputs of the prompt; encounters only where there is no outcome to tell."""
     simulation = imagined.simulation
-    trajectory = simulation.trajectory
-    facts = _outcome_words(trajectory, simulation.grounding.object)
+    trajectory, mover = simulation.trajectory, simulation.grounding.object
+    facts = _outcome_words(trajectory, mover)
+    removed = _removed(simulation.grounding)
+    if trajectory.factual is not None:
+        facts = _of_both(trajectory, trajectory.factual, mover, removed)
     return {
         "sentence": simulation.motion.sentence,
         "times": ", ".join(f"{frame.time:.2f} s" for frame in simulation.frames),
         "law": trajectory.law,
+        "removed": removed,
+        "as_it_is": AS_IT_IS if imagined.factual_frames else "",
         "facts": facts,
         "encounters": () if facts else tuple(_encounter_words(each, trajectory) for each in trajectory.encounters),
         "encounters_known": simulation.encounters_known,
     }
+
+
+def _removed(grounding: Grounding) -> str:
+    """What is taken away, in words; empty where nothing is."""
+    names = [each.object.object for each in grounding.interventions if each.kind == "remove"]
+    return " and ".join(f"the {_bare(name)}" for name in names)
+
+
+def _of_both(changed: Trajectory, factual: Trajectory, mover: str, removed: str) -> tuple[str, ...]:
+    """The outcomes of both worlds, the facts of both in one line."""
+    if changed.outcome is None or factual.outcome is None:
+        return ()
+    lines = [_one_line(changed.outcome.facts)] if changed.outcome.facts else []
+    for trajectory, where in ((changed, f"With {removed} removed"), (factual, AS_IT_IS)):
+        told = _probability(trajectory, mover)
+        lines += [f"{where}, {told[0].lower()}{told[1:]}"] if told else []
+    return (*lines, *_dependence(changed.outcome))
 
 
 def _outcome_words(trajectory: Trajectory, mover: str) -> tuple[str, ...]:
@@ -41,23 +81,44 @@ def _outcome_words(trajectory: Trajectory, mover: str) -> tuple[str, ...]:
     if outcome is None:
         return ()
     lines = [_one_line(outcome.facts)] if outcome.facts else []
-    if outcome.probability is not None:
-        lines.append(f"{_share(outcome.probability, trajectory.ensemble)}: {_event(outcome, _one_line(mover))}.")
-    if outcome.depends_on:
-        lines.append(f"It depends most on {', '.join(DOUBTS[doubt] for doubt in outcome.depends_on)}.")
-    return tuple(lines)
+    told = _probability(trajectory, mover)
+    return (*lines, *([told] if told else []), *_dependence(outcome))
+
+
+def _probability(trajectory: Trajectory, mover: str) -> str:
+    """How probable the outcome is, in a sentence; empty where nothing tells."""
+    outcome = trajectory.outcome
+    if outcome is None or outcome.probability is None:
+        return ""
+    return f"{_share(outcome.probability, trajectory.ensemble)}: {_event(outcome, _one_line(mover))}."
+
+
+def _dependence(outcome: Outcome) -> tuple[str, ...]:
+    if not outcome.depends_on:
+        return ()
+    return (f"It depends most on {', '.join(DOUBTS[doubt] for doubt in outcome.depends_on)}.",)
 
 
 def _event(outcome: Outcome, mover: str) -> str:
     """What `Outcome.probability` is that of."""
     asked = outcome.asked
     does, do = EVENTS[asked.relation]
+    does_not = does.replace("is ", "is not ", 1) if does.startswith("is ") else f"does not {do}"
+    doing = does_not if asked.negated else does
+    subject = f"the {_bare(outcome.subject or mover)}"
     thing = _one_line(outcome.object or asked.target or ("anything" if asked.negated else "something"))
-    if asked.form == "which-first":
-        return f"the first thing that the {_bare(mover)} {does} is {_one_line(outcome.first or 'nothing')}"
+    if asked.form == "changes":
+        same = " not" if asked.negated else ""
+        what = f"whether {subject} {does} {thing}" if asked.target is not None else f"what {subject} {does} first"
+        return f"it does{same} make a difference to {what}"
+    if asked.form in ("which-first", "where", "what-happens"):
+        return f"the first thing that {subject} {does} is {_one_line(outcome.first or 'nothing')}"
     if asked.form == "how-many":
-        return f"the number of things that the {_bare(mover)} {does} is {outcome.count or 0}"
-    event = f"the {_bare(mover)} {f'does not {do}' if asked.negated else does} {thing}"
+        return f"the number of things that {subject} {does} is {outcome.count or 0}"
+    if asked.relation in OF_TARGET:
+        event = f"{thing} {doing}"
+    else:
+        event = f"{subject} {doing}" + ("" if asked.relation == "leaves" else f" {thing}")
     if asked.form != "when" or outcome.time is None:
         return event
     early, late = outcome.time_band or (outcome.time, outcome.time)

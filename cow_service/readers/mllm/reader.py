@@ -17,6 +17,7 @@ from cow_service.readers.mllm.answer import answer_calls
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.directions import Line
+from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.mllm.identify import Identified, identify_call
 from cow_service.readers.mllm.images import EncodedImage, encode
 from cow_service.readers.mllm.locate import Located, locate_call
@@ -135,7 +136,7 @@ class MllmReader:
     ) -> tuple[AnswerReading, ...]:
         """One call per vote, all at the same time. Raises `MllmBadReply`, `MllmUnavailable` where all of them fail."""
         with given.cpu():
-            pixels = (given.scene.image, *(() if imagined is None else imagined.frames))
+            pixels = (given.scene.image, *(() if imagined is None else pictures(imagined)))
             jpegs = tuple(encode(each, self._model.family).jpeg for each in pixels)
         calls = answer_calls(given.question, options, jpegs, imagined, votes, self._reasoning)
         results = self._client.complete_all(calls, given)

@@ -43,17 +43,18 @@ _COUNTING = lex.words(
 
 @dataclass
 class Sentence:
-    """One sentence as tokens, the words of the question that each stands for, and the phrases of its `T` and `K`."""
+    """One sentence as tokens: for each its words and its place in the items, and the phrases of its `T` and `K`."""
 
     tokens: list[str] = field(default_factory=list[str])
     words: list[tuple[str, ...]] = field(default_factory=list[tuple[str, ...]])
+    items: list[int] = field(default_factory=list[int])
     phrases: dict[str, ObjectPhrase] = field(default_factory=dict[str, ObjectPhrase])
 
 
 def sentences(question: Question) -> list[Sentence]:
     """The sentences of a question, empty ones left out."""
     found = [Sentence()]
-    for item in question.items:
+    for at, item in enumerate(question.items):
         if item.key in _ENDS:
             found.append(Sentence())
             continue
@@ -64,6 +65,7 @@ def sentences(question: Question) -> list[Sentence]:
         found[-1].tokens += tokens
         said = tuple(word.lower() for word in (item.words or (item.key,)))
         found[-1].words += [said] * len(tokens)
+        found[-1].items += [at] * len(tokens)
     return [sentence for sentence in found if sentence.tokens]
 
 

@@ -13,14 +13,15 @@ from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
 from cow_service.readers.question.words import Word, words_of
 from cow_service.records import InterventionKind, PlaceRelation
 
-MAX_INTERVENTIONS = 6  # of one question; what comes after them is not looked for
-_WINDOW = 24  # words that one may have
+MAX_TRIES = 6  # of one question: each takes some ms; what comes after them is not looked for
+_WINDOW = 16  # words that one may have
 _BEFORE = lex.CONDITIONALS | lex.words(". ! ? ; : , and but then also that with")
 _ANYWHERE = lex.words("without with remove taking in")
 _TELLING = lex.words(
-    "remove take get be do did disappear vanish there without absence put place insert set position drop lower throw",
-    "release with",
+    "remove delete erase eliminate exclude withdraw discard take rid not gone go absent missing no disappear vanish",
+    "without absence put place insert set position drop lower throw release",
 )
+THINGS = frozenset({"NP", "PRONOUN"})  # terminals of what is named
 _RELATIONS: dict[str, PlaceRelation] = {
     "into": "into", "onto": "onto", "between": "between", "in_front_of": "in-front-of", "behind": "behind",
     "next_to": "next-to", "left_of": "left-of", "right_of": "right-of",
@@ -43,15 +44,33 @@ def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords,
     gone: set[int] = set()
     words = words_of(found)
     begins = {word.at: place for place, word in reversed(list(enumerate(words)))}
+    tries = 0
     for at in _starts(found):
-        if at in gone or len(changes) >= MAX_INTERVENTIONS:
+        ahead = words[begins[at] : begins[at] + _WINDOW] if at in begins else []
+        if at in gone or tries >= MAX_TRIES or _TELLING.isdisjoint(word.text for word in ahead[:8]):
             continue
-        read = _read(found, words[begins[at] : begins[at] + _WINDOW]) if at in begins else None
+        tries += 1
+        read = _read(found, ahead)
         if read is not None:
             said, end = read
             changes += said
             gone |= _emptied(found, at, end, gone)
     return tuple(changes), [item for at, item in enumerate(found) if at not in gone]
+
+
+def implied_placing(found: Sequence[Item]) -> tuple[InterventionWords, ...]:
+    """ "Will the apple fit into the bowl?": where nothing moves, the apple is put there."""
+    words = words_of(found)
+    for place, word in enumerate(words):
+        if word.text == "fit" and place > 1 and (parsed := parse_from("fitting", words[place - 2 : place + 8])):
+            named = [phrase for token in named_in(parsed[0]) if (phrase := _phrase(found, token.line or 0))]
+            return (_placing(parsed[0], named),) if named else ()
+    return ()
+
+
+def _placing(tree: Tree[Token], named: Sequence[ObjectPhrase]) -> InterventionWords:
+    relation: PlaceRelation = next(_RELATIONS[str(n.data)] for n in tree.iter_subtrees() if n.data in _RELATIONS)
+    return InterventionWords("place", named[0], relation, tuple(named[1:]))
 
 
 def _starts(found: Sequence[Item]) -> Iterator[int]:
@@ -63,8 +82,6 @@ def _starts(found: Sequence[Item]) -> Iterator[int]:
 
 def _read(found: Sequence[Item], words: Sequence[Word]) -> tuple[list[InterventionWords], int] | None:
     """The interventions at some words, and the place of the first item behind them."""
-    if not any(word.text in _TELLING for word in words[:8]):
-        return None
     parsed = parse_from("intervention", words)
     while parsed is not None and _begins_clause(words, parsed[1]):
         parsed = parse_from("intervention", words[: parsed[1] - 1])
@@ -78,10 +95,7 @@ def _read(found: Sequence[Item], words: Sequence[Word]) -> tuple[list[Interventi
         return None
     if next(tree.find_data("removal"), None) is not None:
         return [InterventionWords("remove", phrase) for phrase in named], end
-    relation: PlaceRelation = next(
-        _RELATIONS[str(node.data)] for node in tree.iter_subtrees() if node.data in _RELATIONS
-    )
-    return [InterventionWords("place", named[0], relation, tuple(named[1:]))], end
+    return [_placing(tree, named)], end
 
 
 def _begins_clause(words: Sequence[Word], end: int) -> bool:
@@ -91,7 +105,7 @@ def _begins_clause(words: Sequence[Word], end: int) -> bool:
 
 def named_in(tree: Tree[Token]) -> Iterator[Token]:
     """The noun phrases of a tree, in order."""
-    return (token for token in tree.scan_values(lambda value: isinstance(value, Token) and bool(value.type)))
+    return (token for token in tree.scan_values(lambda value: isinstance(value, Token) and value.type in THINGS))
 
 
 def _phrase(found: Sequence[Item], at: int) -> ObjectPhrase | None:

@@ -106,7 +106,8 @@ FUNCTION_WORDS = (
         "whom in inside within on onto upon into at to toward towards from of off over under below above beneath",
         "beside near by with along across through around past behind before between among against via per about",
         "as like than during until till for out outside and or but then so because whether since though how where",
-        "why ~ next close now still think believe predict expect tell know suppose also ever just straight already",
+        "why ~ true false",
+        "next close now still think believe predict expect tell know suppose also ever just straight already",
         "always instead soon again away closer nearer farther further far together too very much only even",
         "perhaps maybe else finally opposite according due parallel perpendicular ahead forward forwards backward",
         "backwards onward onwards sideways yes no please ok has have had having following contrary",
@@ -165,6 +166,7 @@ LAND = words("land settle")
 _OTHER = words(
     "happen become end stop appear look fit affect break point show indicate lie hang face miss avoid fail",
     "remove delete erase eliminate exclude withdraw discard take put place insert set exist stick protrude overflow",
+    "change differ matter leave",
 )
 # Acting on something else with these makes that thing the mover ("someone pushes the cube").
 TRANSITIVE = words(
@@ -184,7 +186,7 @@ _IRREGULAR = {
     "cast": "cast", "sling": "slung",
     "leap": "leapt", "fall": "fell fallen", "stand": "stood", "sit": "sat", "hit": "hit", "strike": "struck stricken",
     "meet": "met", "hide": "hid hidden", "slide": "slid", "become": "became", "break": "broke broken", "show": "shown",
-    "lie": "lay lain", "hang": "hung", "take": "took taken", "put": "put", "set": "set", "stick": "stuck",
+    "lie": "lay lain", "hang": "hung", "take": "took taken", "put": "put", "set": "set", "stick": "stuck", "leave": "",
 }  # fmt: skip
 _PARTICIPLES = words(
     "labeled labelled marked numbered highlighted circled boxed surrounded enclosed bounded outlined encircled drawn",

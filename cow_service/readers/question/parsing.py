@@ -15,7 +15,7 @@ from lark.lexer import Lexer
 
 from cow_service.readers.question.words import Word
 
-STARTS = ["intervention", "trail", "quantity"]
+STARTS = ["intervention", "fitting", "trail", "quantity", "asked"]
 MAX_WORDS = 48  # of one parse: its work may grow with the cube of their number
 
 

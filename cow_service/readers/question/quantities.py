@@ -13,8 +13,8 @@ from cow_service.readers.question.parsing import parse_from
 from cow_service.readers.question.phrases import QUANTITY, Item, QuantityWords
 from cow_service.readers.question.words import PRONOUNS, Word, base_forms
 
-_WINDOW = 16  # words
-_MAX_TRIES = 8  # of one question: each takes some ms
+_WINDOW = 12  # words
+_MAX_TRIES = 5  # of one question: each takes some ms
 _STARTS = lex.words(
     "at with by for during lasting over only exactly very really quite rather slowly slow gently softly lightly fast",
     "quickly rapidly swiftly hard forcefully halfway midway half but until till a an stops stopping",

@@ -12,15 +12,16 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.asked_grammar import PATTERNS, Pattern
 from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
+from cow_service.readers.question.asking import Asking, read_clause
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
+from cow_service.readers.question.words import PRONOUNS, Word, base_forms
 from cow_service.records import Asked
 
 _STARTS = lex.words(
-    "will would do does did can could shall might may be tell say predict know when at in after how what which with",
-    "into on onto",
+    "will would do does did can could shall might may be tell say predict know when where at in after how what which",
+    "with into on onto true",
 )
 _OPENERS = lex.words(", and then so but now please")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
@@ -38,6 +39,8 @@ _NOT_THERE = re.compile(r".*\b(?:not|n't|never) (?:there|here|present|exist|exis
 _SHORT_ANSWER = lex.words(
     "please answer reply respond say just only with by in a single word yes no or not sure either"
 )
+_MAX_TRIES = 8  # of one sentence: each takes some ms
+MAX_SENTENCES = 12  # of one question; more are not read
 _LIST = re.compile(r"(?P<list>T\d+(?: , T\d+)*(?: ,)? or T\d+)")
 _LIST_AT_END = re.compile(r".*?, " + _LIST.pattern)
 _BEFORE_PLACES = lex.words("to of by near behind beside in on at from under above below with toward towards into")
@@ -46,12 +49,13 @@ _HOLLOW = lex.words("bowl basket hole pocket goal bin bucket pit hoop net drawer
 
 @dataclass(frozen=True)
 class _Reading:
-    """What a pattern covers: its things, and which tokens of the sentence."""
+    """What the asking clause says, the things that its tokens stand for, and which tokens of the sentence it covers."""
 
-    pattern: Pattern
-    named: tuple[ObjectPhrase, ...]
+    asking: Asking
+    phrases: dict[str, ObjectPhrase]
     covered: frozenset[int]
-    subject: ObjectPhrase | None = None
+    items: frozenset[int] = frozenset()
+    listed: tuple[ObjectPhrase, ...] = ()
 
 
 def read_asked(question: Question) -> Asked | None:
@@ -63,29 +67,54 @@ def read_asked(question: Question) -> Asked | None:
     reading = _read(question)
     if reading is None:
         return None
-    pattern, several = reading.pattern, reading.pattern.form == "which-first"
-    if len(reading.named) > 1 and not several:
-        return None
-    target = None if several or not reading.named else _as_named(reading.named[0], question)
-    subject = None if reading.subject is None else _as_named(reading.subject, question)
-    if pattern.relation == "inside" and target is None:
+    asking = reading.asking
+    target = None if asking.target is None else _named(asking.target, reading, question)
+    subject = None if asking.subject is None else _named(asking.subject, reading, question)
+    if asking.relation == "inside" and target is None:
         target = next((_as_named(put.targets[0], question) for put in question.interventions if put.targets), None)
-    return Asked(form=pattern.form, relation=pattern.relation, subject=subject, target=target, negated=pattern.negated)
+    among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question))
+    return Asked(
+        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among
+    )
+
+
+def _named(token: str, reading: _Reading, question: Question) -> str | None:
+    if token == "M":
+        return None if question.mover is None else question.mover.text
+    return _as_named(reading.phrases[token], question)
 
 
 def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     """The things, or the one kind, among which a question asks for the first; empty where it asks for any."""
     reading = _read(question)
-    return () if reading is None or reading.pattern.form != "which-first" else reading.named
+    if reading is None or reading.asking.form != "which-first":
+        return ()
+    return (*(reading.phrases[token] for token in reading.asking.among), *reading.listed)
+
+
+def unread_clause(question: Question) -> str:
+    """The words of the question from where it asks on, where they are not understood."""
+    for sentence in sentences(question) if _read(question) is None else []:
+        starts = [at for at, token in enumerate(sentence.tokens) if token in _STARTS and _opens(sentence.tokens[:at])]
+        if starts and not _INVERTED.fullmatch(" ".join(sentence.tokens[: starts[0]])):
+            items = list(dict.fromkeys(sentence.items[starts[0] :]))
+            return " ".join(" ".join(question.items[at].words) or question.items[at].key for at in items)
+    return ""
+
+
+def covered_items(question: Question) -> frozenset[int]:
+    """The places in `Question.items` of the clause that asks, as far as it was read."""
+    reading = _read(question)
+    return frozenset() if reading is None else reading.items
 
 
 @lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
 def _read(question: Question) -> _Reading | None:
     """The one clause of the question that asks; None where none is understood, or several ask."""
     found = sentences(question)
-    if any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
+    if len(found) > MAX_SENTENCES or any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
         return None
-    readings = [(at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence))]
+    readings = [(at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question))]
     if len(readings) != 1:
         return None
     at, reading = readings[0]
@@ -93,21 +122,25 @@ def _read(question: Question) -> _Reading | None:
         covered = reading.covered if place == at else frozenset[int]()
         if place != at and _INVERTED.fullmatch(" ".join(sentence.tokens)):
             return None
-        if not _leaves_world(sentence, covered):
+        if not _leaves_world(sentence, covered, question):
             return None
     listed = _listed(found[at], reading.covered, found[at + 1 :])
-    if listed and reading.pattern.form != "which-first":
+    if listed and reading.asking.form != "which-first":
         return None
-    return replace(reading, named=(*reading.named, *listed))
+    return replace(reading, listed=listed, items=frozenset(found[at].items[place] for place in reading.covered))
 
 
-def _read_sentence(sentence: Sentence) -> _Reading | None:
+def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
     """The longest part of a sentence, up to its end or to a condition, that a pattern covers."""
     tokens = sentence.tokens
+    tries = 0
     ends = [len(tokens), *(at for at, token in enumerate(tokens) if token in _CONDITIONS)]
     for start in (at for at, token in enumerate(tokens) if token in _STARTS and _opens(tokens[:at])):
         for end in (end for end in ends if end > start):
-            reading = _match(sentence, _without_insertion(tokens, start, end))
+            tries += 1
+            if tries > _MAX_TRIES:
+                return None
+            reading = _match(sentence, _without_insertion(tokens, start, end), question)
             if reading is not None:
                 return reading
     return None
@@ -124,31 +157,30 @@ def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]
     return places[:-1] if commas and commas[-1] == end - 1 else places
 
 
-def _match(sentence: Sentence, places: Sequence[int]) -> _Reading | None:
-    tokens = [sentence.tokens[at] for at in places]
-    return _match_tokens(sentence, places, tokens, None) or _match_with_subject(sentence, places, tokens)
-
-
-def _match_with_subject(sentence: Sentence, places: Sequence[int], tokens: list[str]) -> _Reading | None:
-    """Another thing than the mover as the one who does it: "will the cyan ball hit the white ball?"."""
-    at = next((at for at, token in enumerate(tokens) if token in sentence.phrases and token[0] == "T"), None)
-    if at is None or at > 3 or "M" in tokens:
+def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Reading | None:
+    words = [word for at in places for word in _words(sentence.tokens[at], at, question)]
+    beside = question.motion.others[0].object if len(question.motion.others) == 1 else None
+    phrases = sentence.phrases if beside is None else sentence.phrases | {"+": beside}
+    asking = read_clause(words, None if beside is None else "+")
+    if asking is None:
         return None
-    subject = sentence.phrases[tokens[at]]
-    return _match_tokens(sentence, places, [*tokens[:at], "M", *tokens[at + 1 :]], subject)
+    asking = _into_hollow(asking, [sentence.tokens[at] for at in places], phrases)
+    return None if asking is None else _Reading(asking, phrases, frozenset(places))
 
 
-def _match_tokens(
-    sentence: Sentence, places: Sequence[int], tokens: Sequence[str], subject: ObjectPhrase | None
-) -> _Reading | None:
-    clause = " ".join(tokens)
-    for pattern in PATTERNS:
-        match = pattern.regex.fullmatch(clause)
-        if match is not None:
-            names = dict.fromkeys(group for group in match.groups() if group is not None)
-            named = tuple(sentence.phrases[name] for name in names)
-            return None if _is_into_hollow(clause, named) else _Reading(pattern, named, frozenset(places), subject)
-    return None
+def _words(token: str, at: int, question: Question) -> list[Word]:
+    """A token of a sentence as words of the grammar."""
+    if token in {"M", "OBJ", "OBJS", "X"}:
+        return [Word(token, token, at)]
+    if token[:1] in {"T", "K"} and token[1:].isdecimal():
+        return [Word(token[0], token, at)]
+    if token == "still" and question.interventions:
+        return []  # "will it still hit the cup?": with what is taken away
+    if token in PRONOUNS:
+        return [Word("PRONOUN", token, at)]
+    if token.endswith("-ing"):
+        return [Word("", token.removesuffix("-ing"), at), Word("", "-ing", at)]
+    return [Word("", text, at) for text in base_forms(token)]
 
 
 def _opens(before: Sequence[str]) -> bool:
@@ -172,7 +204,7 @@ def _relates(token: str, after: str) -> bool:
     return subject or (token == "when" and after.removesuffix("-ing") in lex.VERBS)
 
 
-def _leaves_world(sentence: Sentence, covered: frozenset[int]) -> bool:
+def _leaves_world(sentence: Sentence, covered: frozenset[int], question: Question) -> bool:
     """Whether the words around a question leave its world as it is: one thing moves, and hits nothing yet."""
     tokens, rest = sentence.tokens, [at for at in range(len(sentence.tokens)) if at not in covered]
     words = [word for at in rest for word in sentence.words[at]]
@@ -180,15 +212,18 @@ def _leaves_world(sentence: Sentence, covered: frozenset[int]) -> bool:
         return True
     if not _INTERVENTIONS.isdisjoint(words) or _NOT_THERE.fullmatch(" ".join(words)):
         return False
-    return not any(_moves_another(sentence, at) or _hits(tokens, at) for at in rest)
+    return not any(_moves_another(sentence, at, question) or _hits(tokens, at) for at in rest)
 
 
-def _moves_another(sentence: Sentence, at: int) -> bool:
+def _moves_another(sentence: Sentence, at: int, question: Question) -> bool:
     """Whether another thing than the mover, or a hand that moves it, is the subject of a verb of motion at a place."""
     tokens = sentence.tokens
     verb = lex.VERBS.get(tokens[at])
     subject = at - 2 if at > 1 and tokens[at - 1] == "be" else at - 1
     if verb is None or verb.kind in {None, "static"} or subject < 0 or tokens[subject] not in sentence.phrases:
+        return False
+    known = [other.object for other in question.motion.others]
+    if sentence.phrases[tokens[subject]] in known:
         return False
     if sentence.phrases[tokens[subject]].head in lex.AGENTS and tokens[at + 1 : at + 2] == ["M"]:
         return False
@@ -204,10 +239,13 @@ def _hits(words: Sequence[str], at: int) -> bool:
     return words[at - 1 : at] != ["be"] and after[:1] not in (["M"], ["it"])
 
 
-def _is_into_hollow(clause: str, named: Sequence[ObjectPhrase]) -> bool:
-    """ "roll into the bowl": it would be in it, not only touch it."""
-    inside = re.search(r"\b(?:run|roll|slide|drive|skid)(?:-ing)? into", clause) is not None
-    return inside and any(phrase.head in _HOLLOW for phrase in named)
+def _into_hollow(asking: Asking, tokens: Sequence[str], phrases: dict[str, ObjectPhrase]) -> Asking | None:
+    """ "Roll into the bowl": it would be in it, not only touch it; "fall into the vase" is to hit it."""
+    hollow = asking.target in phrases and phrases[asking.target].head in _HOLLOW
+    into = any(token in {"into", "in"} for token in tokens)
+    if asking.relation == "touches" and hollow and into and asking.form == "whether":
+        return replace(asking, relation="inside")
+    return asking
 
 
 def _as_named(target: ObjectPhrase, question: Question) -> str:

@@ -22,7 +22,7 @@ from cow_service.readers.question.clauses import (
     is_vague,
     read_clauses,
 )
-from cow_service.readers.question.interventions import InterventionWords, split_interventions
+from cow_service.readers.question.interventions import InterventionWords, implied_placing, split_interventions
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
@@ -45,7 +45,8 @@ class Question:
 
     `others` are the further objects it names, in order, without the mover and without what is taken away; `items`, all
     its words and noun phrases, but for the options that it lists, its `interventions` and its trail.
-    `names_direction`: some word says which way, whether or not it was understood.
+    `clause` are the items that tell the motion. `names_direction`: some word says which way, whether or not it was
+    understood.
     """
 
     mover: ObjectPhrase | None
@@ -53,6 +54,7 @@ class Question:
     others: tuple[ObjectPhrase, ...]
     items: tuple[Item, ...]
     interventions: tuple[InterventionWords, ...]
+    clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
 
@@ -76,6 +78,8 @@ def parse(question: str) -> Question:
         found[at : shared or end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked
     )
     motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
+    if best is None and not interventions:
+        interventions = implied_placing(found)
     put = next((change for change in interventions if change.kind == "place"), None)
     if put is not None and (best is None or best.asked):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
@@ -87,6 +91,7 @@ def parse(question: str) -> Question:
         others=_others(found, mover, clause, interventions, trail),
         items=tuple(everything),
         interventions=interventions,
+        clause=tuple(found[clause.start : clause.stop]),
         mentions_arrow=any(word.startswith("arrow") for word in words),
         names_direction=_DIRECTION_WORDS.search(question) is not None,
     )

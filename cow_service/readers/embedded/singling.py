@@ -1,0 +1,57 @@
+"""Which of several regions a phrase singles out by its place or size: "the ball on the left", "the largest cube"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from cow_service.readers.question.phrases import ObjectPhrase
+from cow_service.vision.regions import Region
+
+CLEAR = 0.25  # of the mean size of the regions: so far ahead of the next one in place
+LARGER = 1.2  # ratio of areas to the next one
+
+# Which of x of the centre, y of the centre and y of the lower end is the largest, or with -1 the smallest.
+_MEASURES: dict[str, tuple[int, int]] = {
+    "left leftmost left-hand": (0, -1),
+    "right rightmost right-hand": (0, 1),
+    "top topmost upper highest uppermost": (1, -1),
+    "bottom lower lowest bottommost": (1, 1),
+    "front nearest closest foreground": (2, 1),
+    "back rear farthest furthest background": (2, -1),
+}
+_PLACES = {word: measure for words, measure in _MEASURES.items() for word in words.split()}
+_LARGE = frozenset({"large", "largest", "big", "biggest", "larger", "bigger", "tallest", "taller", "tall", "huge"})
+_SMALL = frozenset({"small", "smallest", "smaller", "little", "tiny", "shortest", "shorter", "short"})
+_MIDDLE = frozenset({"middle", "center", "centre", "central"})
+
+
+def singled_out(regions: Sequence[Region], phrase: ObjectPhrase) -> list[Region]:
+    """The one region that the words of place or size mean; all of them where these do not decide."""
+    words = phrase.text.lower().replace("-", " ").split()
+    for word in words if len(regions) > 1 else []:
+        if word in _PLACES:
+            return _first(regions, _PLACES[word], CLEAR * _size(regions))
+        if word in _MIDDLE and len(regions) % 2:
+            return [sorted(regions, key=lambda region: region.centre[0])[len(regions) // 2]]
+        if word in _LARGE | _SMALL:
+            sign = 1 if word in _LARGE else -1
+            ordered = sorted(regions, key=lambda region: -sign * region.mask.area)
+            ratio = (ordered[0].mask.area / ordered[1].mask.area) ** sign
+            return [ordered[0]] if ratio >= LARGER else list(regions)
+    return list(regions)
+
+
+def _first(regions: Sequence[Region], measure: tuple[int, int], lead: float) -> list[Region]:
+    which, sign = measure
+    ranked = sorted(regions, key=lambda region: -sign * _places(region)[which])
+    ahead = abs(_places(ranked[0])[which] - _places(ranked[1])[which])
+    return [ranked[0]] if ahead >= lead else list(regions)
+
+
+def _places(region: Region) -> tuple[float, float, float]:
+    return *region.centre, region.bbox[3]
+
+
+def _size(regions: Sequence[Region]) -> float:
+    """The mean side of the regions, px."""
+    return sum((r.bbox[2] - r.bbox[0] + r.bbox[3] - r.bbox[1]) / 2 for r in regions) / len(regions)

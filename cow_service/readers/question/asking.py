@@ -1,0 +1,109 @@
+"""Reads a clause that asks: its tree by the grammar, as the event that is asked about and the things it names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lark import Token, Tree
+
+from cow_service.readers.question.parsing import parse_all
+from cow_service.readers.question.words import Word
+from cow_service.records import AskedForm, AskedRelation
+
+MOVER = frozenset({"M", "PRONOUN"})
+_FORMS: dict[str, AskedForm] = {
+    "whether": "whether", "either": "which-first", "which_first": "which-first", "when": "when",
+    "how_many": "how-many", "where": "where", "what_happens": "what-happens", "changes": "changes",
+}  # fmt: skip
+# By the node of an act: the relation, and whether the subject of the clause is what it is done to.
+_ACTS: dict[str, tuple[AskedRelation, bool]] = {
+    "touches": ("touches", False), "what_touches": ("touches", False), "touched": ("touches", True),
+    "hits_none": ("touches", False), "misses": ("touches", False), "missed": ("touches", True),
+    "untouched": ("touches", True), "collides": ("touches", False), "contact_event": ("touches", False),
+    "together": ("touches", False), "list_hit": ("touches", False),
+    "hides": ("covers", False), "what_hides": ("covers", False), "hidden": ("covers", True), "stays": ("covers", True),
+    "passes_behind": ("covered", False), "what_passes_behind": ("covered", False),
+    "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False),
+    "tips_it": ("tips", False), "tips": ("tips", True), "tipped": ("tips", True),
+    "moves_it": ("moves", False), "moves": ("moves", True), "moved": ("moves", True), "still": ("moves", True),
+}  # fmt: skip
+_INNER = frozenset({"untouched", "still"})  # acts inside `stays`
+_NEGATIONS = frozenset({"no", "none", "misses", "missed", "avoids", "stays", "no_contact", "sticks_out"})
+
+
+@dataclass(frozen=True)
+class Asking:
+    """What a clause asks; things are tokens of the clause. None is the mover as `subject`, anything as `target`."""
+
+    form: AskedForm
+    relation: AskedRelation
+    negated: bool
+    subject: str | None
+    target: str | None
+    among: tuple[str, ...] = ()
+
+
+def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
+    """What a clause asks, if all its words make sense. `beside`: the token of a second mover, for "they"."""
+    tree = parse_all("asked", words)
+    if tree is None:
+        return None
+    form: AskedForm = next(_FORMS[str(node.data)] for node in tree.iter_subtrees_topdown() if node.data in _FORMS)
+    negations = sum(node.data in _NEGATIONS for node in tree.iter_subtrees())
+    relation, done_to = _act(tree)
+    subject = _tokens(next(tree.find_data("subject"), None))
+    listed = [token for node in (*tree.find_data("list"), *tree.find_data("kind")) for token in _tokens(node)]
+    things = list(dict.fromkeys(str(t) for t in _tokens(tree) if t.type == "T" and t not in (*subject, *listed)))
+    if negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
+        return None
+    asking = Asking(form, relation, negations == 1, None, things[0] if things else None, tuple(map(str, listed)))
+    pronoun = next((str(token) for token in subject if token.type == "PRONOUN"), None)
+    if pronoun == "they":
+        return _together(asking, beside)
+    if pronoun is not None and beside is not None:
+        return None  # which of the two movers is meant is open
+    return asking if listed and form == "which-first" else _with_subject(asking, tree, subject, done_to)
+
+
+def _act(tree: Tree[Token]) -> tuple[AskedRelation, bool]:
+    """The relation of the outermost act, and whether the subject suffers it."""
+    found = [str(node.data) for node in tree.iter_subtrees_topdown() if node.data in _ACTS]
+    inner = [name for name in found if name in _INNER]
+    return _ACTS[(inner or found or ["touches"])[0]]
+
+
+def _tokens(tree: Tree[Token] | None) -> list[Token]:
+    """The things and pronouns of a tree, in order."""
+    return [] if tree is None else [t for t in tree.scan_values(lambda value: isinstance(value, Token)) if t.type]
+
+
+def _together(asking: Asking, beside: str | None) -> Asking | None:
+    """ "Will they collide?": the two things that move."""
+    if beside is None or asking.target is not None:
+        return None
+    return Asking(asking.form, asking.relation, asking.negated, None, beside)
+
+
+def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_to: bool) -> Asking:
+    """Who does it, and to whom: the words "it" and the mover's stand for the mover."""
+    thing = next((str(token) for token in subject if token.type == "T"), None)
+    relation, target, doer = asking.relation, asking.target, thing
+    mover_acted = any(t.type in MOVER for node in tree.find_data("object") for t in _tokens(node))
+    if asking.form == "what-happens":
+        target, doer = thing or target, None
+    elif done_to and relation == "covers":
+        # Hidden: the mover by another, one thing by another, or a thing by the mover.
+        by_other = target is not None and thing is not None
+        if (subject and thing is None) or by_other:
+            relation = "covered"
+        else:
+            target, doer = thing, None
+    elif done_to and relation in {"touches", "tips", "moves"}:
+        target, doer = (
+            (thing, target) if thing is not None else (target or ("M" if relation != "touches" else None), None)
+        )
+    elif mover_acted and target is None:
+        target, doer = thing, None
+        relation = "covered" if relation == "covers" else relation
+    return Asking(asking.form, relation, asking.negated, doer, target, asking.among)
