@@ -16,18 +16,17 @@ import numpy as np
 
 from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
+from cow_service.vision.looks import LEAST_CONTRAST, Looks, inside_any
 from cow_service.vision.masks import iou
-from cow_service.vision.types import Floats, Floats32, Image, Mask
+from cow_service.vision.types import Image, Mask
 
 END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
+PALE_SUPPORT, PREDICTED = 0.4, 0.2  # the same of one that a trail's path leads to, and how near to it, in radii
 SURE_SUPPORT = 0.3  # of the circumference: with more, no better circle is sought nearby
 SEEN_SUPPORT = 0.75  # of what the other positions leave to be seen of a circumference, on edges
 NOTCHED = 0.35  # of the depth that the outline of two overlapping circles has between them: less is a straight side
 SIZES = 1.35  # between the radii of neighbours, at most
-LOOKS, LEAST_CONTRAST = 0.3, 12.0  # difference of the looks over the contrast, at most; grey levels of that contrast
-MOST_UNREST = 12.0  # grey levels of a background's variation that are allowed for
 FADED = 0.85  # of the opacity of the most opaque: with less, a position was faded
-LEAST_OPACITY = 0.08
 SPACING = 0.5, 2.0  # between neighbouring gaps
 BEND = math.radians(65)  # between neighbouring legs, at most
 LEAST_GAP, MOST_GAP = 0.35, 5.0  # radii between neighbours
@@ -35,9 +34,6 @@ MOST_SAG = 0.3  # of the distance of two positions: how far those between may li
 MAX_POSITIONS = 12
 MAX_PAIRS = 6  # circles that look alike, between and beyond which others are sought
 SAME_POSITION_IOU = 0.4
-# Radii: offsets from the centre at which looks are compared.
-OFFSETS = np.array([(r * math.cos(t), r * math.sin(t)) for r in (0.25, 0.5, 0.7, 0.85)
-                    for t in np.linspace(0, 2 * math.pi, 24, endpoint=False)])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -133,7 +129,7 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     edges = Edges.of(image)
     if edges is None:
         return ()
-    looks = _Looks(image.astype(np.float32))
+    looks = Looks(image.astype(np.float32))
     ends = [circle for circle in edges.circles() if circle.support >= END_SUPPORT]
     ends = [circle for circle in ends if looks.contrast(circle) >= LEAST_CONTRAST]
     trails: list[Trail] = []
@@ -163,7 +159,7 @@ def _may_be_one(a: Circle, b: Circle) -> bool:
     return 0.25 * mean < apart < MOST_GAP * 3 * mean and max(a.radius, b.radius) < SIZES**3 * min(a.radius, b.radius)
 
 
-def _chain(edges: Edges, looks: _Looks, a: Circle, b: Circle) -> tuple[Circle, ...] | None:
+def _chain(edges: Edges, looks: Looks, a: Circle, b: Circle) -> tuple[Circle, ...] | None:
     """The circles along the path through two of them, in order; None where they are fewer than three, or no path."""
     best: tuple[Circle, ...] = ()
     reach = 0.5 * math.dist((a.x, a.y), (b.x, b.y)) + 1.6 * max(a.radius, b.radius)
@@ -176,10 +172,26 @@ def _chain(edges: Edges, looks: _Looks, a: Circle, b: Circle) -> tuple[Circle, .
         chain = _beyond(edges, looks, _beyond(edges, looks, chain)[::-1])
         if len(chain) > max(2, len(best)) and _is_path(chain) and looks.alike(chain) and _is_outlined(edges, chain):
             best = chain
+    for _ in range(2):  # both ends
+        best = _prolonged(edges, looks, best)[::-1] if best else best
     return best or None
 
 
-def _between(edges: Edges, looks: _Looks, a: Circle, b: Circle, inner: int) -> tuple[Circle, ...] | None:
+def _prolonged(edges: Edges, looks: Looks, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
+    """A chain with circles that its path leads on to, though too pale, or too much overlaid, to be compared."""
+    while len(chain) < MAX_POSITIONS:
+        x, y = (3 * getattr(chain[-1], at) - 3 * getattr(chain[-2], at) + getattr(chain[-3], at) for at in "xy")
+        found = _fit_near(edges, x, y, chain[-1].radius)
+        if found is None or found.support < PALE_SUPPORT or any(found.is_same(other) for other in chain):
+            return chain
+        near = math.dist((found.x, found.y), (x, y)) < PREDICTED * found.radius
+        if not near or not _is_path((*chain, found)) or looks.contrast(found) < LEAST_CONTRAST / 2:
+            return chain
+        chain = (*chain, found)
+    return chain
+
+
+def _between(edges: Edges, looks: Looks, a: Circle, b: Circle, inner: int) -> tuple[Circle, ...] | None:
     """Two circles with so many others between them, evenly along an arc that bulges to one side or the other."""
     apart = math.dist((a.x, a.y), (b.x, b.y))
     gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
@@ -203,7 +215,7 @@ def _between(edges: Edges, looks: _Looks, a: Circle, b: Circle, inner: int) -> t
     return None
 
 
-def _beyond(edges: Edges, looks: _Looks, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
+def _beyond(edges: Edges, looks: Looks, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
     """A chain with what goes on after its last circle."""
     while len(chain) < MAX_POSITIONS:
         last, before = chain[-1], chain[-2]
@@ -276,7 +288,7 @@ def _is_outlined(edges: Edges, chain: Sequence[Circle]) -> bool:
     turns = (np.arange(BINS) + 0.5) * 2 * math.pi / BINS
     for i, circle in enumerate(chain):
         rim = np.stack([circle.x + circle.radius * np.cos(turns), circle.y + circle.radius * np.sin(turns)], axis=1)
-        seen = ~_inside(rim, [other for j, other in enumerate(chain) if j != i], 1.0)
+        seen = ~inside_any(rim, [other for j, other in enumerate(chain) if j != i], 1.0)
         on = np.isin(np.arange(BINS), list(circle.on_edges))
         if np.count_nonzero(on & seen) < SEEN_SUPPORT * max(1, np.count_nonzero(seen)):
             return False
@@ -285,17 +297,9 @@ def _is_outlined(edges: Edges, chain: Sequence[Circle]) -> bool:
     return True
 
 
-def _inside(points: Floats, circles: Sequence[Circle], factor: float) -> Mask:
-    """Which points [N, 2] (px) lie inside any of circles, their radii multiplied."""
-    inside = np.zeros(len(points), bool)
-    for circle in circles:
-        inside |= np.hypot(points[:, 0] - circle.x, points[:, 1] - circle.y) < factor * circle.radius
-    return inside
-
-
-def _trail(looks: _Looks, chain: tuple[Circle, ...]) -> Trail | None:
+def _trail(looks: Looks, chain: tuple[Circle, ...]) -> Trail | None:
     """The trail of a chain, its more opaque end last; where they are alike, that of which more is seen."""
-    shares = looks.opacities(chain)
+    shares = looks.opacities(chain, compared=False)
     if shares is None:
         return None
     opacity = np.clip(shares / shares.max(), 0, 1)
@@ -316,82 +320,3 @@ def _is_part(circle: Circle, trail: Trail) -> bool:
 def _gap(position: Position, bbox: BBox) -> float:
     """px from the centre of a position to that of a box."""
     return math.dist(position.centre, ((bbox[0] + bbox[2]) / 2, (bbox[1] + bbox[3]) / 2))
-
-
-@dataclass(frozen=True, eq=False)
-class _Looks:
-    """How circles of an image [H, W, 3] look inside and about them, in grey levels."""
-
-    image: Floats32
-
-    def contrast(self, circle: Circle) -> float:
-        """Lower quartile of the steps from inside to outside over the edges on a circle."""
-        turns = (np.array(sorted(circle.on_edges)) + 0.5) * 2 * math.pi / BINS
-        rim = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-        inside, outside = (self._at(circle, factor * rim) for factor in (0.85, 1.15))
-        return float(np.percentile(np.linalg.norm(inside - outside, axis=1), 25))
-
-    def alike(self, chain: Sequence[Circle]) -> bool:
-        """Whether all look like the first or the last, faded or not."""
-        return self.opacities(chain) is not None
-
-    def opacities(self, chain: Sequence[Circle]) -> Floats | None:
-        """Opacity [N] of each circle against one that is the most opaque; None where they do not look alike."""
-        rings = [self._ring(i, chain) for i in range(len(chain))]
-        about = [np.median(ring, axis=0) for ring in rings]
-        unrest = [float(np.median(np.linalg.norm(r - a, axis=1))) for r, a in zip(rings, about, strict=True)]
-        inner = [self._at(circle, OFFSETS) for circle in chain]
-        free = [self._free(i, chain) for i in range(len(chain))]
-        strength = [float(np.abs(v[f] - b).mean()) if f.any() else 0.0
-                    for v, b, f in zip(inner, about, free, strict=True)]  # fmt: skip
-        model = max((0, len(chain) - 1), key=lambda i: strength[i])
-        shares: list[float] = []
-        for i in range(len(chain)):
-            both = free[i] & free[model]
-            if np.count_nonzero(both) < 6:
-                both = free[i] | free[model]
-            seen, wanted = inner[i][both], inner[model][both]
-            share = _opacity(seen - about[i], wanted - about[model], seen - wanted, unrest[i])
-            if share is None:
-                return None
-            shares.append(share)
-        return np.array(shares)
-
-    def _at(self, circle: Circle, offsets: Floats) -> Floats:
-        """Colours [N, 3] at offsets [N, 2] (radii) from a circle's centre."""
-        xs = np.clip(circle.x + circle.radius * offsets[:, 0], 0, self.image.shape[1] - 1).astype(int)
-        ys = np.clip(circle.y + circle.radius * offsets[:, 1], 0, self.image.shape[0] - 1).astype(int)
-        return self.image[ys, xs].astype(np.float64)
-
-    def _free(self, i: int, chain: Sequence[Circle]) -> Mask:
-        """Which of `OFFSETS` of a circle lie in no other."""
-        circle = chain[i]
-        points = np.array([circle.x, circle.y]) + circle.radius * OFFSETS
-        return ~_inside(points, [other for j, other in enumerate(chain) if j != i], 1.05)
-
-    def _ring(self, i: int, chain: Sequence[Circle]) -> Floats:
-        """Colours [N, 3] around a circle, others left out."""
-        circle = chain[i]
-        turns = np.linspace(0, 2 * math.pi, 48, endpoint=False)
-        ring = np.concatenate([f * np.stack([np.cos(turns), np.sin(turns)], axis=1) for f in (1.15, 1.3)])
-        points = np.array([circle.x, circle.y]) + circle.radius * ring
-        free = ~_inside(points, [other for j, other in enumerate(chain) if j != i], 1.1)
-        return self._at(circle, ring[free] if free.sum() > 8 else ring)
-
-
-def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float | None:
-    """The share of a model's contrast [N, 3] that is seen [N, 3]; None where what is seen is no share of it.
-
-    `plain` [N, 3] are the differences of the colours themselves, which do not depend on the background; `unrest`
-    is how much that varies (grey levels).
-    """
-    contrast = float(np.median(np.linalg.norm(model, axis=1)))
-    if contrast < LEAST_CONTRAST:
-        return None
-    if float(np.median(np.linalg.norm(plain, axis=1))) < LOOKS * contrast / 2:
-        return 1.0
-    share = float((seen * model).sum() / (model**2).sum())
-    rest = float(np.median(np.linalg.norm(seen - share * model, axis=1)))
-    if not LEAST_OPACITY < share < 1.15 or rest > LOOKS * contrast * share + min(unrest, MOST_UNREST):
-        return None
-    return min(share, 1.0)
