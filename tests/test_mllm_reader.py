@@ -12,8 +12,9 @@ import pytest
 from drawn import ball, floor
 from mllm_server import MllmServer
 
-from cow_service.errors import Canceled, MllmUnavailable
-from cow_service.readers.base import CallLog, MotionHints, ReaderInput
+from cow_service.errors import Canceled, MllmUnavailable, ObjectNotFound
+from cow_service.readers.base import CallLog, MotionHints, Quantity, ReaderInput
+from cow_service.readers.mllm.changes import read_changes
 from cow_service.readers.mllm.reader import MllmReader, create
 from cow_service.records import Grounding
 from cow_service.settings import Settings
@@ -62,6 +63,47 @@ def test_what_was_read_with_the_place_needs_no_second_call(mllm: MllmServer, rea
     assert len(mllm.asked) == 2
     assert (motion.kind, motion.cue, motion.sentence) == ("linear", "arrow", "The red ball rolls.")
     assert motion.direction == pytest.approx((0.37 * scene.width, 0), abs=1)
+
+
+def test_what_is_taken_away_is_located_and_how_far_it_goes_is_kept(
+    mllm: MllmServer, reader: MllmReader, scene: Scene
+) -> None:
+    said = BALL | {"changes": [{"kind": "remove", "object": "blue vase"}], "distance": "10 cm", "until": "contact"}
+    vase = {"label": "blue vase", "bbox_2d": [600, 400, 700, 600]}
+    mllm.say(
+        json.dumps(said | {"speed": "20 pixels per second", "duration": "soon"}), json.dumps(PLACE | {"others": [vase]})
+    )
+    reading = reader.ground(ReaderInput(scene, QUESTION))
+    assert "> blue vase" in mllm.text(1)
+    assert [(each.kind, each.object.object) for each in reading.interventions] == [("remove", "blue vase")]
+    assert reading.others == ()
+    assert reading.hints is not None
+    hints = MotionHints.model_validate_json(reading.hints.model_dump_json())
+    motion = reader.read_motion(ReaderInput(scene, QUESTION), grounding("mllm"), hints)
+    assert (motion.speed, motion.distance, motion.duration) == (Quantity(20, "px/s"), Quantity(0.1, "m"), None)
+    assert motion.until == "contact"
+    mllm.say(json.dumps(said), json.dumps(PLACE))
+    with pytest.raises(ObjectNotFound, match="'blue vase' in the image, which the question changes"):
+        reader.ground(ReaderInput(scene, QUESTION))
+
+
+@pytest.mark.parametrize(
+    ("written", "read"),
+    [
+        ({"kind": "place", "object": "apple", "relation": "inside", "targets": "bowl"}, ("into", ("bowl",))),
+        (
+            [{"kind": "put", "object": "cube", "relation": "between", "targets": ["mug", "vase"]}],
+            ("between", ("mug", "vase")),
+        ),
+        ([{"kind": "place", "object": "apple", "relation": "over there", "targets": ["bowl"]}], None),
+        ([{"kind": "place", "object": "apple", "relation": "into"}], None),
+        (["remove the vase"], None),
+        (None, None),
+    ],
+)
+def test_changes_as_replies_write_them(written, read) -> None:
+    found = read_changes({"changes": written})
+    assert [(each.relation, each.targets) for each in found] == ([] if read is None else [read])
 
 
 @pytest.mark.parametrize(("source", "prompts"), [("request", {"locate"}), ("mllm", {"identify", "locate"})])

@@ -26,7 +26,7 @@ class Verdict:
     """`kind` is right, refused, not-sure or wrong."""
 
     question: str
-    kind: str
+    kind: str  # right, refused, not-sure or wrong
     expected: str
     said: str
 

@@ -102,7 +102,10 @@ class MotionHints(Record):
     ends: tuple[Point, Point] | None = None  # of a line along the motion, px of the upright image
     camera: Literal["towards", "away"] | None = None  # the motion leads straight to the camera, or from it
     depth_degrees: float | None = Field(default=None, ge=-90, le=90)  # out of the image plane, positive away
-    speed: SpeedWord | None = None
+    speed: SpeedWord | Quantity | None = None
+    distance: Quantity | None = None
+    duration: float | None = Field(default=None, gt=0)  # s
+    until: Until | None = None
     cue: Cue | None = None
     along_arrow: bool | None = None
     metres_per_pixel: MetresPerPixel | None = None

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast, get_args
 
+from cow_service.readers.mllm.changes import CHANGE_FIELDS, NOT_SAID, Change, Lengths, read_changes, read_lengths
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.free_text import is_broken_json, names_nothing
 from cow_service.readers.mllm.images import EncodedImage
@@ -47,6 +48,8 @@ class Identified:
     others: tuple[str, ...] = ()
     kind: MotionKind | None = None
     sentence: str | None = None
+    changes: tuple[Change, ...] = ()
+    lengths: Lengths = NOT_SAID
 
 
 def identify_call(question: str, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
@@ -57,11 +60,13 @@ def identify_call(question: str, image: EncodedImage, reasoning_length: int) -> 
 def schema(reasoning_length: int) -> Schema:
     """JSON schema of the reply."""
     return object_of(
+        CHANGE_FIELDS,
         reasoning=words(reasoning_length),
         object=nullable(words(MAX_OBJECT)),
         others={"type": "array", "items": words(MAX_OBJECT), "maxItems": MAX_OTHERS},
         kind=one_of(*KINDS),
         sentence=words(MAX_SENTENCE),
+        **CHANGE_FIELDS,
     )
 
 
@@ -97,12 +102,21 @@ def _named(value: object) -> Iterator[Identified]:
             continue
         kind, sentence = text_of(fields.get("kind")).lower(), text_of(fields.get("sentence"))
         for named in _as_words(first_of(inner, *_INNER) if inner else each):
+            changes = read_changes(fields)
+            placed = any(each.kind == "place" and _same(each.object, named.object) for each in changes)
+            said_kind: MotionKind | None = next((known for known in KINDS if known == kind), None)
             yield Identified(
                 object=named.object,
                 others=_others(fields, named.object),
-                kind=next((known for known in KINDS if known == kind), None),
+                kind=None if said_kind == "place" and not placed else said_kind,
                 sentence=sentence if MIN_SENTENCE <= len(sentence) <= MAX_SENTENCE else None,
+                changes=changes,
+                lengths=read_lengths(fields),
             )
+
+
+def _same(one: str, other: str) -> bool:
+    return name_words(one) == name_words(other)
 
 
 def _as_words(value: object) -> Iterator[Identified]:

@@ -12,8 +12,17 @@ from typing import Any
 from cow_service import __version__
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
+from cow_service.readers.base import (
+    AnswerReading,
+    GroundingReading,
+    Imagined,
+    MotionHints,
+    MotionReading,
+    Quantity,
+    ReaderInput,
+)
 from cow_service.readers.mllm.answer import answer_calls
+from cow_service.readers.mllm.changes import Lengths, located_changes, names_of
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.directions import Line
@@ -35,6 +44,7 @@ from cow_service.records import (
     BBox,
     Cue,
     Grounding,
+    LocatedObject,
     MotionKind,
     ReaderInfo,
     Source,
@@ -92,6 +102,10 @@ class MllmReader:
             phrase = parse_noun_phrase(identified.object)
             warnings = box_warnings(given.scene, bbox, phrase.colour if phrase else None, located.clipped)
         others, doubles = separate_objects(bbox, located.others)
+        mover = LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
+        missing = f"{self._subject} does not see '{{name}}' in the image, which the question changes. {GIVE_PLACE}"
+        interventions = located_changes(identified.changes, mover, others, missing)
+        removed = {each.object.bbox for each in interventions if each.kind == "remove"}
         if located.label and set(name_words(located.label)).isdisjoint(name_words(identified.object)):
             mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
             warnings = (*warnings, mismatch)
@@ -99,7 +113,8 @@ class MllmReader:
             object=identified.object,
             bbox=bbox,
             point=located.point,
-            others=others,
+            others=tuple(other for other in others if other.bbox not in removed),
+            interventions=interventions,
             warnings=(*warnings, *located.warnings, *doubles, *self._family_warnings()),
             hints=hints if given.motion_wanted else None,
             prior=located.prior,
@@ -157,7 +172,9 @@ class MllmReader:
         None where the place was not asked for, or the object not seen. Raises `MllmBadReply`, `MllmUnavailable`.
         """
         kind = _kind(given, identified)
-        others = identified.others if identified is not None and bbox is None else ()
+        others: tuple[str, ...] = ()
+        if identified is not None and bbox is None:
+            others = tuple(dict.fromkeys((*names_of(identified.changes, name), *identified.others)))
         wants_direction = given.motion_wanted and kind in DIRECTED_KINDS
         wants_place = bbox is None or wants_direction
         wants_scale = given.motion_wanted and kind in FALLING_KINDS
@@ -173,13 +190,17 @@ class MllmReader:
             raise located
         line = Line() if located is None or located.line is None else located.line
         scale = scaled if isinstance(scaled, Scaled) else Scaled()
+        lengths = Lengths() if identified is None else identified.lengths
         return located, MotionHints(
             kind=kind,
             sentence=identified.sentence if identified else None,
             ends=line.ends,
             camera=line.camera,
             depth_degrees=line.depth_degrees,
-            speed=line.speed,
+            speed=lengths.speed or line.speed,
+            distance=lengths.distance,
+            duration=lengths.duration,
+            until=lengths.until,
             cue=line.cue,
             along_arrow=line.along_arrow,
             metres_per_pixel=scale.metres_per_pixel,
@@ -196,7 +217,10 @@ class MllmReader:
                 f"{self._subject} found nothing in the image or the question that tells which way the "
                 f"{grounding.object} moves. {GIVE_DIRECTION}"
             )
-        if hints.speed is not None:
+        reading = replace(reading, distance=hints.distance, duration=hints.duration, until=hints.until)
+        if isinstance(hints.speed, Quantity):
+            reading = replace(reading, speed=hints.speed)
+        elif hints.speed is not None:
             reading = replace(reading, speed=hints.speed, speed_deviation=SPEED_DEVIATION)
         question = parse(given.question)
         words = question.motion
