@@ -21,7 +21,7 @@ Found = tuple[ObjectPhrase, BBox]
 def check_changes(question: Question) -> None:
     """Raises `CannotGround` where the mover is taken away, or something is put into itself."""
     for change in question.interventions:
-        if change.kind == "remove" and change.object == question.mover:
+        if change.kind == "remove" and (change.then_moves or change.object == question.mover):
             raise CannotGround(f"The question takes '{change.object.text}' away and says that it moves. {GIVE_PLACE}")
         if change.object in change.targets:
             relation = change.relation or "beside"

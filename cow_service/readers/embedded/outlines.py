@@ -17,7 +17,8 @@ from cow_service.vision.types import Mask
 Range = tuple[float, float]
 
 ASPECT_STEP, WIDTH_STEP = 0.2, 0.1  # natural logarithm, and share of the width: so far off counts as 1
-FITS, CLEARLY_WORSE = 0.5, 2.5  # misfits: up to the first it can be meant; the next must be worse by the second
+FITS, CLEARLY_WORSE = 1.0, 2.5  # misfits: up to the first it can be meant; the next must be worse by the second
+MOSTLY_OUTSIDE = 0.33  # of the area of what fits: of an object that the image's border cuts, hardly the one meant
 
 CONTRADICTS = 3.5  # misfit from which a thing is not what it is called; of things in their own name up to 2.4
 
@@ -42,9 +43,11 @@ def clearest(regions: Sequence[Region], noun: str | None) -> Region | None:
     """The region whose outline fits a noun where all others are clearly worse; None where it does not decide."""
     misfits = [_misfit(region, noun) for region in regions] if noun in OUTLINES else []
     known = sorted((misfit, i) for i, misfit in enumerate(misfits) if misfit is not None)
-    if len(known) < max(2, len(regions)) or known[0][0] > FITS or known[1][0] < known[0][0] + CLEARLY_WORSE:
+    if len(known) < 2 or known[0][0] > FITS or known[1][0] < known[0][0] + CLEARLY_WORSE:
         return None
-    return regions[known[0][1]]
+    best = regions[known[0][1]]
+    cut = (region for region, misfit in zip(regions, misfits, strict=True) if misfit is None)
+    return best if all(region.mask.area < MOSTLY_OUTSIDE * best.mask.area for region in cut) else None
 
 
 def contradicts(region: Region, noun: str | None) -> bool:

@@ -27,6 +27,7 @@ _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
 _SINKING = lex.words("lower descend sink")
+_FALLING = lex.words("fall drop plummet plunge")
 _FACES = lex.words("face head point")
 _GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
 _FORWARD = lex.words("forward forwards ahead onward onwards")
@@ -59,6 +60,7 @@ class MotionWords:
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
     form, empty where no known verb of motion stands in the question. `towards` is the object that the motion aims at;
     the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
+    `rises_in_fall`: it is said to fall and to go up.
     `steps` are the legs behind the first, `others` what moves at the same time.
     """
 
@@ -72,6 +74,7 @@ class MotionWords:
     trail: TrailWords | None = None
     quantities: tuple[QuantityWords, ...] = ()
     steps: tuple[StepWords, ...] = ()
+    rises_in_fall: bool = False
     others: tuple[OtherWords, ...] = ()
 
 
@@ -96,8 +99,14 @@ def read_motion(
     forward = _forward(found, verb, arrow)
     towards = _towards(found, asked or kind == "fall", mover)
     return MotionWords(
-        kind, arrow, direction, depth, forward, verb, towards, quantities=_quantities(legs[0]), steps=tuple(steps)
-    )
+        kind, arrow, direction, depth, forward, verb, towards,
+        quantities=_quantities(legs[0]), steps=tuple(steps), rises_in_fall=kind == "fall" and _rises(legs[0], verb),
+    )  # fmt: skip
+
+
+def _rises(found: Sequence[Item], verb: str) -> bool:
+    """ "Falls upwards": no tilt, no leg behind it, but a contradiction."""
+    return verb in _FALLING and any(_word_step(found, at)[1] < 0 for at in range(1, len(found)))
 
 
 def _legs(found: Sequence[Item], verb: str) -> list[Sequence[Item]]:
@@ -216,6 +225,11 @@ def _forward(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> bool
     return True if verb in _GOES_STRAIGHT and flat[-1:] == ["straight"] else None
 
 
+def _is_one(phrase: ObjectPhrase) -> bool:
+    """ "The pink one"."""
+    return phrase.noun is None and phrase.colour is not None
+
+
 def _towards(found: Sequence[Item], open_end: bool, mover: ObjectPhrase | None) -> ObjectPhrase | None:
     preps = {"toward", "towards"} if open_end else {"toward", "towards", "to", "at", "into"}
     for at, item in enumerate(found):
@@ -224,6 +238,6 @@ def _towards(found: Sequence[Item], open_end: bool, mover: ObjectPhrase | None) 
             aimed = earlier is not None and earlier.noun == "direction" and not has_opposite(flatten(found))
         else:
             aimed = before in preps and key_at(found, at - 2) not in _NOT_AIMED
-        if item.phrase and aimed and item.phrase != mover and item.phrase.is_thing:
+        if item.phrase and aimed and item.phrase != mover and (item.phrase.is_thing or _is_one(item.phrase)):
             return item.phrase
     return None

@@ -21,7 +21,7 @@ from cow_service.records import Asked
 
 _STARTS = lex.words(
     "will would do does did can could shall might may be tell say predict know when where at in after how what which",
-    "with into on onto true",
+    "with into on onto true has have had",
 )
 _OPENERS = lex.words(", and then so but now please")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
@@ -39,6 +39,7 @@ _NOT_THERE = re.compile(r".*\b(?:not|n't|never) (?:there|here|present|exist|exis
 _SHORT_ANSWER = lex.words(
     "please answer reply respond say just only with by in a single word yes no or not sure either"
 )
+_TIMED = re.compile(rf".*\b(?:after|within|before|in) (?:[\d.]+|{'|'.join(lex.NUMBER_WORDS)}) (?:s|secs?|seconds?)\b.*")
 _MAX_TRIES = 8  # of one sentence: each takes some ms
 MAX_SENTENCES = 12  # of one question; more are not read
 _LIST = re.compile(r"(?P<list>T\d+(?: , T\d+)*(?: ,)? or T\d+)")
@@ -89,7 +90,9 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     reading = _read(question)
     if reading is None or reading.asking.form != "which-first":
         return ()
-    return (*(reading.phrases[token] for token in reading.asking.among), *reading.listed)
+    named = {token: reading.phrases[token] for token in reading.asking.among}
+    listed = [*(phrase for token, phrase in named.items() if not token.startswith("K")), *reading.listed]
+    return tuple(listed or named.values())
 
 
 def unread_clause(question: Question) -> str:
@@ -135,7 +138,7 @@ def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
     tokens = sentence.tokens
     tries = 0
     ends = [len(tokens), *(at for at, token in enumerate(tokens) if token in _CONDITIONS)]
-    for start in (at for at, token in enumerate(tokens) if token in _STARTS and _opens(tokens[:at])):
+    for start in (at for at, token in enumerate(tokens) if _starts(sentence, at)):
         for end in (end for end in ends if end > start):
             tries += 1
             if tries > _MAX_TRIES:
@@ -144,6 +147,16 @@ def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
             if reading is not None:
                 return reading
     return None
+
+
+def _starts(sentence: Sentence, at: int) -> bool:
+    """Whether a question may begin at a token: with an auxiliary, or as in "ball rolls left - hits the mug?"."""
+    tokens = sentence.tokens
+    if tokens[at] in _STARTS:
+        return _opens(tokens[:at])
+    said = sentence.words[at][0]
+    finite = said in lex.VERBS and lex.VERBS[said].form == "s"
+    return finite and sentence.asks and (at == 0 or tokens[at - 1] == ",")
 
 
 def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]:
@@ -212,6 +225,8 @@ def _leaves_world(sentence: Sentence, covered: frozenset[int], question: Questio
         return True
     if not _INTERVENTIONS.isdisjoint(words) or _NOT_THERE.fullmatch(" ".join(words)):
         return False
+    if _TIMED.fullmatch(" ".join(words)):
+        return False  # "will it have hit the cup after 2 seconds?"
     return not any(_moves_another(sentence, at, question) or _hits(tokens, at) for at in rest)
 
 
@@ -254,8 +269,12 @@ def _as_named(target: ObjectPhrase, question: Question) -> str:
     if target.text in texts:
         return target.text
     words = set(target.text.lower().split())
-    fuller = [text for text in texts if words <= set(text.lower().split())]
-    return fuller[0] if len(fuller) == 1 else target.text
+    changed = [phrase.text for change in question.interventions for phrase in (change.object, *change.targets)]
+    moving = [] if question.mover is None else [question.mover.text]
+    fuller = {text for text in [*texts, *changed, *moving] if words <= set(text.lower().split())}
+    if len(fuller) > 1:
+        fuller -= {target.text}
+    return fuller.pop() if len(fuller) == 1 else target.text
 
 
 def _listed(asking: Sentence, covered: frozenset[int], following: Sequence[Sentence]) -> tuple[ObjectPhrase, ...]:
