@@ -39,15 +39,17 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range]] = {
 }
 
 
-def clearest(regions: Sequence[Region], noun: str | None) -> Region | None:
-    """The region whose outline fits a noun where all others are clearly worse; None where it does not decide."""
+def clearest(regions: Sequence[Region], noun: str | None, count: int = 1) -> list[Region]:
+    """The so many regions whose outlines fit a noun where all others are clearly worse; none where it is not clear."""
     misfits = [_misfit(region, noun) for region in regions] if noun in OUTLINES else []
     known = sorted((misfit, i) for i, misfit in enumerate(misfits) if misfit is not None)
-    if len(known) < 2 or known[0][0] > FITS or known[1][0] < known[0][0] + CLEARLY_WORSE:
-        return None
-    best = regions[known[0][1]]
-    cut = (region for region, misfit in zip(regions, misfits, strict=True) if misfit is None)
-    return best if all(region.mask.area < MOSTLY_OUTSIDE * best.mask.area for region in cut) else None
+    if len(known) <= count:
+        return []
+    fit, next_one = known[count - 1][0], known[count][0]
+    best = [regions[place] for _, place in known[:count]]
+    cut = [region for region, misfit in zip(regions, misfits, strict=True) if misfit is None]
+    clear = fit <= FITS and next_one >= fit + CLEARLY_WORSE
+    return best if clear and all(each.mask.area < MOSTLY_OUTSIDE * best[0].mask.area for each in cut) else []
 
 
 def contradicts(region: Region, noun: str | None) -> bool:

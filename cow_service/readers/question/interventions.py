@@ -81,7 +81,12 @@ def implied_placing(found: Sequence[Item]) -> tuple[InterventionWords, ...]:
     """ "Will the apple fit into the bowl?": where nothing moves, the apple is put there."""
     words = words_of(found)
     for place, word in enumerate(words):
-        if word.text == "fit" and place > 1 and (parsed := parse_from("fitting", words[place - 2 : place + 8])):
+        if word.text != "fit":
+            continue
+        for start in (place - 2, place - 3, place - 4):
+            parsed = parse_from("fitting", words[start : place + 8]) if start >= 0 else None
+            if parsed is None or parsed[1] <= place - start:
+                continue
             named = [phrase for token in named_in(parsed[0]) if (phrase := _phrase(found, token.line or 0))]
             return (_placing(parsed[0], named),) if named else ()
     return ()

@@ -93,7 +93,7 @@ def read_motion(
     kind = _kind(found, verb, kind)
     if arrow == "along" and _turns_around(found):
         arrow = "against"
-    legs = _legs(found, verb)
+    legs = _legs(found, verb, arrow)
     direction, depth = _way(legs[0], verb, kind)
     steps = [StepWords(*_way(leg, "", None), _quantities(leg)) for leg in legs[1:]]
     forward = _forward(found, verb, arrow)
@@ -109,14 +109,15 @@ def _rises(found: Sequence[Item], verb: str) -> bool:
     return verb in _FALLING and any(_word_step(found, at)[1] < 0 for at in range(1, len(found)))
 
 
-def _legs(found: Sequence[Item], verb: str) -> list[Sequence[Item]]:
+def _legs(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> list[Sequence[Item]]:
     """The words of a motion cut at each "then" that a way to go follows."""
     legs: list[Sequence[Item]] = [found]
     for at in range(len(found) - 1, 0, -1):
         if found[at].key in {"then", "afterwards"} and _way(found[at:], "", None) != (None, 0.0):
             first = legs.pop(0)
             legs = [first[:at], first[at:], *legs]
-    return legs if _way(legs[0], verb, None) != (None, 0.0) else [found]
+    along = arrow is not None and any(is_arrow(legs[0], at) for at in range(len(legs[0])))
+    return legs if along or _way(legs[0], verb, None) != (None, 0.0) else [found]
 
 
 def _way(found: Sequence[Item], verb: str, kind: MotionKind | None) -> tuple[Vector | None, float]:

@@ -72,7 +72,7 @@ def parse(question: str) -> Question:
     end = clause_end(found, at) if best else at
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
-    verb, kind = (best.verb, best.kind) if best else ("", None)
+    verb, kind = (best.verb, best.kind) if best else ("fall", "fall") if _on_its_way_down(found) else ("", None)
     end = min([end, *(other.start for other in _movers_beside(clauses, best))])
     shared = _sharing(found, at, end)
     motion = read_motion(
@@ -81,7 +81,7 @@ def parse(question: str) -> Question:
     first = found[0].quantity if found and at > 0 else None  # "At 100 px/s, would the ball hit ...?"
     motion = motion if first is None else replace(motion, quantities=(first, *motion.quantities))
     motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
-    if best is None and not interventions:
+    if not interventions and (best is None or (best.asked and not _says_way(motion))):
         interventions = implied_placing(found)
     put = next((change for change in interventions if change.kind == "place"), None)
     if put is not None and (best is None or best.asked or best.kind == "static" or _is_carried(best, put)):
@@ -107,6 +107,19 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
         return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
     return phrase
+
+
+def _on_its_way_down(found: Sequence[Item]) -> bool:
+    return any(
+        item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
+        for at, item in enumerate(found)
+    )
+
+
+def _says_way(motion: MotionWords) -> bool:
+    """Whether a motion has a direction of any sort."""
+    said = (motion.direction, motion.arrow, motion.forward, motion.trail)
+    return bool(motion.depth) or motion.kind in {"fall", "projectile"} or any(each is not None for each in said)
 
 
 def _is_carried(best: MotionCandidate, put: InterventionWords) -> bool:
