@@ -158,6 +158,8 @@ does it get as far as the vase? | whether touches vase
 will it touch any other object? | whether touches -
 would it stay there? | whether moves red ball not
 Has the red ball touched the vase if it rolls left? | whether touches vase
+Sent straight towards the vase, does the red ball hit it? | whether touches vase
+If the red ball slides halfway towards the blue one and stops, will it touch the blue ball? | whether touches blue ball
 red ball rolls left - hits the vase? | whether touches vase
 Let go of the red ball. lands on the vase? | whether touches vase
 The red ball rolls left and at the same time the blue ball goes up. Will the two collide? | whether touches blue ball
@@ -191,7 +193,7 @@ def test_what_is_asked(row: str) -> None:
          ["cube", "vase", "mug"]),
         ("Which object does the red ball hit first if it falls? The cube or the mug?", ["cube", "mug"]),
         ("which ball will it hit first?", ["ball"]),
-        ("which cube will it hit first, the red one or the blue one?", ["red one", "blue one"]),
+        ("which cube will it hit first, the red one or the blue one?", ["red cube", "blue cube"]),
         ("which object will it hit first?", []),
         ("will it hit the vase?", []),
     ],

@@ -99,6 +99,14 @@ def test_what_is_taken_away_and_where_things_are_put() -> None:
     assert placed.object.bbox == reading.bbox
 
 
+def test_both_of_a_kind_are_taken_away() -> None:
+    image = block(ball(floor(), (110, 200), 40, RED), (250, 150, 330, 230), GREEN)
+    image = block(image, (430, 150, 520, 235), BLUE)
+    question = "If both cubes are taken away and the red ball rolls right, will it hit anything?"
+    reading = EmbeddedReader().ground(ReaderInput(Scene(jpeg(image)), question))
+    assert {change.object.object for change in reading.interventions} == {"green cube", "blue cube"}
+
+
 @pytest.mark.parametrize(
     ("question", "named"),
     [

@@ -53,7 +53,7 @@ def _one(regions: Sequence[Region], phrase: ObjectPhrase) -> list[tuple[str, Reg
 
 def _both(regions: Sequence[Region], phrase: ObjectPhrase) -> list[tuple[str, Region]]:
     """ "Both cylinders", each under its colour."""
-    return [(f"{region.colour} {phrase.noun or 'object'}", region) for region in match_both(regions, phrase)]
+    return [(f"{region.colour} {phrase.head or 'object'}", region) for region in match_both(regions, phrase)]
 
 
 def without(regions: Sequence[Region], removed: Sequence[Intervention]) -> tuple[Region, ...]:

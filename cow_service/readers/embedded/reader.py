@@ -172,10 +172,10 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
-    if words.rises_in_fall:
+    if words.contradictory:
         raise CannotReadDirection(
-            f"The question says that the {grounding.object} falls, and that it goes up: which is meant was not "
-            f"understood. {GIVE_DIRECTION}"
+            f"The verb '{words.verb}' and the direction that the question gives for the {grounding.object} contradict "
+            f"each other: which is meant was not understood. {GIVE_DIRECTION}"
         )
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")

@@ -136,7 +136,7 @@ ABSTRACT = (
         "part area region space height angle air air's depth reverse motionless stationary number label influence",
         "choice choices yes no forth freefall place front manner fashion pace future scenario situation half",
         "absence trail trails positions ghosts copies outcome",
-        "border upright force fall toss possible likely true sure going visible untouched rest unison parabola arc",
+        "border tip upright force fall toss possible likely true sure going visible untouched rest unison parabola arc",
     )
 )
 NO_THINGS = ABSTRACT | SCENERY

@@ -27,7 +27,8 @@ _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
 _SINKING = lex.words("lower descend sink")
-_FALLING = lex.words("fall drop plummet plunge")
+_FALLING = lex.words("fall drop plummet plunge descend sink")
+_CLIMBING = lex.words("rise ascend")
 _FACES = lex.words("face head point")
 _GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
 _FORWARD = lex.words("forward forwards ahead onward onwards")
@@ -60,7 +61,7 @@ class MotionWords:
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
     form, empty where no known verb of motion stands in the question. `towards` is the object that the motion aims at;
     the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
-    `rises_in_fall`: it is said to fall and to go up.
+    `contradictory`: it is said to fall upwards or to rise downwards.
     `steps` are the legs behind the first, `others` what moves at the same time.
     """
 
@@ -74,7 +75,7 @@ class MotionWords:
     trail: TrailWords | None = None
     quantities: tuple[QuantityWords, ...] = ()
     steps: tuple[StepWords, ...] = ()
-    rises_in_fall: bool = False
+    contradictory: bool = False
     others: tuple[OtherWords, ...] = ()
 
 
@@ -100,13 +101,14 @@ def read_motion(
     towards = _towards(found, asked or kind == "fall", mover)
     return MotionWords(
         kind, arrow, direction, depth, forward, verb, towards,
-        quantities=_quantities(legs[0]), steps=tuple(steps), rises_in_fall=kind == "fall" and _rises(legs[0], verb),
+        quantities=_quantities(legs[0]), steps=tuple(steps), contradictory=_contradicts_verb(legs[0], verb),
     )  # fmt: skip
 
 
-def _rises(found: Sequence[Item], verb: str) -> bool:
-    """ "Falls upwards": no tilt, no leg behind it, but a contradiction."""
-    return verb in _FALLING and any(_word_step(found, at)[1] < 0 for at in range(1, len(found)))
+def _contradicts_verb(found: Sequence[Item], verb: str) -> bool:
+    """ "Falls upwards", "rises downwards"."""
+    ways = [_word_step(found, at)[1] for at in range(1, len(found))] if verb in _FALLING | _CLIMBING else []
+    return any(way > 0 if verb in _CLIMBING else way < 0 for way in ways)
 
 
 def _legs(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> list[Sequence[Item]]:

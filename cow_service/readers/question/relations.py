@@ -13,7 +13,7 @@ from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
-from cow_service.readers.question.asking import Asking, read_clause
+from cow_service.readers.question.asking import IT, Asking, read_clause
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import PRONOUNS, Word, base_forms
@@ -73,7 +73,8 @@ def read_asked(question: Question) -> Asked | None:
     subject = None if asking.subject is None else _named(asking.subject, reading, question)
     if asking.relation == "inside" and target is None:
         target = next((_as_named(put.targets[0], question) for put in question.interventions if put.targets), None)
-    among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question))
+    kinds = [phrase for token, phrase in reading.phrases.items() if token.startswith("K")]
+    among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question) if phrase not in kinds)
     return Asked(
         form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among
     )
@@ -138,7 +139,7 @@ def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
     tokens = sentence.tokens
     tries = 0
     ends = [len(tokens), *(at for at, token in enumerate(tokens) if token in _CONDITIONS)]
-    for start in (at for at, token in enumerate(tokens) if _starts(sentence, at)):
+    for start in (at for at in range(len(tokens)) if _starts(sentence, at)):
         for end in (end for end in ends if end > start):
             tries += 1
             if tries > _MAX_TRIES:
@@ -177,6 +178,10 @@ def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Re
     asking = read_clause(words, None if beside is None else "+")
     if asking is None:
         return None
+    if asking.target == IT:
+        if len(question.others) != 1:
+            return None
+        phrases = phrases | {IT: question.others[0]}
     asking = _into_hollow(asking, [sentence.tokens[at] for at in places], phrases)
     return None if asking is None else _Reading(asking, phrases, frozenset(places))
 

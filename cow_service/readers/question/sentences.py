@@ -25,6 +25,7 @@ from cow_service.readers.question.clauses import (
 from cow_service.readers.question.interventions import InterventionWords, implied_placing, split_interventions
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
+from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 
@@ -63,7 +64,7 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    interventions, everything = split_interventions(items(split_options(question)[1]))
+    interventions, everything = split_interventions(with_nouns(items(split_options(question)[1])))
     trail, everything = split_trail(_at_the_same_time(everything))
     found = _without_instructions(everything)
     clauses = read_clauses(found)
