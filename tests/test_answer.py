@@ -145,6 +145,27 @@ Suppose the vase were not there. If the red ball rolls left, will it hit the cub
 If I put the cyan cube into the pink bowl, will it fit inside? | whether inside pink bowl
 If I put the cyan cube into the pink bowl, will it stick out? | whether inside pink bowl not
 If the orange ball flies on along the trail of positions that is shown, will it hit the cube? | whether touches cube
+will it cover any part of the vase? | whether covers vase
+will it hide a part of the vase? | whether covers vase
+will part of it be hidden behind the vase? | whether covered vase
+will it be partly hidden by the vase? | whether covered vase
+will it stay completely visible? | whether covered - not
+will the vase remain fully visible? | whether covers vase not
+will the vase be covered at any time? | whether covers vase
+is it hidden for a moment? | whether covered -
+when will it start to cover the vase? | when covers vase
+does it get as far as the vase? | whether touches vase
+will it touch any other object? | whether touches -
+would it stay there? | whether moves red ball not
+Has the red ball touched the vase if it rolls left? | whether touches vase
+Sent straight towards the vase, does the red ball hit it? | whether touches vase
+If the red ball slides halfway towards the blue one and stops, will it touch the blue ball? | whether touches blue ball
+red ball rolls left - hits the vase? | whether touches vase
+Let go of the red ball. lands on the vase? | whether touches vase
+The red ball rolls left and at the same time the blue ball goes up. Will the two collide? | whether touches blue ball
+The red ball rolls left and the blue ball rolls right. Do they meet? | whether touches blue ball
+Were the cup to vanish, would the red ball rolling along the green arrow hit the vase? | whether touches vase
+How would its path change if it rolls left and the vase is removed? | changes touches -
 """
 
 
@@ -172,6 +193,7 @@ def test_what_is_asked(row: str) -> None:
          ["cube", "vase", "mug"]),
         ("Which object does the red ball hit first if it falls? The cube or the mug?", ["cube", "mug"]),
         ("which ball will it hit first?", ["ball"]),
+        ("which cube will it hit first, the red one or the blue one?", ["red cube", "blue cube"]),
         ("which object will it hit first?", []),
         ("will it hit the vase?", []),
     ],
@@ -204,11 +226,11 @@ won't it hit the vase?
 will it lose contact with the vase?
 will it smash the vase?
 will it be blocked by the vase?
-will it cover the vase?
 will it completely hide the vase?
 will the vase be hidden at the end?
 will the vase still be visible?
-will the vase remain fully visible?
+will it have hit the vase after 2 seconds?
+will it hit the vase after two seconds?
 will it disappear?
 will it stop behind the vase?
 will it land behind the cube?

@@ -126,6 +126,23 @@ def test_falls_throws_and_rests() -> None:
     assert read(drawn(False), "If the red ball stays still, will it hit the cube?")[1].kind == "static"
 
 
+@pytest.mark.parametrize("words", ["falls upwards", "rises downwards"])
+def test_a_verb_that_its_direction_contradicts_is_refused(words: str) -> None:
+    assert "contradict" in refusal(CannotReadDirection, drawn(False), f"If the red ball {words}, what happens?")
+
+
+def test_one_is_no_noun() -> None:
+    image = ball(block(floor(), (430, 150, 520, 250), RED), (150, 200), 40, RED)
+    assert "2 that fit" in refusal(CannotGround, Scene(jpeg(image)), "If the red one slides left, what happens?")
+
+
+def test_what_is_longer_than_high_is_the_vehicle() -> None:
+    image = block(block(floor(), (400, 200, 540, 260), BLUE), (430, 160, 510, 202), BLUE)
+    image = block(ball(image, (150, 200), 40, RED), (260, 150, 340, 240), GREEN)
+    grounding, _ = read(Scene(jpeg(image)), "If the bus moves left, what happens?")
+    assert grounding.point[0] == pytest.approx(470, abs=6)
+
+
 def test_the_only_ball_needs_no_colour() -> None:
     grounding, _ = read(drawn(False), "If the ball moves left, what happens?")
     assert iou(grounding.bbox, (110, 160, 190, 240)) > 0.8

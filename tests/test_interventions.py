@@ -30,6 +30,10 @@ If I put the apple into the bowl, will it fit? | place apple into bowl | apple p
 If the apple is placed on top of the red box, will it fall off? | place apple onto red box | apple put
 If I put the box between the vase and the cup, does it touch the cup? | place box between vase & cup | box put
 If the ball is put in front of the mug, will the mug be hidden? | place ball in-front-of mug | ball put
+Were the vase to vanish, would the car, rolling left, hit the mug? | remove vase | car roll
+If I set the ball down on the mug, would it stay there? | place ball onto mug | ball put
+Put the mug on the cube; does it stay visible? | place mug onto cube | mug put
+If someone lifted the ball and put it into the mug, would it fit? | place ball into mug | ball put
 Will the apple fit into the bowl? | place apple into bowl | apple put
 If the cup to the left of the vase is dropped, will it fall into the bowl? | | cup drop
 If the ball rolls left, will it hit the vase? | | ball roll
@@ -95,12 +99,22 @@ def test_what_is_taken_away_and_where_things_are_put() -> None:
     assert placed.object.bbox == reading.bbox
 
 
+def test_both_of_a_kind_are_taken_away() -> None:
+    image = block(ball(floor(), (110, 200), 40, RED), (250, 150, 330, 230), GREEN)
+    image = block(image, (430, 150, 520, 235), BLUE)
+    question = "If both cubes are taken away and the red ball rolls right, will it hit anything?"
+    reading = EmbeddedReader().ground(ReaderInput(Scene(jpeg(image)), question))
+    assert {change.object.object for change in reading.interventions} == {"green cube", "blue cube"}
+
+
 @pytest.mark.parametrize(
     ("question", "named"),
     [
         ("If the white vase is removed and the red ball rolls right, will it hit the cube?", "'white vase'"),
         ("If I put the red ball into the pink bowl, will it fit?", "'pink bowl'"),
         ("If the red ball is removed and the red ball rolls right, will it hit the cube?", "'red ball' away"),
+        ("If the red ball is taken away and then rolls right, does it hit the blue cube?", "'red ball' away"),
+        ("If the red ball is removed and it rolls right, does it hit the blue cube?", "'red ball' away"),
         ("If I put the red ball into itself, will it fit?", "into itself"),
     ],
 )

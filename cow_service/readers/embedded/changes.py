@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from cow_service.errors import CannotGround
-from cow_service.readers.embedded.matching import describe, match_one
+from cow_service.readers.embedded.matching import describe, match_both, match_one
 from cow_service.readers.question.interventions import InterventionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
@@ -21,7 +21,7 @@ Found = tuple[ObjectPhrase, BBox]
 def check_changes(question: Question) -> None:
     """Raises `CannotGround` where the mover is taken away, or something is put into itself."""
     for change in question.interventions:
-        if change.kind == "remove" and change.object == question.mover:
+        if change.kind == "remove" and (change.then_moves or change.object == question.mover):
             raise CannotGround(f"The question takes '{change.object.text}' away and says that it moves. {GIVE_PLACE}")
         if change.object in change.targets:
             relation = change.relation or "beside"
@@ -33,13 +33,27 @@ def check_changes(question: Question) -> None:
 def find_removed(scene: Scene, question: Question) -> tuple[Intervention, ...]:
     """What is taken away, where exactly one region fits. Raises `CannotGround`."""
     removed = [change.object for change in question.interventions if change.kind == "remove"]
-    taken: list[Region] = []
+    taken: list[tuple[str, Region]] = []
     for phrase in removed:
-        region = match_one([each for each in scene.regions if each not in taken], phrase)
-        if region is None:
+        left = [each for each in scene.regions if all(each is not region for _, region in taken)]
+        found = _both(left, phrase) if phrase.text.lower().startswith("both ") else _one(left, phrase)
+        if not found:
             raise _not_found(scene, f"takes '{phrase.text}' away", phrase)
-        taken.append(region)
-    return tuple(Intervention(kind="remove", object=_located(p, r.bbox)) for p, r in zip(removed, taken, strict=True))
+        taken += found
+    return tuple(
+        Intervention(kind="remove", object=LocatedObject(object=name, bbox=region.bbox, source="embedded"))
+        for name, region in taken
+    )
+
+
+def _one(regions: Sequence[Region], phrase: ObjectPhrase) -> list[tuple[str, Region]]:
+    region = match_one(regions, phrase)
+    return [] if region is None else [(phrase.text, region)]
+
+
+def _both(regions: Sequence[Region], phrase: ObjectPhrase) -> list[tuple[str, Region]]:
+    """ "Both cylinders", each under its colour."""
+    return [(f"{region.colour} {phrase.head or 'object'}", region) for region in match_both(regions, phrase)]
 
 
 def without(regions: Sequence[Region], removed: Sequence[Intervention]) -> tuple[Region, ...]:

@@ -40,8 +40,7 @@ def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequen
         near = [region for region in possible if phrase.colour in region.colours and region.colour not in claimed]
         fitting = exact or [region for region in near if _looks_like(region, phrase)]
     fitting = [region for region in fitting if _looks_like(region, phrase)] or fitting
-    clear = clearest(fitting, phrase.head)
-    return singled_out(fitting, phrase) if clear is None else [clear]
+    return clearest(fitting, phrase.head) or singled_out(fitting, phrase)
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:
@@ -50,6 +49,12 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:
     if len(fitting) != 1 or (phrase.colour is None and contradicts(fitting[0], phrase.head)):
         return None
     return fitting[0]
+
+
+def match_both(regions: Sequence[Region], phrase: ObjectPhrase) -> list[Region]:
+    """The two regions that fit a phrase such as "both mugs"; empty where it is not clear which two."""
+    fitting = best_matches(regions, phrase)
+    return fitting if len(fitting) == 2 else clearest(fitting, phrase.head, 2)
 
 
 def inside_drawn_box(scene: Scene, phrase: ObjectPhrase, remedy: str) -> BBox:

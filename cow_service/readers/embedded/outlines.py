@@ -17,9 +17,12 @@ from cow_service.vision.types import Mask
 Range = tuple[float, float]
 
 ASPECT_STEP, WIDTH_STEP = 0.2, 0.1  # natural logarithm, and share of the width: so far off counts as 1
-FITS, CLEARLY_WORSE = 0.5, 2.5  # misfits: up to the first it can be meant; the next must be worse by the second
+FITS, CLEARLY_WORSE = 1.0, 2.5  # misfits: up to the first it can be meant; the next must be worse by the second
+MOSTLY_OUTSIDE = 0.33  # of the area of what fits: of an object that the image's border cuts, hardly the one meant
 
 CONTRADICTS = 3.5  # misfit from which a thing is not what it is called; of things in their own name up to 2.4
+VEHICLES = frozenset({"car", "bus", "truck", "van", "taxi", "lorry", "train"})
+LONG, NOT_LONG = 1.2, 1.05  # width over height: of a vehicle from the side, and of what is none
 
 # Rows over which a width is taken, from the upper end, as shares of the height.
 BANDS = ((0.08, 0.2), (0.2, 0.35), (0.35, 0.5), (0.5, 0.8), (0.8, 0.95))
@@ -38,13 +41,33 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range]] = {
 }
 
 
-def clearest(regions: Sequence[Region], noun: str | None) -> Region | None:
-    """The region whose outline fits a noun where all others are clearly worse; None where it does not decide."""
+def clearest(regions: Sequence[Region], noun: str | None, count: int = 1) -> list[Region]:
+    """The so many regions whose outlines fit a noun where all others are clearly worse; none where it is not clear."""
+    if noun in VEHICLES and count == 1 and len(regions) > 1:
+        return _longest(regions)
     misfits = [_misfit(region, noun) for region in regions] if noun in OUTLINES else []
     known = sorted((misfit, i) for i, misfit in enumerate(misfits) if misfit is not None)
-    if len(known) < max(2, len(regions)) or known[0][0] > FITS or known[1][0] < known[0][0] + CLEARLY_WORSE:
-        return None
-    return regions[known[0][1]]
+    if len(known) <= count:
+        return []
+    fit, next_one = known[count - 1][0], known[count][0]
+    best = [regions[place] for _, place in known[:count]]
+    cut = [region for region, misfit in zip(regions, misfits, strict=True) if misfit is None]
+    clear = fit <= FITS and next_one >= fit + CLEARLY_WORSE
+    return best if clear and all(each.mask.area < MOSTLY_OUTSIDE * best[0].mask.area for each in cut) else []
+
+
+def _longest(regions: Sequence[Region]) -> list[Region]:
+    """The one region that is longer than high and outlined like a car, where no other one is long."""
+    ranked = sorted(regions, key=_length, reverse=True)
+    misfit = _misfit(ranked[0], "car")
+    clear = _length(ranked[0]) >= LONG and _length(ranked[1]) <= NOT_LONG and misfit is not None and misfit <= FITS
+    return ranked[:1] if clear else []
+
+
+def _length(region: Region) -> float:
+    """Width over height."""
+    x0, y0, x1, y1 = region.bbox
+    return (x1 - x0) / (y1 - y0)
 
 
 def contradicts(region: Region, noun: str | None) -> bool:

@@ -172,6 +172,11 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
             f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
+    if words.contradictory:
+        raise CannotReadDirection(
+            f"The verb '{words.verb}' and the direction that the question gives for the {grounding.object} contradict "
+            f"each other: which is meant was not understood. {GIVE_DIRECTION}"
+        )
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
     return _as_said(scene, words, kind, grounding) or _as_shown(scene, question, kind, grounding)

@@ -49,6 +49,7 @@ class Sentence:
     words: list[tuple[str, ...]] = field(default_factory=list[tuple[str, ...]])
     items: list[int] = field(default_factory=list[int])
     phrases: dict[str, ObjectPhrase] = field(default_factory=dict[str, ObjectPhrase])
+    asks: bool = False  # it ends with a question mark, or with the text
 
 
 def sentences(question: Question) -> list[Sentence]:
@@ -56,6 +57,7 @@ def sentences(question: Question) -> list[Sentence]:
     found = [Sentence()]
     for at, item in enumerate(question.items):
         if item.key in _ENDS:
+            found[-1].asks = item.key == "?"
             found.append(Sentence())
             continue
         if item.phrase is None:
@@ -66,6 +68,7 @@ def sentences(question: Question) -> list[Sentence]:
         said = tuple(word.lower() for word in (item.words or (item.key,)))
         found[-1].words += [said] * len(tokens)
         found[-1].items += [at] * len(tokens)
+    found[-1].asks = True
     return [sentence for sentence in found if sentence.tokens]
 
 
@@ -84,6 +87,8 @@ def _phrase_tokens(item: Item, phrase: ObjectPhrase, question: Question, known: 
     content = words[len(determiners) :]
     if words == ["each", "other"] or phrase.head in lex.NO_THINGS or set(content) <= _PLAIN_WORDS:
         return [_word(word) for word in words]
+    if question.motion.others and words in (["the", "two"], ["both"]):
+        return ["they"]
     asked = words[0] in {"which", "what"}
     if means_mover(phrase, question) and not asked:
         return ["M"]

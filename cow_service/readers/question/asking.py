@@ -11,6 +11,7 @@ from cow_service.readers.question.parsing import parse_all
 from cow_service.readers.question.words import Word
 from cow_service.records import AskedForm, AskedRelation
 
+IT = "it"  # as a target: the one other thing that is named
 MOVER = frozenset({"M", "PRONOUN"})
 _FORMS: dict[str, AskedForm] = {
     "whether": "whether", "either": "which-first", "which_first": "which-first", "when": "when",
@@ -60,12 +61,19 @@ def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
     if negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
     asking = Asking(form, relation, negations == 1, None, things[0] if things else None, tuple(map(str, listed)))
+    if any(token.type == "M" for token in subject) and _speaks_of_it(tree):
+        asking = Asking(form, relation, negations == 1, None, IT, asking.among)
     pronoun = next((str(token) for token in subject if token.type == "PRONOUN"), None)
     if pronoun == "they":
         return _together(asking, beside)
     if pronoun is not None and beside is not None:
         return None  # which of the two movers is meant is open
     return asking if listed and form == "which-first" else _with_subject(asking, tree, subject, done_to)
+
+
+def _speaks_of_it(tree: Tree[Token]) -> bool:
+    """ "Does the ball hit it?": not the ball itself."""
+    return any(token == IT for node in tree.find_data("object") for token in _tokens(node))
 
 
 def _act(tree: Tree[Token]) -> tuple[AskedRelation, bool]:
@@ -92,6 +100,8 @@ def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_
     thing = next((str(token) for token in subject if token.type == "T"), None)
     relation, target, doer = asking.relation, asking.target, thing
     mover_acted = any(t.type in MOVER for node in tree.find_data("object") for t in _tokens(node))
+    if target == IT:
+        return asking
     if asking.form == "what-happens":
         target, doer = thing or target, None
     elif done_to and relation == "covers":

@@ -111,9 +111,14 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
     if begun and closed and key_at(found, at - 1) in lex.PLACES:
         return False  # "the balls to the left move up"
     if not has_noun:
+        before = key_at(found, at - 1)
+        if verb.form == "base" and asked and before in {"one", "two", "both"}:
+            return False  # "will the two collide?"
+        if verb.form == "s" and before == "one":
+            return False  # "the orange one slides"
         begun = begun or (verb.form == "base" and _is_label(found, at + 1))
         # "orange" is the one colour that is also a thing that moves: "the orange falls".
-        return begun and not (verb.form == "s" and verb.kind is not None and key_at(found, at - 1) == "orange")
+        return begun and not (verb.form == "s" and verb.kind is not None and before == "orange")
     if verb.form == "base":
         return not asked or after in lex.VERBS or after in _FINITE_BE
     return verb.form == "s" and after in {"are", "were"}

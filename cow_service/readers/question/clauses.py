@@ -205,6 +205,8 @@ def _subject(found: Sequence[Item], at: int, verb: str, clause: _Clause) -> Obje
     near = phrase_at(found, at - 1)
     if (form == "ing" or (form == "past" and clause.kind == "question")) and near and near.head not in lex.ABSTRACT:
         return near
+    if form == "past" and not passive and clause.verbs and near and near.is_thing and near.head not in lex.AGENTS:
+        return near  # "which cube is hit by the ball thrown along the arrow"
     relative = at - 2 if key_at(found, at - 1) in lex.BE else at - 1
     if key_at(found, relative) in {"that", "which", "who"} and phrase_at(found, relative - 1):
         return phrase_at(found, relative - 1)

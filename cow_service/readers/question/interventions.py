@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lark import Token, Tree
 
@@ -30,12 +30,16 @@ _RELATIONS: dict[str, PlaceRelation] = {
 
 @dataclass(frozen=True)
 class InterventionWords:
-    """A change of the scene in the words of the question. `relation` and `targets` are those of `place`."""
+    """A change of the scene in the words of the question. `relation` and `targets` are those of `place`.
+
+    `then_moves`: what is taken away is said to move then, which is a contradiction.
+    """
 
     kind: InterventionKind
     object: ObjectPhrase
     relation: PlaceRelation | None = None
     targets: tuple[ObjectPhrase, ...] = ()
+    then_moves: bool = False
 
 
 def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords, ...], list[Item]]:
@@ -53,16 +57,36 @@ def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords,
         read = _read(found, ahead)
         if read is not None:
             said, end = read
+            if said[0].kind == "remove" and ahead[0].kind and _goes_on(found, at, end):
+                said = [replace(change, then_moves=True) for change in said]
             changes += said
             gone |= _emptied(found, at, end, gone)
     return tuple(changes), [item for at, item in enumerate(found) if at not in gone]
+
+
+def _goes_on(found: Sequence[Item], start: int, end: int) -> bool:
+    """Whether the subject of an intervention moves behind it: "if the ball is removed and then (it) rolls left"."""
+    rest = [item for item in found[end : end + 5] if item.key != ","]
+    joined = bool(rest) and rest[0].key in {"and", "then"}
+    while rest and rest[0].key in {"and", "then", "afterwards"}:
+        rest = rest[1:]
+    named = any(item.phrase is not None and item.phrase.is_thing for item in found[:start])
+    if rest and rest[0].key == "it" and not named:
+        rest = rest[1:]
+    verb = lex.VERBS.get(rest[0].key) if rest else None
+    return joined and verb is not None and verb.kind not in {None, "static"} and verb.form != "ing"
 
 
 def implied_placing(found: Sequence[Item]) -> tuple[InterventionWords, ...]:
     """ "Will the apple fit into the bowl?": where nothing moves, the apple is put there."""
     words = words_of(found)
     for place, word in enumerate(words):
-        if word.text == "fit" and place > 1 and (parsed := parse_from("fitting", words[place - 2 : place + 8])):
+        if word.text != "fit":
+            continue
+        for start in (place - 2, place - 3, place - 4):
+            parsed = parse_from("fitting", words[start : place + 8]) if start >= 0 else None
+            if parsed is None or parsed[1] <= place - start:
+                continue
             named = [phrase for token in named_in(parsed[0]) if (phrase := _phrase(found, token.line or 0))]
             return (_placing(parsed[0], named),) if named else ()
     return ()

@@ -136,7 +136,7 @@ ABSTRACT = (
         "part area region space height angle air air's depth reverse motionless stationary number label influence",
         "choice choices yes no forth freefall place front manner fashion pace future scenario situation half",
         "absence trail trails positions ghosts copies outcome",
-        "border force fall toss possible likely true sure going visible untouched rest unison parabola arc",
+        "border tip upright force fall toss possible likely true sure going visible untouched rest unison parabola arc",
     )
 )
 NO_THINGS = ABSTRACT | SCENERY
@@ -166,7 +166,7 @@ LAND = words("land settle")
 _OTHER = words(
     "happen become end stop appear look fit affect break point show indicate lie hang face miss avoid fail",
     "remove delete erase eliminate exclude withdraw discard take put place insert set exist stick protrude overflow",
-    "change differ matter leave",
+    "change differ matter leave count",
 )
 # Acting on something else with these makes that thing the mover ("someone pushes the cube").
 TRANSITIVE = words(

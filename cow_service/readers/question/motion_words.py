@@ -27,6 +27,8 @@ _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
 _SINKING = lex.words("lower descend sink")
+_FALLING = lex.words("fall drop plummet plunge descend sink")
+_CLIMBING = lex.words("rise ascend")
 _FACES = lex.words("face head point")
 _GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
 _FORWARD = lex.words("forward forwards ahead onward onwards")
@@ -59,6 +61,7 @@ class MotionWords:
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
     form, empty where no known verb of motion stands in the question. `towards` is the object that the motion aims at;
     the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
+    `contradictory`: it is said to fall upwards or to rise downwards.
     `steps` are the legs behind the first, `others` what moves at the same time.
     """
 
@@ -72,6 +75,7 @@ class MotionWords:
     trail: TrailWords | None = None
     quantities: tuple[QuantityWords, ...] = ()
     steps: tuple[StepWords, ...] = ()
+    contradictory: bool = False
     others: tuple[OtherWords, ...] = ()
 
 
@@ -90,24 +94,32 @@ def read_motion(
     kind = _kind(found, verb, kind)
     if arrow == "along" and _turns_around(found):
         arrow = "against"
-    legs = _legs(found, verb)
+    legs = _legs(found, verb, arrow)
     direction, depth = _way(legs[0], verb, kind)
     steps = [StepWords(*_way(leg, "", None), _quantities(leg)) for leg in legs[1:]]
     forward = _forward(found, verb, arrow)
     towards = _towards(found, asked or kind == "fall", mover)
     return MotionWords(
-        kind, arrow, direction, depth, forward, verb, towards, quantities=_quantities(legs[0]), steps=tuple(steps)
-    )
+        kind, arrow, direction, depth, forward, verb, towards,
+        quantities=_quantities(legs[0]), steps=tuple(steps), contradictory=_contradicts_verb(legs[0], verb),
+    )  # fmt: skip
 
 
-def _legs(found: Sequence[Item], verb: str) -> list[Sequence[Item]]:
+def _contradicts_verb(found: Sequence[Item], verb: str) -> bool:
+    """ "Falls upwards", "rises downwards"."""
+    ways = [_word_step(found, at)[1] for at in range(1, len(found))] if verb in _FALLING | _CLIMBING else []
+    return any(way > 0 if verb in _CLIMBING else way < 0 for way in ways)
+
+
+def _legs(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> list[Sequence[Item]]:
     """The words of a motion cut at each "then" that a way to go follows."""
     legs: list[Sequence[Item]] = [found]
     for at in range(len(found) - 1, 0, -1):
         if found[at].key in {"then", "afterwards"} and _way(found[at:], "", None) != (None, 0.0):
             first = legs.pop(0)
             legs = [first[:at], first[at:], *legs]
-    return legs if _way(legs[0], verb, None) != (None, 0.0) else [found]
+    along = arrow is not None and any(is_arrow(legs[0], at) for at in range(len(legs[0])))
+    return legs if along or _way(legs[0], verb, None) != (None, 0.0) else [found]
 
 
 def _way(found: Sequence[Item], verb: str, kind: MotionKind | None) -> tuple[Vector | None, float]:
@@ -216,6 +228,11 @@ def _forward(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> bool
     return True if verb in _GOES_STRAIGHT and flat[-1:] == ["straight"] else None
 
 
+def _is_one(phrase: ObjectPhrase) -> bool:
+    """ "The pink one"."""
+    return phrase.noun is None and phrase.colour is not None
+
+
 def _towards(found: Sequence[Item], open_end: bool, mover: ObjectPhrase | None) -> ObjectPhrase | None:
     preps = {"toward", "towards"} if open_end else {"toward", "towards", "to", "at", "into"}
     for at, item in enumerate(found):
@@ -224,6 +241,6 @@ def _towards(found: Sequence[Item], open_end: bool, mover: ObjectPhrase | None) 
             aimed = earlier is not None and earlier.noun == "direction" and not has_opposite(flatten(found))
         else:
             aimed = before in preps and key_at(found, at - 2) not in _NOT_AIMED
-        if item.phrase and aimed and item.phrase != mover and item.phrase.is_thing:
+        if item.phrase and aimed and item.phrase != mover and (item.phrase.is_thing or _is_one(item.phrase)):
             return item.phrase
     return None

@@ -67,7 +67,8 @@ class Item:
 
 def tokens(text: str) -> list[Item]:
     """The words and punctuation marks of a text; a typographic apostrophe counts as a plain one."""
-    plain = text.replace("’", "'")  # one character for one, so that positions stay those of the text
+    # One character for one, so that positions stay those of the text.
+    plain = text.replace("’", "'").replace(" - ", " – ")
     return [Item(found.group().lower(), found.start(), found.end()) for found in _TOKEN.finditer(plain)]
 
 

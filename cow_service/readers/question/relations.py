@@ -13,7 +13,7 @@ from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
-from cow_service.readers.question.asking import Asking, read_clause
+from cow_service.readers.question.asking import IT, Asking, read_clause
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import PRONOUNS, Word, base_forms
@@ -21,7 +21,7 @@ from cow_service.records import Asked
 
 _STARTS = lex.words(
     "will would do does did can could shall might may be tell say predict know when where at in after how what which",
-    "with into on onto true",
+    "with into on onto true has have had",
 )
 _OPENERS = lex.words(", and then so but now please")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
@@ -39,6 +39,7 @@ _NOT_THERE = re.compile(r".*\b(?:not|n't|never) (?:there|here|present|exist|exis
 _SHORT_ANSWER = lex.words(
     "please answer reply respond say just only with by in a single word yes no or not sure either"
 )
+_TIMED = re.compile(rf".*\b(?:after|within|before|in) (?:[\d.]+|{'|'.join(lex.NUMBER_WORDS)}) (?:s|secs?|seconds?)\b.*")
 _MAX_TRIES = 8  # of one sentence: each takes some ms
 MAX_SENTENCES = 12  # of one question; more are not read
 _LIST = re.compile(r"(?P<list>T\d+(?: , T\d+)*(?: ,)? or T\d+)")
@@ -72,7 +73,8 @@ def read_asked(question: Question) -> Asked | None:
     subject = None if asking.subject is None else _named(asking.subject, reading, question)
     if asking.relation == "inside" and target is None:
         target = next((_as_named(put.targets[0], question) for put in question.interventions if put.targets), None)
-    among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question))
+    kinds = [phrase for token, phrase in reading.phrases.items() if token.startswith("K")]
+    among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question) if phrase not in kinds)
     return Asked(
         form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among
     )
@@ -89,7 +91,9 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     reading = _read(question)
     if reading is None or reading.asking.form != "which-first":
         return ()
-    return (*(reading.phrases[token] for token in reading.asking.among), *reading.listed)
+    named = {token: reading.phrases[token] for token in reading.asking.among}
+    listed = [*(phrase for token, phrase in named.items() if not token.startswith("K")), *reading.listed]
+    return tuple(listed or named.values())
 
 
 def unread_clause(question: Question) -> str:
@@ -135,7 +139,7 @@ def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
     tokens = sentence.tokens
     tries = 0
     ends = [len(tokens), *(at for at, token in enumerate(tokens) if token in _CONDITIONS)]
-    for start in (at for at, token in enumerate(tokens) if token in _STARTS and _opens(tokens[:at])):
+    for start in (at for at in range(len(tokens)) if _starts(sentence, at)):
         for end in (end for end in ends if end > start):
             tries += 1
             if tries > _MAX_TRIES:
@@ -144,6 +148,16 @@ def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
             if reading is not None:
                 return reading
     return None
+
+
+def _starts(sentence: Sentence, at: int) -> bool:
+    """Whether a question may begin at a token: with an auxiliary, or as in "ball rolls left - hits the mug?"."""
+    tokens = sentence.tokens
+    if tokens[at] in _STARTS:
+        return _opens(tokens[:at])
+    said = sentence.words[at][0]
+    finite = said in lex.VERBS and lex.VERBS[said].form == "s"
+    return finite and sentence.asks and (at == 0 or tokens[at - 1] == ",")
 
 
 def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]:
@@ -164,6 +178,10 @@ def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Re
     asking = read_clause(words, None if beside is None else "+")
     if asking is None:
         return None
+    if asking.target == IT:
+        if len(question.others) != 1:
+            return None
+        phrases = phrases | {IT: question.others[0]}
     asking = _into_hollow(asking, [sentence.tokens[at] for at in places], phrases)
     return None if asking is None else _Reading(asking, phrases, frozenset(places))
 
@@ -212,6 +230,8 @@ def _leaves_world(sentence: Sentence, covered: frozenset[int], question: Questio
         return True
     if not _INTERVENTIONS.isdisjoint(words) or _NOT_THERE.fullmatch(" ".join(words)):
         return False
+    if _TIMED.fullmatch(" ".join(words)):
+        return False  # "will it have hit the cup after 2 seconds?"
     return not any(_moves_another(sentence, at, question) or _hits(tokens, at) for at in rest)
 
 
@@ -254,8 +274,12 @@ def _as_named(target: ObjectPhrase, question: Question) -> str:
     if target.text in texts:
         return target.text
     words = set(target.text.lower().split())
-    fuller = [text for text in texts if words <= set(text.lower().split())]
-    return fuller[0] if len(fuller) == 1 else target.text
+    changed = [phrase.text for change in question.interventions for phrase in (change.object, *change.targets)]
+    moving = [] if question.mover is None else [question.mover.text]
+    fuller = {text for text in [*texts, *changed, *moving] if words <= set(text.lower().split())}
+    if len(fuller) > 1:
+        fuller -= {target.text}
+    return fuller.pop() if len(fuller) == 1 else target.text
 
 
 def _listed(asking: Sentence, covered: frozenset[int], following: Sequence[Sentence]) -> tuple[ObjectPhrase, ...]:

@@ -25,12 +25,14 @@ from cow_service.readers.question.clauses import (
 from cow_service.readers.question.interventions import InterventionWords, implied_placing, split_interventions
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
+from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
 )
+_SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
     r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
@@ -62,8 +64,8 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    interventions, everything = split_interventions(items(split_options(question)[1]))
-    trail, everything = split_trail(everything)
+    interventions, everything = split_interventions(with_nouns(items(split_options(question)[1])))
+    trail, everything = split_trail(_at_the_same_time(everything))
     found = _without_instructions(everything)
     clauses = read_clauses(found)
     best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
@@ -71,17 +73,19 @@ def parse(question: str) -> Question:
     end = clause_end(found, at) if best else at
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
-    verb, kind = (best.verb, best.kind) if best else ("", None)
+    verb, kind = (best.verb, best.kind) if best else ("fall", "fall") if _on_its_way_down(found) else ("", None)
     end = min([end, *(other.start for other in _movers_beside(clauses, best))])
     shared = _sharing(found, at, end)
     motion = read_motion(
         found[at : shared or end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked
     )
+    first = found[0].quantity if found and at > 0 else None  # "At 100 px/s, would the ball hit ...?"
+    motion = motion if first is None else replace(motion, quantities=(first, *motion.quantities))
     motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
-    if best is None and not interventions:
+    if not interventions and (best is None or (best.asked and not _says_way(motion))):
         interventions = implied_placing(found)
     put = next((change for change in interventions if change.kind == "place"), None)
-    if put is not None and (best is None or best.asked):
+    if put is not None and (best is None or best.asked or best.kind == "static" or _is_carried(best, put)):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
     clause = range(best.start if best else at, end)
     words = {token.key for token in tokens(question)}
@@ -104,6 +108,24 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
         return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
     return phrase
+
+
+def _on_its_way_down(found: Sequence[Item]) -> bool:
+    return any(
+        item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
+        for at, item in enumerate(found)
+    )
+
+
+def _says_way(motion: MotionWords) -> bool:
+    """Whether a motion has a direction of any sort."""
+    said = (motion.direction, motion.arrow, motion.forward, motion.trail)
+    return bool(motion.depth) or motion.kind in {"fall", "projectile"} or any(each is not None for each in said)
+
+
+def _is_carried(best: MotionCandidate, put: InterventionWords) -> bool:
+    """ "If you lift the ball and put it into the mug": the lifting is a part of it."""
+    return best.verb in {"lift", "raise", "carry", "bring"} and best.subject == put.object
 
 
 def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhrase | None:
@@ -161,6 +183,19 @@ def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:
     """The first mention of the mover where it is worded more fully: "the white pawn ... if the pawn moves"."""
     fuller = {item.phrase for item in before if item.phrase and item.phrase != mover and _repeats(mover, item.phrase)}
     return fuller.pop() if len(fuller) == 1 else mover
+
+
+def _at_the_same_time(found: list[Item]) -> list[Item]:
+    """Without "at the same time", which says what "and" says; "at the same time as" is "and" too."""
+    kept: list[Item] = []
+    for at, item in enumerate(found):
+        if kept and item.words in _SAME_TIME and kept[-1].key == "at":
+            as_well = kept.pop()
+            if key_at(found, at + 1) == "as":
+                kept.append(replace(as_well, key="and"))
+        elif not (item.key == "as" and at and found[at - 1].words in _SAME_TIME):
+            kept.append(item)
+    return kept
 
 
 def _without_instructions(found: list[Item]) -> list[Item]:

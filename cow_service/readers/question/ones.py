@@ -1,0 +1,43 @@
+"""What "the red one" is one of: "which cone is hit first, the red one or the blue one?"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from cow_service.readers.question import lexicon as lex
+from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
+
+
+def with_nouns(found: Sequence[Item]) -> list[Item]:
+    """The items, where "the red one" has the noun of the kind that is asked for, or that of all things before it."""
+    kinds = {_kind_of(item.phrase) for at, item in enumerate(found) if item.phrase and _is_asked_for(found, at)} - {""}
+    before: set[str] = set()
+    said: list[Item] = []
+    for item in found:
+        nouns, phrase = kinds or before, item.phrase
+        if phrase is not None and phrase.noun is None and phrase.colour is not None and len(nouns) == 1:
+            said.append(replace(item, phrase=_of_kind(phrase, next(iter(nouns)))))
+        else:
+            said.append(item)
+            before |= {_kind_of(phrase)} - {""}
+    return said
+
+
+def _is_asked_for(found: Sequence[Item], at: int) -> bool:
+    """ "Which cone", "which of the cones"."""
+    return found[at].words[:1] in {("which",), ("what",)} or (
+        key_at(found, at - 1) == "of" and key_at(found, at - 2) in {"which", "what"}
+    )
+
+
+def _kind_of(phrase: ObjectPhrase | None) -> str:
+    """The noun of a phrase that names a thing by one; empty otherwise."""
+    named = phrase is not None and phrase.is_thing and phrase.head not in lex.GENERIC | lex.AGENTS
+    return phrase.noun or "" if phrase is not None and named else ""
+
+
+def _of_kind(phrase: ObjectPhrase, noun: str) -> ObjectPhrase:
+    words = phrase.text.split()
+    kept = words[:-1] if words[-1].lower() == "one" else words
+    return replace(phrase, text=" ".join([*kept, noun]), noun=noun)
