@@ -357,7 +357,7 @@ def test_a_tool_takes_what_people_know_better(here: tuple[Session, Path]) -> Non
         ({"bbox": [1, 2, 3]}, ("invalid-request", "bbox: list should have at least 4 items")),
         ({"bbox": [9, 9, 9, 9]}, ("invalid-request", "bbox: [x0, y0, x1, y1] must span at least 2 px")),
         ({"object": "ball"}, ("invalid-request", "give either `bbox` or `point`")),
-        ({"speed": 5}, ("invalid-request", "`direction`")),
+        ({"motion_kind": "projectile"}, ("invalid-request", "needs a `direction`")),
         ({"frames_count": 1000}, ("invalid-request", "frames_count: ")),
         ({"generator": "nobody"}, ("invalid-request", "generator: There is no generator 'nobody'", "cutout")),
         ({"bBox": [1, 2, 3, 4]}, ("invalid-request", "bBox: there is no such argument", "bbox")),

@@ -14,9 +14,15 @@ from cow_service.settings import Settings
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak]
 EVERY = max(1, 10 // SCALE)  # a tenth of them; all in `make soak`
-RIGHT = 0.4  # share of all that is right, or refused where it must be
+RIGHT = 0.55  # share of all that is right, or refused where it must be
 # Wrong without a word, as things are: whoever mends one takes it out.
-STILL_WRONG: frozenset[str] = frozenset()
+STILL_WRONG: frozenset[str] = frozenset(
+    {
+        "If the white cylinder is removed and the red bottle moves in the direction of the arrow, will t"
+        "he green cylinder be occluded at some moment? Answer by (A) Yes, (B) No or (C) Not sure.",
+        "Let the purple mug slide straight up until it meets something. What does it hit?",
+    }
+)
 
 
 @pytest.fixture(scope="module")
