@@ -8,8 +8,7 @@ the truth, with its probability; path error (% of the image's width: mean distan
 contact, to the path) and the same with the true path moved to where the path begins (the middle of a box is not where
 the middle of a car or a candle is seen), size error (% of the apparent size at the nearest point of the path, for what
 stands on a floor), push error (of what is pushed: distance of its last centre to the true one, as a share of how far
-off it would be if it had stayed), and whether the path shown agrees with the answer. Scenes of forms that the service
-does not know yet (`remove`, `billiards`, `place`, `trail`) are left out.
+off it would be if it had stayed), and whether the path shown agrees with the answer.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ from cow_service.service import Service
 from cow_service.settings import Settings
 
 LINEAR = ("linear", "slide", "slide-occlude", "car")
-LEFT_OUT: tuple[str, ...] = ()
 PUSHED = 5.0  # px: what truly moves less is not pushed
 TOUCHING = 1.15  # of the summed half extents: bodies of one path that come nearer than this are shown to touch
 
@@ -64,8 +62,6 @@ def measure(service: Service, folder: Path) -> Row | None:
     """Runs one scene as a caller would."""
     meta = json.loads((folder / "meta.json").read_text())
     form = meta.get("form") or meta["motion"]
-    if form in LEFT_OUT:
-        return None
     image, _ = service.keep_image((folder / "image.jpg").read_bytes())
     body: dict[str, Any] = {"image": {"artifact": image.sha256}, "question": meta["question"]}
     if meta["motion"] == "linear" and " forward" in meta["question"]:
@@ -95,10 +91,17 @@ def _row(folder: Path, form: str, meta: dict[str, Any], answer: Answer, trajecto
         moved_path_error=_path_error(trajectory, meta, moved=True),
         size_error=_size_error(trajectory, meta) if meta["motion"] == "linear" and form != "table" else None,
         push_error=_push_error(trajectory, meta),
-        agrees=None if happens is None else _shown(trajectory, meta) == happens,
+        agrees=None if happens is None else _happens(trajectory, meta) == happens,
         seconds=None if simulation is None else simulation.timings.get("trajectory"),
         facts="" if told is None else told.facts,
     )
+
+
+def _happens(trajectory: Trajectory, meta: dict[str, Any]) -> bool:
+    """Whether what is asked happens in the world that is shown."""
+    if trajectory.placement is not None:
+        return trajectory.placement.result == "inside"
+    return _shown(trajectory, meta)
 
 
 def _until_contact(meta: dict[str, Any]) -> int:
