@@ -211,7 +211,7 @@ class ImageUrlUnreachable(CowError):
 
 
 class CannotGround(CowError):
-    """The object that moves could not be found."""
+    """An object that the question names could not be found, or not be used as it says."""
 
     code, status = "cannot-ground", 422
 

@@ -108,7 +108,11 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "told"),
     [
-        (["If the pink car moves left, what?"], 1, "cannot-ground: The object that moves could not be found."),
+        (
+            ["If the pink car moves left, what?"],
+            1,
+            "cannot-ground: An object that the question names could not be found, or not be used as it says.",
+        ),
         (["If the red ball moves forward, what?"], 1, "Here: --direction DX,DY."),
         ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers with commas between"),
         ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),

@@ -368,6 +368,17 @@ def test_what_is_saved_is_the_result(client: Any, tmp_path: Path) -> None:
     assert again._repr_png_() is None
 
 
+def test_the_scene_as_it_is_is_saved_beside_what_becomes_of_it(client: Any, tmp_path: Path) -> None:
+    box = {"object": "thing", "bbox": (20, 20, 60, 60)}
+    told = client.simulate(
+        IMAGE, QUESTION, objects=[box], interventions=[{"kind": "remove", "object": "thing"}], **SMALL
+    )
+    assert told.factual_frames
+    told.save(tmp_path)
+    kept = {path.name for path in tmp_path.glob("factual_*.png")}
+    assert kept == {f"factual_{frame.index:03d}.png" for frame in told.factual_frames}
+
+
 def test_results_can_be_copied_compared_and_sent_to_other_processes(address: str) -> None:
     with Client(address) as client:
         simulation = client.simulate(IMAGE, QUESTION, **SMALL).load()

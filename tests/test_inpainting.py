@@ -46,6 +46,15 @@ def test_what_is_to_be_avoided_does_not_bleed_in() -> None:
     assert (filled[:, 0] - filled[:, 1]).max() < 12
 
 
+def test_a_hole_among_nothing_but_what_is_to_be_avoided_is_filled_from_afar() -> None:
+    image = floor()
+    ys, xs = np.mgrid[:400, :640]
+    away = np.hypot(xs - 300, ys - 200)
+    image[away < 24] = (220, 20, 20)
+    filled = fill_hole(image, away < 10, (away >= 10) & (away < 24))[away < 10].astype(int)
+    assert (filled[:, 0] - filled[:, 1]).max() < 20
+
+
 def test_nothing_to_fill_is_no_work() -> None:
     image = floor()
     nothing = np.zeros(image.shape[:2], bool)

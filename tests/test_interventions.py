@@ -12,6 +12,7 @@ from cow_service.readers.base import ReaderInput
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.readers.question.relations import read_asked
 from cow_service.readers.question.sentences import parse
+from cow_service.records import LocatedObject
 from cow_service.vision.scene import Scene
 
 RED, BLUE, GREEN = (200, 30, 30), (50, 80, 200), (50, 150, 50)
@@ -97,6 +98,16 @@ def test_what_is_taken_away_and_where_things_are_put() -> None:
     (placed,) = reading.interventions
     assert (placed.kind, placed.relation, placed.targets[0].object) == ("place", "onto", "blue cube")
     assert placed.object.bbox == reading.bbox
+
+
+def test_what_the_caller_has_located_is_not_looked_for() -> None:
+    crate, bowl = (LocatedObject(object=name, bbox=(x, 20, x + 60, 70)) for name, x in (("Crate", 200), ("bowl", 300)))
+    asked = "If the crate is removed and the red ball rolls right, will it hit the blue cube?"
+    (removed,) = EmbeddedReader().ground(ReaderInput(scene(), asked, known=(crate, bowl))).interventions
+    assert removed.object == crate
+    asked = "If I put the red ball into the bowl, will it fit?"
+    (placed,) = EmbeddedReader().ground(ReaderInput(scene(), asked, known=(crate, bowl))).interventions
+    assert placed.targets == (bowl,)
 
 
 def test_both_of_a_kind_are_taken_away() -> None:

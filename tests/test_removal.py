@@ -147,6 +147,13 @@ class TestLocating:
         assert error.pointer == pointer
         assert words in raised.value.detail
 
+    def test_the_question_says_it_of_objects_that_are_given(self) -> None:
+        question = "If the green block is removed and the red ball rolls right, will it hit the cube?"
+        (removed,) = ground(run(interventions=(), question=question)).value.interventions
+        assert (removed.kind, removed.object.object, removed.object.bbox) == ("remove", "Green  block", BETWEEN)
+        with pytest.raises(InvalidRequest, match="the question changes 'green block'"):
+            ground(run(interventions=(), objects=ALL[:1], question=question))
+
 
 class TestFrames:
     def clip(self, generator: Any = None, **frames: Any) -> tuple[Run, Clip]:

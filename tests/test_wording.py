@@ -56,23 +56,26 @@ def test_a_tool_tells_contacts_probabilities_and_the_outcome(simulation: Simulat
     assert told.outcome is not None
     assert (told.outcome.probability, told.outcome.sure, told.outcome.depends_on) == (0.93, True, ["speed", "heading"])
     text = simulation_text(told)
-    for part in ("92 of 100 worlds", FACTS, "it depends on speed and heading", "red ball and blue mug at 1.12 s"):
+    for part in ("92% of the worlds", FACTS, "it depends on speed and heading", "red ball and blue mug at 1.12 s"):
         assert part in text
 
 
 def test_a_notebook_shows_the_same(simulation: Simulation) -> None:
     html = simulation_html(simulation, lambda _: None)
-    for part in ("touches blue mug at 0.1 s (92 of 100 worlds)", FACTS, "Nothing moves in the image from 2.5 s on"):
+    for part in ("touches blue mug at 0.1 s (92% of the worlds)", FACTS, "Nothing moves in the image from 2.5 s on"):
         assert part in html
 
 
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"probability": 0.97}, "what is asked happens in 97 of 100 worlds; robust"),
+        ({"probability": 0.97}, "what is asked happens in 97% of the worlds; robust"),
         ({"sure": False, "robust": False, "depends_on": ("camera",)}, "not sure; it depends on camera"),
         ({"asked": Asked(form="which-first", relation="touches"), "first": "mug"}, "first: mug; robust"),
-        ({"asked": Asked(form="how-many", relation="touches"), "count": 2, "probability": 0.8}, "count: 2, 80 of 100"),
+        (
+            {"asked": Asked(form="how-many", relation="touches"), "count": 2, "probability": 0.8},
+            "count: 2, 80% of the worlds",
+        ),
         (
             {"asked": Asked(form="when", relation="touches"), "time": 1.13, "time_band": (0.9, 1.4)},
             "after 1.1 s (0.9 to 1.4 s)",

@@ -18,7 +18,7 @@ from cow_service.cli.options import read_file
 from cow_service.client.wording import contacts_words, encounters_words, outcome_words
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.images import DecodedImage
-from cow_service.records import Answer, BackendInfo, Models, Simulation, Verdict
+from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.service import Service
 
@@ -125,8 +125,7 @@ def make_folder(out: Path) -> None:
 
 def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
     """Writes frames, video, overlay and simulation.json into a folder; returns their names."""
-    files = {f"frame_{frame.index:03d}.png": frame.sha256 for frame in simulation.frames}
-    files["overlay.png"] = simulation.overlay.sha256
+    files = dict(simulation.pictures)
     if simulation.video is not None:
         files["video.mp4"] = simulation.video.sha256
     with writable(out):
@@ -176,10 +175,11 @@ def _stage_lines(simulation: Simulation) -> dict[Stage, str]:
     way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"
     if motion.depth:
         way += " and towards the camera" if motion.depth < 0 else " and away from the camera"
+    speed = f", {motion.speed:.0f} px/s" if motion.kind in DIRECTED_KINDS else ""
     video = f", {simulation.video.num_frames}-frame video" if simulation.video else ""
     return {
         "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
-        "motion": f"{motion.kind}{way}, {motion.speed:.0f} px/s, from {motion.cue}",
+        "motion": f"{motion.kind}{way}{speed}, from {motion.cue}",
         "trajectory": f"{encounters_words(trajectory)}, law {trajectory.law}",
         "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
     }

@@ -9,7 +9,9 @@ from typer.core import TyperGroup
 
 from cow_service.errors import CowError
 
-_GIVE_PLACE = "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME)."
+_GIVE_PLACE = (
+    "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME) for what moves, --other NAME=X0,Y0,X1,Y1 for the rest."
+)
 HINTS = {  # the options that an error's remedy asks for, by the error's code
     "cannot-ground": _GIVE_PLACE,
     "object-not-found": _GIVE_PLACE,

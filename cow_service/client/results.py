@@ -97,12 +97,6 @@ class _Simulation(records.Simulation):
         """The bytes of a picture for a notebook; None where they are not available."""
         return self._files.held.get(sha256)
 
-    def _names(self) -> dict[str, str]:
-        """The digests of its pictures by their names in a folder."""
-        return {f"frame_{frame.index:03d}.png": frame.sha256 for frame in self.frames} | {
-            "overlay.png": self.overlay.sha256
-        }
-
     def _pil(self, sha256: str) -> Steps[Image.Image]:
         return picture_of((yield from self._files.fetch(sha256)))
 
@@ -121,14 +115,14 @@ class _Simulation(records.Simulation):
         return (yield from self._files.fetch(self.video.sha256))
 
     def _load(self) -> Steps[Self]:
-        for sha256 in self._names().values():
+        for sha256 in self.pictures.values():
             yield from self._files.fetch(sha256)
         return self
 
     def save_steps(self, folder: str | Path) -> Steps[Path]:
         """The steps of `save`."""
         folder = _made(folder)
-        for name, sha256 in self._names().items():
+        for name, sha256 in self.pictures.items():
             (folder / name).write_bytes((yield from self._files.fetch(sha256)))
         if self.video is not None:
             (folder / "video.mp4").write_bytes((yield from self._video_bytes()))

@@ -9,7 +9,7 @@ MAX_CONTACTS = 6  # that are told
 
 def worlds(probability: float) -> str:
     """A probability as people read it."""
-    return f"{round(100 * probability)} of 100 worlds"
+    return f"{probability:.0%} of the worlds"
 
 
 def encounter_words(encounter: Encounter, fps: float) -> str:
@@ -66,4 +66,6 @@ def _value(outcome: Outcome) -> str:
     if outcome.asked.form == "when" and outcome.time is not None:
         band = "" if outcome.time_band is None else f" ({outcome.time_band[0]:.1f} to {outcome.time_band[1]:.1f} s)"
         return f"after {outcome.time:.1f} s{band}{sure}"
-    return "" if outcome.probability is None else f"what is asked happens in {worlds(outcome.probability)}"
+    if outcome.probability is None or outcome.asked.form in ("where", "what-happens"):  # the facts are the answer
+        return ""
+    return f"what is asked happens in {worlds(outcome.probability)}"

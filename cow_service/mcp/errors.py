@@ -6,7 +6,8 @@ from cow_service.client import CowError
 
 _GIVE_PLACE = (
     "Look at the image and call again with `bbox` [x0, y0, x1, y1] or `point` [x, y] of the thing that moves, in "
-    "pixels of the image, and `object`, its name."
+    "pixels of the image, and `object`, its name; give other things that the question names in `objects`, each with "
+    "`object` and `bbox`."
 )
 _RETRY_LATER = "Call again in a while, with the same arguments."
 REMEDIES = {

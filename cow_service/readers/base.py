@@ -89,6 +89,7 @@ class ReaderInput:
     question: str
     seed: int = 0
     motion_wanted: bool = True  # stage 2 is left to the reader, too
+    known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: nobody need look for them
     calls: CallLog = field(default_factory=CallLog)
     check_canceled: Callable[[], None] = _never_canceled  # to be called while waiting; raises `Canceled`
     cpu: Callable[[], AbstractContextManager[None]] = nullcontext  # to be held around work on the CPU; not reentrant

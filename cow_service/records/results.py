@@ -112,6 +112,13 @@ class Simulation(Record):
     warnings: tuple[str, ...] = ()
 
     @property
+    def pictures(self) -> dict[str, Sha256]:
+        """The digests of its pictures by the names of files: frames, those of the scene as it is, the overlay."""
+        frames = {f"frame_{frame.index:03d}.png": frame.sha256 for frame in self.frames}
+        factual = {f"factual_{frame.index:03d}.png": frame.sha256 for frame in self.factual_frames}
+        return frames | factual | {"overlay.png": self.overlay.sha256}
+
+    @property
     def encounters_known(self) -> bool:
         """Whether an empty list of encounters means that nothing is met."""
         return self.trajectory.encounters_known

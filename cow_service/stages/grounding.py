@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 from cow_service.errors import FieldError, InvalidRequest
@@ -10,7 +11,7 @@ from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import GroundingReading
 from cow_service.records import Artifact, BBox, Grounding, LocatedObject, Point, Source
 from cow_service.requests import GroundingRequest, SimulateRequest
-from cow_service.stages.interventions import locate_interventions, without_removed
+from cow_service.stages.interventions import locate_interventions, stated_changes, without_removed
 from cow_service.stages.places import place_of, prior_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
@@ -31,19 +32,26 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     """
     place = run.request.place
     source: Source = "request"
+    with run.cpu():
+        all_given, told_of_given = _given_objects(run)
     if place is None:
-        reading, source = run.reader.ground(run.reader_input("grounding")), run.reader.source
+        asked = replace(run.reader_input("grounding"), known=all_given)
+        reading, source = run.reader.ground(asked), run.reader.source
     else:
         with run.cpu():
             reading = _given(run, place)
     with run.cpu():
         run.place_mover(reading.bbox)
         mask = _store_mask(run, reading.bbox)
-        given, warnings = _given_objects(run, reading.bbox)
+    given, warnings = _without_mover(all_given, reading.bbox)
+    warnings = (*told_of_given, *warnings)
     read = (other.model_copy(update={"source": other.source or source}) for other in reading.others)
     seen = [other for other in read if not any(_same(other.bbox, one.bbox) for one in given)]
     mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
-    interventions = locate_interventions(run.request.interventions, reading.interventions, mover, given, seen)
+    changes = reading.interventions
+    if place is not None and not run.request.interventions:
+        changes = stated_changes(run.request.question, (*given, mover))
+    interventions = locate_interventions(run.request.interventions, changes, mover, given, seen)
     grounding = Grounding(
         object=reading.object,
         point=reading.point or _centre(reading.bbox),
@@ -86,8 +94,8 @@ def _given(run: Run[SimulateRequest], given: GroundingRequest) -> GroundingReadi
     return GroundingReading(given.object or DEFAULT_NAME, place.bbox, prior=prior_of(given), warnings=place.warnings)
 
 
-def _given_objects(run: Run[SimulateRequest], mover: BBox) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
-    """The other objects of a request, and warnings. One at the place of the mover is taken for the mover.
+def _given_objects(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
+    """The objects of a request, and warnings.
 
     Raises as `place_of` does, and `InvalidRequest` for an object that is given twice.
     """
@@ -100,9 +108,6 @@ def _given_objects(run: Run[SimulateRequest], mover: BBox) -> tuple[tuple[Locate
         warnings += place.warnings
         _check_new(place.bbox, boxes, index)
         boxes.append(place.bbox)
-        if _same(place.bbox, mover):
-            warnings.append(f"`objects.{index}` ('{given.object}') lies where the mover is, and was taken for it.")
-            continue
         found.append(
             LocatedObject(
                 object=given.object,
@@ -114,6 +119,13 @@ def _given_objects(run: Run[SimulateRequest], mover: BBox) -> tuple[tuple[Locate
             )
         )
     return tuple(found), tuple(warnings)
+
+
+def _without_mover(given: Sequence[LocatedObject], mover: BBox) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
+    """The objects beside the mover, and warnings: one at its place was taken for it."""
+    at_mover = [index for index, each in enumerate(given) if _same(each.bbox, mover)]
+    told = (f"`objects.{i}` ('{given[i].object}') lies where the mover is, and was taken for it." for i in at_mover)
+    return tuple(each for i, each in enumerate(given) if i not in at_mover), tuple(told)
 
 
 def _check_new(bbox: BBox, boxes: Sequence[BBox], index: int) -> None:

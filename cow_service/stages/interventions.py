@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from cow_service.errors import CannotGround, FieldError, InvalidRequest
-from cow_service.readers.question.choices import plain
+from cow_service.readers.question.sentences import parse
+from cow_service.readers.question.wording import same_name
+from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import BBox, Intervention, LocatedObject
 from cow_service.requests import InterventionRequest
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
-
-_ARTICLES = frozenset({"the", "a", "an"})
 
 
 def locate_interventions(
@@ -51,6 +51,30 @@ def locate_interventions(
     return tuple(found)
 
 
+def stated_changes(question: str, places: Sequence[LocatedObject]) -> tuple[Intervention, ...]:
+    """The changes that a question names, where no reader looks for their objects: they must be among those given.
+
+    Raises `InvalidRequest` for one that is not.
+    """
+
+    def named(words: str) -> LocatedObject:
+        found = next((place for place in places if same_name(place.object, words)), None)
+        if found is None:
+            detail = f"the question changes '{words}', and with `grounding` given nobody looks for it"
+            raise InvalidRequest(f"`objects`: {detail}. {GIVE_OBJECT}", errors=(FieldError("/objects", detail),))
+        return found
+
+    return tuple(
+        Intervention(
+            kind=change.kind,
+            object=named(change.object.text),
+            relation=change.relation,
+            targets=tuple(named(target.text) for target in change.targets),
+        )
+        for change in parse(question).interventions
+    )
+
+
 def without_removed(
     others: Sequence[LocatedObject], interventions: Sequence[Intervention]
 ) -> tuple[LocatedObject, ...]:
@@ -61,21 +85,15 @@ def without_removed(
 
 def _named(words: str, places: Sequence[LocatedObject], pointer: str) -> LocatedObject:
     """The object of a name, whatever its letters' case, its spaces and its article. Raises `InvalidRequest`."""
-    wanted = _bare(words)
-    found = next((place for place in places if _bare(place.object) == wanted), None)
+    found = next((place for place in places if same_name(place.object, words)), None)
     if found is not None:
         return found
     known = ", ".join(f"'{place.object}'" for place in places)
     detail = f"there is no '{words}' among the objects of the scene, which are {known}"
     raise InvalidRequest(
-        f"`{pointer[1:].replace('/', '.')}`: {detail}. Give its box under that name in `objects`.",
+        f"`{pointer[1:].replace('/', '.')}`: {detail}. {GIVE_OBJECT}",
         errors=(FieldError(pointer, detail),),
     )
-
-
-def _bare(words: str) -> str:
-    found = plain(words).split()
-    return " ".join(found[1:] if len(found) > 1 and found[0] in _ARTICLES else found)
 
 
 def _fault(each: Intervention, mover: LocatedObject, before: Sequence[Intervention]) -> str | None:

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.readers.base import OtherMotionReading, Quantity, StepReading
-from cow_service.readers.question.choices import plain
-from cow_service.readers.question.wording import bare_name, direction_words
+from cow_service.readers.question.wording import bare_name, direction_words, same_name
 from cow_service.records import DIRECTED_KINDS, AlsoMoving, Grounding, LocatedObject, MotionStep, Vector
 from cow_service.requests import MotionStepRequest, OtherMotionRequest
 from cow_service.stages.quantities import Measures
@@ -44,7 +43,7 @@ def _given_other(index: int, given: OtherMotionRequest, grounding: Grounding) ->
 
 
 def _located(index: int, name: str, grounding: Grounding) -> LocatedObject:
-    found = [other for other in grounding.others if plain(other.object) == plain(name)]
+    found = [other for other in grounding.others if same_name(other.object, name)]
     if len(found) != 1:
         seen = ", ".join(f"'{other.object}'" for other in grounding.others) or "none"
         detail = f"'{name}' names {len(found)} of the located objects ({seen})"

@@ -54,11 +54,11 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
         reach = np.inf
     if around is None:
         return image
-    beside = around.trusted & (around.away < reach)
+    beside = _beside(around, reach)
     varied = _is_varied(around.source, around.inside, around.trusted)
     if varied and np.isfinite(reach):
         around = _surroundings(image, hole, avoid, max(24, int(WIDE * size))) or around
-        beside = around.trusted & (around.away < reach)
+        beside = _beside(around, reach)
     shading = push_pull(around.source, beside)
     if varied:
         filled = exemplar_inpaint(around.source, around.inside | (around.away <= around.rim), ~around.trusted, shading)
@@ -101,6 +101,12 @@ def _surroundings(image: Image, hole: Mask, avoid: Mask | None, margin: int) -> 
     shadow = _contact_shadow(source, inside, known)
     trusted = known & ~shadow & (away > rim)
     return _Surroundings(crop, source, inside, known, trusted if trusted.any() else known, shadow, away, rim)
+
+
+def _beside(around: _Surroundings, reach: float) -> Mask:
+    """[h, w]: what shading is taken from: what lies within a reach (px) of the hole, or else all that is trusted."""
+    near = around.trusted & (around.away < reach)
+    return near if near.any() else around.trusted
 
 
 def _faded_in(image: Image, filled: Floats32, around: _Surroundings, size: float) -> Image:

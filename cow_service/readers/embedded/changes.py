@@ -9,7 +9,8 @@ from cow_service.readers.embedded.matching import describe, match_both, match_on
 from cow_service.readers.question.interventions import InterventionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
-from cow_service.readers.remedies import GIVE_PLACE
+from cow_service.readers.question.wording import same_name
+from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import BBox, Intervention, LocatedObject
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region
@@ -22,38 +23,43 @@ def check_changes(question: Question) -> None:
     """Raises `CannotGround` where the mover is taken away, or something is put into itself."""
     for change in question.interventions:
         if change.kind == "remove" and (change.then_moves or change.object == question.mover):
-            raise CannotGround(f"The question takes '{change.object.text}' away and says that it moves. {GIVE_PLACE}")
+            raise CannotGround(
+                f"The question takes '{change.object.text}' away and says that it moves: ask one of both."
+            )
         if change.object in change.targets:
             relation = change.relation or "beside"
-            raise CannotGround(
-                f"The question puts '{change.object.text}' {relation} itself, which is not possible. {GIVE_PLACE}"
-            )
+            raise CannotGround(f"The question puts '{change.object.text}' {relation} itself: name another thing.")
 
 
-def find_removed(scene: Scene, question: Question) -> tuple[Intervention, ...]:
-    """What is taken away, where exactly one region fits. Raises `CannotGround`."""
+def find_removed(scene: Scene, question: Question, given: Sequence[LocatedObject] = ()) -> tuple[Intervention, ...]:
+    """What is taken away: `given` under that name, or where exactly one region fits. Raises `CannotGround`."""
     removed = [change.object for change in question.interventions if change.kind == "remove"]
-    taken: list[tuple[str, Region]] = []
+    taken: list[LocatedObject] = []
     for phrase in removed:
-        left = [each for each in scene.regions if all(each is not region for _, region in taken)]
-        found = _both(left, phrase) if phrase.text.lower().startswith("both ") else _one(left, phrase)
+        left = [each for each in scene.regions if all(each.bbox != one.bbox for one in taken)]
+        found = _both(left, phrase) if phrase.text.lower().startswith("both ") else _one(left, phrase, given)
         if not found:
             raise _not_found(scene, f"takes '{phrase.text}' away", phrase)
         taken += found
-    return tuple(
-        Intervention(kind="remove", object=LocatedObject(object=name, bbox=region.bbox, source="embedded"))
-        for name, region in taken
-    )
+    return tuple(Intervention(kind="remove", object=each) for each in taken)
 
 
-def _one(regions: Sequence[Region], phrase: ObjectPhrase) -> list[tuple[str, Region]]:
-    region = match_one(regions, phrase)
-    return [] if region is None else [(phrase.text, region)]
+def given_as(phrase: ObjectPhrase, given: Sequence[LocatedObject]) -> LocatedObject | None:
+    """The object that the caller gave under the words of a phrase."""
+    return next((each for each in given if same_name(each.object, phrase.text)), None)
 
 
-def _both(regions: Sequence[Region], phrase: ObjectPhrase) -> list[tuple[str, Region]]:
+def _one(regions: Sequence[Region], phrase: ObjectPhrase, given: Sequence[LocatedObject]) -> list[LocatedObject]:
+    named, region = given_as(phrase, given), match_one(regions, phrase)
+    if named is not None:
+        return [named]
+    return [] if region is None else [_located(phrase.text, region.bbox)]
+
+
+def _both(regions: Sequence[Region], phrase: ObjectPhrase) -> list[LocatedObject]:
     """ "Both cylinders", each under its colour."""
-    return [(f"{region.colour} {phrase.head or 'object'}", region) for region in match_both(regions, phrase)]
+    found = match_both(regions, phrase)
+    return [_located(f"{region.colour} {phrase.head or 'object'}", region.bbox) for region in found]
 
 
 def without(regions: Sequence[Region], removed: Sequence[Intervention]) -> tuple[Region, ...]:
@@ -62,43 +68,63 @@ def without(regions: Sequence[Region], removed: Sequence[Intervention]) -> tuple
     return tuple(region for region in regions if all(iou(region.bbox, box) < SAME_OBJECT_IOU for box in boxes))
 
 
-def find_placed(scene: Scene, regions: Sequence[Region], question: Question, mover: Found) -> tuple[Intervention, ...]:
-    """What is put somewhere, and where. Raises `CannotGround`."""
+def find_placed(
+    scene: Scene,
+    regions: Sequence[Region],
+    question: Question,
+    mover: Found,
+    given: Sequence[LocatedObject] = (),
+) -> tuple[Intervention, ...]:
+    """What is put somewhere, and where; what is `given` under its name is not looked for. Raises `CannotGround`."""
     changes = [change for change in question.interventions if change.kind == "place"]
-    return tuple(_placed(scene, regions, change, mover) for change in changes)
+    return tuple(_placed(scene, regions, change, mover, given) for change in changes)
 
 
-def _placed(scene: Scene, regions: Sequence[Region], change: InterventionWords, mover: Found) -> Intervention:
-    thing = _find(scene, regions, change.object, f"puts '{change.object.text}' somewhere", [mover])
+def _placed(
+    scene: Scene,
+    regions: Sequence[Region],
+    change: InterventionWords,
+    mover: Found,
+    given: Sequence[LocatedObject],
+) -> Intervention:
+    thing = _find(scene, regions, change.object, f"puts '{change.object.text}' somewhere", [mover], given)
     known = [mover, (change.object, thing.bbox)]
     targets: list[LocatedObject] = []
     for phrase in change.targets:
         told = f"puts '{change.object.text}' {change.relation} '{phrase.text}'"
-        targets.append(_find(scene, regions, phrase, told, known))
+        targets.append(_find(scene, regions, phrase, told, known, given))
         known.append((phrase, targets[-1].bbox))
     return Intervention(kind="place", object=thing, relation=change.relation, targets=tuple(targets))
 
 
 def _find(
-    scene: Scene, regions: Sequence[Region], phrase: ObjectPhrase, told: str, known: Sequence[Found]
+    scene: Scene,
+    regions: Sequence[Region],
+    phrase: ObjectPhrase,
+    told: str,
+    known: Sequence[Found],
+    given: Sequence[LocatedObject],
 ) -> LocatedObject:
-    """A thing that is known already, or the one region besides those that fits its words."""
+    """A thing that is known already or was given, or the one region besides those that fits its words."""
     for other, bbox in known:
         if other == phrase:
-            return _located(phrase, bbox)
+            return _located(phrase.text, bbox)
+    named = given_as(phrase, given)
+    if named is not None:
+        return named
     free = [region for region in regions if all(iou(region.bbox, bbox) < SAME_OBJECT_IOU for _, bbox in known)]
     region = match_one(free, phrase)
     if region is None:
         raise _not_found(scene, told, phrase)
-    return _located(phrase, region.bbox)
+    return _located(phrase.text, region.bbox)
 
 
-def _located(phrase: ObjectPhrase, bbox: BBox) -> LocatedObject:
-    return LocatedObject(object=phrase.text, bbox=bbox, source="embedded")
+def _located(name: str, bbox: BBox) -> LocatedObject:
+    return LocatedObject(object=name, bbox=bbox, source="embedded")
 
 
 def _not_found(scene: Scene, told: str, phrase: ObjectPhrase) -> CannotGround:
     return CannotGround(
         f"The question {told}, and '{phrase.text}' was not found, or not for certain. Seen: {describe(scene.regions)}. "
-        f"{GIVE_PLACE}"
+        f"{GIVE_OBJECT}"
     )

@@ -10,7 +10,7 @@ from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.embedded.answers import answer_from
-from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, without
+from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
 from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
@@ -57,13 +57,14 @@ class EmbeddedReader:
         with given.cpu():
             check_changes(question)
             scene = scene_of_mover(scene, question)
-            removed = find_removed(scene, question)
+            removed = find_removed(scene, question, given.known)
             regions = without(scene.regions, removed)
             bbox = _mover(scene, regions, question, question.mover)
-            placed = find_placed(scene, regions, question, (question.mover, bbox))
+            placed = find_placed(scene, regions, question, (question.mover, bbox), given.known)
             others = _others(regions, question, bbox)
             found = {other.object for other in others}
-            missing = [_not_found(scene, phrase.text) for phrase in question.others if phrase.text not in found]
+            unseen = (each for each in question.others if each.text not in found)
+            missing = [_not_found(scene, each.text) for each in unseen if given_as(each, given.known) is None]
             boxes = {other.object: other.bbox for other in others} | {question.mover.text: bbox}
             things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
             doubts = [*noun_warnings(scene, things), *unread_warnings(question)]

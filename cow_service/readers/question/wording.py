@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from cow_service.readers.prompts import load_prompt
+from cow_service.readers.question.choices import plain
 from cow_service.records import MotionKind, Vector
 
 MAX_OBJECT = 200  # characters
@@ -62,6 +63,11 @@ def motion_sentence(
         also=also,
     )
     return " ".join(text.split())
+
+
+def same_name(one: str, other: str) -> bool:
+    """Whether two texts name an object alike, whatever their determiners, letters' case and spaces."""
+    return plain(bare_name(one)) == plain(bare_name(other)) != ""
 
 
 def bare_name(object: str) -> str:
