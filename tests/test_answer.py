@@ -471,6 +471,7 @@ def answered(service: Service, image: bytes, question: str, **body) -> Answer:
     return service.answer(AnswerRequest.model_validate(request))
 
 
+@pytest.mark.soak
 def test_the_scenes_are_answered_right_or_not_at_all(service: Service) -> None:
     outcomes: list[str] = []
     for folder in all_scenes():

@@ -20,7 +20,7 @@ from typing import Any
 import httpx
 import mllm_server as say
 import pytest
-from conftest import ROOT, example
+from conftest import ROOT, SCALE, example
 from drawn import DrawnArrow, angle_between, ball, block, floor
 from engines import FRESH, app_for, running_engine
 from hypothesis import given
@@ -186,7 +186,10 @@ def test_every_reply_is_understood(case) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['stage']}-{case['family']}-{case['id']}")
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    "case", CASES[:: max(1, 5 // SCALE)], ids=lambda case: f"{case['stage']}-{case['family']}-{case['id']}"
+)
 def test_every_reply_is_read_right_or_refused(case, mllm: MllmServer, make) -> None:
     told = asked(case, mllm, make(MANIFESTS[case["family"]]))
     expect = case["expect"]
