@@ -25,6 +25,7 @@ from cow_service.net.images import ImageUrls
 from cow_service.observability.metrics import Metrics
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader
+from cow_service.readers.chat import ChatReader
 from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulation
 from cow_service.registry import Registry
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, PlaceRequest, SimulateRequest
@@ -140,6 +141,14 @@ class Service:
             generators=tuple(self._describe("generator", name) for name in self.generators.names()),
             mllms=tuple(name for name, manifest in load_manifests().items() if manifest.role == "mllm"),
         )
+
+    def chat_reader(self, name: str) -> ChatReader | None:
+        """The reader of that name where an MLLM is behind it, which can be chatted with; else None.
+
+        Raises `ReaderUnavailable`, and whatever loading the reader raises.
+        """
+        reader = self._reader(name)
+        return reader if isinstance(reader, ChatReader) else None
 
     def __enter__(self) -> Service:
         return self

@@ -11,6 +11,7 @@ from fastapi import FastAPI
 from cow_service import __version__
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.middleware.order import LayeredApp, install_layers
+from cow_service.api.openai.completing import Completer
 from cow_service.api.openai.errors import ChatProblems
 from cow_service.api.openai.routes import chat_routes
 from cow_service.api.openapi import contract
@@ -34,12 +35,15 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
     """
     service = engine.service
     readiness = readiness or Readiness(service)
+    submitter = Submitter(engine)
+    completer = Completer(submitter)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
         if not engine.is_running:
             await to_thread.run_sync(engine.start)
         yield
+        await completer.close()
         if closing:
             await to_thread.run_sync(engine.close)
             await to_thread.run_sync(service.close)
@@ -60,10 +64,9 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
     layers = app.surround
     # Outermost: the other layers refuse requests, too.
     app.surround = lambda stack: ChatProblems(stack if layers is None else layers(stack))
-    submitter = Submitter(engine)
     for router in (
         simulate_routes(submitter),
-        chat_routes(submitter),
+        chat_routes(submitter, completer),
         job_routes(engine),
         artifact_routes(engine),
         health_routes(engine, readiness),

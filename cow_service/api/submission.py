@@ -96,7 +96,7 @@ class Submitter:
             created_at = await self.submit(submission, read)
             if submission.prefer.respond_async and not submission.prefer.wait:
                 return None
-            async with _disconnected(request) as gone:
+            async with disconnected(request) as gone:
                 return await self.outcome(submission, waiter, created_at, gone, submission.prefer.wait)
 
     async def accepted(self, submission: Submission) -> Response:
@@ -131,7 +131,7 @@ class Submitter:
         """
         loop = asyncio.get_running_loop()
         until = None if wait is None else loop.time() + wait
-        disconnected = asyncio.ensure_future(gone.wait())
+        left = asyncio.ensure_future(gone.wait())
         look = may_have_ended or created_at is None
         try:
             while True:
@@ -141,7 +141,7 @@ class Submitter:
                 if rest <= 0:
                     return None
                 ended = asyncio.ensure_future(waiter.ended.wait())
-                await asyncio.wait({ended, disconnected}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait({ended, left}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
                 ended.cancel()
                 look = True
                 if waiter.ended.is_set():
@@ -150,11 +150,11 @@ class Submitter:
                         if isinstance(outcome, CowError):
                             raise outcome
                         return outcome
-                elif disconnected.done():
+                elif left.done():
                     await self.leave(submission, created_at)
                     raise Canceled("The caller went away before the work was done.")
         finally:
-            disconnected.cancel()
+            left.cancel()
 
     async def leave(self, submission: Submission, created_at: str | None) -> None:
         """The caller has disconnected: cancels a new job that nobody can ask for."""
@@ -213,7 +213,7 @@ def json_response(body: str, status: int = HTTPStatus.OK, headers: dict[str, str
 
 
 @asynccontextmanager
-async def _disconnected(request: Request) -> AsyncGenerator[asyncio.Event]:
+async def disconnected(request: Request) -> AsyncGenerator[asyncio.Event]:
     """An event that is set when the caller has closed the connection."""
     gone = asyncio.Event()
 

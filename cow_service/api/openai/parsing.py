@@ -1,21 +1,34 @@
-"""From a chat to the `AnswerRequest` that it asks for: its question, image and model, and what of it is not used."""
+"""From a chat with a model without an MLLM to the `AnswerRequest` that it asks for, and what of it is not used."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from pydantic import ValidationError
 
-from cow_service.api.body import read_object
-from cow_service.api.openai.models import answerer
-from cow_service.api.openai.requests import ChatMessage, ChatPart, ChatRequest, Neutral
+from cow_service.api.openai.chats import Chat, wrong
+from cow_service.api.openai.messages import ImagePart, images_of, other_parts, role_of, texts_of
+from cow_service.api.openai.models import Answerer
 from cow_service.api.problems import invalid
 from cow_service.errors import CowError, FieldError, InvalidRequest
 from cow_service.requests import AnswerRequest
-from cow_service.service import Service
 
 FIELDS_OF_CHAT = ("image", "question", "imagine", "reader")  # of an `AnswerRequest`: from messages and model
+# Fields of a chat that are used, or that ask for nothing of the reply.
+SILENT = frozenset({
+    "model", "messages", "stream", "stream_options", "seed", "cow", "max_tokens", "max_completion_tokens",
+    "parallel_tool_calls", "prediction", "user", "safety_identifier", "metadata", "store", "service_tier",
+    "prompt_cache_key", "prompt_cache_options", "prompt_cache_retention",
+})  # fmt: skip
+# Values of other fields that ask for nothing; null, false and what is empty never does.
+NEUTRAL: dict[str, tuple[Any, ...]] = {
+    "n": (1,), "tool_choice": ("none", "auto"), "function_call": ("none", "auto"), "top_logprobs": (0,),
+    "response_format": ({"type": "text"},), "modalities": (["text"],), "temperature": (0, 1), "top_p": (1,),
+    "top_k": (-1, 0, 1), "min_p": (0,), "presence_penalty": (0,), "frequency_penalty": (0,),
+    "repetition_penalty": (1,), "reasoning_effort": ("medium",), "verbosity": ("medium",),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,104 +64,91 @@ class ParsedChat:
     with_usage: bool
 
 
-def parse_chat(body: bytes, service: Service) -> ParsedChat:
-    """The chat of a body. Raises `MalformedBody`, `InvalidRequest`, `ModelNotFound`."""
-    try:
-        chat = ChatRequest.model_validate(read_object(body, "The body"))
-    except ValidationError as error:
-        raise invalid(error) from error
-    model = answerer(service, chat.model)
-    image, image_place = _image_of(chat.messages)
-    place = max(place for place, message in enumerate(chat.messages) if message.role == "user")
-    question = "\n".join(_texts(chat.messages[place]))
+def parse_chat(chat: Chat, model: Answerer) -> ParsedChat:
+    """The answer that a chat asks for. Raises `InvalidRequest`."""
+    messages = chat.messages()
+    if not messages:
+        raise wrong("/messages", "is missing: send the image and the question in one user message")
+    image = _image_of(messages)
+    place = max((place for place, each in enumerate(messages) if role_of(each) == "user"), default=len(messages) - 1)
+    question = "\n".join(texts_of(messages[place]))
     if not question.strip():
-        raise _wrong(f"/messages/{place}/content", "the last user message has no text: put the question there")
-    given = chat.cow or {}
+        raise wrong(f"/messages/{place}/content", "the last user message has no text: put the question there")
     for name in FIELDS_OF_CHAT:
-        if name in given:
-            raise _wrong(f"/cow/{name}", "is said by `messages` and `model`; leave it out")
-    seeds: dict[str, int] = {} if chat.seed is None else {"seed": chat.seed}
-    if seeds and "seed" in given:
-        raise _wrong("/cow/seed", "stands in `seed`, too; give it once")
-    pointers = FieldPointers(image_place, f"/messages/{place}/content", "/seed" if seeds else "/cow/seed")
-    is_data = image[:5].lower() == "data:"
-    fields = {**given, **seeds, "question": question, "image": image if is_data else {"url": image}}
+        if name in chat.cow:
+            raise wrong(f"/cow/{name}", "is said by `messages` and `model`; leave it out")
+    seed = chat.fields.get("seed")
+    seeds: dict[str, Any] = {} if seed is None else {"seed": seed}
+    if seeds and "seed" in chat.cow:
+        raise wrong("/cow/seed", "stands in `seed`, too; give it once")
+    pointers = FieldPointers(image.url_pointer, f"/messages/{place}/content", "/seed" if seeds else "/cow/seed")
+    fields = {**chat.cow, **seeds, "question": question, "image": image.reference}
     try:
         request = AnswerRequest.model_validate({**fields, "reader": model.reader, "imagine": model.imagine})
     except ValidationError as error:
         raise invalid(error, pointers.translate) from error
-    limits = [limit for limit in (chat.max_tokens, chat.max_completion_tokens) if limit is not None]
+    limits = [limit for name in ("max_tokens", "max_completion_tokens") if type(limit := chat.fields.get(name)) is int]
+    options = chat.fields.get("stream_options")
     return ParsedChat(
         model=chat.model,
         request=request,
         pointers=pointers,
         warnings=tuple(_warnings(chat, place)),
         max_tokens=min(limits, default=None),
-        stream=bool(chat.stream),
-        with_usage=chat.stream_options is not None and bool(chat.stream_options.include_usage),
+        stream=chat.stream,
+        with_usage=isinstance(options, dict) and bool(options.get("include_usage")),
     )
 
 
-def _image_of(messages: tuple[ChatMessage, ...]) -> tuple[str, str]:
-    """The only image's URL, and where it stands. The same image may stand in several messages."""
-    found: dict[str, str] = {}
-    for pointer, message, part in _parts(messages):
-        if part.image_url is not None:
-            if message.role != "user":
-                raise _wrong(pointer, f"images are read in `user` messages only, got one of `{message.role}`")
-            found.setdefault(part.image_url.url, f"{pointer}/image_url/url")
+def _image_of(messages: list[Any]) -> ImagePart:
+    """The only image. The same image may stand in several messages."""
+    if others := list(other_parts(messages)):
+        pointer, kind = others[0]
+        raise wrong(f"{pointer}/type", f"is {kind}: only parts of the types `text` and `image_url` are read")
+    found: dict[str, ImagePart] = {}
+    for image in images_of(messages):
+        if image.role != "user":
+            raise wrong(image.pointer, f"images are read in `user` messages only, got one of `{image.role}`")
+        found.setdefault(image.url, image)
     if not found:
-        raise _wrong(
-            f"/messages/{len(messages) - 1}/content" if messages else "/messages",
+        raise wrong(
+            f"/messages/{len(messages) - 1}/content",
             "no user message has an image: add a part "
             '{"type": "image_url", "image_url": {"url": "data:image/png;base64,..."}}',
         )
     if len(found) > 1:
         detail = f"a question is about one image, got {len(found)}: send one"
-        raise InvalidRequest(
-            f"`messages`: {detail}.", errors=tuple(FieldError(pointer, detail) for pointer in found.values())
-        )
-    url, pointer = next(iter(found.items()))
-    if not url[:8].lower().startswith(("data:", "http://", "https://")):
-        raise _wrong(pointer, "is neither a data URL (data:image/png;base64,...) nor one of http or https")
-    return url, pointer
+        places = tuple(FieldError(image.url_pointer, detail) for image in found.values())
+        raise InvalidRequest(f"`messages`: {detail}.", errors=places)
+    image = next(iter(found.values()))
+    if not image.url[:8].lower().startswith(("data:", "http://", "https://")):
+        raise wrong(image.url_pointer, "is neither a data URL (data:image/png;base64,...) nor one of http or https")
+    return image
 
 
-def _parts(messages: tuple[ChatMessage, ...]) -> Iterator[tuple[str, ChatMessage, ChatPart]]:
-    for place, message in enumerate(messages):
-        for number, part in enumerate(message.content or ()):
-            yield f"/messages/{place}/content/{number}", message, part
-
-
-def _texts(message: ChatMessage) -> list[str]:
-    return [part.text for part in message.content or () if part.text is not None]
-
-
-def _warnings(chat: ChatRequest, question: int) -> Iterator[str]:
+def _warnings(chat: Chat, question: int) -> Iterator[str]:
     """What of the chat has no effect."""
     unread = [
-        f"{place} ({message.role})"
-        for place, message in enumerate(chat.messages)
-        if place != question and any(text.strip() for text in _texts(message))
+        f"{place} ({role_of(message)})"
+        for place, message in enumerate(chat.messages())
+        if place != question and any(text.strip() for text in texts_of(message))
     ]
     if unread:
         yield (
-            f"The text of these `messages` was not read: {_some(unread)}. COW takes one image and one question: all "
-            "that matters must stand in the last user message."
+            f"The text of these `messages` was not read: {_some(unread)}. This model takes one image and one question: "
+            "all that matters must stand in the last user message."
         )
-    unused = [
-        name
-        for name, field in ChatRequest.model_fields.items()
-        for neutral in field.metadata
-        if isinstance(neutral, Neutral) and getattr(chat, name) not in (None, *neutral.values)
-    ]
+    unused = [f"`{name[:40]}`" for name, value in chat.fields.items() if name not in SILENT and _asks(name, value)]
     if unused:
-        yield f"Not used: {', '.join(f'`{name}`' for name in unused)}. COW asks with settings of its own."
+        yield f"Not used: {_some(unused)}. This model has no MLLM behind it that could use them."
+
+
+def _asks(name: str, value: Any) -> bool:
+    """Whether the value of a field asks for something."""
+    if value is None or value is False or value in ([], {}, ""):
+        return False
+    return isinstance(value, bool) or value not in NEUTRAL.get(name, ())
 
 
 def _some(names: list[str], most: int = 10) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def _wrong(pointer: str, detail: str) -> InvalidRequest:
-    return InvalidRequest(f"{pointer}: {detail}.", errors=(FieldError(pointer, detail),))

@@ -1,12 +1,15 @@
-"""What the `/v1` operations return: OpenAI's records, each with what COW has to say besides as `cow`."""
+"""What the `/v1` operations return: OpenAI's records, each with what COW has to say besides as `cow`.
+
+Replies of an MLLM go on as they came: of those, these records say only what COW adds.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 
-from cow_service.records import Answer, JobStatus, Problem, Record
+from cow_service.records import Answer, Frame, JobStatus, Problem, Record, Usage
 
 
 class ChatModel(Record):
@@ -63,6 +66,32 @@ class ChatCompletion(Record):
     cow: Answer = Field(description="The whole answer, as `POST /answer` returns it.")
 
 
+class MllmCompletion(BaseModel):
+    """What `POST /v1/chat/completions` returns of an MLLM: the reply as it came, and `cow`."""
+
+    model_config = ConfigDict(extra="allow")
+
+    cow: ChatImagination
+
+
+class ChatImagination(Record):
+    """What COW did with a chat before the MLLM was asked: `cow` of the reply of an MLLM."""
+
+    imagined: bool = Field(description="Whether imagined frames were added to the last user message.")
+    reason: str | None = Field(
+        default=None,
+        description="Why not: `no-imagination` (the model's name says so), `no-question`, `no-image`, "
+        "`several-images`, `other-parts` (a video, a file...), or the code of the problem that imagining came to.",
+    )
+    detail: str | None = Field(default=None, description="The same in a sentence.")
+    simulation: str | None = Field(default=None, description="Id of the simulation and its job: `GET /jobs/{id}`.")
+    frames: tuple[Frame, ...] = Field(default=(), description="The frames that were added, in their order.")
+    prompts: dict[str, int] = Field(default_factory=dict, description="Version of the note that introduces them.")
+    usage: Usage = Field(default=Usage(), description="Of imagining alone; the reply's own is `usage` beside `cow`.")
+    reused: tuple[str, ...] = Field(default=(), description="Stages of the simulation that were found again.")
+    warnings: tuple[str, ...] = ()
+
+
 class ChatDelta(Record):
     """What a chunk adds to the message."""
 
@@ -98,7 +127,10 @@ class ChatChunk(Record):
     model: str
     choices: tuple[ChunkChoice, ...] = Field(description="Empty in the chunk that has `usage`.")
     usage: ChatUsage | None = None
-    cow: ChatProgress | Answer | None = Field(default=None, description="Progress; the answer in the last chunk.")
+    cow: ChatProgress | Answer | ChatImagination | None = Field(
+        default=None,
+        description="Progress; the answer in the last chunk; of an MLLM, what was imagined, before its first chunk.",
+    )
 
 
 class ChatError(Record):
@@ -108,6 +140,14 @@ class ChatError(Record):
     type: str
     param: str | None = Field(description="The first invalid field.")
     code: str = Field(description="The last segment of the problem's `type`.")
+
+
+class UpstreamError(BaseModel):
+    """An error of the MLLM's server, with its status, in OpenAI's form."""
+
+    model_config = ConfigDict(extra="allow")
+
+    error: dict[str, Any] = Field(description="`message`, `type`, `param` and `code`, as far as the server gave them.")
 
 
 class ChatProblem(Problem):

@@ -1,91 +1,127 @@
-"""`POST /v1/chat/completions`, `GET /v1/models` and `GET /v1/models/{model}`: COW for clients of OpenAI's API."""
+"""`POST /v1/chat/completions`, `POST /v1/responses`, `GET /v1/models`: COW for clients of OpenAI's API."""
 
 from __future__ import annotations
 
+import json
 import time
 from functools import partial
 from typing import Annotated, Any
 
-from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode
 
 from cow_service import errors
+from cow_service.api.body import read_object
+from cow_service.api.openai.chats import EXTENSION, chat_of, read_chat
+from cow_service.api.openai.completing import Completer
 from cow_service.api.openai.errors import ROOT, document_problems
 from cow_service.api.openai.models import answerer, usable
-from cow_service.api.openai.parsing import FIELDS_OF_CHAT, ParsedChat, parse_chat
-from cow_service.api.openai.records import ChatChunk, ChatCompletion, ChatModel, ChatModels, ChatProblem
-from cow_service.api.openai.replies import ChatAnswer
-from cow_service.api.openai.requests import ChatRequest
-from cow_service.api.openai.stream import stream
+from cow_service.api.openai.parsing import FIELDS_OF_CHAT
+from cow_service.api.openai.records import (
+    ChatChunk,
+    ChatCompletion,
+    ChatModel,
+    ChatModels,
+    ChatProblem,
+    MllmCompletion,
+    UpstreamError,
+)
+from cow_service.api.openai.requests import ChatRequest, ResponsesRequest
+from cow_service.api.openai.responses_reply import response_of
+from cow_service.api.openai.responses_request import chat_fields
+from cow_service.api.openai.responses_stream import as_response
+from cow_service.api.openai.splicing import as_json
+from cow_service.api.openai.stream import EventsResponse, Streamed
 from cow_service.api.problems import documented
 from cow_service.api.routes.simulate import ACCEPTED, FAILURES, PREFERENCES
-from cow_service.api.submission import Submission, Submitter, json_response
-from cow_service.errors import BodyTypeUnsupported, CowError, shortened
+from cow_service.api.submission import Submitter, json_response
+from cow_service.errors import BodyTypeUnsupported, shortened
 from cow_service.requests import AnswerRequest
 
 SHOWN_CHARACTERS = 80  # of what the caller sent
-EXTENSION = "ChatExtension"  # the schema of `cow` in a request
+ANSWER_FIELDS = "ChatExtension"  # the schema of `cow` in a request
 REFERENCE = "#/components/schemas/{model}"
 TAG = "OpenAI-compatible"
-EVENT: dict[str, Any] = {
-    "type": "object",
-    "required": ["data"],
-    "properties": {
-        "data": {
-            "type": "string",
-            "description": "A `ChatChunk`, or a `ChatProblem` at the end, as JSON; or `[DONE]`.",
-        },
-    },
+UPSTREAM_ERRORS: dict[int | str, dict[str, Any]] = {
+    "default": {
+        "description": "What the server of the MLLM answered with, as it came, in OpenAI's form.",
+        "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=UpstreamError.__name__)}}},
+    }
 }
 RECORDS: tuple[tuple[type[BaseModel], JsonSchemaMode], ...] = (
     (ChatRequest, "validation"),
+    (ResponsesRequest, "validation"),
     (ChatChunk, "serialization"),
+    (ChatCompletion, "serialization"),
+    (MllmCompletion, "serialization"),
+    (UpstreamError, "serialization"),
     (ChatProblem, "serialization"),
 )
 
 
-def chat_routes(submitter: Submitter) -> APIRouter:
+def chat_routes(submitter: Submitter, completer: Completer) -> APIRouter:
     """The operations, bound to an engine."""
     router = APIRouter(prefix=ROOT.rstrip("/"), tags=[TAG])
     engine = submitter.engine
+    settings = engine.service.settings
     created = int(time.time())
 
     @router.post(
         "/chat/completions",
         operation_id="chat",
-        response_model=ChatCompletion,
-        summary="Look, then answer a chat",
+        summary="The MLLM behind a model, seeing more",
         responses={
-            200: {
-                "description": "The answer; with `stream` the chunks of it: progress first, and `data: [DONE]` last.",
-                "content": {"text/event-stream": {"schema": EVENT}},
-            },
+            200: _reply(["ChatCompletion", "MllmCompletion"], "A `ChatChunk`, or a `ChatProblem` at the end"),
             **ACCEPTED,
             **documented(*FAILURES, errors.ModelNotFound),
+            **UPSTREAM_ERRORS,
         },
-        openapi_extra={
-            "requestBody": {
-                "required": True,
-                "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=ChatRequest.__name__)}}},
-            },
-            "parameters": PREFERENCES,
-        },
+        openapi_extra={"requestBody": _body_of(ChatRequest), "parameters": PREFERENCES},
     )
     async def chat(request: Request) -> Response:
-        """As `POST /answer`, for clients of OpenAI's API: one image and one question in messages, a letter out.
+        """The chat goes on to the MLLM as it is, and the MLLM's reply comes back as it is, with `cow` beside it.
 
-        `cow` in the request holds all else that `/answer` takes, and `cow` in the response all that it returns. A job
-        that fails while it streams ends the stream with its problem as `data`.
+        Where the last user message asks a what-if question about the only image, what would happen is simulated first,
+        and the imagined frames are added behind that message. `cow.imagined` says whether. A model without an MLLM,
+        such as `cow/embedded`, answers as `POST /answer`.
         """
-        submission = submitter.submission(request, "answer")
         body = await _body(request)
-        parsed = await submitter.in_thread(partial(parse_chat, body, engine.service))
-        try:
-            return await _answered(submitter, request, submission, parsed)
-        except CowError as error:
-            raise parsed.pointers.translate_error(error) from error
+        asked = await submitter.in_thread(partial(read_chat, body))
+        reply = await completer.complete(request, asked)
+        if isinstance(reply, Response):
+            return reply
+        if isinstance(reply, Streamed):
+            return EventsResponse(reply, settings)
+        return json_response(reply.text, reply.status, reply.headers)
+
+    @router.post(
+        "/responses",
+        operation_id="responses",
+        summary="The same, as OpenAI's responses",
+        responses={
+            200: _reply(["MllmCompletion"], "An event of OpenAI's responses"),
+            **documented(*FAILURES, errors.ModelNotFound),
+            **UPSTREAM_ERRORS,
+        },
+        openapi_extra={"requestBody": _body_of(ResponsesRequest), "parameters": PREFERENCES[2:]},
+    )
+    async def responses(request: Request) -> Response:
+        """Text and images in, without state: what needs it (`previous_response_id`, `store`...) is refused by name.
+
+        The input is turned into a chat, which is answered as above, and the reply into a response.
+        """
+        body = await _body(request)
+        asked = await submitter.in_thread(lambda: read_object(body, "The body"))
+        chat_asked = chat_of(chat_fields(asked))
+        reply = await completer.complete(request, chat_asked, stored=False)
+        if isinstance(reply, Response):
+            return reply
+        if isinstance(reply, Streamed):
+            return EventsResponse(as_response(reply, asked, chat_asked.model), settings)
+        if not reply.succeeded:
+            return json_response(reply.text, reply.status, reply.headers)
+        return json_response(as_json(response_of(json.loads(reply.text), asked)))
 
     @router.get("/models", operation_id="chatModels", summary="Models to chat with")
     def models() -> ChatModels:
@@ -114,15 +150,36 @@ def document_chat(document: dict[str, Any]) -> None:
         for name, part in (schema.pop("$defs", {}) | {record.__name__: schema}).items():
             schemas.setdefault(name, part)
     others = AnswerRequest.model_json_schema(ref_template=REFERENCE)["properties"]
-    schemas[EXTENSION] = {
+    schemas[ANSWER_FIELDS] = {
         "type": "object",
         "additionalProperties": False,
-        "description": "An `AnswerRequest` without what messages and model say.",
+        "description": "An `AnswerRequest` without what messages and model say; with an MLLM behind the model, a "
+        "`SimulateRequest` without image and question.",
         "properties": {name: schema for name, schema in others.items() if name not in FIELDS_OF_CHAT},
     }
-    own = schemas[ChatRequest.__name__]["properties"]["cow"]
-    own["anyOf"] = [{"$ref": REFERENCE.format(model=EXTENSION)}, {"type": "null"}]
+    for request in (ChatRequest, ResponsesRequest):
+        own = schemas[request.__name__]["properties"][EXTENSION]
+        own["anyOf"] = [{"$ref": REFERENCE.format(model=ANSWER_FIELDS)}, {"type": "null"}]
     document_problems(document)
+
+
+def _body_of(record: type[BaseModel]) -> dict[str, Any]:
+    schema = {"$ref": REFERENCE.format(model=record.__name__)}
+    return {"required": True, "content": {"application/json": {"schema": schema}}}
+
+
+def _reply(records: list[str], data: str) -> dict[str, Any]:
+    """A reply, whole or streamed."""
+    event = {
+        "type": "object",
+        "required": ["data"],
+        "properties": {"data": {"type": "string", "description": f"{data}, as JSON; or `[DONE]`."}},
+    }
+    whole: dict[str, Any] = {"anyOf": [{"$ref": REFERENCE.format(model=name)} for name in records]}
+    return {
+        "description": "The reply; with `stream` the chunks of it, progress of imagining before them.",
+        "content": {"application/json": {"schema": whole}, "text/event-stream": {"schema": event}},
+    }
 
 
 async def _body(request: Request) -> bytes:
@@ -132,14 +189,3 @@ async def _body(request: Request) -> bytes:
             f"The body has the media type '{shortened(media_type, SHOWN_CHARACTERS)}'. Send application/json."
         )
     return await request.body()
-
-
-async def _answered(submitter: Submitter, request: Request, submission: Submission, chat: ParsedChat) -> Response:
-    """The response to a chat. Errors point into its `AnswerRequest`."""
-    if chat.stream:
-        created_at = await submitter.submit(submission, lambda: (chat.request, None))
-        return stream(submitter, submission, chat, created_at)
-    result = await submitter.result(request, submission, lambda: (chat.request, None))
-    if result is None:
-        return await submitter.accepted(submission)
-    return json_response(await to_thread.run_sync(lambda: ChatAnswer.parse(chat, result).completion()))

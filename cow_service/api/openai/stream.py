@@ -1,14 +1,15 @@
-"""A chat completion as server-sent events: progress while the job runs, then the answer."""
+"""Chats as server-sent events: progress while a job runs, then the reply."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import aclosing, suppress
+from dataclasses import dataclass
 
 from anyio import to_thread
-from sse_starlette import EventSourceResponse, ServerSentEvent
-from starlette.types import Message
+from sse_starlette import EventSourceResponse
+from starlette.types import Message, Receive, Scope, Send
 
 from cow_service.api.openai.errors import chat_problem
 from cow_service.api.openai.parsing import ParsedChat
@@ -19,53 +20,108 @@ from cow_service.errors import CowError
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.events import QUEUED, follow
 from cow_service.records import TERMINAL, Job, Problem
+from cow_service.settings import Settings
 
 MIN_PROGRESS_SECONDS = 0.25  # between two chunks of progress
 CLOSING_SECONDS = 2.0  # for the last event of a stream, after the grace period of a server that stops
 DONE = "[DONE]"
 
 
-def stream(
-    submitter: Submitter, submission: Submission, chat: ParsedChat, created_at: str | None
-) -> EventSourceResponse:
-    """Streams the job of a chat. A caller who disconnects cancels it by the same rule as for a whole answer."""
-
-    async def disconnected(_: Message) -> None:
-        with suppress(CowError):
-            await submitter.leave(submission, created_at)
-
-    return EventSourceResponse(
-        _events(submitter, submission, chat, created_at),
-        ping=PING_SECONDS,
-        sep="\n",
-        headers={"Cache-Control": "no-store"},
-        client_close_handler_callable=disconnected,
-        # Else the stream would end early and look complete.
-        shutdown_grace_period=submitter.engine.service.settings.shutdown_grace + CLOSING_SECONDS,
-    )
+async def nothing() -> None:
+    """Does nothing."""
 
 
-async def _events(
-    submitter: Submitter, submission: Submission, chat: ParsedChat, created_at: str | None
-) -> AsyncGenerator[ServerSentEvent]:
-    """The events of a stream; the last may be the problem with which the job failed."""
+def unchanged(error: CowError) -> CowError:
+    """The error itself."""
+    return error
+
+
+@dataclass(frozen=True)
+class Streamed:
+    """A reply as it is streamed: server-sent events, each whole, with the blank line at its end."""
+
+    events: AsyncGenerator[bytes]
+    located: Callable[[CowError], CowError] = unchanged  # an error, pointing into what the caller sent
+    left: Callable[[], Awaitable[None]] = nothing  # to be called where the caller has disconnected
+    close: Callable[[], Awaitable[None]] = nothing  # to be called at the end, however it came
+
+
+class EventsResponse(EventSourceResponse):
+    """Sends the events of a reply. A failure becomes the last event."""
+
+    def __init__(self, streamed: Streamed, settings: Settings) -> None:
+        async def disconnected(_: Message) -> None:
+            with suppress(CowError):
+                await streamed.left()
+
+        self._close = streamed.close
+        super().__init__(
+            _told_to_the_end(streamed),
+            ping=PING_SECONDS,
+            sep="\n",
+            headers={"Cache-Control": "no-store"},
+            client_close_handler_callable=disconnected,
+            # Else the stream would end early and look complete.
+            shutdown_grace_period=settings.shutdown_grace + CLOSING_SECONDS,
+        )
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Sends, then closes: also where not one event was asked for."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            await self._close()
+
+
+async def _told_to_the_end(streamed: Streamed) -> AsyncGenerator[bytes]:
+    """The events; the last may be the problem that they ended with."""
     try:
-        async with aclosing(_chunks(submitter, submission, chat, created_at)) as chunks:
-            async for chunk in chunks:
-                yield ServerSentEvent(chunk, sep="\n")
+        async with aclosing(streamed.events) as events:
+            async for event in events:
+                yield event
     except CowError as error:
-        problem = Problem(**chat.pointers.translate_error(error).as_problem())
-        yield ServerSentEvent(chat_problem(problem).model_dump_json(), sep="\n")
+        yield event_of(problem_of(streamed.located(error)))
 
 
-async def _chunks(
+def problem_of(error: CowError) -> str:
+    """An error as `ChatProblem`, JSON on one line."""
+    return chat_problem(Problem(**error.as_problem())).model_dump_json()
+
+
+def event_of(data: str, name: str | None = None) -> bytes:
+    """A server-sent event whose data is one line."""
+    head = "" if name is None else f"event: {name}\n"
+    return f"{head}data: {data}\n\n".encode()
+
+
+async def answer_events(
     submitter: Submitter, submission: Submission, chat: ParsedChat, created_at: str | None
-) -> AsyncGenerator[str]:
+) -> AsyncGenerator[bytes]:
+    """The chunks of an answer job: progress first. Raises what the job fails with."""
+    async with aclosing(follow_job(submitter, submission, created_at)) as news:
+        job = await anext(news)
+        assert isinstance(job, Job), "the job itself comes first"
+        chunks = Chunks(job.id, job.created_at, chat.model)
+        last = chunks.progress(job)
+        yield event_of(chunks.first(job))
+        async for update in news:
+            if isinstance(update, str):
+                told = await to_thread.run_sync(lambda result=update: chunks.answer(ChatAnswer.parse(chat, result)))
+                for chunk in told:
+                    yield event_of(chunk)
+            elif (chunk := chunks.progress(update)) != last:
+                last = chunk
+                yield event_of(chunk)
+    yield event_of(DONE)
+
+
+async def follow_job(submitter: Submitter, submission: Submission, created_at: str | None) -> AsyncGenerator[Job | str]:
+    """The job as it is now, then as it goes on, a few times a second; last its result as JSON.
+
+    Raises what the job fails with.
+    """
     engine = submitter.engine
-    job = (await to_thread.run_sync(lambda: engine.find(submission.job_id, submission.owner, full=False))).job
-    chunks = Chunks(job.id, job.created_at, chat.model)
-    last = chunks.progress(job)
-    yield chunks.first(job)
+    yield (await to_thread.run_sync(lambda: engine.find(submission.job_id, submission.owner, full=False))).job
     updates: asyncio.Queue[Job | None] = asyncio.Queue()
 
     def over(task: asyncio.Future[str | None]) -> None:
@@ -73,25 +129,21 @@ async def _chunks(
             task.exception()  # else asyncio logs it as never retrieved where the caller has disconnected
         updates.put_nowait(None)
 
-    with engine.active.waiting(job.id) as waiter:
+    with engine.active.waiting(submission.job_id) as waiter:
         listening = asyncio.ensure_future(_listen(engine, submission, updates))
         gone = asyncio.Event()  # never set: the response itself notices that the caller has disconnected
         ending = asyncio.ensure_future(submitter.outcome(submission, waiter, created_at, gone, may_have_ended=True))
         ending.add_done_callback(over)
         try:
             while (job := await _newest(updates)) is not None:
-                if (chunk := chunks.progress(job)) != last:
-                    last = chunk
-                    yield chunk
+                yield job
                 await asyncio.wait({ending}, timeout=MIN_PROGRESS_SECONDS)
             result = await ending
         finally:
             listening.cancel()
             ending.cancel()
     assert result is not None, "it waits as long as it takes"
-    for chunk in await to_thread.run_sync(lambda: chunks.answer(ChatAnswer.parse(chat, result))):
-        yield chunk
-    yield DONE
+    yield result
 
 
 async def _listen(engine: JobEngine, submission: Submission, updates: asyncio.Queue[Job | None]) -> None:

@@ -11,12 +11,15 @@ from typing import Any, Generic, TypeVar, cast
 
 import anyio
 from pydantic_ai import Agent, BinaryContent, ModelRetry, RunContext, TextOutput
-from pydantic_ai.exceptions import AgentRunError, ContentFilterError, ModelAPIError, UserError
+from pydantic_ai.direct import model_request
+from pydantic_ai.exceptions import AgentRunError, ContentFilterError, ModelAPIError, ModelHTTPError, UserError
 from pydantic_ai.settings import ModelSettings
 from pydantic_ai.usage import RunUsage
 
-from cow_service.errors import CowError, MllmBadReply, MllmUnavailable
+from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmUnavailable
 from cow_service.readers.base import ReaderInput
+from cow_service.readers.chat import ChatTurn
+from cow_service.readers.mllm.chat import completion_of, prepare_chat
 from cow_service.readers.mllm.event_loop import EventLoopThread
 from cow_service.readers.mllm.images import MEDIA_TYPE
 from cow_service.readers.mllm.models import ConfiguredModel
@@ -119,6 +122,44 @@ class MllmClient:
             for future in futures:
                 future.cancel()  # nothing happens to one that is done
         return [self._closed() if future.cancelled() else future.result() for future in futures]
+
+    async def chat(self, body: dict[str, Any]) -> ChatTurn:
+        """The reply to a chat of a caller's own words and settings, asked once.
+
+        Raises `InvalidRequest` and `MllmUnavailable`; what the provider refuses comes back with its status.
+        """
+        if self._thread.closed:
+            raise self._closed()
+        return await asyncio.wrap_future(self._thread.submit(self._chat(body)))
+
+    async def _chat(self, body: dict[str, Any]) -> ChatTurn:
+        model = self.model.model
+        chat = prepare_chat(body, model)
+        settings = chat.settings | ModelSettings(timeout=self._timeout, max_retries=0)
+        for name in model.unsupported_settings & settings.keys():
+            del settings[name]
+        try:
+            async with self._slots:
+                with anyio.fail_after(self._timeout):
+                    response = await model_request(
+                        model, chat.messages, model_settings=settings, model_request_parameters=chat.parameters
+                    )
+        except UserError as error:
+            raise InvalidRequest(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}") from error
+        except ModelHTTPError as error:
+            message = f"{self._name} answered with status {error.status_code}: {reason_of(error)}."
+            told = {"message": message, "type": "upstream_error", "param": None, "code": str(error.status_code)}
+            retry = {} if error.retry_after is None else {"Retry-After": f"{error.retry_after:.0f}"}
+            return ChatTurn({"error": told}, error.status_code, chat.warnings, retry)
+        except TimeoutError as error:
+            raise MllmUnavailable(
+                f"{self._name} gave no reply within {self._timeout:g} s (COW_MLLM_TIMEOUT)."
+            ) from error
+        except ModelAPIError as error:
+            raise MllmUnavailable(f"{self._name} could not be asked: {reason_of(error)}.") from error
+        except AgentRunError as error:
+            raise MllmBadReply(f"{self._name} gave a reply that could not be read.") from error
+        return ChatTurn(completion_of(response, self.model.name), warnings=chat.warnings)
 
     async def _complete(self, call: PromptCall[T], given: ReaderInput) -> T | CowError:
         """The parsed reply, or the error that the call came to: one failed vote must not lose the others."""

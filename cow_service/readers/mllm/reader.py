@@ -21,6 +21,7 @@ from cow_service.readers.base import (
     Quantity,
     ReaderInput,
 )
+from cow_service.readers.chat import ChatTurn, Upstream
 from cow_service.readers.mllm.answer import answer_calls
 from cow_service.readers.mllm.changes import Lengths, located_changes, names_of
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
@@ -30,11 +31,12 @@ from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.mllm.identify import Identified, identify_call
 from cow_service.readers.mllm.images import EncodedImage, encode
 from cow_service.readers.mllm.locate import Located, locate_call
-from cow_service.readers.mllm.models import UNKNOWN, configure
+from cow_service.readers.mllm.models import UNKNOWN, configure, resolve_model
 from cow_service.readers.mllm.others import separate_objects
 from cow_service.readers.mllm.priors import HEADING_DEVIATION, SPEED_DEVIATION
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.mllm.scale import Scaled, scale_call
+from cow_service.readers.mllm.upstream import upstream_of
 from cow_service.readers.question.sentences import parse, parse_noun_phrase
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
@@ -61,8 +63,9 @@ class MllmReader:
 
     source: Source = "mllm"
 
-    def __init__(self, name: str, client: MllmClient, origin: str = "") -> None:
+    def __init__(self, name: str, client: MllmClient, origin: str = "", upstream: Upstream | None = None) -> None:
         """`origin` says which server, or which weights."""
+        self.upstream = upstream
         self._client = client
         self._model = client.model
         self._origin = origin
@@ -82,6 +85,10 @@ class MllmReader:
     def close(self) -> None:
         """Closes its connections."""
         self._client.close()
+
+    async def chat(self, body: dict[str, Any]) -> ChatTurn:
+        """The reply to a chat of OpenAI's protocol, through pydantic-ai. Raises `InvalidRequest`, `MllmUnavailable`."""
+        return await self._client.chat(body)
 
     def ground(self, given: ReaderInput) -> GroundingReading:
         """Two calls: what moves, in words; then where it is and, in the same call, which way it moves.
@@ -252,7 +259,9 @@ class MllmReader:
 
 def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable` where COW_MLLM cannot be used."""
-    return MllmReader("mllm", MllmClient(configure(settings), settings), settings.mllm_base_url or "")
+    configured = configure(settings)
+    upstream = upstream_of(settings, resolve_model(settings), configured)
+    return MllmReader("mllm", MllmClient(configured, settings), settings.mllm_base_url or "", upstream)
 
 
 def _kind(given: ReaderInput, identified: Identified | None) -> MotionKind:

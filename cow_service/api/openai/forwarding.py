@@ -1,0 +1,210 @@
+"""Sends chats on to the OpenAI-compatible server behind a model, and its replies back: each once, and as it is."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import Any, cast
+
+import httpx
+
+from cow_service import __version__
+from cow_service.api.openai.splicing import as_json
+from cow_service.errors import CowError, MllmBadReply, MllmUnavailable, shortened
+from cow_service.readers.chat import Upstream
+from cow_service.settings import Settings
+
+CONNECT_SECONDS = 10.0
+MAX_ERROR_CHARACTERS = 2000  # of a server's own words
+PASSED_HEADERS = ("retry-after", "retry-after-ms", "x-should-retry")
+PASSED_PREFIX = "x-ratelimit-"
+# These say that this server's own key, or address, is wrong: nothing that a caller could mend.
+NOT_THE_CALLERS = (HTTPStatus.UNAUTHORIZED, HTTPStatus.PROXY_AUTHENTICATION_REQUIRED)
+END = b"[DONE]"
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A reply in one piece: a JSON object, be it a completion or an error, with the status that it came with."""
+
+    text: str
+    status: int = HTTPStatus.OK
+    headers: dict[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether it is a completion."""
+        return self.status == HTTPStatus.OK
+
+
+@dataclass(frozen=True)
+class Events:
+    """A reply as server-sent events, each whole, with the blank line at its end."""
+
+    events: AsyncGenerator[bytes]
+
+
+class Forwarder:
+    """One connection pool for all chats, used from one event loop; `COW_MLLM_CONCURRENCY` of them at a time."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
+        self._permits = settings.mllm_concurrency
+        self._slots: asyncio.Semaphore | None = None
+        self._client: httpx.AsyncClient | None = None
+
+    async def close(self) -> None:
+        """Closes its connections."""
+        if self._client is not None:
+            await self._client.aclose()
+            self._client = None
+
+    @asynccontextmanager
+    async def send(self, upstream: Upstream, body: bytes) -> AsyncGenerator[Whole | Events]:
+        """The reply to a chat, sent once. Raises `MllmUnavailable`, `MllmBadReply`."""
+        headers = {"Content-Type": "application/json"}
+        if upstream.key is not None:
+            headers["Authorization"] = f"Bearer {upstream.key}"
+        request = self._pool().build_request(
+            "POST", f"{upstream.base_url}/chat/completions", content=body, headers=headers
+        )
+        async with self._slot():
+            response = await self._sent(request)
+            try:
+                streams = response.headers.get("content-type", "").startswith("text/event-stream")
+                if response.status_code == HTTPStatus.OK and streams:
+                    yield Events(_events(response))
+                else:
+                    yield _whole(response, await _read(response), upstream)
+            finally:
+                await response.aclose()
+
+    async def _sent(self, request: httpx.Request) -> httpx.Response:
+        try:
+            return await self._pool().send(request, stream=True)
+        except httpx.HTTPError as error:
+            raise _unavailable(error) from error
+
+    def _pool(self) -> httpx.AsyncClient:
+        if self._client is None:
+            self._client = httpx.AsyncClient(
+                timeout=httpx.Timeout(self._timeout, connect=CONNECT_SECONDS, pool=None),
+                limits=httpx.Limits(max_connections=None, max_keepalive_connections=self._permits),
+                headers={"User-Agent": f"cow-service/{__version__}"},
+            )
+        return self._client
+
+    @asynccontextmanager
+    async def _slot(self) -> AsyncGenerator[None]:
+        if self._slots is None:
+            self._slots = asyncio.Semaphore(self._permits)
+        try:
+            async with asyncio.timeout(self._budget):
+                await self._slots.acquire()
+        except TimeoutError as error:
+            raise MllmUnavailable(
+                f"{self._permits} chats were being answered (COW_MLLM_CONCURRENCY), and none of them ended within "
+                f"{self._budget:g} s (COW_MLLM_BUDGET). Ask with fewer threads."
+            ) from error
+        try:
+            yield
+        finally:
+            self._slots.release()
+
+
+async def _read(response: httpx.Response) -> bytes:
+    try:
+        return await response.aread()
+    except httpx.HTTPError as error:
+        raise _unavailable(error) from error
+
+
+async def _events(response: httpx.Response) -> AsyncGenerator[bytes]:
+    """The events of a stream. Raises `MllmUnavailable` where it breaks off before its end."""
+    ended = False
+    try:
+        async for event in whole_events(response.aiter_bytes()):
+            ended = ended or event.strip().removeprefix(b"data:").strip() == END
+            yield event
+    except httpx.HTTPError as error:
+        raise _unavailable(error) from error
+    if not ended:
+        raise MllmUnavailable("The server of the multimodal LLM ended its stream before the reply was whole ([DONE]).")
+
+
+async def whole_events(chunks: AsyncIterator[bytes]) -> AsyncGenerator[bytes]:
+    """Bytes as they arrive, cut where an event ends: behind a blank line, however lines end."""
+    held = b""
+    async for chunk in chunks:
+        held += chunk
+        while (cut := _end_of_event(held)) is not None:
+            event, held = held[:cut], held[cut:]
+            yield event
+    if held.strip():
+        yield held
+
+
+def _end_of_event(data: bytes) -> int | None:
+    ends = [at + len(mark) for mark in (b"\n\n", b"\r\n\r\n", b"\r\r") if (at := data.find(mark)) >= 0]
+    return min(ends, default=None)
+
+
+def _whole(response: httpx.Response, body: bytes, upstream: Upstream) -> Whole:
+    status = response.status_code
+    text, value = body.decode("utf-8", errors="replace"), None
+    with suppress(ValueError, RecursionError):
+        value = json.loads(text)
+    if status == HTTPStatus.OK:
+        if not isinstance(value, dict):
+            raise MllmBadReply("The server of the multimodal LLM replied with something that is no JSON object.")
+        return Whole(text)
+    if status in NOT_THE_CALLERS or status < HTTPStatus.BAD_REQUEST:
+        raise MllmUnavailable(
+            f"The server of the multimodal LLM answered with status {status}: its address or this server's own key for "
+            "it is wrong (COW_MLLM_BASE_URL, COW_MLLM_API_KEY)."
+        )
+    headers = {
+        name: value
+        for name, value in response.headers.items()
+        if name in PASSED_HEADERS or name.startswith(PASSED_PREFIX)
+    }
+    told = _error_of(status, value, text if response.headers.get("content-type", "").startswith("text/plain") else "")
+    return Whole(_without(as_json(told), upstream.key), status, headers)
+
+
+def _error_of(status: int, value: Any, text: str) -> dict[str, Any]:
+    """What a server says went wrong, in OpenAI's form; as it is where that is its form."""
+    given = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
+    if isinstance(given.get("error"), dict):
+        return given
+    said = given.get("message") or given.get("error") or given.get("detail") or text.strip()
+    message = said if isinstance(said, str) else as_json(said)
+    return {
+        "error": {
+            "message": shortened(message, MAX_ERROR_CHARACTERS)
+            or f"The server of the multimodal LLM answered with status {status}.",
+            "type": given.get("type", "upstream_error"),
+            "param": given.get("param"),
+            "code": given.get("code", str(status)),
+        }
+    }
+
+
+def _without(text: str, key: str | None) -> str:
+    """A text that a key of this server does not stand in."""
+    return text.replace(key, "***") if key else text
+
+
+def _unavailable(error: httpx.HTTPError) -> CowError:
+    """The error for a connection that failed, in words without addresses."""
+    if isinstance(error, httpx.TimeoutException):
+        reason = "it did not reply in time (COW_MLLM_TIMEOUT)"
+    elif isinstance(error, httpx.ConnectError):
+        reason = "it could not be reached; check that it runs, and COW_MLLM_BASE_URL"
+    else:
+        reason = "it broke off before its reply was whole"
+    return MllmUnavailable(f"The server of the multimodal LLM gave no reply: {reason}. It was asked once.")

@@ -1,0 +1,43 @@
+"""What a reader that asks a multimodal LLM offers beside its readings: chats with that MLLM itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import Any, Protocol, runtime_checkable
+
+
+@dataclass(frozen=True)
+class Upstream:
+    """The OpenAI-compatible server behind a reader: where it is, and what it is sent of this server's own."""
+
+    base_url: str  # without a slash at its end
+    model: str  # as it is served there
+    key: str | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True)
+class ChatTurn:
+    """What an MLLM replied that was not asked over OpenAI's protocol, in the form of that protocol."""
+
+    body: dict[str, Any]  # a chat completion or, where the status is no success, an object with `error`
+    status: int = HTTPStatus.OK
+    warnings: tuple[str, ...] = ()  # what of the chat could not be sent
+    headers: dict[str, str] = field(default_factory=dict[str, str])
+
+
+@runtime_checkable
+class ChatReader(Protocol):
+    """A reader with an MLLM behind it."""
+
+    @property
+    def upstream(self) -> Upstream | None:
+        """Where chats can be sent on as they are; None where its MLLM does not speak OpenAI's protocol."""
+        ...
+
+    async def chat(self, body: dict[str, Any]) -> ChatTurn:
+        """The reply to a chat (the JSON object of OpenAI's chat completions), as far as it can be sent.
+
+        Raises `InvalidRequest` for what can neither be sent nor left out, and `MllmUnavailable`.
+        """
+        ...

@@ -1,0 +1,230 @@
+"""A chat of OpenAI's protocol through pydantic-ai, for MLLMs that do not speak it.
+
+What can be sent is; `ChatTurn.warnings` names the fields that were left out. Messages that cannot be sent are refused,
+as leaving them out would change what is asked.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import time
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+from pydantic_ai.messages import (
+    BinaryContent,
+    ModelMessage,
+    ModelRequest,
+    ModelResponse,
+    SystemPromptPart,
+    TextPart,
+    ThinkingPart,
+    ToolCallPart,
+    ToolReturnPart,
+    UserContent,
+    UserPromptPart,
+)
+from pydantic_ai.models import Model, ModelRequestParameters
+from pydantic_ai.output import OutputObjectDefinition
+from pydantic_ai.settings import ModelSettings
+from pydantic_ai.tools import ToolDefinition
+
+from cow_service.errors import FieldError, InvalidRequest
+
+# OpenAI's names of settings, and pydantic-ai's. Of two names for one setting the later one counts.
+SETTINGS = {
+    "temperature": "temperature", "top_p": "top_p", "top_k": "top_k", "max_tokens": "max_tokens",
+    "max_completion_tokens": "max_tokens", "stop": "stop_sequences", "seed": "seed",
+    "presence_penalty": "presence_penalty", "frequency_penalty": "frequency_penalty", "logit_bias": "logit_bias",
+    "parallel_tool_calls": "parallel_tool_calls", "tool_choice": "tool_choice",
+}  # fmt: skip
+READ = ("model", "messages", "stream", "stream_options", "tools", "response_format")  # beside the settings
+# Values that ask for nothing.
+NEUTRAL: dict[str, tuple[Any, ...]] = {"n": (1,), "logprobs": (False,), "response_format": ({"type": "text"},)}
+FINISHED = {"stop": "stop", "length": "length", "content_filter": "content_filter", "tool_call": "tool_calls"}
+
+
+@dataclass(frozen=True)
+class PreparedChat:
+    """A chat as pydantic-ai takes it."""
+
+    messages: list[ModelMessage]
+    settings: ModelSettings
+    parameters: ModelRequestParameters
+    warnings: tuple[str, ...]
+
+
+def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
+    """The chat as far as the model takes it. Raises `InvalidRequest` for messages that cannot be sent."""
+    left_out = [
+        name
+        for name, value in body.items()
+        if name not in (*SETTINGS, *READ) and value is not None and value not in NEUTRAL.get(name, ())
+    ]
+    settings: dict[str, Any] = {}
+    for name, own in SETTINGS.items():
+        value = body.get(name)
+        if value is None:
+            continue
+        if own in model.unsupported_settings or (name == "tool_choice" and not body.get("tools")):
+            left_out.append(name)
+        else:
+            settings[own] = _setting(name, value)
+    output = _schema_of(body.get("response_format"))
+    if output is None and body.get("response_format") not in (None, *NEUTRAL["response_format"]):
+        left_out.append("response_format")
+    parameters = ModelRequestParameters(
+        function_tools=[_tool(place, tool) for place, tool in enumerate(_list_of(body, "tools"))],
+        output_mode="text" if output is None else "native",
+        output_object=output,
+    )
+    warnings: tuple[str, ...] = ()
+    if left_out:
+        names = ", ".join(f"`{name}`" for name in left_out)
+        warnings = (
+            f"Not sent: {names}. This MLLM is not asked over OpenAI's protocol, and its own has no such field.",
+        )
+    return PreparedChat(list(_messages(body)), cast("ModelSettings", settings), parameters, warnings)
+
+
+def completion_of(response: ModelResponse, model: str) -> dict[str, Any]:
+    """The reply as a chat completion."""
+    texts = [part.content for part in response.parts if isinstance(part, TextPart)]
+    thoughts = [part.content for part in response.parts if isinstance(part, ThinkingPart) and part.content]
+    calls = [part for part in response.parts if isinstance(part, ToolCallPart)]
+    message: dict[str, Any] = {"role": "assistant", "content": "".join(texts) if texts else None, "refusal": None}
+    if thoughts:
+        message["reasoning_content"] = "".join(thoughts)
+    if calls:
+        message["tool_calls"] = [_called(call) for call in calls]
+    usage = response.usage
+    finish = FINISHED.get(response.finish_reason or "stop", "stop")
+    return {
+        "id": response.provider_response_id or f"chatcmpl-{uuid.uuid4()}",
+        "object": "chat.completion",
+        "created": int(time.time()),
+        "model": response.model_name or model,
+        "choices": [
+            {"index": 0, "message": message, "finish_reason": "tool_calls" if calls else finish, "logprobs": None}
+        ],
+        "usage": {
+            "prompt_tokens": usage.input_tokens,
+            "completion_tokens": usage.output_tokens,
+            "total_tokens": usage.input_tokens + usage.output_tokens,
+        },
+    }
+
+
+def _called(call: ToolCallPart) -> dict[str, Any]:
+    function = {"name": call.tool_name, "arguments": call.args_as_json_str()}
+    return {"id": call.tool_call_id, "type": "function", "function": function}
+
+
+def _setting(name: str, value: Any) -> Any:
+    if name == "stop":
+        return [value] if isinstance(value, str) else value
+    if name == "tool_choice" and isinstance(value, dict):
+        return [_at(cast("dict[str, Any]", value), "/tool_choice", "function", "name")]
+    return value
+
+
+def _schema_of(response_format: Any) -> OutputObjectDefinition | None:
+    if not isinstance(response_format, dict) or response_format.get("type") != "json_schema":
+        return None
+    asked = cast("dict[str, Any]", response_format)
+    schema = _at(asked, "/response_format", "json_schema", "schema")
+    return OutputObjectDefinition(schema, asked["json_schema"].get("name", "reply"))
+
+
+def _tool(place: int, tool: Any) -> ToolDefinition:
+    pointer = f"/tools/{place}"
+    if not isinstance(tool, dict) or tool.get("type", "function") != "function":
+        raise _wrong(pointer, "only tools of the type `function` can be sent to this MLLM")
+    function = _at(cast("dict[str, Any]", tool), pointer, "function")
+    name = _at(function, pointer + "/function", "name")
+    schema = function.get("parameters") or {"type": "object", "properties": {}}
+    return ToolDefinition(name=name, description=function.get("description"), parameters_json_schema=schema)
+
+
+def _messages(body: dict[str, Any]) -> Iterator[ModelMessage]:
+    tools: dict[str, str] = {}  # names of the tools that were called, by the id of the call
+    for place, message in enumerate(_list_of(body, "messages")):
+        pointer = f"/messages/{place}"
+        if not isinstance(message, dict):
+            raise _wrong(pointer, "is no object")
+        given = cast("dict[str, Any]", message)
+        role, content = given.get("role"), list(_contents(given.get("content"), pointer + "/content"))
+        if role in ("system", "developer"):
+            yield ModelRequest([SystemPromptPart(_text(content, pointer))])
+        elif role == "user":
+            yield ModelRequest([UserPromptPart(content)])
+        elif role == "assistant":
+            calls = [_call(call, pointer) for call in _list_of(given, "tool_calls")]
+            tools |= {call.tool_call_id: call.tool_name for call in calls}
+            texts = [TextPart(text)] if (text := _text(content, pointer)) else []
+            yield ModelResponse([*texts, *calls])
+        elif role == "tool":
+            call = given.get("tool_call_id", "")
+            yield ModelRequest([ToolReturnPart(tools.get(call, "tool"), _text(content, pointer), call)])
+        else:
+            raise _wrong(pointer + "/role", f"messages of the role {str(role)[:40]!r} cannot be sent to this MLLM")
+
+
+def _call(call: Any, pointer: str) -> ToolCallPart:
+    function = _at(call, pointer + "/tool_calls", "function")
+    return ToolCallPart(_at(function, pointer + "/tool_calls", "name"), function.get("arguments"), call.get("id", ""))
+
+
+def _contents(content: Any, pointer: str) -> Iterator[UserContent]:
+    parts: list[Any] = [content] if isinstance(content, str) else list(content or ())
+    for place, part in enumerate(parts):
+        if isinstance(part, str):
+            yield part
+        elif isinstance(part, dict) and isinstance(part.get("text"), str):
+            yield part["text"]
+        elif isinstance(part, dict) and part.get("type") == "image_url":
+            yield _image(part, f"{pointer}/{place}")
+        else:
+            raise _wrong(f"{pointer}/{place}", "only texts and images can be sent to this MLLM")
+
+
+def _image(part: dict[str, Any], pointer: str) -> BinaryContent:
+    given = part.get("image_url")
+    url = given.get("url") if isinstance(given, dict) else given
+    head, comma, data = str(url).partition(",")
+    if not (comma and head.lower().startswith("data:image/") and head.lower().endswith(";base64")):
+        raise _wrong(pointer, "images are sent to this MLLM as data URLs (data:image/png;base64,...) only")
+    try:
+        return BinaryContent(base64.b64decode(data, validate=True), media_type=head[5:-7].lower())
+    except binascii.Error as error:
+        raise _wrong(pointer, "the data URL is no base64") from error
+
+
+def _text(content: list[UserContent], pointer: str) -> str:
+    texts = [part for part in content if isinstance(part, str)]
+    if len(texts) < len(content):
+        raise _wrong(pointer, "images can be sent to this MLLM in `user` messages only")
+    return "\n".join(texts)
+
+
+def _list_of(given: dict[str, Any], name: str) -> list[Any]:
+    value = given.get(name)
+    if value is not None and not isinstance(value, list):
+        raise _wrong(f"/{name}", "is no array")
+    return value or []
+
+
+def _at(value: Any, pointer: str, *names: str) -> Any:
+    """What stands below these names. Raises `InvalidRequest` where one is missing."""
+    for name in names:
+        if not isinstance(value, dict) or name not in value:
+            raise _wrong(pointer, f"`{name}` is missing")
+        value = cast("dict[str, Any]", value)[name]
+    return value
+
+
+def _wrong(pointer: str, detail: str) -> InvalidRequest:
+    return InvalidRequest(f"{pointer}: {detail}.", errors=(FieldError(pointer, detail),))
