@@ -23,7 +23,7 @@ class Chat:
     cow: dict[str, Any]  # what COW itself is told
 
     def sent(self, model: str, messages: list[Any] | None = None) -> bytes:
-        """The body for the MLLM: as it arrived, but for the model's name, `cow`, and messages where others are given."""
+        """The body for the MLLM: as it arrived, but for the model's name, `cow`, and messages if others are given."""
         replaced = {"model": as_json(model)}
         if messages is not None:
             replaced["messages"] = as_json(messages)
