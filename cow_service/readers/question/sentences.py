@@ -32,6 +32,7 @@ from cow_service.readers.question.trail_words import TrailWords, split_trail
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
 )
+_PICTURES = lex.words("image images frame frames picture pictures photo photos")
 _SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
@@ -64,7 +65,7 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    interventions, everything = split_interventions(with_nouns(items(split_options(question)[1])))
+    interventions, everything = split_interventions(with_nouns(items(split_options(question).rest)))
     trail, everything = split_trail(_at_the_same_time(everything))
     found = _without_instructions(everything)
     clauses = read_clauses(found)
@@ -205,7 +206,8 @@ def _without_instructions(found: list[Item]) -> list[Item]:
         sentence.append(item)
         if item.key in SENTENCE_END:
             first = next((word for word in flatten(sentence[:2]) if word != "please"), None)
-            if first is not None and first not in _INSTRUCTIONS:
+            about_images = first == "note" and not _PICTURES.isdisjoint(flatten(sentence))
+            if first is not None and first not in _INSTRUCTIONS and not about_images:
                 kept += sentence
             sentence = []
     return kept
