@@ -21,7 +21,11 @@ from openai import AsyncOpenAI, OpenAI
 from random_mllm import RATE, USAGE, RandomMllm, cut, failing, paused, random_mllm, silent
 from servers import BODY, QUESTION, Served, data_url, picture, problem
 
+from cow_service.api.openai.forwarding import Forwarder, Whole
 from cow_service.api.openai.records import ChatImagination
+from cow_service.errors import MllmUnavailable
+from cow_service.readers.chat import Upstream
+from cow_service.settings import Settings
 
 pytestmark = pytest.mark.slow
 NAME, WITHOUT = "cow/qwen3-vl-8b", "cow/qwen3-vl-8b:no-imagination"
@@ -54,7 +58,7 @@ def mllm() -> Iterator[RandomMllm]:
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory, mllm: RandomMllm) -> Iterator[Served]:
     own = {"COW_MLLM": "qwen3-vl-8b", "COW_MLLM_BASE_URL": mllm.address, "COW_MLLM_API_KEY": KEY}
-    with Served(tmp_path_factory.mktemp("chat"), COW_MLLM_TIMEOUT="3", COW_WEBHOOK_SECRET="", **own) as one:
+    with Served(tmp_path_factory.mktemp("chat"), COW_MLLM_TIMEOUT="2", COW_WEBHOOK_SECRET="", **own) as one:
         yield one
         assert "Traceback" not in one.log()
         assert KEY not in one.log()
@@ -249,21 +253,22 @@ def test_all_that_an_mllm_says_comes_back(client: OpenAI, mllm: RandomMllm) -> N
     assert reply.choices[0].finish_reason == "tool_calls"
 
 
+ASKED = 8
 LETTER = re.compile(r"(?i)ANSWER\s*:\s*([A-Za-z\d ,]+)")
 
 
 def test_inspects_stock_multiple_choice_as_it_goes_over_the_wire(client: OpenAI, mllm: RandomMllm) -> None:
-    """Inspect's template of `multiple_choice()` and what its `choice()` scorer reads, written from its documentation."""
+    """Inspect's template of `multiple_choice()` and what its scorer reads, written from its documentation."""
     head = (
         "Answer the following multiple choice question. The entire content of your response should be of the following "
         "format: 'ANSWER: $LETTER' (without quotes) where LETTER is one of A,B.\n\n"
     )
     words = f"{head}{QUESTION}\n\nA) Yes\nB) No"
     mllm.draws.seed(3)
-    deserved = ["A" if mllm.draws.random() < RATE else "B" for _ in range(18)]
+    deserved = ["A" if mllm.draws.random() < RATE else "B" for _ in range(ASKED)]
     mllm.draws.seed(3)
     read: list[str] = []
-    for _ in range(18):
+    for _ in range(ASKED):
         reply = client.chat.completions.create(
             model=NAME, messages=what_if(4, words, detail="auto"), max_tokens=2048, seed=7, extra_body={"cow": COW}
         )
@@ -277,11 +282,11 @@ def test_the_papers_own_request_and_score(client: OpenAI, mllm: RandomMllm) -> N
     words = f"{QUESTION} A. Yes. B. No. C. Not Sure.\n\nWrite your response into this json template: {template}"
     extra = {"enable_thinking": False, "cow": COW}
     mllm.draws.seed(5)
-    deserved = ["A" if mllm.draws.random() < RATE else "B" for _ in range(18)]
+    deserved = ["A" if mllm.draws.random() < RATE else "B" for _ in range(ASKED)]
     mllm.draws.seed(5)
     replies = [
         client.chat.completions.create(model=NAME, messages=what_if(6, words), max_tokens=8192, extra_body=extra)
-        for _ in range(18)
+        for _ in range(ASKED)
     ]
     assert [re.search(r"'Answer': '(\w)'", each.choices[0].message.content)[1] for each in replies] == deserved
     assert mllm.last()["enable_thinking"] is False
@@ -390,13 +395,14 @@ def test_a_caller_who_leaves_ends_the_call(served: Served, mllm: RandomMllm) -> 
     mllm.left.clear()
     mllm.next_replies = [silent]
     body = json.dumps({"model": NAME, "messages": HELLO}).encode()
-    head = f"POST /v1/chat/completions HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
+    head = f"POST /v1/chat/completions HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n"
+    head += "Content-Type: application/json"
     asked = len(mllm.received)
     with socket.create_connection(served.host_and_port) as raw:
         raw.sendall(f"{head}\r\n\r\n".encode() + body)
         while len(mllm.received) == asked:
             pass
-    assert mllm.left.wait(2.5)  # before COW_MLLM_TIMEOUT
+    assert mllm.left.wait(1.5)  # before COW_MLLM_TIMEOUT
 
 
 @pytest.mark.parametrize(
@@ -434,15 +440,24 @@ def test_headers_that_speak_of_jobs(served: Served) -> None:
     assert "preference-applied" not in response.headers
 
 
-def test_many_at_a_time_wait_for_a_place(tmp_path: Path, mllm: RandomMllm) -> None:
-    own = {"COW_MLLM": "qwen3-vl-8b", "COW_MLLM_BASE_URL": mllm.address, "COW_MLLM_CONCURRENCY": "1"}
-    with Served(tmp_path, COW_MLLM_BUDGET="1", **own) as one, ThreadPoolExecutor(2) as pool:
-        mllm.next_replies = [paused(2)]
-        first, second = (pool.submit(post, one, {"model": NAME, "messages": HELLO}) for _ in range(2))
-        codes = sorted(each.result().status_code for each in (first, second))
-        assert codes == [200, 503]
-        refused = first.result() if first.result().status_code == 503 else second.result()
-        assert "COW_MLLM_CONCURRENCY" in problem(refused, 503, "mllm-unavailable")["detail"]
+def test_many_at_a_time_wait_for_a_place(mllm: RandomMllm) -> None:
+    forwarder = Forwarder(Settings(mllm_concurrency=1, mllm_budget=0.3))
+    upstream = Upstream(mllm.address, "m")
+
+    async def ask() -> Any:
+        async with forwarder.send(upstream, json.dumps({"messages": HELLO}).encode()) as reply:
+            return reply
+
+    async def ask_twice() -> list[Any]:
+        mllm.next_replies = [paused(1)]
+        found = await asyncio.gather(ask(), ask(), return_exceptions=True)
+        await forwarder.close()
+        return found
+
+    refused, reply = sorted(asyncio.run(ask_twice()), key=lambda each: isinstance(each, Whole))
+    assert reply.succeeded
+    assert isinstance(refused, MllmUnavailable)
+    assert "COW_MLLM_CONCURRENCY" in refused.detail
 
 
 # --- responses ---
@@ -453,7 +468,11 @@ SEEN = {"type": "input_image", "image_url": data_url(picture(1)), "detail": "hig
 def test_responses_of_text_and_of_an_image(client: OpenAI, mllm: RandomMllm) -> None:
     reply = client.responses.create(model=NAME, input="hello", instructions="Be terse.", max_output_tokens=9)
     assert reply.output_text.startswith("It rolls on.")
-    assert (reply.status, reply.usage.input_tokens, reply.usage.input_tokens_details.cached_tokens) == ("completed", 21, 4)
+    assert (reply.status, reply.usage.input_tokens, reply.usage.input_tokens_details.cached_tokens) == (
+        "completed",
+        21,
+        4,
+    )
     assert (reply.instructions, reply.max_output_tokens, reply.cow["imagined"]) == ("Be terse.", 9, False)
     system = {"role": "system", "content": "Be terse."}
     assert mllm.last() == {"model": SERVED_NAME, "messages": [system, *HELLO], "max_completion_tokens": 9}
@@ -550,7 +569,9 @@ def test_errors_of_responses_are_those_of_chats(served: Served, mllm: RandomMllm
     response = post(served, {"model": NAME, "input": "hello"}, "responses")
     assert (response.status_code, response.headers["retry-after"]) == (429, "2")
     problem(post(served, {"model": "nobody", "input": "hello"}, "responses"), 404, "model-not-found")
-    problem(post(served, {"model": NAME, "input": "x"}, "responses", **{"Idempotency-Key": "k"}), 422, "invalid-request")
+    problem(
+        post(served, {"model": NAME, "input": "x"}, "responses", **{"Idempotency-Key": "k"}), 422, "invalid-request"
+    )
 
 
 def test_it_may_be_asked_from_an_event_loop(served: Served) -> None:

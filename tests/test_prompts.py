@@ -93,7 +93,9 @@ SCHEMAS = {
 }
 
 
-@pytest.mark.parametrize("name", [name for name in PROMPTS.names() if name not in {"looking", "motion-sentence", "imagined-frames"}])
+@pytest.mark.parametrize(
+    "name", [name for name in PROMPTS.names() if name not in {"looking", "motion-sentence", "imagined-frames"}]
+)
 def test_a_prompt_shows_the_fields_of_its_schema(name: str) -> None:
     prompt = load_prompt(name)
     text = prompt.render(**{each: SAMPLES[each] for each in prompt.inputs})

@@ -43,17 +43,23 @@ class WhatIf:
     request: SimulateRequest
     message: int  # place of the message whose question it is: frames are added to it
     image: ImagePart
+    given: frozenset[str]  # fields of `cow` in the request
 
     def why_not(self, error: CowError) -> NotImagined | None:
         """Why nothing was imagined, where the chat goes on without; None where the error is the caller's to hear."""
         told = self.located(error)
-        own = any(field.pointer.startswith(f"/{EXTENSION}") for field in told.errors)
+        own = any(self._is_given(field.pointer) for field in told.errors)
         return NotImagined(error.code, error.detail) if isinstance(error, PASSED_OVER) and not own else None
 
     def located(self, error: CowError) -> CowError:
         """An error of the simulation, pointing into the chat."""
         fields = tuple(FieldError(self._pointer(field.pointer), field.detail) for field in error.errors)
         return type(error)(error.detail, errors=fields, headers=error.headers)
+
+    def _is_given(self, pointer: str) -> bool:
+        """Whether that is a field of `cow`, and one that the caller gave."""
+        _, extension, name, *_ = (*pointer.split("/"), "", "", "")
+        return extension == EXTENSION and name in self.given
 
     def _pointer(self, pointer: str) -> str:
         head = "/".join(pointer.split("/")[:2])
@@ -79,7 +85,7 @@ def what_if(chat: Chat) -> WhatIf | NotImagined:
         return NotImagined("no-question", "The last user message has no text.")
     try:
         fields = {"video": False, **chat.cow, "question": question, "image": images[0].reference}
-        return WhatIf(SimulateRequest.model_validate(fields), asked, images[0])
+        return WhatIf(SimulateRequest.model_validate(fields), asked, images[0], frozenset(chat.cow))
     except ValidationError as error:
         told = invalid(error)
         return NotImagined(told.code, told.detail)
