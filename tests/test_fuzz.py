@@ -43,6 +43,8 @@ def contract(tmp_path_factory: pytest.TempPathFactory):
         ("POST", "/answer", GenerationMode.NEGATIVE),
         ("POST", "/v1/chat/completions", GenerationMode.POSITIVE),
         ("POST", "/v1/chat/completions", GenerationMode.NEGATIVE),
+        ("POST", "/v1/responses", GenerationMode.POSITIVE),
+        ("POST", "/v1/responses", GenerationMode.NEGATIVE),
         ("GET", "/v1/models", GenerationMode.POSITIVE),
         ("GET", "/v1/models/{model}", GenerationMode.POSITIVE),
         ("GET", "/artifacts/{sha256}", GenerationMode.POSITIVE),
@@ -96,5 +98,5 @@ def test_a_real_server_keeps_the_contract(server: Server) -> None:
 def test_the_contract_has_no_other_operations(contract) -> None:
     jobs = {"/jobs", "/jobs/{id}", "/jobs/{id}/events", "/jobs/{id}/cancel"}
     others = {"/artifacts/{sha256}", "/models", "/livez", "/readyz", "/metrics"}
-    chat = {"/v1/chat/completions", "/v1/models", "/v1/models/{model}"}
+    chat = {"/v1/chat/completions", "/v1/responses", "/v1/models", "/v1/models/{model}"}
     assert set(contract) == {"/simulate", "/answer"} | chat | jobs | others

@@ -92,6 +92,18 @@ class ChatImagination(Record):
     warnings: tuple[str, ...] = ()
 
 
+class ResponseReply(BaseModel):
+    """What `POST /v1/responses` returns: a response as OpenAI has it, and `cow` as in a chat."""
+
+    model_config = ConfigDict(extra="allow")
+
+    id: str
+    object: Literal["response"]
+    status: Literal["completed", "incomplete"]
+    output: list[dict[str, Any]]
+    cow: Answer | ChatImagination
+
+
 class ChatDelta(Record):
     """What a chunk adds to the message."""
 

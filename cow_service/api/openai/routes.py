@@ -25,6 +25,7 @@ from cow_service.api.openai.records import (
     ChatModels,
     ChatProblem,
     MllmCompletion,
+    ResponseReply,
     UpstreamError,
 )
 from cow_service.api.openai.requests import ChatRequest, ResponsesRequest
@@ -55,6 +56,7 @@ RECORDS: tuple[tuple[type[BaseModel], JsonSchemaMode], ...] = (
     (ChatChunk, "serialization"),
     (ChatCompletion, "serialization"),
     (MllmCompletion, "serialization"),
+    (ResponseReply, "serialization"),
     (UpstreamError, "serialization"),
     (ChatProblem, "serialization"),
 )
@@ -72,7 +74,7 @@ def chat_routes(submitter: Submitter, completer: Completer) -> APIRouter:
         operation_id="chat",
         summary="The MLLM behind a model, seeing more",
         responses={
-            200: _reply(["ChatCompletion", "MllmCompletion"], "A `ChatChunk`, or a `ChatProblem` at the end"),
+            200: _reply([ChatCompletion, MllmCompletion], "A `ChatChunk`, or a `ChatProblem` at the end"),
             **ACCEPTED,
             **documented(*FAILURES, errors.ModelNotFound),
             **UPSTREAM_ERRORS,
@@ -100,7 +102,7 @@ def chat_routes(submitter: Submitter, completer: Completer) -> APIRouter:
         operation_id="responses",
         summary="The same, as OpenAI's responses",
         responses={
-            200: _reply(["MllmCompletion"], "An event of OpenAI's responses"),
+            200: _reply([ResponseReply], "An event of OpenAI's responses"),
             **documented(*FAILURES, errors.ModelNotFound),
             **UPSTREAM_ERRORS,
         },
@@ -168,14 +170,14 @@ def _body_of(record: type[BaseModel]) -> dict[str, Any]:
     return {"required": True, "content": {"application/json": {"schema": schema}}}
 
 
-def _reply(records: list[str], data: str) -> dict[str, Any]:
+def _reply(records: list[type[BaseModel]], data: str) -> dict[str, Any]:
     """A reply, whole or streamed."""
     event = {
         "type": "object",
         "required": ["data"],
         "properties": {"data": {"type": "string", "description": f"{data}, as JSON; or `[DONE]`."}},
     }
-    whole: dict[str, Any] = {"anyOf": [{"$ref": REFERENCE.format(model=name)} for name in records]}
+    whole: dict[str, Any] = {"anyOf": [{"$ref": REFERENCE.format(model=record.__name__)} for record in records]}
     return {
         "description": "The reply; with `stream` the chunks of it, progress of imagining before them.",
         "content": {"application/json": {"schema": whole}, "text/event-stream": {"schema": event}},
