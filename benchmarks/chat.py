@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -66,7 +66,7 @@ def serve_instant() -> None:
 
 
 @contextmanager
-def started(command: list[str], **settings: str) -> Iterator[subprocess.Popen[str]]:
+def started(command: list[str], **settings: str) -> Generator[subprocess.Popen[str]]:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")} | settings
     streams: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     with subprocess.Popen(command, env=environment, **streams) as process:

@@ -58,8 +58,8 @@ class WhatIf:
 
     def _is_given(self, pointer: str) -> bool:
         """Whether that is a field of `cow`, and one that the caller gave."""
-        _, extension, name, *_ = (*pointer.split("/"), "", "", "")
-        return extension == EXTENSION and name in self.given
+        steps = pointer.split("/")[1:3]
+        return steps[:1] == [EXTENSION] and not self.given.isdisjoint(steps[1:])
 
     def _pointer(self, pointer: str) -> str:
         head = "/".join(pointer.split("/")[:2])
