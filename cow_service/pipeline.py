@@ -22,7 +22,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
     """
     run.check_request()
     grounding = run.stage("grounding", ground)
-    use_stored_masks(run, grounding)
+    run.before_computing(lambda: use_stored_masks(run, grounding))  # it looks for trails, which takes long
     motion = run.stage("motion", read_motion, grounding, run.hints)
     trajectory = run.stage("trajectory", compute_trajectory, grounding, motion)
     clip = run.stage("generation", generate, grounding, motion, trajectory)

@@ -86,6 +86,7 @@ class Run(Generic[Request_co]):
     timings: dict[str, float] = field(default_factory=dict[str, float])  # seconds per stage
     reused: list[Stage] = field(default_factory=list[Stage])  # results that another request had computed
     _calls: dict[Stage, CallLog] = field(default_factory=dict[Stage, CallLog])  # of the stages that asked the reader
+    _before: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
     _current: tuple[Stage | None, float] = (None, 0.0)
 
     @cached_property
@@ -96,6 +97,10 @@ class Run(Generic[Request_co]):
     def place_mover(self, bbox: BBox) -> None:
         """Has the scene know where what moves is: which end of a trail it is, the other positions are taken out."""
         self.scene = self.scene.with_mover(bbox)
+
+    def before_computing(self, work: Callable[[], None]) -> None:
+        """Has something done before the next stage is computed: never, where all stages that follow are found again."""
+        self._before.append(work)
 
     @property
     def reader(self) -> Reader:
@@ -210,6 +215,8 @@ class Run(Generic[Request_co]):
         return {"generator": fingerprint, "options": self.generator_options.model_dump(mode="json")}
 
     def _compute(self, name: Stage, function: Callable[..., StageResult[Any]], inputs: tuple[Any, ...]) -> Any:
+        while self._before:
+            self._before.pop(0)()
         result = function(self, *inputs)
         if name not in self._calls:
             return result
