@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from typing import Any
 
 import av
 import cv2
@@ -12,9 +13,11 @@ import pytest
 from conftest import Example, all_scenes
 from drawn import DrawnArrow, angle_between, ball, block, floor, png_bytes
 from PIL import Image
+from servers import data_url, picture
 
 from cow_service.errors import ArtifactNotFound, CannotReadDirection, ImageUrlNotAllowed, InvalidRequest
 from cow_service.media.data_urls import decode_data_url
+from cow_service.pipeline import simulate
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
@@ -254,3 +257,24 @@ def test_records_are_frozen_and_round_trip(service: Service) -> None:
     with pytest.raises(ValueError, match="frozen"):
         simulation.id = "other"  # type: ignore[misc]
     assert json.loads(simulation.model_dump_json())["trajectory"]["units"]["position"] == "m"
+
+
+def test_what_is_found_again_is_not_looked_for_in_the_image(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored: dict[str, Any] = {}
+
+    def step(stage: Any, key: Any, compute: Any) -> tuple[Any, bool]:
+        found = key.digest in stored
+        if not found:
+            stored[key.digest] = compute()
+        return stored[key.digest], found
+
+    def unexpected(*_: Any) -> Any:
+        raise AssertionError("nothing is computed that needs it")
+
+    fields = {"grounding": {"point": [60, 80]}, "motion": {"direction": [1, 0]}, "num_frames": 3, "video": False}
+    request = SimulateRequest.model_validate({"image": data_url(picture()), "question": "?", **fields})
+    first = simulate(service.prepare(request, step=step))
+    monkeypatch.setattr(Scene, "with_mover", unexpected)
+    again = simulate(service.prepare(request, step=step))
+    assert again.reused == ("grounding", "motion", "trajectory", "generation")
+    assert again.frames == first.frames
