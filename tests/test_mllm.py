@@ -675,7 +675,7 @@ def test_the_frames_follow_the_image_and_encounters_are_a_hypothesis(mllm: MllmS
     assert "hypothesis" in words
     assert "The yellow ball rolls" in words
     assert "The simulation came to this" in words or "meets these on its way" in words
-    assert told["reader"]["prompts"] == {"answer-with-frames": 3, "identify": 2, "locate": 2, "looking": 1}
+    assert told["reader"]["prompts"] == {"answer-with-frames": 4, "identify": 2, "locate": 2, "looking": 1}
     assert told["usage"]["calls"] == 3
 
 
