@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from cow_service.readers.question.place_relations import PREPOSITIONS
 from cow_service.readers.question.wording import bare_name
 from cow_service.records import Intervention, PlacedBefore, Placement, PlacementResult, PlaceRelation
 
 SURE = 0.9  # share of the worlds: where something is as it was meant in fewer, a warning says so
 HARDLY_SEEN = 0.25  # share of a thing that is seen
 _WHERE: dict[PlaceRelation, str] = {"into": "in", "onto": "on"}  # of what is there; else as it is put
-_PREPOSITIONS: dict[PlaceRelation, str] = {
-    "into": "into", "onto": "onto", "between": "between", "in-front-of": "in front of", "behind": "behind",
-    "next-to": "next to", "left-of": "to the left of", "right-of": "to the right of",
-}  # fmt: skip
 _DOES_NOT_STAY: dict[PlacementResult, str] = {
     "overlaps": "there is no room for it, and it overlaps",
     "falls-off": "it does not stay there, but falls off",
@@ -51,7 +48,7 @@ def placement_share(placement: Placement) -> float | None:
 def place_words(placed: Intervention) -> str:
     """Where something is put, as in: between the bowl and the cone."""
     to = " and ".join(f"the {bare_name(target.object)}" for target in placed.targets)
-    return f"{_PREPOSITIONS[placed.relation or 'into']} {to}"
+    return f"{PREPOSITIONS[placed.relation or 'into']} {to}"
 
 
 def state_words(placed: Intervention) -> str:
