@@ -167,6 +167,15 @@ def test_an_earlier_image_and_a_text_alone(served: Served, mllm: RandomMllm) -> 
     assert content[0] == text(QUESTION)
 
 
+def test_two_worlds_are_two_named_strips(served: Served, mllm: RandomMllm) -> None:
+    cube = {"object": "blue cube", "bbox": [170, 60, 205, 98]}
+    taken = {"objects": [cube], "interventions": [{"kind": "remove", "object": "blue cube"}]}
+    cow = told(post(served, {"model": NAME, "messages": what_if(), "cow": {**COW, **taken}}))["cow"]
+    _, _, note, *strips = mllm.last()["messages"][0]["content"]
+    assert '"With the blue cube removed"' in note["text"]
+    assert (len(strips), len(cow["frames"])) == (2, 2)
+
+
 VIDEO = {"type": "video_url", "video_url": {"url": "data:video/mp4;base64,AAAA"}}
 
 

@@ -13,7 +13,7 @@ import pytest
 from conftest import Example, all_scenes
 from drawn import DrawnArrow, angle_between, ball, block, floor, png_bytes
 from PIL import Image
-from servers import data_url, picture
+from servers import BODY
 
 from cow_service.errors import ArtifactNotFound, CannotReadDirection, ImageUrlNotAllowed, InvalidRequest
 from cow_service.media.data_urls import decode_data_url
@@ -272,7 +272,7 @@ def test_what_is_found_again_is_not_looked_for_in_the_image(service: Service, mo
         raise AssertionError("nothing is computed that needs it")
 
     fields = {"grounding": {"point": [60, 80]}, "motion": {"direction": [1, 0]}, "num_frames": 3, "video": False}
-    request = SimulateRequest.model_validate({"image": data_url(picture()), "question": "?", **fields})
+    request = SimulateRequest.model_validate({"image": BODY["image"], "question": "?", **fields})
     first = simulate(service.prepare(request, step=step))
     monkeypatch.setattr(Scene, "with_mover", unexpected)
     again = simulate(service.prepare(request, step=step))
