@@ -6,6 +6,7 @@ import asyncio
 import base64
 import json
 import socket
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -372,14 +373,16 @@ def chunks_of(chat: Any, **given: Any) -> list[Any]:
 
 def test_a_stream_tells_its_progress_and_then_the_answer(chat: Any) -> None:
     given = slowly(11, seconds=1.2) | {"stream_options": {"include_usage": True}}
+    started = time.monotonic()
     first, *progress, reasoning, content, last, usage = chunks_of(chat, **given)
+    took = time.monotonic() - started
     assert (first.choices[0].delta.role, first.choices[0].delta.content) == ("assistant", "")
     job = first.cow["job"]
     assert set(first.cow) == {"job", "status", "stage", "progress"}
     assert first.cow["status"] in ("queued", "running")
     done = [first.cow["progress"], *(chunk.cow["progress"] for chunk in progress)]
     assert done == sorted(done)
-    assert 3 <= len(set(done)) <= 10
+    assert 3 <= len(set(done)) <= 3 + took / 0.25  # not more than a few a second
     assert all(chunk.choices[0].delta.content is None for chunk in progress)
     assert "generation" in {chunk.cow["stage"] for chunk in progress}
     answer = Answer.model_validate(last.cow)
