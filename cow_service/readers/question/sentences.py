@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.arrow_words import read_arrow
 from cow_service.readers.question.chunks import items
 from cow_service.readers.question.clauses import (
     SENTENCE_END,
@@ -24,7 +23,7 @@ from cow_service.readers.question.clauses import (
 )
 from cow_service.readers.question.interventions import InterventionWords, implied_placing, split_interventions
 from cow_service.readers.question.listed_options import split_options
-from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
+from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
 from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
 from cow_service.readers.question.trail_words import TrailWords, split_trail
@@ -74,21 +73,24 @@ def parse(question: str) -> Question:
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
     verb, kind = (best.verb, best.kind) if best else ("fall", "fall") if _on_its_way_down(found) else ("", None)
-    end = min([end, *(other.start for other in _movers_beside(clauses, best))])
+    beside = _movers_beside(clauses, best)
+    end = min([end, *(other.start for other in beside)])
     shared = _sharing(found, at, end)
+    told = arrow_statement(found)
+    words = {token.key for token in tokens(question)}
+    arrow = any(word.startswith("arrow") for word in words)
     motion = read_motion(
-        found[at : shared or end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked
+        found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
     )
-    first = found[0].quantity if found and at > 0 else None  # "At 100 px/s, would the ball hit ...?"
-    motion = motion if first is None else replace(motion, quantities=(first, *motion.quantities))
+    start = best.start if best else 0
+    motion = with_front(motion, found[start:at] if best else found, told)
     motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
     if not interventions and (best is None or (best.asked and not _says_way(motion))):
         interventions = implied_placing(found)
     put = next((change for change in interventions if change.kind == "place"), None)
     if put is not None and (best is None or best.asked or best.kind == "static" or _is_carried(best, put)):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
-    clause = range(best.start if best else at, end)
-    words = {token.key for token in tokens(question)}
+    clause = range(start if best else at, end)
     return Question(
         mover=mover,
         motion=motion,
@@ -96,7 +98,7 @@ def parse(question: str) -> Question:
         items=tuple(everything),
         interventions=interventions,
         clause=tuple(found[clause.start : clause.stop]),
-        mentions_arrow=any(word.startswith("arrow") for word in words),
+        mentions_arrow=arrow,
         names_direction=_DIRECTION_WORDS.search(question) is not None,
     )
 
@@ -158,7 +160,7 @@ def _sharing(found: Sequence[Item], at: int, end: int) -> int | None:
     for place in range(at + 1, end - 2):
         phrase = found[place + 1].phrase
         if found[place].key in {"and", "while"} and phrase is not None and phrase.is_thing:
-            way = read_motion(found[place + 1 : end], "", None, None, None)
+            way = read_motion(found[place + 1 : end], "", None, None)
             if way.direction is not None or way.depth:
                 return place
     return None
@@ -170,12 +172,12 @@ def _other_motions(
     """What else moves at the same time, and how."""
     others: list[OtherWords] = []
     if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
-        motion = read_motion(found[shared + 1 : end], best.verb, best.kind, None, thing)
+        motion = read_motion(found[shared + 1 : end], best.verb, best.kind, thing)
         others.append(OtherWords(thing, motion))
     for each in _movers_beside(clauses, best):
         if each.subject is not None and all(each.subject != other.object for other in others):
             words = found[each.at : clause_end(found, each.at)]
-            others.append(OtherWords(each.subject, read_motion(words, each.verb, each.kind, None, each.subject)))
+            others.append(OtherWords(each.subject, read_motion(words, each.verb, each.kind, each.subject)))
     return tuple(others)
 
 
