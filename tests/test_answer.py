@@ -455,7 +455,7 @@ def test_why_it_is_not_sure(world: Outcome, note: str) -> None:
 
 
 def test_what_no_world_can_tell_is_said_so() -> None:
-    assert "understands only" in answer_from(YES_NO, None, YES, simulated=True).notes[0]
+    assert "did not understand" in answer_from(YES_NO, None, YES, simulated=True).notes[0]
     assert "without a simulation" in answer_from(YES_NO, HIT, None, simulated=False).notes[0]
     assert "does not tell" in answer_from(YES_NO, HIT, None, simulated=True).notes[0]
     among = read_alternatives(parse(IF + "will it hit the red cube or the blue mug first?"))

@@ -19,11 +19,14 @@ from cow_service.records import AnswerOption, Asked, Doubt, Outcome
 HAPPENS = 0.5  # probability from which what is asked happens
 
 NOT_ASKED = (
-    "Not sure, because the embedded reader understands only plain questions: whether the mover hits, lands on, hides, "
-    "misses or is hidden by one thing or any, which thing it hits first, when, and how many. Set COW_MLLM to ask a "
-    "multimodal LLM."
+    "Not sure, because the embedded reader did not understand '{words}'. It reads questions in English of whether, when "
+    "or where the mover hits, lands on, hides, enters, leaves, misses or is hidden by something, what it hits first, how "
+    "many things it hits, whether something is moved or tips, and what changes. Set COW_MLLM to ask a multimodal LLM."
 )
-NOT_READ = " What it did not understand: '{words}'."
+NOT_ALL_READ = (
+    "Not sure, because the words '{words}' were not understood, and they may change the answer. Say it without them, or "
+    "set COW_MLLM to ask a multimodal LLM."
+)
 MAX_UNREAD = 200  # characters
 NO_SIMULATION = "Not sure, because without a simulation there is nothing for the embedded reader to judge by."
 NO_OUTCOME = "Not sure, because the simulation does not tell what the question asks."
@@ -49,12 +52,15 @@ def answer_from(
     outcome: Outcome | None,
     simulated: bool,
     alternatives: Sequence[ObjectPhrase] = (),
-    unread: str = "",
+    unread: Sequence[str] = (),
 ) -> AnswerReading:
-    """The answer, and why it is not sure. `asked`, `alternatives` and the `unread` words are read in the question."""
+    """The answer, and why it is not sure. `asked` and `alternatives` are read in the question, `unread` words not."""
+    words = "', '".join(unread)[:MAX_UNREAD]
+    if asked is not None and unread:
+        return _unsure(options, NOT_ALL_READ.format(words=words))
     if asked is None or not simulated or outcome is None:
         why = (
-            f"{NOT_ASKED}{NOT_READ.format(words=unread[:MAX_UNREAD]) if unread else ''}"
+            NOT_ASKED.format(words=words or "what it asks")
             if asked is None
             else NO_OUTCOME
             if simulated

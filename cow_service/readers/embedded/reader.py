@@ -15,10 +15,10 @@ from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
-from cow_service.readers.question.accounting import unread_warnings
+from cow_service.readers.question.accounting import unread_words
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.relations import read_alternatives, read_asked, unread_clause
+from cow_service.readers.question.relations import read_alternatives, read_asked
 from cow_service.readers.question.sentences import Question, parse
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
@@ -67,7 +67,7 @@ class EmbeddedReader:
             missing = [_not_found(scene, each.text) for each in unseen if given_as(each, given.known) is None]
             boxes = {other.object: other.bbox for other in others} | {question.mover.text: bbox}
             things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
-            doubts = [*noun_warnings(scene, things), *unread_warnings(question)]
+            doubts = [*noun_warnings(scene, things), *_unread_warnings(question)]
         return GroundingReading(
             question.mover.text, bbox, others=others, warnings=(*missing, *doubts), interventions=(*removed, *placed)
         )
@@ -96,7 +96,7 @@ class EmbeddedReader:
         outcome = None if imagined is None else imagined.simulation.trajectory.outcome
         alternatives = read_alternatives(question)
         reading = answer_from(
-            options, read_asked(question), outcome, imagined is not None, alternatives, unread_clause(question)
+            options, read_asked(question), outcome, imagined is not None, alternatives, unread_words(question).turning
         )
         if votes > 1:
             again = "The embedded reader gives the same answer every time: more votes say no more."
@@ -107,6 +107,12 @@ class EmbeddedReader:
 def create(settings: Settings) -> EmbeddedReader:
     """Factory for the registry."""
     return EmbeddedReader()
+
+
+def _unread_warnings(question: Question) -> list[str]:
+    unread = unread_words(question)
+    said = [f"The words '{words}' were not understood, so no answer is given." for words in unread.turning]
+    return said + [f"The words '{words}' were not understood and changed nothing." for words in unread.beside]
 
 
 def _names_motion(words: MotionWords) -> bool:

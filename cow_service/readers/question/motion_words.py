@@ -132,7 +132,9 @@ def read_motion(
     """
     read = {found[0].start} if found and found[0].phrase is None else set[int]()
     legs = [_Leg(verb)]
-    for tree, items in _adverbials(found, 1):
+    if verb == "let go":
+        read |= {item.start for item in found[1:3] if item.key in {"go", "loose", "of"}}
+    for tree, items in _adverbials(found, 0 if verb == "follow" else 1):
         node = None if tree is None else next(iter(tree.children), None)
         if tree is None:
             leg = legs[-1]
@@ -278,6 +280,8 @@ def _apply(
             leg.ahead.add(name == "forward")
         case "beside_it":
             return False
+        case "stops":
+            return bool(leg.quantities)
         case "towards":
             return _aim(leg, node, found, mover, open_end)
         case _:

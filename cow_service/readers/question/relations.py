@@ -96,16 +96,6 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     return tuple(listed or named.values())
 
 
-def unread_clause(question: Question) -> str:
-    """The words of the question from where it asks on, where they are not understood."""
-    for sentence in sentences(question) if _read(question) is None else []:
-        starts = [at for at, token in enumerate(sentence.tokens) if token in _STARTS and _opens(sentence.tokens[:at])]
-        if starts and not _INVERTED.fullmatch(" ".join(sentence.tokens[: starts[0]])):
-            items = list(dict.fromkeys(sentence.items[starts[0] :]))
-            return " ".join(" ".join(question.items[at].words) or question.items[at].key for at in items)
-    return ""
-
-
 def covered_items(question: Question) -> frozenset[int]:
     """The places in `Question.items` of the clause that asks, as far as it was read."""
     reading = _read(question)
@@ -131,7 +121,11 @@ def _read(question: Question) -> _Reading | None:
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
         return None
-    return replace(reading, listed=listed, items=frozenset(found[at].items[place] for place in reading.covered))
+    named = {found[at].items[place] for place in reading.covered}
+    named |= {place for place, item in enumerate(question.items) if item.phrase in listed}
+    if listed:
+        named |= {place for place, item in enumerate(question.items) if item.key == "or"}
+    return replace(reading, listed=listed, items=frozenset(named))
 
 
 def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:

@@ -47,7 +47,7 @@ class Question:
     `others` are the further objects it names, in order, without the mover and without what is taken away; `items`, all
     its words and noun phrases, but for the options that it lists, its `interventions` and its trail.
     `clause` are the items that tell the motion. `names_direction`: some word says which way, whether or not it was
-    understood.
+    understood. `read` are the places in the text of the items that tell the motion and were understood.
     """
 
     mover: ObjectPhrase | None
@@ -58,6 +58,7 @@ class Question:
     clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
+    read: frozenset[int] = frozenset()
 
 
 @lru_cache(maxsize=64)  # every stage of a request asks for it
@@ -90,16 +91,20 @@ def parse(question: str) -> Question:
     put = next((change for change in interventions if change.kind == "place"), None)
     if put is not None and (best is None or best.asked or best.kind == "static" or _is_carried(best, put)):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
+    read = motion.read.union(*(other.motion.read for other in motion.others))
+    if put is not None and (best is None or _is_carried(best, put)):
+        read |= {item.start for item in found[start:end]}
     clause = range(start if best else at, end)
     return Question(
         mover=mover,
         motion=motion,
         others=_others(found, mover, clause, interventions, trail),
-        items=tuple(everything),
+        items=tuple(found),
         interventions=interventions,
         clause=tuple(found[clause.start : clause.stop]),
         mentions_arrow=arrow,
         names_direction=_DIRECTION_WORDS.search(question) is not None,
+        read=read,
     )
 
 
@@ -210,7 +215,7 @@ def _without_instructions(found: list[Item]) -> list[Item]:
             if first is not None and first not in _INSTRUCTIONS:
                 kept += sentence
             sentence = []
-    return kept
+    return [item for item in kept if item.end]  # without the full stop added
 
 
 def _others(
