@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -104,6 +105,10 @@ class EmbeddedReader:
         return (reading,) * votes
 
 
+AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
+_SEVERAL = frozenset({"both", "two", "three", "all", "four", "several"})
+
+
 def create(settings: Settings) -> EmbeddedReader:
     """Factory for the registry."""
     return EmbeddedReader()
@@ -122,6 +127,8 @@ def _names_motion(words: MotionWords) -> bool:
 
 
 def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: ObjectPhrase) -> BBox:
+    if phrase.text.lower().split()[0] in _SEVERAL:
+        raise CannotGround(f"The question moves '{phrase.text}' at once: ask of one thing, or name each. {GIVE_PLACE}")
     if phrase.inside_box:
         return inside_drawn_box(scene, phrase, GIVE_PLACE)
     if not scene.regions:
@@ -194,7 +201,12 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
     if words.arrow is not None:
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
         along = words.arrow == "along"
-        return MotionReading(kind, (x, y) if along else (-x, -y), "arrow", along_arrow=along)
+        x, y = (x, y) if along else (-x, -y)
+        if words.direction is not None and x * words.direction[0] + y * words.direction[1] < AGREES * math.hypot(x, y):
+            raise CannotReadDirection(
+                f"The question names the arrow and another direction, and the arrow does not point there. {GIVE_DIRECTION}"
+            )
+        return MotionReading(kind, (x, y), "arrow", along_arrow=along)
     if words.direction is not None:
         return MotionReading(kind, words.direction, "text", depth=words.depth)
     if words.depth:

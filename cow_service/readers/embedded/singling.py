@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from cow_service.readers.question.phrases import ObjectPhrase
@@ -39,6 +40,34 @@ def singled_out(regions: Sequence[Region], phrase: ObjectPhrase) -> list[Region]
             ratio = (ordered[0].mask.area / ordered[1].mask.area) ** sign
             return [ordered[0]] if ratio >= LARGER else list(regions)
     return list(regions)
+
+
+def at_place(regions: Sequence[Region], relation: str, beside: Region | None) -> list[Region]:
+    """The one region that is where a relation to another region says; all of them where that does not decide.
+
+    Without another region the relation is to the camera: what is lower in the image is nearer.
+    """
+    lead = CLEAR * _size(regions)
+    if beside is None:
+        return _first(regions, (2, -1 if relation == "far" else 1), lead)
+    x0, _, x1, y1 = beside.bbox
+    x, y = beside.centre
+    on_side = {
+        "behind": lambda region: region.bbox[3] < y1 and region.bbox[0] < x1 and region.bbox[2] > x0,
+        "front_of": lambda region: region.bbox[3] > y1 and region.bbox[0] < x1 and region.bbox[2] > x0,
+        "left_of": lambda region: region.centre[0] < x,
+        "right_of": lambda region: region.centre[0] > x,
+        "above": lambda region: region.centre[1] < y and x0 < region.centre[0] < x1,
+        "on": lambda region: region.centre[1] < y and x0 < region.centre[0] < x1,
+        "below": lambda region: region.centre[1] > y and x0 < region.centre[0] < x1,
+    }  # fmt: skip
+    possible = [region for region in regions if relation not in on_side or on_side[relation](region)]
+    if len(possible) < 2:
+        return possible
+    sign = -1 if relation == "far" else 1
+    ranked = sorted(possible, key=lambda region: sign * math.dist(region.centre, (x, y)))
+    gap = abs(math.dist(ranked[1].centre, (x, y)) - math.dist(ranked[0].centre, (x, y)))
+    return ranked[:1] if gap >= lead else possible
 
 
 def _first(regions: Sequence[Region], measure: tuple[int, int], lead: float) -> list[Region]:

@@ -43,7 +43,7 @@ class Unread:
 def unread_words(question: Question) -> Unread:
     """The words that no rule read, sentence by sentence."""
     items, covered = question.items, covered_items(question)
-    turning: list[str] = []
+    turning = [question.pronoun] if question.pronoun else list[str]()
     beside: list[str] = []
     for sentence in _sentences(items):
         runs = [" ".join(_text(items[at]) for at in run) for run in _runs(question, sentence, covered)]

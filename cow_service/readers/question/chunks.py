@@ -20,6 +20,8 @@ _LINKS = lex.words(
     "circled boxed surrounded enclosed bounded outlined encircled indicated shown drawn number saying bearing",
     "carrying called",
 )
+# Behind a noun they are no part of it: "the ball and the mug both move".
+_BEHIND = lex.words("both twice earlier later last hard all each together neither either nearest closest able farthest")
 _CLOSED = lex.FUNCTION_WORDS | lex.DETERMINERS
 _NUMBERED = lex.words("with labeled labelled marked numbered bearing carrying saying called")
 _FINITE_BE = lex.words("be is are was were 's")
@@ -91,7 +93,7 @@ def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: b
         return not _is_determiner(found, at)
     if key in lex.PLACES or key == "one":
         return determined and not has_noun
-    if key in PUNCTUATION or key in _CLOSED or _is_measure(found, at, has_noun):
+    if key in PUNCTUATION or key in _CLOSED or (has_noun and key in _BEHIND) or _is_measure(found, at, has_noun):
         return False
     if lex.is_adverb(key) or key == "first":  # "will it hit the mug first?"
         return determined and not has_noun

@@ -20,7 +20,7 @@ from lark.parsers.earley_forest import ForestToParseTree
 
 from cow_service.readers.question.words import Word
 
-STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial"]
+STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial", "place"]
 MAX_WORDS = 48  # of one parse: its work may grow with the cube of their number
 
 

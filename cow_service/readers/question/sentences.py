@@ -26,6 +26,7 @@ from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
 from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
+from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 
 _INSTRUCTIONS = lex.words(
@@ -58,13 +59,14 @@ class Question:
     clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
+    pronoun: str = ""  # that stands for the mover where it may stand for two things
     read: frozenset[int] = frozenset()
 
 
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    interventions, everything = split_interventions(with_nouns(items(split_options(question)[1])))
+    interventions, everything = split_interventions(with_places(with_nouns(items(split_options(question)[1]))))
     trail, everything = split_trail(_at_the_same_time(everything))
     found = _without_instructions(everything)
     clauses = read_clauses(found)
@@ -86,13 +88,14 @@ def parse(question: str) -> Question:
     start = best.start if best else 0
     motion = with_front(motion, found[start:at] if best else found, told)
     motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
+    fitted = frozenset[int]()
     if not interventions and (best is None or (best.asked and not _says_way(motion))):
-        interventions = implied_placing(found)
+        interventions, fitted = implied_placing(found)
     put = next((change for change in interventions if change.kind == "place"), None)
     if put is not None and (best is None or best.asked or best.kind == "static" or _is_carried(best, put)):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
-    read = motion.read.union(*(other.motion.read for other in motion.others))
-    if put is not None and (best is None or _is_carried(best, put)):
+    read = motion.read.union(fitted, *(other.motion.read for other in motion.others))
+    if put is not None and best is not None and _is_carried(best, put):
         read |= {item.start for item in found[start:end]}
     clause = range(start if best else at, end)
     return Question(
@@ -104,6 +107,7 @@ def parse(question: str) -> Question:
         clause=tuple(found[clause.start : clause.stop]),
         mentions_arrow=arrow,
         names_direction=_DIRECTION_WORDS.search(question) is not None,
+        pronoun=_open_pronoun(found, best, mover),
         read=read,
     )
 
@@ -146,6 +150,17 @@ def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhras
     asked = [(place, phrase) for place, phrase in clauses.question_subjects if phrase.head not in lex.ABSTRACT]
     before = [phrase for place, phrase in asked if place < at] + [phrase for place, phrase in named if place < at]
     return next(iter(before + [phrase for _, phrase in asked + named]), None)
+
+
+def _open_pronoun(found: Sequence[Item], best: MotionCandidate | None, mover: ObjectPhrase | None) -> str:
+    """The pronoun that moves where two things were named alike before it: "the ball and the mug ... if it rolls"."""
+    if best is None or best.subject is not None:
+        return ""
+    for at in range(best.at - 2):
+        two = found[at].phrase, found[at + 2].phrase
+        if found[at + 1].key == "and" and mover in two and all(each is not None and each.is_thing for each in two):
+            return next((item.key for item in found[at + 3 : best.at] if item.key in lex.MOVER_PRONOUNS), "")
+    return ""
 
 
 def _movers_beside(clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
@@ -228,8 +243,9 @@ def _others(
     removed = [change.object for change in interventions if change.kind == "remove"]
     named = [phrase for change in interventions for phrase in change.targets]
     named += [] if trail is None or trail.near is None else [trail.near]
-    for at, item in enumerate(found):
-        phrase = item.phrase
+    things = [(at, item, item.phrase) for at, item in enumerate(found)]
+    things += [(at, item, item.phrase.place.of) for at, item, _ in things if item.phrase and item.phrase.place]
+    for at, item, phrase in sorted(things, key=lambda each: each[0]):
         if phrase is None or is_vague(item) or not _is_object(phrase) or (at in clause and phrase.head in lex.AGENTS):
             continue
         if phrase.noun in lex.ADJECTIVES and item.words[0] not in lex.DETERMINERS:
