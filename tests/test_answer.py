@@ -216,8 +216,6 @@ will it hit the vase hard?
 will it hit the vase first?
 will it hit anything but the vase?
 will it hit the vase by bouncing off the wall?
-will it hit the vase within 2 seconds?
-will it hit the cup behind the vase?
 will it almost hit the vase?
 will it only hit the vase?
 will it still hit the vase?
@@ -229,7 +227,6 @@ will it be blocked by the vase?
 will it completely hide the vase?
 will the vase be hidden at the end?
 will the vase still be visible?
-will it have hit the vase after 2 seconds?
 will it hit the vase after two seconds?
 will it disappear?
 will it stop behind the vase?

@@ -24,7 +24,7 @@ def events(touches=None, occludes=None, covered=None, count=COUNT, bodies=4, sta
     eligible = np.array([i != 0 and i not in stands_on for i in range(bodies)])
     found = Events(times, {kind: np.zeros((count, bodies)) for kind in KINDS}, eligible)
     never = np.full((count, bodies), NEVER)
-    return WorldEvents({0: found}, never, never, never)
+    return WorldEvents({0: found}, never, never, never, never)
 
 
 def share(value: float, time: float = 1.0) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.chains import NEVER, set_off, times_gone, times_moved, times_tipped
+from cow_service.physics.chains import NEVER, set_off, times_gone, times_landed, times_moved, times_tipped
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.occlusion import shares
 from cow_service.physics.projection import SeenPaths, seen_paths
@@ -59,6 +59,7 @@ class WorldEvents:
     moved: Floats  # [K, B] s: when it is set in motion
     tipped: Floats  # [K, B] s: when it is knocked over; infinite where that was not looked for
     gone: Floats  # [K, B] s: when it leaves the image
+    landed: Floats  # [K, B] s: when it first meets the floor
     placed: Floats | None = None  # [K] s: when the mover is where it was to be put; infinite where it does not fit
     order: tuple[int, ...] = (0,)  # of the first draw: what moves, in the order in which it is set in motion
 
@@ -75,6 +76,7 @@ def find_world_events(
         moved=times_moved(worlds),
         tipped=times_tipped(worlds),
         gone=times_gone(paths, size, worlds),
+        landed=times_landed(worlds),
         placed=None if worlds.placements is None else worlds.placements.times,
         order=order,
     )

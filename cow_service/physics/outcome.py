@@ -122,7 +122,9 @@ def _per_body(query: Query, events: WorldEvents) -> Floats:
     relation, of_subject = query.asked.relation, events.of[query.subject]
     bodies = np.arange(len(of_subject.eligible))
     if relation == "leaves":
-        return np.where(bodies[None] == query.subject, events.gone, NEVER)
+        return _in_time(query, np.where(bodies[None] == query.subject, events.gone, NEVER))
+    if relation == "lands":
+        return _in_time(query, np.where(bodies[None] == query.subject, events.landed, NEVER))
     if relation == "inside":
         times = np.full_like(events.moved, NEVER) if events.placed is None else events.placed[:, None]
     elif relation in ("tips", "moves"):
@@ -133,7 +135,13 @@ def _per_body(query: Query, events: WorldEvents) -> Floats:
         meant = bodies == query.target
     else:
         meant = np.isin(bodies, query.among) if query.among else of_subject.eligible
-    return np.where(meant[None], times, NEVER)
+    return _in_time(query, np.where(meant[None], times, NEVER))
+
+
+def _in_time(query: Query, times: Floats) -> Floats:
+    """What happens later than asked about does not happen."""
+    limit = query.asked.within
+    return times if limit is None else np.where(times <= limit, times, NEVER)
 
 
 def _depends_on(same: Mask, draws: Floats) -> tuple[Doubt, ...]:

@@ -25,6 +25,7 @@ _STRUCTURE = (
     | lex.words("someone somebody")
     | lex.words("what happens happen will keep keeps continue continues start starts begin begins s yes ok either")
 )  # fmt: skip
+_NAMING = lex.words(", and there is are we see you have here with in on")
 _NEGATIVE = lex.words("no none nothing neither nor unless except")
 _END = frozenset(".?!;")
 _NO_MATTER = frozenset({"", "marked", "told"})  # adverbials that say nothing of a motion
@@ -48,7 +49,7 @@ def unread_words(question: Question) -> Unread:
     for sentence in _sentences(items):
         runs = [" ".join(_text(items[at]) for at in run) for run in _runs(question, sentence, covered)]
         told = any(at in covered or items[at].start in question.read for at in sentence)
-        (turning if told or _acts(items, sentence) else beside).extend(run[:MAX_TEXT] for run in runs)
+        (beside if not told and _describes(items, sentence) else turning).extend(run[:MAX_TEXT] for run in runs)
     return Unread(tuple(dict.fromkeys(turning)), tuple(dict.fromkeys(beside)))
 
 
@@ -61,12 +62,13 @@ def _sentences(items: tuple[Item, ...]) -> Iterator[range]:
             start = at + 1
 
 
-def _acts(items: tuple[Item, ...], sentence: range) -> bool:
-    """Whether something happens in a sentence, or is denied."""
+def _describes(items: tuple[Item, ...], sentence: range) -> bool:
+    """Whether a sentence only says how something is: nothing happens in it, and nothing is denied."""
     keys = [items[at].key for at in sentence]
     verbs = [lex.VERBS[key] for key in keys if key in lex.VERBS]
     acting = any(verb.kind not in {None, "static"} or verb.lemma in lex.TOUCH | lex.OCCLUDE for verb in verbs)
-    return acting or not (lex.NEGATIONS | _NEGATIVE).isdisjoint(keys)
+    states = not lex.BE.isdisjoint(keys) or any(verb.kind == "static" for verb in verbs)
+    return states and not acting and (lex.NEGATIONS | _NEGATIVE).isdisjoint(keys)
 
 
 def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Iterator[list[int]]:
@@ -75,7 +77,7 @@ def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Itera
     run: list[int] = []
     for at in sentence:
         item = question.items[at]
-        read = at in covered or item.start in question.read or at in harmless
+        read = at in covered or item.start in question.read or at in harmless or _leads_on(question, at)
         structure = item.phrase is None and (item.key in _STRUCTURE or (item.key == "first" and at == sentence.start))
         if not read and (run or not structure) and item.key not in PUNCTUATION:
             run.append(at)
@@ -83,6 +85,13 @@ def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Itera
             yield from _trimmed(question, run)
             run = []
     yield from _trimmed(question, run)
+
+
+def _leads_on(question: Question, at: int) -> bool:
+    """ "By rolling left", "of sliding": before a verb of the motion that was read."""
+    after = question.items[at + 1] if at + 1 < len(question.items) else None
+    rolling = after is not None and after.key in lex.VERBS and lex.VERBS[after.key].form == "ing"
+    return rolling and after.start in question.read and question.items[at].key in {"by", "of", "when"}
 
 
 def _trimmed(question: Question, run: list[int]) -> Iterator[list[int]]:
@@ -96,6 +105,10 @@ def _harmless(question: Question, sentence: range, covered: frozenset[int]) -> s
     """The places of what changes nothing: a floor where it moves, "please", the mover named again."""
     items = question.items
     found = {at for at in sentence if _names_known(question, items[at])}
+    named = [items[at].phrase for at in sentence if items[at].phrase is not None]
+    if all(items[at].key in _NAMING or items[at].phrase for at in sentence) and all(each.is_thing for each in named):
+        if lex.BE.isdisjoint(items[at].key for at in sentence) or items[sentence.start].key in {"there", "here"}:
+            return set(sentence)  # "There is a ball and a mug."
     words, tries = words_of(items[sentence.start : sentence.stop]), 0
     for place, word in enumerate(words):
         at = sentence.start + word.at

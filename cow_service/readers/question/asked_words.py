@@ -32,7 +32,7 @@ _PLURAL = lex.words("objects things items ones obstacles bodies")
 _PLAIN_WORDS = lex.words(
     "take takes taking long soon clear free untouched visible unobstructed unoccluded uncovered unhidden unblocked",
     "first elapse elapses pass passes seconds whole entire total overall altogether",
-    "number least all short",
+    "number least all short able",
 )
 _OF_GENERIC = lex.words("first other different all")
 _TRAILING = lex.words("hard fast slow alone anyway whatsoever second third last twice once again")  # more is asked
@@ -59,6 +59,8 @@ def sentences(question: Question) -> list[Sentence]:
         if item.key in _ENDS:
             found[-1].asks = item.key == "?"
             found.append(Sentence())
+            continue
+        if item.quantity is not None and item.quantity.within is not None:
             continue
         if item.phrase is None:
             tokens = ["," if item.key in _PAUSES else _word(item.key)]
@@ -97,7 +99,8 @@ def _phrase_tokens(item: Item, phrase: ObjectPhrase, question: Question, known: 
         return _generic(determiners, content)
     vague = not asked and not lex.VAGUE_DETERMINERS.isdisjoint(determiners)
     counted = content[0].isdecimal() and phrase.number is None  # "3 balls"
-    if vague or counted or set(content) & _COUNTING or content[-1] in _TRAILING:
+    single = determiners == ["the"] and content[0] == "other" and lex.singular(content[-1]) == content[-1]
+    if vague or counted or set(content[single:]) & _COUNTING or content[-1] in _TRAILING:
         return ["X"]
     name = f"{'K' if asked else 'T'}{len(known)}"
     known[name] = phrase

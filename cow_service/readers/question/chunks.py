@@ -39,7 +39,7 @@ def _chunked(text: str, found: Sequence[Item]) -> Iterator[Item]:
         first, end = _phrase_span(found, at, asked)
         if end == first or at == verb:
             yield found[at]
-            asked = at != verb and _still_asked(found[at].key, asked)
+            asked = at != verb and (_still_asked(found[at].key, asked) or _asks_state(found, at))
             at += 1
             continue
         if _ends_in_unknown_verb(found, at, first, end, asked):
@@ -83,6 +83,11 @@ def _still_asked(key: str, asked: bool) -> bool:
         return True
     done = key in {".", "?", "!", ";"} or (key in lex.VERBS and lex.VERBS[key].form == "base")
     return asked and not done
+
+
+def _asks_state(found: Sequence[Item], at: int) -> bool:
+    """ "Is the mug hit?": a form of "be" that opens a clause waits for a participle."""
+    return found[at].key in {"is", "are", "was", "were"} and (at == 0 or found[at - 1].key in PUNCTUATION)
 
 
 def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: bool, asked: bool) -> bool:

@@ -284,7 +284,7 @@ def _agreement(trajectory: Trajectory) -> float | None:
         met = _told(trajectory, 0)
         return met[0].probability if met else None
     asked, first = outcome.asked, _asked_about(trajectory)
-    if asked.relation not in _KINDS:
+    if asked.relation not in _KINDS or asked.within is not None:
         return None
     agreeing: dict[str, float | None] = {
         "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,

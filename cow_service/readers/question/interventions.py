@@ -19,7 +19,7 @@ _BEFORE = lex.CONDITIONALS | lex.words(". ! ? ; : , and but then also that with"
 _ANYWHERE = lex.words("without with remove taking in")
 _TELLING = lex.words(
     "remove delete erase eliminate exclude withdraw discard take rid not gone go absent missing no disappear vanish",
-    "without absence put place insert set position drop lower throw release",
+    "without absence out put place insert set position drop lower throw release",
 )
 THINGS = frozenset({"NP", "PRONOUN"})  # terminals of what is named
 _RELATIONS: dict[str, PlaceRelation] = {

@@ -110,7 +110,7 @@ FUNCTION_WORDS = (
         "next close now still think believe predict expect tell know suppose also ever just straight already",
         "always instead soon again away closer nearer farther further far together too very much only even",
         "perhaps maybe else finally opposite according due parallel perpendicular ahead forward forwards backward",
-        "backwards onward onwards sideways yes no please ok has have had having following contrary",
+        "backwards onward onwards sideways yes no please pls ok has have had having following contrary",
     )
 )
 AGENTS = words(

@@ -138,6 +138,8 @@ def read_motion(
         node = None if tree is None else next(iter(tree.children), None)
         if tree is None:
             leg = legs[-1]
+            if items[0].quantity is not None and items[0].quantity.within is not None:
+                continue
             if items[0].quantity is not None:
                 leg.quantities.append(items[0].quantity)
             elif items[0].key in _THEN:
@@ -158,7 +160,7 @@ def with_front(motion: MotionWords, before: Sequence[Item], told: frozenset[int]
     for tree, items in _adverbials(before, 0):
         node = None if tree is None else next(iter(tree.children), None)
         name = str(node.data) if isinstance(node, Tree) else ""
-        if tree is None and items[0].quantity is not None:
+        if tree is None and items[0].quantity is not None and items[0].quantity.within is None:
             leg.quantities.append(items[0].quantity)
         elif name in {"along", "against"}:
             leg.senses |= {"along"} if name == "along" else {"against"}

@@ -57,6 +57,7 @@ class QuantityWords:
     share: float | None = None  # of the way to what it moves towards
     duration: float | None = None  # s
     until: Until | None = None
+    within: float | None = None  # s: a limit of what is asked about, not of the motion
 
 
 @dataclass(frozen=True)

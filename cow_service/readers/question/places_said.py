@@ -32,6 +32,7 @@ def with_places(found: Sequence[Item]) -> list[Item]:
             if parsed is not None and read is not None and not _is_goal(found, at, ahead[0].text):
                 stop = end + ahead[parsed[1] - 1].at + 1
                 several = texts.count(item.phrase.text.lower()) > 1
+                stop += ahead[0].text == "," and key_at(found, stop) == ","
                 words = " ".join(" ".join(each.words) or each.key for each in found[end:stop])
                 text = f"{item.phrase.text} {words}" if several else item.phrase.text
                 item = replace(item, end=found[stop - 1].end, phrase=replace(item.phrase, text=text, place=read))

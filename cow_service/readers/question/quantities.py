@@ -16,7 +16,7 @@ from cow_service.readers.question.words import PRONOUNS, Word, base_forms
 _WINDOW = 12  # words
 _MAX_TRIES = 5  # of one question: each takes some ms
 _STARTS = lex.words(
-    "at with by for during lasting over only exactly very really quite rather slowly slow gently softly lightly fast",
+    "within in after at with by for during lasting over only exactly very really quite rather slowly slow gently softly lightly fast",
     "quickly rapidly swiftly hard forcefully halfway midway half but until till a an stops stopping",
 )
 _PACES = lex.words("slowly slow gently softly lightly fast quickly rapidly swiftly hard forcefully halfway midway")
@@ -97,6 +97,8 @@ def _quantity(tree: Tree[Token]) -> QuantityWords:
                 per_second: dict[str, Unit] = {"px": "px/s", "m": "m/s", "widths": "widths/s"}
                 return QuantityWords(speed=Quantity(number * value, per_second[unit]))
             return QuantityWords(speed="slow" if list(kind.find_data("slow")) else "fast")
+        case "limit":
+            return QuantityWords(within=number)
         case "duration":
             return QuantityWords(duration=number)
         case "distance":

@@ -14,7 +14,7 @@ from functools import lru_cache
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
 from cow_service.readers.question.asking import IT, Asking, read_clause
-from cow_service.readers.question.phrases import ObjectPhrase
+from cow_service.readers.question.phrases import Item, ObjectPhrase
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import PRONOUNS, Word, base_forms
 from cow_service.records import Asked
@@ -57,6 +57,7 @@ class _Reading:
     covered: frozenset[int]
     items: frozenset[int] = frozenset()
     listed: tuple[ObjectPhrase, ...] = ()
+    within: float | None = None  # s
 
 
 def read_asked(question: Question) -> Asked | None:
@@ -66,8 +67,9 @@ def read_asked(question: Question) -> Asked | None:
     `read_alternatives`.
     """
     reading = _read(question)
-    if reading is None:
-        return None
+    falls = question.motion.kind in {"fall", "projectile"}
+    if reading is None or (reading.asking.relation == "lands" and not falls):
+        return None  # what stands on the floor lands on it by nothing that the worlds tell
     asking = reading.asking
     target = None if asking.target is None else _named(asking.target, reading, question)
     subject = None if asking.subject is None else _named(asking.subject, reading, question)
@@ -76,8 +78,9 @@ def read_asked(question: Question) -> Asked | None:
     kinds = [phrase for token, phrase in reading.phrases.items() if token.startswith("K")]
     among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question) if phrase not in kinds)
     return Asked(
-        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among
-    )
+        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among,
+        within=reading.within,
+    )  # fmt: skip
 
 
 def _named(token: str, reading: _Reading, question: Question) -> str | None:
@@ -125,14 +128,27 @@ def _read(question: Question) -> _Reading | None:
     named |= {place for place, item in enumerate(question.items) if item.phrase in listed}
     if listed:
         named |= {place for place, item in enumerate(question.items) if item.key == "or"}
-    return replace(reading, listed=listed, items=frozenset(named))
+    limits = {at: item.quantity.within for at, item in enumerate(question.items) if item.quantity}
+    limits = {at: limit for at, limit in limits.items() if limit is not None}
+    if not all(_limits(question, named, at) for at in limits):
+        return None
+    within = min(limits.values(), default=None)
+    return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within)
+
+
+def _limits(question: Question, asking: set[int], at: int) -> bool:
+    """Whether a time limits what is asked: not the motion, and "after 2 s" only where it is asked what has happened."""
+    items = question.items
+    have = not {"has", "have", "had"}.isdisjoint(items[place].key for place in asking)
+    moves = items[at] in question.clause and not any(items[place] in question.clause for place in asking)
+    return not moves and (have or "after" not in items[at].words)
 
 
 def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
     """The longest part of a sentence, up to its end or to a condition, that a pattern covers."""
     tokens = sentence.tokens
     tries = 0
-    ends = [len(tokens), *(at for at, token in enumerate(tokens) if token in _CONDITIONS)]
+    ends = [len(tokens), *(at for at in range(len(tokens)) if _ends(tokens, at, question))]
     for start in (at for at in range(len(tokens)) if _starts(sentence, at)):
         for end in (end for end in ends if end > start):
             tries += 1
@@ -142,6 +158,11 @@ def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
             if reading is not None:
                 return reading
     return None
+
+
+def _ends(tokens: Sequence[str], at: int, question: Question) -> bool:
+    """Whether a condition begins at a token: "if it rolls", "by rolling"."""
+    return tokens[at] in _CONDITIONS or (tokens[at] == "by" and tokens[at + 1 : at + 2] == [f"{question.motion.verb}-ing"])
 
 
 def _starts(sentence: Sentence, at: int) -> bool:
@@ -166,7 +187,9 @@ def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]
 
 
 def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Reading | None:
-    words = [word for at in places for word in _words(sentence.tokens[at], at, question)]
+    tokens = [*sentence.tokens, ""]
+    spoken = [at for at in places if tokens[at] != "n't" or not _is_subject(tokens[at + 1])]  # "won't it hit the cup?"
+    words = [word for at in spoken for word in _words(tokens[at], at, question)]
     beside = question.motion.others[0].object if len(question.motion.others) == 1 else None
     phrases = sentence.phrases if beside is None else sentence.phrases | {"+": beside}
     asking = read_clause(words, None if beside is None else "+")
@@ -178,6 +201,10 @@ def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Re
         phrases = phrases | {IT: question.others[0]}
     asking = _into_hollow(asking, [sentence.tokens[at] for at in places], phrases)
     return None if asking is None else _Reading(asking, phrases, frozenset(places))
+
+
+def _is_subject(token: str) -> bool:
+    return token in PRONOUNS or token in {"M", "OBJ", "OBJS"} or token[:1] == "T"
 
 
 def _words(token: str, at: int, question: Question) -> list[Word]:

@@ -87,6 +87,8 @@ def parse(question: str) -> Question:
     )
     start = best.start if best else 0
     motion = with_front(motion, found[start:at] if best else found, told)
+    if trail is not None and trail.near is None and trail.side is None and motion.direction is not None:
+        trail = replace(trail, side=motion.direction)  # "on along its trail to the right": its last end is on the right
     motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
     fitted = frozenset[int]()
     if not interventions and (best is None or (best.asked and not _says_way(motion))):
