@@ -37,6 +37,12 @@ def check_changes(question: Question) -> None:
             raise CannotGround(f"The question puts '{change.object.text}' {relation} itself: name another thing.")
 
 
+def _is_plural(phrase: ObjectPhrase) -> bool:
+    """ "Both mugs", "the mugs"."""
+    last = phrase.text.lower().split()[-1]
+    return phrase.text.lower().startswith("both ") or (last != phrase.head and last == f"{phrase.head}s")
+
+
 def _is_asked_about(removed: ObjectPhrase, asked: Asked) -> bool:
     names = (asked.subject, asked.target, *asked.among)
     return any(name is not None and same_name(name, removed.text) for name in names)
@@ -48,7 +54,7 @@ def find_removed(scene: Scene, question: Question, given: Sequence[LocatedObject
     taken: list[LocatedObject] = []
     for phrase in removed:
         left = [each for each in scene.regions if all(each.bbox != one.bbox for one in taken)]
-        found = _both(left, phrase) if phrase.text.lower().startswith("both ") else _one(left, phrase, given)
+        found = _both(left, phrase) if _is_plural(phrase) else _one(left, phrase, given)
         if not found:
             raise _not_found(scene, f"takes '{phrase.text}' away", phrase)
         taken += found

@@ -15,6 +15,7 @@ from cow_service.readers.embedded.changes import check_changes, find_placed, fin
 from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
+from cow_service.readers.embedded.outlines import OUTLINES
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.accounting import unread_words
 from cow_service.readers.question.motion_words import MotionWords
@@ -106,6 +107,7 @@ class EmbeddedReader:
 
 
 AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
+_ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # what does so keeps touching what it stands on
 _SEVERAL = frozenset({"both", "two", "three", "all", "four", "several"})
 
 
@@ -147,7 +149,7 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
             f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. "
             f"Seen in all: {seen}. {GIVE_PLACE}"
         )
-    if phrase.colour is None and not is_known(phrase) and len(scene.regions) > 1:
+    if phrase.colour is None and not is_known(phrase) and phrase.head not in OUTLINES and len(scene.regions) > 1:
         raise CannotGround(
             f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
             f"Seen: {seen}. {GIVE_PLACE}"
@@ -207,6 +209,9 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
                 f"The question names the arrow and another direction, and the arrow does not point there. {GIVE_DIRECTION}"
             )
         return MotionReading(kind, (x, y), "arrow", along_arrow=along)
+    if words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth:
+        direction, depth = depth_motion(-math.copysign(1.0, words.direction[1]))  # up the image is away on the floor
+        return MotionReading(kind, direction, "text", depth=depth)
     if words.direction is not None:
         return MotionReading(kind, words.direction, "text", depth=words.depth)
     if words.depth:

@@ -60,12 +60,14 @@ def sentences(question: Question) -> list[Sentence]:
             found[-1].asks = item.key == "?"
             found.append(Sentence())
             continue
-        if item.quantity is not None and item.quantity.within is not None:
+        limit = item.quantity is not None and item.quantity.within is not None
+        if limit or (item.start in question.read and item.quantity is not None and item not in question.clause):
             continue
         if item.phrase is None:
             tokens = ["," if item.key in _PAUSES else _word(item.key)]
         else:
-            tokens = _phrase_tokens(item, item.phrase, question, found[-1].phrases)
+            of_kind = found[-1].tokens[-2:] in (["which", "of"], ["what", "of"])
+            tokens = _phrase_tokens(item, item.phrase, question, found[-1].phrases, of_kind)
         found[-1].tokens += tokens
         said = tuple(word.lower() for word in (item.words or (item.key,)))
         found[-1].words += [said] * len(tokens)
@@ -83,7 +85,9 @@ def _word(key: str) -> str:
     return f"{verb.lemma}-ing" if verb.form == "ing" else verb.lemma
 
 
-def _phrase_tokens(item: Item, phrase: ObjectPhrase, question: Question, known: dict[str, ObjectPhrase]) -> list[str]:
+def _phrase_tokens(
+    item: Item, phrase: ObjectPhrase, question: Question, known: dict[str, ObjectPhrase], of_kind: bool
+) -> list[str]:
     words = [word.lower() for word in item.words]
     determiners = words[: _count_determiners(words)]
     content = words[len(determiners) :]
@@ -91,6 +95,9 @@ def _phrase_tokens(item: Item, phrase: ObjectPhrase, question: Question, known: 
         return [_word(word) for word in words]
     if question.motion.others and words in (["the", "two"], ["both"]):
         return ["they"]
+    if of_kind and phrase.noun is not None and phrase.head not in _GENERIC and "other" not in content:
+        known[f"K{len(known)}"] = phrase
+        return [list(known)[-1]]
     asked = words[0] in {"which", "what"}
     if means_mover(phrase, question) and not asked:
         return ["M"]

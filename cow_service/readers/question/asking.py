@@ -27,7 +27,7 @@ _ACTS: dict[str, tuple[AskedRelation, bool]] = {
     "together": ("touches", False),
     "hides": ("covers", False), "what_hides": ("covers", False), "hidden": ("covers", True), "stays": ("covers", True),
     "passes_behind": ("covered", False), "what_passes_behind": ("covered", False),
-    "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False), "lands": ("lands", False),
+    "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False), "lands": ("lands", False), "disappears": ("covers", True),
     "tips_it": ("tips", False), "tips": ("tips", True), "tipped": ("tips", True),
     "moves_it": ("moves", False), "moves": ("moves", True), "moved": ("moves", True), "still": ("moves", True),
 }  # fmt: skip
@@ -63,10 +63,11 @@ def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
     asking = Asking(form, relation, negations == 1, None, things[0] if things else None, tuple(map(str, listed)))
     if any(token.type == "M" for token in subject) and _speaks_of_it(tree):
         asking = Asking(form, relation, negations == 1, None, IT, asking.among)
+    alone = next(tree.find_data("meet_bare"), None) is not None
     pronoun = next((str(token) for token in subject if token.type == "PRONOUN"), None)
     if pronoun == "they":
         return _together(asking, beside)
-    if pronoun is not None and beside is not None:
+    if alone or (pronoun is not None and beside is not None):
         return None  # which of the two movers is meant is open
     return asking if listed and form == "which-first" else _with_subject(asking, tree, subject, done_to)
 

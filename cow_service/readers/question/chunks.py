@@ -115,7 +115,7 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
     """Whether a verb's form is read as a noun or an adjective: "the travel mug", "the red block"."""
     verb, after = lex.VERBS[key_at(found, at)], key_at(found, at + 1)
     closed = after in lex.PLACES or after in _CLOSED or after in PUNCTUATION
-    if begun and closed and key_at(found, at - 1) in lex.PLACES:
+    if begun and (closed or asked) and key_at(found, at - 1) in lex.PLACES:
         return False  # "the balls to the left move up"
     if not has_noun:
         before = key_at(found, at - 1)

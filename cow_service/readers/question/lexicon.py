@@ -102,6 +102,7 @@ FUNCTION_WORDS = (
     | CAUSATIVES
     | MOVER_PRONOUNS
     | words(
+        "except rather neither nor versus whereas apart",
         "i you we us me him someone somebody anyone anybody anything something nothing everything there here who",
         "whom in inside within on onto upon into at to toward towards from of off over under below above beneath",
         "beside near by with along across through around past behind before between among against via per about",

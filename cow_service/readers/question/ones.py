@@ -32,12 +32,18 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             continue
         if phrase is not None and phrase.is_thing and phrase.noun and all(phrase != each.phrase for each in things):
             things.append(item)
-        if phrase is not None and phrase.noun is None and phrase.colour is not None and len(nouns) == 1:
+        if phrase is not None and phrase.noun is None and _singles_out(item, phrase) and len(nouns) == 1:
             said.append(replace(item, phrase=_of_kind(phrase, next(iter(nouns)))))
         else:
             said.append(item)
             before |= {_kind_of(phrase)} - {""}
     return said
+
+
+def _singles_out(item: Item, phrase: ObjectPhrase) -> bool:
+    """ "The red one", "the left one", "the one on the left"."""
+    words = phrase.text.lower().split()
+    return phrase.colour is not None or (item.words[-1:] == ("one",) and len(words) > 1)
 
 
 def _is_asked_for(found: Sequence[Item], at: int) -> bool:
@@ -55,5 +61,6 @@ def _kind_of(phrase: ObjectPhrase | None) -> str:
 
 def _of_kind(phrase: ObjectPhrase, noun: str) -> ObjectPhrase:
     words = phrase.text.split()
-    kept = words[:-1] if words[-1].lower() == "one" else words
-    return replace(phrase, text=" ".join([*kept, noun]), noun=noun)
+    if "one" not in words:
+        return replace(phrase, text=" ".join([*words, noun]), noun=noun)
+    return replace(phrase, text=" ".join(noun if word == "one" else word for word in words), noun=noun)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+from cow_service.readers.base import Quantity
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.chunks import items
 from cow_service.readers.question.clauses import (
@@ -75,7 +76,7 @@ def parse(question: str) -> Question:
     end = clause_end(found, at) if best else at
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
-    verb, kind = (best.verb, best.kind) if best else ("fall", "fall") if _on_its_way_down(found) else ("", None)
+    verb, kind = (best.verb, best.kind) if best else ("fall", "fall") if _on_its_way_down(found, interventions) else ("", None)
     beside = _movers_beside(clauses, best)
     end = min([end, *(other.start for other in beside)])
     shared = _sharing(found, at, end)
@@ -87,6 +88,11 @@ def parse(question: str) -> Question:
     )
     start = best.start if best else 0
     motion = with_front(motion, found[start:at] if best else found, told)
+    speeds = [each for each in [*found[:start], *found[end:]] if each.quantity and isinstance(each.quantity.speed, Quantity)]
+    motion = replace(
+        motion, quantities=(*motion.quantities, *(each.quantity for each in speeds if each.quantity)),
+        read=motion.read.union(each.start for each in speeds),
+    )  # fmt: skip
     if trail is not None and trail.near is None and trail.side is None and motion.direction is not None:
         trail = replace(trail, side=motion.direction)  # "on along its trail to the right": its last end is on the right
     motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
@@ -123,8 +129,10 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     return phrase
 
 
-def _on_its_way_down(found: Sequence[Item]) -> bool:
-    return any(
+def _on_its_way_down(found: Sequence[Item], changes: Sequence[InterventionWords]) -> bool:
+    """ "What does it touch on its way down?", and "where would it land?" of what loses its support."""
+    removed = any(change.kind == "remove" for change in changes)
+    return any(removed and lex.lemma(item.key) == "land" for item in found) or any(
         item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
         for at, item in enumerate(found)
     )
