@@ -20,6 +20,7 @@ from cow_service.vision.types import Floats, Mask
 __all__ = ["COVERED", "KINDS", "NEVER", "Events", "WorldEvents", "encounters", "find_events", "find_world_events"]
 
 COVERED = 0.3  # share of a silhouette from which it counts as covered
+ANY_PART = 0.03  # share from which a part of it is covered: less is an inexact outline
 COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
 PerKind = dict[EncounterKind, Floats]  # [K, B] each
@@ -32,6 +33,7 @@ class Events:
     times: PerKind
     shares: PerKind  # 0 for touches
     eligible: Mask  # [B]: neither the subject, nor the mover, nor what the subject stands on
+    partly: PerKind  # as times, where any part is covered
     subject: int = 0  # the body that meets the others
 
     def happens(self, kind: EncounterKind) -> Mask:
@@ -95,6 +97,7 @@ def _events_of(
     on = worlds.scene.supports[subject]
     eligible[[0, subject, *([] if on is None else [on])]] = False
     times: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
+    partly: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
     most: PerKind = {kind: np.zeros((len(draws), count)) for kind in KINDS}
     times["touches"] = _touches(subject, worlds, count, on)
     path, step = paths[subject], worlds.every / fps
@@ -108,7 +111,8 @@ def _events_of(
             seen = np.where(before, values, 0.0)
             most[kind][:, other] = seen.max(axis=1)
             times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)
-    return Events(times, most, eligible, subject)
+            partly[kind][:, other] = np.where(seen >= ANY_PART, clock[None], NEVER).min(axis=1)
+    return Events(times, most, eligible, partly, subject)
 
 
 def _touches(subject: int, worlds: Worlds, count: int, on: int | None) -> Floats:

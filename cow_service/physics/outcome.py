@@ -130,7 +130,8 @@ def _per_body(query: Query, events: WorldEvents) -> Floats:
     elif relation in ("tips", "moves"):
         times = events.tipped if relation == "tips" else events.moved
     else:
-        times = of_subject.times[KIND_OF[relation]]
+        kinds = of_subject.partly if query.asked.partly else of_subject.times
+        times = kinds[KIND_OF[relation]]
     if query.target is not None:
         meant = bodies == query.target
     else:

@@ -29,6 +29,7 @@ class Asked(Record):
     among: tuple[str, ...] = Field(
         default=(), description="Of `which-first`: the alternatives that the question names; empty: any."
     )
+    partly: bool = Field(default=False, description="Of `covers` and `covered`: it counts where any part is hidden.")
     within: float | None = Field(
         default=None, gt=0, description="How long it may take to happen, s; null: as long as the clip."
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lark import Token, Tree
 
@@ -35,6 +35,9 @@ _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
 _NEGATIONS = frozenset({"no", "none", "misses", "missed", "avoids", "stays", "no_contact", "sticks_out", "stops_short"})
 
 
+_ANY_PART = frozenset({"any_part", "partly", "wholly"})  # hidden in part, or not wholly visible
+
+
 @dataclass(frozen=True)
 class Asking:
     """What a clause asks; things are tokens of the clause. None is the mover as `subject`, anything as `target`."""
@@ -45,6 +48,7 @@ class Asking:
     subject: str | None
     target: str | None
     among: tuple[str, ...] = ()
+    partly: bool = False
 
 
 def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
@@ -60,9 +64,11 @@ def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
     things = list(dict.fromkeys(str(t) for t in _tokens(tree) if t.type == "T" and t not in (*subject, *listed)))
     if negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
-    asking = Asking(form, relation, negations == 1, None, things[0] if things else None, tuple(map(str, listed)))
+    partly = relation in {"covers", "covered"} and any(node.data in _ANY_PART for node in tree.iter_subtrees())
+    target = things[0] if things else None
+    asking = Asking(form, relation, negations == 1, None, target, tuple(map(str, listed)), partly)
     if any(token.type == "M" for token in subject) and _speaks_of_it(tree):
-        asking = Asking(form, relation, negations == 1, None, IT, asking.among)
+        asking = replace(asking, target=IT)
     alone = next(tree.find_data("meet_bare"), None) is not None
     pronoun = next((str(token) for token in subject if token.type == "PRONOUN"), None)
     if pronoun == "they":
@@ -93,7 +99,7 @@ def _together(asking: Asking, beside: str | None) -> Asking | None:
     """ "Will they collide?": the two things that move."""
     if beside is None or asking.target is not None:
         return None
-    return Asking(asking.form, asking.relation, asking.negated, None, beside)
+    return replace(asking, subject=None, target=beside)
 
 
 def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_to: bool) -> Asking:
@@ -119,4 +125,4 @@ def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_
     elif mover_acted and target is None:
         target, doer = thing, None
         relation = "covered" if relation == "covers" else relation
-    return Asking(asking.form, relation, asking.negated, doer, target, asking.among)
+    return replace(asking, relation=relation, subject=doer, target=target)

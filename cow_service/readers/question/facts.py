@@ -259,6 +259,10 @@ def _missed(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> str:
         return ""
     if _asked_about(trajectory) is not None:
         return ""
+    if outcome.asked.partly and outcome.probability is not None:
+        name = named(outcome.object, "the") if outcome.object else "something"
+        if (outcome.probability >= 0.5) != outcome.asked.negated:  # less than an encounter tells of
+            return f"hides a part of {name}" if outcome.asked.relation == "covers" else f"is partly hidden by {name}"
     if outcome.asked.target is None or outcome.object is None:
         return _NOTHING_MET[outcome.asked.relation]
     return _NOT_MET[outcome.asked.relation].format(named(outcome.object, "the"))
@@ -284,7 +288,7 @@ def _agreement(trajectory: Trajectory) -> float | None:
         met = _told(trajectory, 0)
         return met[0].probability if met else None
     asked, first = outcome.asked, _asked_about(trajectory)
-    if asked.relation not in _KINDS or asked.within is not None:
+    if asked.relation not in _KINDS or asked.within is not None or asked.partly:
         return None
     agreeing: dict[str, float | None] = {
         "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,

@@ -79,7 +79,7 @@ def read_asked(question: Question) -> Asked | None:
     among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question) if phrase not in kinds)
     return Asked(
         form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among,
-        within=reading.within,
+        within=reading.within, partly=asking.partly,
     )  # fmt: skip
 
 
