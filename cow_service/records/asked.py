@@ -19,7 +19,8 @@ class Asked(Record):
     relation: AskedRelation = Field(
         description="`touches`: the subject hits it or lands on it; `covers`: the subject hides it; `covered`: the "
         "subject is hidden by it; `inside`: the subject fits or ends up in it; `tips`: the target is knocked over; "
-        "`moves`: the target is set in motion; `leaves`: the subject leaves the image; `lands`: the subject comes down on the floor."
+        "`moves`: the target is set in motion; `leaves`: the subject leaves the image; `lands`: the subject "
+        "comes down on the floor."
     )
     subject: str | None = Field(
         default=None, description="Who does it, in the question's words, where that is not the mover; null: the mover."

@@ -17,10 +17,9 @@ from cow_service.readers.embedded.matching import best_matches, describe, inside
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
 from cow_service.readers.embedded.outlines import OUTLINES
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
-from cow_service.readers.question.accounting import unread_words
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.relations import read_alternatives, read_asked
+from cow_service.readers.question.relations import read_alternatives, read_asked, unread
 from cow_service.readers.question.sentences import Question, parse
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
@@ -98,7 +97,7 @@ class EmbeddedReader:
         outcome = None if imagined is None else imagined.simulation.trajectory.outcome
         alternatives = read_alternatives(question)
         reading = answer_from(
-            options, read_asked(question), outcome, imagined is not None, alternatives, unread_words(question).turning
+            options, read_asked(question), outcome, imagined is not None, alternatives, unread(question)
         )
         if votes > 1:
             again = "The embedded reader gives the same answer every time: more votes say no more."
@@ -117,9 +116,9 @@ def create(settings: Settings) -> EmbeddedReader:
 
 
 def _unread_warnings(question: Question) -> list[str]:
-    unread = unread_words(question)
-    said = [f"The words '{words}' were not understood, so no answer is given." for words in unread.turning]
-    return said + [f"The words '{words}' were not understood and changed nothing." for words in unread.beside]
+    words = unread(question)
+    said = [f"The words '{each}' were not understood, so no answer is given." for each in words.turning]
+    return said + [f"The words '{each}' were not understood and changed nothing." for each in words.beside]
 
 
 def _names_motion(words: MotionWords) -> bool:
@@ -204,9 +203,11 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
         along = words.arrow == "along"
         x, y = (x, y) if along else (-x, -y)
-        if words.direction is not None and x * words.direction[0] + y * words.direction[1] < AGREES * math.hypot(x, y):
+        said = words.direction or (x, y)
+        if x * said[0] + y * said[1] < AGREES * math.hypot(x, y) * math.hypot(*said):
             raise CannotReadDirection(
-                f"The question names the arrow and another direction, and the arrow does not point there. {GIVE_DIRECTION}"
+                "The question names the arrow and another direction, and the arrow does not point there. "
+                f"{GIVE_DIRECTION}"
             )
         return MotionReading(kind, (x, y), "arrow", along_arrow=along)
     if words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth:

@@ -50,24 +50,28 @@ def at_place(regions: Sequence[Region], relation: str, beside: Region | None) ->
     lead = CLEAR * _size(regions)
     if beside is None:
         return _first(regions, (2, -1 if relation == "far" else 1), lead)
-    x0, _, x1, y1 = beside.bbox
     x, y = beside.centre
-    on_side = {
-        "behind": lambda region: region.bbox[3] < y1 and region.bbox[0] < x1 and region.bbox[2] > x0,
-        "front_of": lambda region: region.bbox[3] > y1 and region.bbox[0] < x1 and region.bbox[2] > x0,
-        "left_of": lambda region: region.centre[0] < x,
-        "right_of": lambda region: region.centre[0] > x,
-        "above": lambda region: region.centre[1] < y and x0 < region.centre[0] < x1,
-        "on": lambda region: region.centre[1] < y and x0 < region.centre[0] < x1,
-        "below": lambda region: region.centre[1] > y and x0 < region.centre[0] < x1,
-    }  # fmt: skip
-    possible = [region for region in regions if relation not in on_side or on_side[relation](region)]
+    possible = [region for region in regions if _is_there(region, relation, beside)]
     if len(possible) < 2:
         return possible
     sign = -1 if relation == "far" else 1
     ranked = sorted(possible, key=lambda region: sign * math.dist(region.centre, (x, y)))
     gap = abs(math.dist(ranked[1].centre, (x, y)) - math.dist(ranked[0].centre, (x, y)))
     return ranked[:1] if gap >= lead else possible
+
+
+def _is_there(region: Region, relation: str, beside: Region) -> bool:
+    """Whether a region is on the side of another one that a relation names; near and far are on every side."""
+    (x, y), (x0, _, x1, y1) = beside.centre, beside.bbox
+    own_x, own_y = region.centre
+    overlaps = region.bbox[0] < x1 and region.bbox[2] > x0
+    sides = {
+        "behind": overlaps and region.bbox[3] < y1, "front_of": overlaps and region.bbox[3] > y1,
+        "left_of": own_x < x, "right_of": own_x > x,
+        "above": own_y < y and x0 < own_x < x1, "on": own_y < y and x0 < own_x < x1,
+        "below": own_y > y and x0 < own_x < x1,
+    }  # fmt: skip
+    return sides.get(relation, True)
 
 
 def _first(regions: Sequence[Region], measure: tuple[int, int], lead: float) -> list[Region]:

@@ -14,7 +14,6 @@ from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.asked_words import means_mover
 from cow_service.readers.question.parsing import parse_from
 from cow_service.readers.question.phrases import PUNCTUATION, Item, key_at
-from cow_service.readers.question.relations import covered_items
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import words_of
 
@@ -41,9 +40,9 @@ class Unread:
     beside: tuple[str, ...] = ()
 
 
-def unread_words(question: Question) -> Unread:
-    """The words that no rule read, sentence by sentence."""
-    items, covered = question.items, covered_items(question)
+def unread_words(question: Question, covered: frozenset[int]) -> Unread:
+    """The words that no rule read, sentence by sentence. `covered` are the places of the items that ask."""
+    items = question.items
     turning = [question.pronoun] if question.pronoun else list[str]()
     beside: list[str] = []
     for sentence in _sentences(items):
@@ -89,9 +88,11 @@ def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Itera
 
 def _leads_on(question: Question, at: int) -> bool:
     """ "By rolling left", "of sliding": before a verb of the motion that was read."""
-    after = question.items[at + 1] if at + 1 < len(question.items) else None
-    rolling = after is not None and after.key in lex.VERBS and lex.VERBS[after.key].form == "ing"
-    return rolling and after.start in question.read and question.items[at].key in {"by", "of", "when"}
+    if question.items[at].key not in {"by", "of", "when"} or at + 1 == len(question.items):
+        return False
+    after = question.items[at + 1]
+    rolling = after.key in lex.VERBS and lex.VERBS[after.key].form == "ing"
+    return rolling and after.start in question.read
 
 
 def _trimmed(question: Question, run: list[int]) -> Iterator[list[int]]:
@@ -105,10 +106,8 @@ def _harmless(question: Question, sentence: range, covered: frozenset[int]) -> s
     """The places of what changes nothing: a floor where it moves, "please", the mover named again."""
     items = question.items
     found = {at for at in sentence if _names_known(question, items[at])}
-    named = [items[at].phrase for at in sentence if items[at].phrase is not None]
-    if all(items[at].key in _NAMING or items[at].phrase for at in sentence) and all(each.is_thing for each in named):
-        if lex.BE.isdisjoint(items[at].key for at in sentence) or items[sentence.start].key in {"there", "here"}:
-            return set(sentence)  # "There is a ball and a mug."
+    if _only_names([items[at] for at in sentence]):
+        return set(sentence)
     words, tries = words_of(items[sentence.start : sentence.stop]), 0
     for place, word in enumerate(words):
         at = sentence.start + word.at
@@ -124,6 +123,12 @@ def _harmless(question: Question, sentence: range, covered: frozenset[int]) -> s
         if (str(node.data) if isinstance(node, Tree) else "") in _NO_MATTER:
             found |= set(range(at, sentence.start + end))
     return found
+
+
+def _only_names(sentence: list[Item]) -> bool:
+    """ "There is a ball and a mug.", "A ball, a mug." """
+    plain = all(item.key in _NAMING if item.phrase is None else item.phrase.is_thing for item in sentence)
+    return plain and (lex.BE.isdisjoint(item.key for item in sentence) or sentence[0].key in {"there", "here"})
 
 
 def _names_known(question: Question, item: Item) -> bool:

@@ -104,14 +104,19 @@ def _phrase_tokens(
     named = phrase.inside_box or phrase.colour is not None or phrase.number is not None
     if not named and _GENERIC.intersection(content) and set(content) <= _GENERIC | _OF_GENERIC:
         return _generic(determiners, content)
-    vague = not asked and not lex.VAGUE_DETERMINERS.isdisjoint(determiners)
-    counted = content[0].isdecimal() and phrase.number is None  # "3 balls"
-    single = determiners == ["the"] and content[0] == "other" and lex.singular(content[-1]) == content[-1]
-    if vague or counted or set(content[single:]) & _COUNTING or content[-1] in _TRAILING:
+    if _is_several(determiners, content, phrase, asked):
         return ["X"]
     name = f"{'K' if asked else 'T'}{len(known)}"
     known[name] = phrase
     return ["which", name] if asked else [name]
+
+
+def _is_several(determiners: Sequence[str], content: Sequence[str], phrase: ObjectPhrase, asked: bool) -> bool:
+    """Whether a phrase is of no one thing, or has a word of counting or of order in it."""
+    vague = not asked and not lex.VAGUE_DETERMINERS.isdisjoint(determiners)
+    counted = content[0].isdecimal() and phrase.number is None  # "3 balls"
+    single = determiners == ["the"] and content[0] == "other" and lex.singular(content[-1]) == content[-1]
+    return vague or counted or bool(set(content[single:]) & _COUNTING) or content[-1] in _TRAILING
 
 
 def _count_determiners(words: Sequence[str]) -> int:

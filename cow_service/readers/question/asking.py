@@ -27,7 +27,8 @@ _ACTS: dict[str, tuple[AskedRelation, bool]] = {
     "together": ("touches", False),
     "hides": ("covers", False), "what_hides": ("covers", False), "hidden": ("covers", True), "stays": ("covers", True),
     "passes_behind": ("covered", False), "what_passes_behind": ("covered", False),
-    "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False), "lands": ("lands", False), "disappears": ("covers", True),
+    "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False),
+    "lands": ("lands", False), "disappears": ("covers", True),
     "tips_it": ("tips", False), "tips": ("tips", True), "tipped": ("tips", True),
     "moves_it": ("moves", False), "moves": ("moves", True), "moved": ("moves", True), "still": ("moves", True),
 }  # fmt: skip

@@ -255,14 +255,11 @@ def _missed(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> str:
     touched = any(each.kind == "touches" for each in met)
     if outcome is None or outcome.asked.relation not in _KINDS or (outcome.asked.target and not outcome.object):
         return "" if body or touched else _NOTHING_MET["touches"]
-    if asked != body:
+    if asked != body or _asked_about(trajectory) is not None:
         return ""
-    if _asked_about(trajectory) is not None:
-        return ""
-    if outcome.asked.partly and outcome.probability is not None:
-        name = named(outcome.object, "the") if outcome.object else "something"
-        if (outcome.probability >= 0.5) != outcome.asked.negated:  # less than an encounter tells of
-            return f"hides a part of {name}" if outcome.asked.relation == "covers" else f"is partly hidden by {name}"
+    if outcome.asked.partly and ((outcome.probability or 0.0) >= 0.5) != outcome.asked.negated:
+        name = named(outcome.object, "the") if outcome.object else "something"  # less than an encounter tells of
+        return f"hides a part of {name}" if outcome.asked.relation == "covers" else f"is partly hidden by {name}"
     if outcome.asked.target is None or outcome.object is None:
         return _NOTHING_MET[outcome.asked.relation]
     return _NOT_MET[outcome.asked.relation].format(named(outcome.object, "the"))

@@ -24,6 +24,7 @@ ArrowSense = Literal["along", "against"]
 SLIGHTLY = math.tan(math.pi / 8)  # "slightly up": half of a diagonal's 45 degrees
 _WINDOW = 14  # words of one adverbial
 _MAX_TRIES = 24  # of one motion: each takes a part of a ms
+_FIRST_LEG_ONLY = frozenset({"along", "against", "reversed", "towards", "forward", "backward"})
 _THEN = lex.words("then afterwards finally")
 _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
@@ -147,8 +148,10 @@ def read_motion(
                     legs.append(_Leg(""))
             elif items[0].key in lex.VERBS and len(legs) > 1 and not leg.verb:
                 leg.verb = lex.lemma(items[0].key)
-        elif isinstance(node, Tree) and not _apply(legs[-1], node, found, mover, asked or kind == "fall", arrow, len(legs) > 1):
-            continue
+        elif isinstance(node, Tree):
+            later = len(legs) > 1 and str(node.data) in _FIRST_LEG_ONLY
+            if later or not _apply(legs[-1], node, found, mover, asked or kind == "fall", arrow):
+                continue
         read |= {item.start for item in items}
     first, *rest = [leg for at, leg in enumerate(legs) if not at or leg.way(None) is not None or leg.depths]
     return _motion(first, rest, _kind(first, kind), frozenset(read))
@@ -183,7 +186,9 @@ def arrow_statement(found: Sequence[Item]) -> frozenset[int]:
         opens = key_at(found, word.at - 1) in {".", "?", "!", ";", ":", ",", "that", "and"} and not (
             place and words[place - 1].at == word.at
         )
-        parsed = parse_from("adverbial", words[place : place + _WINDOW]) if opens and word.text in {"the", "a"} else None
+        if not opens or word.text not in {"the", "a"}:
+            continue
+        parsed = parse_from("adverbial", words[place : place + _WINDOW])
         if parsed is not None and isinstance(parsed[0].children[0], Tree) and parsed[0].children[0].data == "told":
             return frozenset(found[each.at].start for each in words[place : place + parsed[1]])
     return frozenset()
@@ -259,12 +264,10 @@ def _is_next_verb(found: Sequence[Item], at: int) -> bool:
 
 
 def _apply(
-    leg: _Leg, node: Tree[Token], found: Sequence[Item], mover: ObjectPhrase | None, open_end: bool, arrow: bool, later: bool
+    leg: _Leg, node: Tree[Token], found: Sequence[Item], mover: ObjectPhrase | None, open_end: bool, arrow: bool
 ) -> bool:
     """Takes one adverbial into a leg; false where it says nothing there."""
     name = str(node.data)
-    if later and name in {"along", "against", "reversed", "towards", "forward", "backward"}:
-        return False
     match name:
         case "heading":
             weight = SLIGHTLY if next(node.find_data("slight"), None) is not None else 1.0

@@ -8,13 +8,16 @@ from dataclasses import replace
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
 
-
 _REFERRING = frozenset([("the", "latter"), ("the", "former")])
 _OTHER = frozenset([("the", "other", "one"), ("the", "other")])
 
 
 def with_nouns(found: Sequence[Item]) -> list[Item]:
-    """The items, where "the latter" is what was named last, "the other one" is of the kind named, and "the red one" has the noun of the kind that is asked for, or that of all things before it."""
+    """The items, where a reference has what it means.
+
+    "The latter" is what was named last, "the other one" is of the kind named, and "the red one" of the kind that is
+    asked for, or of that of all things before it.
+    """
     kinds = {_kind_of(item.phrase) for at, item in enumerate(found) if item.phrase and _is_asked_for(found, at)} - {""}
     before: set[str] = set()
     said: list[Item] = []

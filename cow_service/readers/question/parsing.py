@@ -107,7 +107,8 @@ class _Grammar:
         """The tree of a rule that is whole in a column; None where it is not."""
         for item in column:
             if item.is_complete and item.node is not None and item.s == NonTerminal(start) and item.start == 0:
-                made: Any = ForestToParseTree(Tree, self.earley.callbacks, None, True, False).transform(item.node)
+                to_tree: Any = ForestToParseTree
+                made: Any = to_tree(Tree, self.earley.callbacks, None, True, False).transform(item.node)
                 return made
         return None
 

@@ -1,7 +1,7 @@
 """Reads which event a question asks about: that the mover hits, lands on, hides or is hidden by something.
 
-The question is taken at its word, by the grammar of `asked_grammar`. Anything beside it (an order of events, a number,
-a thing that is taken away, another thing that moves) leaves it unread: a wrong yes is worse than "not sure".
+The question is taken at its word: one that has a word which no rule reads, where that may turn its meaning, is not
+read at all. A wrong yes is worse than "not sure".
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
+from cow_service.readers.question.accounting import Unread, unread_words
 from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
 from cow_service.readers.question.asking import IT, Asking, read_clause
-from cow_service.readers.question.phrases import Item, ObjectPhrase
+from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import PRONOUNS, Word, base_forms
 from cow_service.records import Asked
@@ -27,24 +28,10 @@ _OPENERS = lex.words(", and then so but now please")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
 _SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
 _CONDITIONS = lex.words("if when once after as while upon assuming given provided suppose supposing")
-_SUBJECT = r"(?:it|M|T\d+|they|there)(?: .*)?"
-_INVERTED = re.compile(rf"(?:.* )?(?:will|would|do|does|did|can|could) {_SUBJECT}|be {_SUBJECT}")
-# They set something else in motion, take it away, put it in, or turn the condition round.
-_INTERVENTIONS = lex.words(
-    "remove removes removed removing delete deleted erase erased taken without absent gone missing put puts putting",
-    "insert inserted add added replace replaced swap swapped exchange exchanged trail unless instead otherwise except",
-    "rather no",
-)
-_NOT_THERE = re.compile(r".*\b(?:not|n't|never) (?:there|here|present|exist|existed)\b.*")
-_SHORT_ANSWER = lex.words(
-    "please answer reply respond say just only with by in a single word yes no or not sure either"
-)
-_TIMED = re.compile(rf".*\b(?:after|within|before|in) (?:[\d.]+|{'|'.join(lex.NUMBER_WORDS)}) (?:s|secs?|seconds?)\b.*")
 _MAX_TRIES = 8  # of one sentence: each takes some ms
 MAX_SENTENCES = 12  # of one question; more are not read
 _LIST = re.compile(r"(?P<list>T\d+(?: , T\d+)*(?: ,)? or T\d+)")
 _LIST_AT_END = re.compile(r".*?, " + _LIST.pattern)
-_BEFORE_PLACES = lex.words("to of by near behind beside in on at from under above below with toward towards into")
 _HOLLOW = lex.words("bowl basket hole pocket goal bin bucket pit hoop net drawer gap garage tunnel cave tray pan pot")
 
 
@@ -68,7 +55,7 @@ def read_asked(question: Question) -> Asked | None:
     """
     reading = _read(question)
     falls = question.motion.kind in {"fall", "projectile"}
-    if reading is None or (reading.asking.relation == "lands" and not falls):
+    if reading is None or unread(question).turning or (reading.asking.relation == "lands" and not falls):
         return None  # what stands on the floor lands on it by nothing that the worlds tell
     asking = reading.asking
     target = None if asking.target is None else _named(asking.target, reading, question)
@@ -99,10 +86,11 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     return tuple(listed or named.values())
 
 
-def covered_items(question: Question) -> frozenset[int]:
-    """The places in `Question.items` of the clause that asks, as far as it was read."""
+@lru_cache(maxsize=64)
+def unread(question: Question) -> Unread:
+    """The words of the question that no rule has read."""
     reading = _read(question)
-    return frozenset() if reading is None else reading.items
+    return unread_words(question, frozenset() if reading is None else reading.items)
 
 
 @lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
@@ -115,12 +103,6 @@ def _read(question: Question) -> _Reading | None:
     if len(readings) != 1:
         return None
     at, reading = readings[0]
-    for place, sentence in enumerate(found):
-        covered = reading.covered if place == at else frozenset[int]()
-        if place != at and _INVERTED.fullmatch(" ".join(sentence.tokens)):
-            return None
-        if not _leaves_world(sentence, covered, question):
-            return None
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
         return None
@@ -162,7 +144,9 @@ def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
 
 def _ends(tokens: Sequence[str], at: int, question: Question) -> bool:
     """Whether a condition begins at a token: "if it rolls", "by rolling"."""
-    return tokens[at] in _CONDITIONS or (tokens[at] == "by" and tokens[at + 1 : at + 2] == [f"{question.motion.verb}-ing"])
+    return tokens[at] in _CONDITIONS or (
+        tokens[at] == "by" and tokens[at + 1 : at + 2] == [f"{question.motion.verb}-ing"]
+    )
 
 
 def _starts(sentence: Sentence, at: int) -> bool:
@@ -187,9 +171,7 @@ def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]
 
 
 def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Reading | None:
-    tokens = [*sentence.tokens, ""]
-    spoken = [at for at in places if tokens[at] != "n't" or not _is_subject(tokens[at + 1])]  # "won't it hit the cup?"
-    words = [word for at in spoken for word in _words(tokens[at], at, question)]
+    words = [word for at in places for word in _words(sentence.tokens[at], at, question)]
     beside = question.motion.others[0].object if len(question.motion.others) == 1 else None
     phrases = sentence.phrases if beside is None else sentence.phrases | {"+": beside}
     asking = read_clause(words, None if beside is None else "+")
@@ -201,10 +183,6 @@ def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Re
         phrases = phrases | {IT: question.others[0]}
     asking = _into_hollow(asking, [sentence.tokens[at] for at in places], phrases)
     return None if asking is None else _Reading(asking, phrases, frozenset(places))
-
-
-def _is_subject(token: str) -> bool:
-    return token in PRONOUNS or token in {"M", "OBJ", "OBJS"} or token[:1] == "T"
 
 
 def _words(token: str, at: int, question: Question) -> list[Word]:
@@ -241,43 +219,6 @@ def _relates(token: str, after: str) -> bool:
     """Whether a clause follows on "which", "when" or "where": then nothing is asked with them."""
     subject = after[:1] in {"M", "T", "X"} or after in _SUBJECTS or after.startswith("OBJ")
     return subject or (token == "when" and after.removesuffix("-ing") in lex.VERBS)
-
-
-def _leaves_world(sentence: Sentence, covered: frozenset[int], question: Question) -> bool:
-    """Whether the words around a question leave its world as it is: one thing moves, and hits nothing yet."""
-    tokens, rest = sentence.tokens, [at for at in range(len(sentence.tokens)) if at not in covered]
-    words = [word for at in rest for word in sentence.words[at]]
-    if set(words) <= _SHORT_ANSWER:
-        return True
-    if not _INTERVENTIONS.isdisjoint(words) or _NOT_THERE.fullmatch(" ".join(words)):
-        return False
-    if _TIMED.fullmatch(" ".join(words)):
-        return False  # "will it have hit the cup after 2 seconds?"
-    return not any(_moves_another(sentence, at, question) or _hits(tokens, at) for at in rest)
-
-
-def _moves_another(sentence: Sentence, at: int, question: Question) -> bool:
-    """Whether another thing than the mover, or a hand that moves it, is the subject of a verb of motion at a place."""
-    tokens = sentence.tokens
-    verb = lex.VERBS.get(tokens[at])
-    subject = at - 2 if at > 1 and tokens[at - 1] == "be" else at - 1
-    if verb is None or verb.kind in {None, "static"} or subject < 0 or tokens[subject] not in sentence.phrases:
-        return False
-    known = [other.object for other in question.motion.others]
-    if sentence.phrases[tokens[subject]] in known:
-        return False
-    if sentence.phrases[tokens[subject]].head in lex.AGENTS and tokens[at + 1 : at + 2] == ["M"]:
-        return False
-    return subject == 0 or tokens[subject - 1] not in _BEFORE_PLACES
-
-
-def _hits(words: Sequence[str], at: int) -> bool:
-    """Whether something is said to hit, hide or reach another thing than the mover."""
-    lemma = words[at].removesuffix("-ing")
-    if lemma not in lex.TOUCH | lex.OCCLUDE or lemma in {"contact", "impact"}:
-        return False
-    after = [word for word in words[at + 1 : at + 3] if word not in {"into", "against", "with"}]
-    return words[at - 1 : at] != ["be"] and after[:1] not in (["M"], ["it"])
 
 
 def _into_hollow(asking: Asking, tokens: Sequence[str], phrases: dict[str, ObjectPhrase]) -> Asking | None:

@@ -29,6 +29,7 @@ from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
 from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.trail_words import TrailWords, split_trail
+from cow_service.records import MotionKind
 
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
@@ -67,57 +68,74 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    interventions, everything = split_interventions(with_places(with_nouns(items(split_options(question)[1]))))
-    trail, everything = split_trail(_at_the_same_time(everything))
-    found = _without_instructions(everything)
+    listed = with_places(with_nouns(items(split_options(question)[1])))
+    changes, found = split_interventions(listed)
+    trail, found = split_trail(_at_the_same_time(found))
+    found = _without_instructions(found)
     clauses = read_clauses(found)
     best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
     at = best.at if best else len(found)
-    end = clause_end(found, at) if best else at
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
-    verb, kind = (best.verb, best.kind) if best else ("fall", "fall") if _on_its_way_down(found, interventions) else ("", None)
-    beside = _movers_beside(clauses, best)
-    end = min([end, *(other.start for other in beside)])
-    shared = _sharing(found, at, end)
-    told = arrow_statement(found)
-    words = {token.key for token in tokens(question)}
-    arrow = any(word.startswith("arrow") for word in words)
-    motion = read_motion(
-        found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
-    )
-    start = best.start if best else 0
-    motion = with_front(motion, found[start:at] if best else found, told)
-    speeds = [each for each in [*found[:start], *found[end:]] if each.quantity and isinstance(each.quantity.speed, Quantity)]
-    motion = replace(
-        motion, quantities=(*motion.quantities, *(each.quantity for each in speeds if each.quantity)),
-        read=motion.read.union(each.start for each in speeds),
-    )  # fmt: skip
-    if trail is not None and trail.near is None and trail.side is None and motion.direction is not None:
-        trail = replace(trail, side=motion.direction)  # "on along its trail to the right": its last end is on the right
-    motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
-    fitted = frozenset[int]()
-    if not interventions and (best is None or (best.asked and not _says_way(motion))):
-        interventions, fitted = implied_placing(found)
-    put = next((change for change in interventions if change.kind == "place"), None)
-    if put is not None and (best is None or best.asked or best.kind == "static" or _is_carried(best, put)):
-        mover, motion = put.object, replace(motion, kind="place", verb="put")
+    arrow = any(token.key.startswith("arrow") for token in tokens(question))
+    clause, motion = _motion(found, clauses, best, mover, arrow, changes)
+    motion, fitted = replace(motion, trail=_ending(trail, motion)), frozenset[int]()
+    if not changes and (best is None or (best.asked and not _says_way(motion))):
+        changes, fitted = implied_placing(found)
     read = motion.read.union(fitted, *(other.motion.read for other in motion.others))
-    if put is not None and best is not None and _is_carried(best, put):
-        read |= {item.start for item in found[start:end]}
-    clause = range(start if best else at, end)
+    put = next((change for change in changes if change.kind == "place"), None)
+    carried = put is not None and best is not None and _is_carried(best, put)
+    if put is not None and (best is None or best.asked or best.kind == "static" or carried):
+        mover, motion = put.object, replace(motion, kind="place", verb="put")
     return Question(
         mover=mover,
         motion=motion,
-        others=_others(found, mover, clause, interventions, trail),
+        others=_others(found, mover, clause, changes, trail),
         items=tuple(found),
-        interventions=interventions,
+        interventions=changes,
         clause=tuple(found[clause.start : clause.stop]),
         mentions_arrow=arrow,
         names_direction=_DIRECTION_WORDS.search(question) is not None,
         pronoun=_open_pronoun(found, best, mover),
-        read=read,
+        read=read.union(item.start for item in found[clause.start : clause.stop]) if carried else read,
     )
+
+
+def _motion(
+    found: Sequence[Item],
+    clauses: Clauses,
+    best: MotionCandidate | None,
+    mover: ObjectPhrase | None,
+    arrow: bool,
+    changes: Sequence[InterventionWords],
+) -> tuple[range, MotionWords]:
+    """The places of the clause that tells the motion, and what it tells."""
+    at = best.at if best else len(found)
+    beside = _movers_beside(clauses, best)
+    end = min([clause_end(found, at) if best else at, *(other.start for other in beside)])
+    shared = _sharing(found, at, end)
+    verb, kind = (best.verb, best.kind) if best else _falling(found, changes)
+    motion = read_motion(
+        found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
+    )
+    start = best.start if best else 0
+    motion = with_front(motion, found[start:at] if best else found, arrow_statement(found))
+    speeds = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
+    speeds = [(place, said) for place, said in speeds if isinstance(said.speed, Quantity)]
+    motion = replace(
+        motion,
+        quantities=(*motion.quantities, *(said for _, said in speeds)),
+        read=motion.read.union(place for place, _ in speeds),
+        others=_other_motions(found, clauses, best, shared, end),
+    )
+    return range(start if best else at, end), motion
+
+
+def _ending(trail: TrailWords | None, motion: MotionWords) -> TrailWords | None:
+    """ "On along its trail to the right": its last end is on the right."""
+    if trail is None or trail.near is not None or trail.side is not None or motion.direction is None:
+        return trail
+    return replace(trail, side=motion.direction)
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
@@ -129,13 +147,14 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     return phrase
 
 
-def _on_its_way_down(found: Sequence[Item], changes: Sequence[InterventionWords]) -> bool:
+def _falling(found: Sequence[Item], changes: Sequence[InterventionWords]) -> tuple[str, MotionKind | None]:
     """ "What does it touch on its way down?", and "where would it land?" of what loses its support."""
     removed = any(change.kind == "remove" for change in changes)
-    return any(removed and lex.lemma(item.key) == "land" for item in found) or any(
+    falls = any(removed and lex.lemma(item.key) == "land" for item in found) or any(
         item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
         for at, item in enumerate(found)
     )
+    return ("fall", "fall") if falls else ("", None)
 
 
 def _says_way(motion: MotionWords) -> bool:
