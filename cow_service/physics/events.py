@@ -20,7 +20,7 @@ from cow_service.vision.types import Floats, Mask
 __all__ = ["COVERED", "KINDS", "NEVER", "Events", "WorldEvents", "encounters", "find_events", "find_world_events"]
 
 COVERED = 0.3  # share of a silhouette from which it counts as covered
-ANY_PART = 0.03  # share from which a part of it is covered: less is an inexact outline
+ANY_PART = 0.06  # share from which a part of it is covered: less is an inexact outline
 COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
 PerKind = dict[EncounterKind, Floats]  # [K, B] each

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 from lark import Tree
 
@@ -22,7 +23,7 @@ _STRUCTURE = (
     PUNCTUATION | lex.AUXILIARIES | lex.BE | lex.MOVER_PRONOUNS | lex.CAUSATIVES | (lex.CONDITIONALS - {"unless"})
     | lex.words("to that which who and but then so i you we us me there also have has had please now here go come get")
     | lex.words("someone somebody")
-    | lex.words("what happens happen will keep keeps continue continues start starts begin begins s yes ok either")
+    | lex.words("what happens happen tell know will keep keeps continue continues start starts begin begins s yes ok either")
 )  # fmt: skip
 _NAMING = lex.words(", and there is are we see you have here with in on")
 _NEGATIVE = lex.words("no none nothing neither nor unless except")
@@ -128,6 +129,7 @@ def _harmless(question: Question, sentence: range, covered: frozenset[int]) -> s
 def _only_names(sentence: list[Item]) -> bool:
     """ "There is a ball and a mug.", "A ball, a mug." """
     plain = all(item.key in _NAMING if item.phrase is None else item.phrase.is_thing for item in sentence)
+    plain = plain and not any(one.phrase and two.phrase for one, two in pairwise(sentence))  # "Replace the ball"
     return plain and (lex.BE.isdisjoint(item.key for item in sentence) or sentence[0].key in {"there", "here"})
 
 

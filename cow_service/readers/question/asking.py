@@ -29,14 +29,14 @@ _ACTS: dict[str, tuple[AskedRelation, bool]] = {
     "passes_behind": ("covered", False), "what_passes_behind": ("covered", False),
     "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False),
     "lands": ("lands", False), "disappears": ("covers", True),
-    "tips_it": ("tips", False), "tips": ("tips", True), "tipped": ("tips", True),
+    "stays_up": ("tips", True), "tips_it": ("tips", False), "tips": ("tips", True), "tipped": ("tips", True),
     "moves_it": ("moves", False), "moves": ("moves", True), "moved": ("moves", True), "still": ("moves", True),
 }  # fmt: skip
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
-_NEGATIONS = frozenset({"no", "none", "misses", "missed", "avoids", "stays", "no_contact", "sticks_out", "stops_short"})
+_NEGATIONS = frozenset({"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"})
 
 
-_ANY_PART = frozenset({"any_part", "partly", "wholly"})  # hidden in part, or not wholly visible
+_ANY_PART = frozenset({"any_part", "partly", "wholly", "at_some_time"})  # hidden in part or for once, or not wholly visible
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,7 @@ def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: b
         return inside and not has_noun and key_at(found, at - 1) in lex.COLOURS and key_at(found, at + 1) in lex.COLOURS
     if key == "a" and (inside or key_at(found, at - 1) in _NUMBERED):
         return not _is_determiner(found, at)
-    if key in lex.PLACES or key == "one":
+    if key in lex.PLACES or key in {"one", "far"}:
         return determined and not has_noun
     if key in PUNCTUATION or key in _CLOSED or (has_noun and key in _BEHIND) or _is_measure(found, at, has_noun):
         return False
@@ -126,6 +126,8 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
         begun = begun or (verb.form == "base" and _is_label(found, at + 1))
         # "orange" is the one colour that is also a thing that moves: "the orange falls".
         return begun and not (verb.form == "s" and verb.kind is not None and before == "orange")
+    if verb.form == "base" and asked and (verb.kind == "static" or verb.lemma in lex.WEAK):
+        return False  # "will the mug remain standing?"
     if verb.form == "base":
         return not asked or after in lex.VERBS or after in _FINITE_BE
     return verb.form == "s" and after in {"are", "were"}

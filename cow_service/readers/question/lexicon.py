@@ -50,7 +50,7 @@ ADJECTIVES = words(
     "glass rubber paper ceramic stone leather steel cardboard soft hard smooth rough old new other same different",
     "nearest closest farthest furthest nearby leftmost rightmost topmost first second third last single main",
     "whole entire own current original constant lone fuzzy larger smaller bigger taller shorter largest smallest",
-    "biggest tallest shortest latest newest oldest earliest fast slow central front rear distant",
+    "biggest tallest shortest far latest newest oldest earliest fast slow central front rear distant",
 )
 # Nouns that stand before a noun: they stay in a compound, but do not yet make it whole ("toy racing car").
 NOUN_MODIFIERS = words("toy model billiard pool snooker tennis")

@@ -111,7 +111,7 @@ def _motion(
 ) -> tuple[range, MotionWords]:
     """The places of the clause that tells the motion, and what it tells."""
     at = best.at if best else len(found)
-    beside = _movers_beside(clauses, best)
+    beside = _movers_beside(found, clauses, best)
     end = min([clause_end(found, at) if best else at, *(other.start for other in beside)])
     shared = _sharing(found, at, end)
     verb, kind = (best.verb, best.kind) if best else _falling(found, changes)
@@ -192,14 +192,15 @@ def _open_pronoun(found: Sequence[Item], best: MotionCandidate | None, mover: Ob
     return ""
 
 
-def _movers_beside(clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
+def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
     """Motions of other things than the mover's, said in the same way: "the ball moves left and the car goes right"."""
     if best is None or best.asked or best.subject is None or best.subject.head in lex.AGENTS:
         return []
+    while_it = found[best.start].key == "while"  # "while the ball rolls right, the mug slides left"
     return [
         each
         for each in clauses.candidates
-        if each.rank == best.rank and each.at > best.at and each.kind not in {None, "static"}
+        if (each.rank == best.rank or (while_it and not each.asked)) and each.at > best.at and each.kind not in {None, "static"}
         and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 
@@ -223,7 +224,7 @@ def _other_motions(
     if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
         motion = read_motion(found[shared + 1 : end], best.verb, best.kind, thing)
         others.append(OtherWords(thing, motion))
-    for each in _movers_beside(clauses, best):
+    for each in _movers_beside(found, clauses, best):
         if each.subject is not None and all(each.subject != other.object for other in others):
             words = found[each.at : clause_end(found, each.at)]
             others.append(OtherWords(each.subject, read_motion(words, each.verb, each.kind, each.subject)))
