@@ -1,4 +1,4 @@
-"""Every word of a question is read, changes nothing, or is named: where it may turn the meaning, nothing is answered."""
+"""Every word of a question is read, changes nothing, or is named; where it may turn the meaning, no answer is given."""
 
 from __future__ import annotations
 

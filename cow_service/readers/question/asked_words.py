@@ -99,8 +99,16 @@ def _phrase_tokens(
         known[f"K{len(known)}"] = phrase
         return [list(known)[-1]]
     asked = words[0] in {"which", "what"}
-    if means_mover(phrase, question) and not asked:
-        return ["M"]
+    return ["M"] if means_mover(phrase, question) and not asked else _named(determiners, content, phrase, asked, known)
+
+
+def _named(
+    determiners: Sequence[str],
+    content: Sequence[str],
+    phrase: ObjectPhrase,
+    asked: bool,
+    known: dict[str, ObjectPhrase],
+) -> list[str]:
     named = phrase.inside_box or phrase.colour is not None or phrase.number is not None
     if not named and _GENERIC.intersection(content) and set(content) <= _GENERIC | _OF_GENERIC:
         return _generic(determiners, content)

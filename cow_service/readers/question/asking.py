@@ -33,10 +33,12 @@ _ACTS: dict[str, tuple[AskedRelation, bool]] = {
     "moves_it": ("moves", False), "moves": ("moves", True), "moved": ("moves", True), "still": ("moves", True),
 }  # fmt: skip
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
-_NEGATIONS = frozenset({"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"})
+_NEGATIONS = frozenset(
+    {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"}
+)
 
 
-_ANY_PART = frozenset({"any_part", "partly", "wholly", "at_some_time"})  # hidden in part or for once, or not wholly visible
+_ANY_PART = frozenset({"any_part", "partly", "wholly", "at_some_time"})  # hidden in part or once
 
 
 @dataclass(frozen=True)

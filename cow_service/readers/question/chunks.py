@@ -126,10 +126,9 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
         begun = begun or (verb.form == "base" and _is_label(found, at + 1))
         # "orange" is the one colour that is also a thing that moves: "the orange falls".
         return begun and not (verb.form == "s" and verb.kind is not None and before == "orange")
-    if verb.form == "base" and asked and (verb.kind == "static" or verb.lemma in lex.WEAK):
-        return False  # "will the mug remain standing?"
+    goes_on = verb.kind == "static" or verb.lemma in lex.WEAK  # "will the mug remain standing?"
     if verb.form == "base":
-        return not asked or after in lex.VERBS or after in _FINITE_BE
+        return not asked or (not goes_on and (after in lex.VERBS or after in _FINITE_BE))
     return verb.form == "s" and after in {"are", "were"}
 
 

@@ -16,8 +16,9 @@ from cow_service.readers.question.words import PRONOUNS, Word, base_forms
 _WINDOW = 12  # words
 _MAX_TRIES = 5  # of one question: each takes some ms
 _STARTS = lex.words(
-    "within in after at with by for during lasting over only exactly very really quite rather slowly slow gently softly",
-    "lightly fast quickly rapidly swiftly hard forcefully halfway midway half but until till a an stops stopping",
+    "within in after at with by for during lasting over only exactly very really quite rather slowly slow gently",
+    "softly lightly fast quickly rapidly swiftly hard forcefully halfway midway half but until till a an",
+    "stops stopping",
 )
 _PACES = lex.words("slowly slow gently softly lightly fast quickly rapidly swiftly hard forcefully halfway midway")
 _MEASURES = _PACES | lex.words(

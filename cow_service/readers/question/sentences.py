@@ -200,7 +200,8 @@ def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidat
     return [
         each
         for each in clauses.candidates
-        if (each.rank == best.rank or (while_it and not each.asked)) and each.at > best.at and each.kind not in {None, "static"}
+        if (each.rank == best.rank or (while_it and not each.asked)) and each.at > best.at
+        and each.kind not in {None, "static"}
         and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 
