@@ -29,7 +29,7 @@ _NAMING = lex.words(", and there is are we see you have here with in on")
 _NEGATIVE = lex.words("no none nothing neither nor unless except")
 _END = frozenset(".?!;")
 _NO_MATTER = frozenset({"", "marked", "told"})  # adverbials that say nothing of a motion
-_TRIES = 12  # of one question
+_TRIES = 8  # of one question
 MAX_TEXT = 200  # characters of unread words that are named
 
 
@@ -44,7 +44,7 @@ class Unread:
 def unread_words(question: Question, covered: frozenset[int]) -> Unread:
     """The words that no rule read, sentence by sentence. `covered` are the places of the items that ask."""
     items = question.items
-    turning = [question.pronoun] if question.pronoun else list[str]()
+    turning = [words for words in (question.pronoun, question.beyond) if words]
     beside: list[str] = []
     for sentence in _sentences(items):
         runs = [" ".join(_text(items[at]) for at in run) for run in _runs(question, sentence, covered)]

@@ -16,14 +16,14 @@ from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.parsing import parse_from
 from cow_service.readers.question.phrases import Item, ObjectPhrase, QuantityWords, key_at
 from cow_service.readers.question.trail_words import TrailWords
-from cow_service.readers.question.words import words_of
+from cow_service.readers.question.words import ARROWS, words_of
 from cow_service.records import MotionKind, Vector
 
 ArrowSense = Literal["along", "against"]
 
 SLIGHTLY = math.tan(math.pi / 8)  # "slightly up": half of a diagonal's 45 degrees
 _WINDOW = 14  # words of one adverbial
-_MAX_TRIES = 24  # of one motion: each takes a part of a ms
+_MAX_TRIES = 16  # of one motion: each takes a part of a ms
 _FIRST_LEG_ONLY = frozenset({"along", "against", "reversed", "towards", "forward", "backward"})
 _THEN = lex.words("then afterwards finally")
 _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
@@ -186,7 +186,7 @@ def arrow_statement(found: Sequence[Item]) -> frozenset[int]:
         opens = key_at(found, word.at - 1) in {".", "?", "!", ";", ":", ",", "that", "and"} and not (
             place and words[place - 1].at == word.at
         )
-        if not opens or word.text not in {"the", "a"}:
+        if not opens or all(each.text not in ARROWS for each in words[place : place + 4]):
             continue
         parsed = parse_from("adverbial", words[place : place + _WINDOW])
         if parsed is not None and isinstance(parsed[0].children[0], Tree) and parsed[0].children[0].data == "told":

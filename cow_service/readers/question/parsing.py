@@ -54,6 +54,7 @@ class _Grammar:
         self.earley.term_matcher = self._may_be
         self.rules: dict[Any, Any] = self.earley.predictions
         self.earley.predictions = self
+        self.firsts = {rule: self._first(rule.expansion) for rules in self.rules.values() for rule in rules}
         self.kept: dict[tuple[Any, frozenset[str]], list[Any]] = {}
         self.ahead: frozenset[str] = frozenset()  # the terminals that the next word may be
         self.words: Sequence[Word] = ()
@@ -82,7 +83,7 @@ class _Grammar:
         """The rules of a symbol that the next word may begin: lark's parser would follow up all of them."""
         key = symbol, self.ahead
         if key not in self.kept:
-            firsts = [(rule, *self._first(rule.expansion)) for rule in self.rules[symbol]]
+            firsts = [(rule, *self.firsts[rule]) for rule in self.rules[symbol]]
             self.kept[key] = [rule for rule, first, empty in firsts if empty or not self.ahead.isdisjoint(first)]
         return self.kept[key]
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 from lark import Token, Tree
 
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.parsing import may_begin, parse_from
 from cow_service.readers.question.phrases import Item, PlaceWords, key_at
 from cow_service.readers.question.words import words_of
 
-_MAX_TRIES = 10  # of one question
+_MAX_TRIES = 8  # of one question
 _WINDOW = 9  # words
 _PUTS = lex.words("put place insert set position lower")
 
@@ -25,9 +25,13 @@ def with_places(found: Sequence[Item]) -> list[Item]:
     while at < len(found):
         item, end = found[at], at + 1
         if item.phrase is not None and item.phrase.is_thing and tries < _MAX_TRIES and end < len(found):
+            if not may_begin("place", words_of(found[end : end + 1])[0]):
+                joined.append(item)
+                at = end
+                continue
             ahead = words_of(found[end : end + _WINDOW])
             parsed = parse_from("place", ahead)
-            tries += parsed is not None
+            tries += 1
             read = None if parsed is None else _place(found[end:], parsed[0])
             if parsed is not None and read is not None and not _is_goal(found, at, ahead[0].text):
                 stop = end + ahead[parsed[1] - 1].at + 1

@@ -31,6 +31,7 @@ from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 from cow_service.records import MotionKind
 
+MAX_WORDS = 240  # of a question that are read
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
 )
@@ -61,6 +62,7 @@ class Question:
     clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
+    beyond: str = ""  # how what is not read any more begins
     pronoun: str = ""  # that stands for the mover where it may stand for two things
     read: frozenset[int] = frozenset()
 
@@ -68,8 +70,8 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    listed = with_places(with_nouns(items(split_options(question)[1])))
-    changes, found = split_interventions(listed)
+    text, beyond = _cut(split_options(question)[1])
+    changes, found = split_interventions(with_places(with_nouns(items(text))))
     trail, found = split_trail(_at_the_same_time(found))
     found = _without_instructions(found)
     clauses = read_clauses(found)
@@ -96,9 +98,19 @@ def parse(question: str) -> Question:
         clause=tuple(found[clause.start : clause.stop]),
         mentions_arrow=arrow,
         names_direction=_DIRECTION_WORDS.search(question) is not None,
+        beyond=beyond,
         pronoun=_open_pronoun(found, best, mover),
         read=read.union(item.start for item in found[clause.start : clause.stop]) if carried else read,
     )
+
+
+def _cut(text: str) -> tuple[str, str]:
+    """So much of a text as is read, and how the rest begins."""
+    found = tokens(text)
+    if len(found) <= MAX_WORDS:
+        return text, ""
+    rest = text[found[MAX_WORDS].start : found[min(MAX_WORDS + 6, len(found) - 1)].end]
+    return text[: found[MAX_WORDS].start], " ".join(rest.split())
 
 
 def _motion(
