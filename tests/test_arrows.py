@@ -98,6 +98,7 @@ def test_large_images_are_measured_in_their_own_pixels() -> None:
     assert found[0].mask.shape == (1500, 2000)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("folder", all_scenes(), ids=lambda path: path.name)
 def test_images_without_a_drawing_have_no_cues(folder) -> None:
     clean = np.ascontiguousarray(cv2.imread(str(folder / "clean.jpg"))[..., ::-1])

@@ -68,6 +68,7 @@ class Checkout:
     port: int
     server: ExitStack = field(default_factory=ExitStack)  # of the programs and commands that start none themselves
     is_serving: bool = False
+    is_refused: bool = False  # what needs a GPU was
 
     def serve(self) -> None:
         """Sees to it that `cow serve` runs."""
@@ -250,6 +251,9 @@ def run_commands(checkout: Checkout, text: str) -> None:
         serves = False
         for part in parts(text):
             if NEEDS_A_GPU in part:
+                if checkout.is_refused:
+                    continue  # as on another page
+                checkout.is_refused = True
                 checkout.stop()
                 refused = checkout.run(part)  # here, a GPU and the real weights are what is missing
                 assert refused.returncode != 0

@@ -18,6 +18,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
+from conftest import SCALE
 from drawn import png_bytes
 from hypothesis import HealthCheck, given
 from hypothesis import settings as trying
@@ -382,7 +383,7 @@ def test_jobs_that_come_and_go_between_pages_hide_no_others(tmp_path_factory: py
     with Served(tmp_path_factory.mktemp("coming")) as one:
 
         @given(data=st.data(), limit=st.integers(1, 6), count=st.integers(1, 12))
-        @trying(max_examples=12, suppress_health_check=list(HealthCheck))
+        @trying(max_examples=6 * SCALE, suppress_health_check=list(HealthCheck))
         def check(data: st.DataObject, limit: int, count: int) -> None:
             made = [one.submit(BODY)["id"] for _ in range(count)]
             for job in made:

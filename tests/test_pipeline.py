@@ -37,6 +37,7 @@ def picture(service: Service, sha256: str) -> np.ndarray:
     return np.array(Image.open(io.BytesIO(service.artifacts.read(sha256))))
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("folder", all_scenes(), ids=lambda path: path.name)
 def test_scenes_with_known_truth(service: Service, folder) -> None:
     scene = Example(folder)
@@ -55,6 +56,7 @@ def test_scenes_with_known_truth(service: Service, folder) -> None:
     assert meta["target"] in [other.object for other in simulation.grounding.others]
 
 
+@pytest.mark.soak
 def test_encounters_give_the_true_answer(service: Service) -> None:
     right = []
     for folder in all_scenes():

@@ -133,6 +133,7 @@ def test_a_cluttered_image_gives_nothing() -> None:
     assert find_regions(cv2.resize(noise, (640, 480), interpolation=cv2.INTER_NEAREST)) == ()
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("folder", all_scenes(), ids=lambda path: path.name)
 def test_objects_of_rendered_scenes(folder) -> None:
     scene = example(folder.name) if folder.parent.name == "examples" else type(example("x"))(folder)

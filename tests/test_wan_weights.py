@@ -17,8 +17,11 @@ from golden import original_weights
 from hub import Blob, Hub, running
 from safetensors.torch import save
 
+from cow_service.errors import CheckpointInvalid, WeightsUnavailable
+from cow_service.generators.wan.loading import create_ati
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.records import Simulation
+from cow_service.settings import Settings
 from cow_service.weights.manifests import load_manifests
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -66,20 +69,18 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def cow(home: Path, hub: Hub, *arguments: str, **settings: str) -> subprocess.CompletedProcess[str]:
+def cow(home: Path, hub: Hub, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {
         "COW_DATA_DIR": str(home / "data"), "COW_PROFILE": "portable", "COW_DEVICE": "cpu", "HF_ENDPOINT": hub.address,
         "HF_HOME": str(home / "hub"), "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb",
     }  # fmt: skip
     command = [sys.executable, "-m", "cow_service.cli.main", *arguments]
-    return subprocess.run(
-        command, env=os.environ | environment | settings, cwd=home, capture_output=True, text=True, check=False
-    )
+    return subprocess.run(command, env=os.environ | environment, cwd=home, capture_output=True, text=True, check=False)
 
 
-def simulate(home: Path, hub: Hub, **settings: str) -> subprocess.CompletedProcess[str]:
-    options = ("--generator", "ati", "--num-frames", "5", "--no-video", "--out", "out", "--option", "steps=2")
-    return cow(home, hub, "simulate", "image.jpg", BALL.meta["question"], *options, **settings)
+def settings(home: Path, **given: Any) -> Settings:
+    """Those of the server that `cow` is."""
+    return Settings(data_dir=home / "data", profile="portable", device="cpu", **given)
 
 
 def test_pulled_checked_loaded_and_used(home: Path, hub: Hub) -> None:
@@ -91,7 +92,8 @@ def test_pulled_checked_loaded_and_used(home: Path, hub: Hub) -> None:
     assert cow(home, hub, "models", "check", "ati").returncode == 0
     models = json.loads(cow(home, hub, "models", "--json").stdout)["generators"]
     assert [(m["ready"], m["pull"]) for m in models if m["name"] == "ati"] == [(True, None)]
-    done = simulate(home, hub)
+    options = ("--generator", "ati", "--num-frames", "5", "--no-video", "--out", "out", "--option", "steps=2")
+    done = cow(home, hub, "simulate", "image.jpg", BALL.meta["question"], *options)
     assert done.returncode == 0, done.stderr
     found = Simulation.model_validate_json((home / "out" / "simulation.json").read_bytes())
     repository = ATI.sources["transformer"].repository
@@ -108,24 +110,22 @@ def test_damaged_weights_are_not_loaded(home: Path, hub: Hub) -> None:
     whole = file.read_bytes()
     try:
         file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-        refused = simulate(home, hub)
-        assert refused.returncode == 1
-        assert "weights-unavailable: " in refused.stderr
-        assert "diffusion_pytorch_model-00002-of-00002.safetensors" in refused.stderr
-        assert "cow models pull ati" in refused.stderr
+        with pytest.raises(WeightsUnavailable) as refused:
+            create_ati(settings(home))
+        assert "diffusion_pytorch_model-00002-of-00002.safetensors" in refused.value.detail
+        assert "cow models pull ati" in refused.value.detail
     finally:
         file.write_bytes(whole)
 
 
 def test_a_checkpoint_of_ones_own(home: Path, hub: Hub, tmp_path: Path) -> None:
     """One file in place of the pulled transformer; what is wrong with it is named, and no path of this machine."""
-    absent = simulate(home, hub, COW_CHECKPOINTS=json.dumps({"ati": str(tmp_path / "absent.safetensors")}))
-    assert "There is no checkpoint 'absent.safetensors'" in absent.stderr
+    assert cow(home, hub, "models", "pull", "ati").returncode == 0
+    with pytest.raises(CheckpointInvalid, match=r"There is no checkpoint 'absent.safetensors'"):
+        create_ati(settings(home, checkpoints={"ati": tmp_path / "absent.safetensors"}))
     (tmp_path / "mine.safetensors").write_bytes(
         save({"blocks.0.self_attn.q.weight": original_weights()["head.head.bias"]})
     )
-    refused = simulate(home, hub, COW_CHECKPOINTS=json.dumps({"ati": str(tmp_path / "mine.safetensors")}))
-    assert refused.returncode == 1
-    assert "checkpoint-invalid: " in refused.stderr
-    assert "missing: " in refused.stderr
-    assert str(tmp_path) not in refused.stderr
+    with pytest.raises(CheckpointInvalid, match="missing: ") as refused:
+        create_ati(settings(home, checkpoints={"ati": tmp_path / "mine.safetensors"}))
+    assert str(tmp_path) not in refused.value.detail

@@ -78,7 +78,7 @@ class Clip(Record):
 
     frames: tuple[Frame, ...]
     factual_frames: tuple[Frame, ...] = Field(
-        default=(), description="The same frames of the scene as it is, where something is taken away."
+        default=(), description="The same frames of the scene as it is, where something is taken away or put elsewhere."
     )
     video: Video | None = None
     overlay: Artifact
@@ -98,7 +98,7 @@ class Simulation(Record):
     trajectory: Trajectory
     frames: tuple[Frame, ...] = Field(description="The frames chosen for reasoning.")
     factual_frames: tuple[Frame, ...] = Field(
-        default=(), description="The same frames of the scene as it is, where something is taken away."
+        default=(), description="The same frames of the scene as it is, where something is taken away or put elsewhere."
     )
     video: Video | None = Field(description="Null where the request said `video: false`.")
     overlay: Artifact = Field(description="The input with box, point, arrow and path drawn.")
@@ -146,6 +146,9 @@ class Problem(BaseModel):
         return self.type.rpartition(":")[2]
 
 
+OptionsSource = Literal["request", "question-letters", "question-list", "none"]
+
+
 class AnswerOption(Record):
     """One of the answers that a question offers."""
 
@@ -175,6 +178,11 @@ class Answer(Verdict):
     created_at: str = Field(description="RFC 3339, UTC.")
     question: str
     options: tuple[AnswerOption, ...] = Field(description="From the request or the question; empty where it is open.")
+    options_source: OptionsSource = Field(
+        default="none",
+        description="Where they stand: in the request, in the question with letters, or there as a list without (which "
+        "get A, B, C...).",
+    )
     image: ImageInfo
     simulation: Simulation | None = Field(description="Null where nothing was imagined, or that failed.")
     simulation_problem: Problem | None = Field(default=None, description="Why imagining failed, where it did.")

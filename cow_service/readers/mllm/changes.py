@@ -12,6 +12,7 @@ from cow_service.readers.base import Quantity, Unit
 from cow_service.readers.mllm.coordinates import NUMBER
 from cow_service.readers.mllm.replies import fields_of, first_of, is_none, name_words, text_of
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
+from cow_service.readers.question.place_relations import RELATION_WORDS
 from cow_service.records import Intervention, InterventionKind, LocatedObject, PlaceRelation, Until
 
 MAX_CHANGES = 4
@@ -21,12 +22,6 @@ RELATIONS: tuple[PlaceRelation, ...] = get_args(PlaceRelation)
 _KIND_WORDS: dict[str, InterventionKind] = {
     "remove": "remove", "place": "place",
     "removed": "remove", "removal": "remove", "take away": "remove", "put": "place", "placed": "place", "add": "place",
-}  # fmt: skip
-_RELATION_WORDS: dict[str, PlaceRelation] = {
-    "into": "into", "onto": "onto", "between": "between", "behind": "behind", "in-front-of": "in-front-of",
-    "next-to": "next-to", "left-of": "left-of", "right-of": "right-of",
-    "in": "into", "inside": "into", "on": "onto", "on top of": "onto", "in front of": "in-front-of",
-    "beside": "next-to", "next to": "next-to", "left of": "left-of", "right of": "right-of",
 }  # fmt: skip
 _UNITS: dict[str, tuple[Unit, float]] = {
     "px": ("px", 1.0), "pixel": ("px", 1.0), "m": ("m", 1.0), "metre": ("m", 1.0), "meter": ("m", 1.0),
@@ -105,7 +100,7 @@ def _change(value: object) -> Change | None:
     if kind == "remove":
         return Change(kind, name)
     written = text_of(fields.get("relation")).lower().replace("_", "-")
-    relation = _RELATION_WORDS.get(written)
+    relation = RELATION_WORDS.get(written)
     held = first_of(fields, "targets", "target")
     named = [text_of(each)[:MAX_NAME] for each in (cast("list[object]", held) if isinstance(held, list) else [held])]
     targets = tuple(each for each in named if each)

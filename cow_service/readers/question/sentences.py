@@ -28,6 +28,7 @@ from cow_service.readers.question.motion_words import MotionWords, OtherWords, a
 from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
 from cow_service.readers.question.places_said import with_places
+from cow_service.readers.question.reply_forms import without_reply_form
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 from cow_service.records import MotionKind
 
@@ -35,6 +36,7 @@ MAX_WORDS = 240  # of a question that are read
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
 )
+_PICTURES = lex.words("image images frame frames picture pictures photo photos")
 _SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
@@ -70,7 +72,7 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    text, beyond = _cut(split_options(question)[1])
+    text, beyond = _cut(without_reply_form(split_options(question).rest))
     changes, found = split_interventions(with_places(with_nouns(items(text))))
     trail, found = split_trail(_at_the_same_time(found))
     found = _without_instructions(found)
@@ -269,11 +271,18 @@ def _without_instructions(found: list[Item]) -> list[Item]:
     for item in [*found, Item(".", 0, 0)]:
         sentence.append(item)
         if item.key in SENTENCE_END:
-            first = next((word for word in flatten(sentence[:2]) if word != "please"), None)
-            if first is not None and first not in _INSTRUCTIONS:
+            if not _is_instruction(flatten(sentence)):
                 kept += sentence
             sentence = []
     return [item for item in kept if item.end]  # without the full stop added
+
+
+def _is_instruction(words: Sequence[str]) -> bool:
+    """Whether a sentence says how to answer, or what the images are, not what happens in them."""
+    first = next((word for word in words[:2] if word != "please"), None)
+    if first is None or first in _INSTRUCTIONS:
+        return True
+    return first == "note" and not _PICTURES.isdisjoint(words)
 
 
 def _others(
