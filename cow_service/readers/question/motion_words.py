@@ -78,7 +78,7 @@ class MotionWords:
     steps: tuple[StepWords, ...] = ()
     contradictory: bool = False
     others: tuple[OtherWords, ...] = ()
-    read: frozenset[int] = frozenset()
+    read: frozenset[int] = field(default_factory=frozenset[int], compare=False)
 
 
 @dataclass

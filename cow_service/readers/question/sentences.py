@@ -34,7 +34,7 @@ from cow_service.records import MotionKind
 
 MAX_WORDS = 240  # of a question that are read
 _INSTRUCTIONS = lex.words(
-    "answer choose select pick option options choices explain respond reply provide return output"
+    "think reason answer choose select pick option options choices explain respond reply provide return output"
 )
 _PICTURES = lex.words("image images frame frames picture pictures photo photos")
 _SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
