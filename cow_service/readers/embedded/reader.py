@@ -10,7 +10,7 @@ from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
-from cow_service.readers.embedded.answers import answer_from
+from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
 from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
@@ -51,9 +51,12 @@ class EmbeddedReader:
         """The region that fits the mover's words. Raises `CannotGround` where none or several do."""
         scene, question = given.scene, parse(given.question)
         if question.mover is None or not _names_motion(question.motion):
+            words = unread(question)
+            named = ("', '".join((*words.turning, *words.beside)) or given.question)[:MAX_UNREAD]
             raise CannotGround(
-                'The question does not say in words what moves. Ask like "If the red ball moves to the left, '
-                f'will it hit the vase?". {GIVE_PLACE}'
+                "The question does not say in words what moves, as far as the embedded reader understands it; it reads "
+                f"English. It did not understand '{named}'. "
+                f'Ask like "If the red ball moves to the left, will it hit the vase?". {GIVE_PLACE}'
             )
         with given.cpu():
             check_changes(question)
