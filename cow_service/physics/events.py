@@ -100,6 +100,7 @@ def _events_of(
     partly: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
     most: PerKind = {kind: np.zeros((len(draws), count)) for kind in KINDS}
     times["touches"] = _touches(subject, worlds, count, on)
+    partly["touches"] = times["touches"]
     path, step = paths[subject], worlds.every / fps
     clock = np.arange(path.depth.shape[1]) * step
     for other in range(count):
@@ -129,20 +130,26 @@ def _touches(subject: int, worlds: Worlds, count: int, on: int | None) -> Floats
 
 
 def encounters(
-    likeliest: WorldEvents, ensemble: WorldEvents | None, bodies: Sequence[SeenBody], fps: float, num_frames: int
+    likeliest: WorldEvents,
+    ensemble: WorldEvents | None,
+    bodies: Sequence[SeenBody],
+    fps: float,
+    num_frames: int,
+    partly: bool = False,
 ) -> tuple[Encounter, ...]:
     """Those of the likeliest world, in the order of their first frame, with their share of the ensemble's worlds.
 
-    Of two that both move, the one that was set in motion first is the subject.
+    Of two that both move, the one that was set in motion first is the subject. `partly`: also where any part is hidden.
     """
     found: list[Encounter] = []
     for place, subject in enumerate(likeliest.order):
         events, before = likeliest.of[subject], likeliest.order[:place]
         for kind in KINDS:
-            for body in np.nonzero(events.happens(kind)[0])[0].tolist():
+            times = (events.partly if partly else events.times)[kind][0]
+            for body in np.nonzero(np.isfinite(times))[0].tolist():
                 if body in before:
                     continue
-                frame = math.ceil(events.times[kind][0, body] * fps - 1e-6)
+                frame = math.ceil(times[body] * fps - 1e-6)
                 found.append(
                     Encounter(
                         object=bodies[body].name,

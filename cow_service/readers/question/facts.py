@@ -118,7 +118,8 @@ def _asked_about(trajectory: Trajectory) -> Encounter | None:
     if outcome is None or body is None or outcome.asked.relation not in _KINDS:
         return None
     kind = _KINDS[outcome.asked.relation]
-    fitting = [each for each in trajectory.encounters if each.kind == kind and _happened(each)]
+    partly = outcome.asked.partly
+    fitting = [each for each in trajectory.encounters if each.kind == kind and (partly or _happened(each))]
     own = [each for each in fitting if each.subject == body]
     if outcome.asked.target is not None:
         pair = {trajectory.bodies[body].object, outcome.object} if trajectory.bodies else set[str | None]()
