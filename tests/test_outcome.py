@@ -22,9 +22,9 @@ def events(touches=None, occludes=None, covered=None, count=COUNT, bodies=4, sta
         for body, values in (given or {}).items():
             times[kind][:, body] = values
     eligible = np.array([i != 0 and i not in stands_on for i in range(bodies)])
-    found = Events(times, {kind: np.zeros((count, bodies)) for kind in KINDS}, eligible)
+    found = Events(times, {kind: np.zeros((count, bodies)) for kind in KINDS}, eligible, times)
     never = np.full((count, bodies), NEVER)
-    return WorldEvents({0: found}, never, never, never)
+    return WorldEvents({0: found}, never, never, never, never)
 
 
 def share(value: float, time: float = 1.0) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Questions in many wordings: which are read right, refused or not sure, and which are still wrong without a word."""
+"""Questions in many wordings: which are read right, refused or not sure; none is wrong without a word."""
 
 from __future__ import annotations
 
@@ -14,15 +14,7 @@ from cow_service.settings import Settings
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak]
 EVERY = max(1, 10 // SCALE)  # a tenth of them; all in `make soak`
-RIGHT = 0.55  # share of all that is right, or refused where it must be
-# Wrong without a word, as things are: whoever mends one takes it out.
-STILL_WRONG: frozenset[str] = frozenset(
-    {
-        "If the white cylinder is removed and the red bottle moves in the direction of the arrow, will t"
-        "he green cylinder be occluded at some moment? Answer by (A) Yes, (B) No or (C) Not sure.",
-        "Let the purple mug slide straight up until it meets something. What does it hit?",
-    }
-)
+RIGHT = 0.7  # share of all that is right, or refused where it must be
 
 
 @pytest.fixture(scope="module")
@@ -31,13 +23,13 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Verdict]]:
         yield list(verdicts(service, part=slice(0, None, EVERY)))
 
 
-def test_nothing_new_is_wrong_without_a_word(found: list[Verdict]) -> None:
-    assert {each.question for each in found if each.kind == "wrong"} <= STILL_WRONG
+def test_nothing_is_wrong_without_a_word(found: list[Verdict]) -> None:
+    assert not [each for each in found if each.kind == "wrong"]
 
 
 def test_what_must_be_refused_is_refused(found: list[Verdict]) -> None:
     refused = {each["question"] for each in items() if each["expect"]["refuse"]}
-    assert {each.kind for each in found if each.question in refused - STILL_WRONG} <= {"refused", "not-sure", "right"}
+    assert {each.kind for each in found if each.question in refused} <= {"refused", "not-sure", "right"}
 
 
 def test_how_many_are_right(found: list[Verdict]) -> None:

@@ -55,6 +55,16 @@ def times_tipped(worlds: Worlds) -> Floats:
     return _first(leans, worlds)
 
 
+def times_landed(worlds: Worlds) -> Floats:
+    """[K, B]: when each body first meets the floor (s)."""
+    times = np.full((len(worlds.runs), len(worlds.shapes[0])), NEVER)
+    for k, run in enumerate(worlds.runs):
+        for meeting in run.meetings:
+            if meeting.b is None:
+                times[k, meeting.a] = min(times[k, meeting.a], meeting.time)
+    return times
+
+
 def times_gone(paths: Sequence[SeenPaths], size: tuple[int, int], worlds: Worlds) -> Floats:
     """[K, B]: when the middle of each body leaves an image of a size (width, height; px), or passes the camera (s)."""
     outside: list[Mask] = []

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.chains import NEVER, set_off, times_gone, times_moved, times_tipped
+from cow_service.physics.chains import NEVER, set_off, times_gone, times_landed, times_moved, times_tipped
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.occlusion import shares
 from cow_service.physics.projection import SeenPaths, seen_paths
@@ -20,6 +20,7 @@ from cow_service.vision.types import Floats, Mask
 __all__ = ["COVERED", "KINDS", "NEVER", "Events", "WorldEvents", "encounters", "find_events", "find_world_events"]
 
 COVERED = 0.3  # share of a silhouette from which it counts as covered
+ANY_PART = 0.06  # share from which a part of it is covered: less is an inexact outline
 COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
 PerKind = dict[EncounterKind, Floats]  # [K, B] each
@@ -32,6 +33,7 @@ class Events:
     times: PerKind
     shares: PerKind  # 0 for touches
     eligible: Mask  # [B]: neither the subject, nor the mover, nor what the subject stands on
+    partly: PerKind  # as times, where any part is covered
     subject: int = 0  # the body that meets the others
 
     def happens(self, kind: EncounterKind) -> Mask:
@@ -59,6 +61,7 @@ class WorldEvents:
     moved: Floats  # [K, B] s: when it is set in motion
     tipped: Floats  # [K, B] s: when it is knocked over; infinite where that was not looked for
     gone: Floats  # [K, B] s: when it leaves the image
+    landed: Floats  # [K, B] s: when it first meets the floor
     placed: Floats | None = None  # [K] s: when the mover is where it was to be put; infinite where it does not fit
     order: tuple[int, ...] = (0,)  # of the first draw: what moves, in the order in which it is set in motion
 
@@ -75,6 +78,7 @@ def find_world_events(
         moved=times_moved(worlds),
         tipped=times_tipped(worlds),
         gone=times_gone(paths, size, worlds),
+        landed=times_landed(worlds),
         placed=None if worlds.placements is None else worlds.placements.times,
         order=order,
     )
@@ -93,8 +97,10 @@ def _events_of(
     on = worlds.scene.supports[subject]
     eligible[[0, subject, *([] if on is None else [on])]] = False
     times: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
+    partly: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
     most: PerKind = {kind: np.zeros((len(draws), count)) for kind in KINDS}
     times["touches"] = _touches(subject, worlds, count, on)
+    partly["touches"] = times["touches"]
     path, step = paths[subject], worlds.every / fps
     clock = np.arange(path.depth.shape[1]) * step
     for other in range(count):
@@ -106,7 +112,8 @@ def _events_of(
             seen = np.where(before, values, 0.0)
             most[kind][:, other] = seen.max(axis=1)
             times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)
-    return Events(times, most, eligible, subject)
+            partly[kind][:, other] = np.where(seen >= ANY_PART, clock[None], NEVER).min(axis=1)
+    return Events(times, most, eligible, partly, subject)
 
 
 def _touches(subject: int, worlds: Worlds, count: int, on: int | None) -> Floats:
@@ -123,20 +130,26 @@ def _touches(subject: int, worlds: Worlds, count: int, on: int | None) -> Floats
 
 
 def encounters(
-    likeliest: WorldEvents, ensemble: WorldEvents | None, bodies: Sequence[SeenBody], fps: float, num_frames: int
+    likeliest: WorldEvents,
+    ensemble: WorldEvents | None,
+    bodies: Sequence[SeenBody],
+    fps: float,
+    num_frames: int,
+    partly: bool = False,
 ) -> tuple[Encounter, ...]:
     """Those of the likeliest world, in the order of their first frame, with their share of the ensemble's worlds.
 
-    Of two that both move, the one that was set in motion first is the subject.
+    Of two that both move, the one that was set in motion first is the subject. `partly`: also where any part is hidden.
     """
     found: list[Encounter] = []
     for place, subject in enumerate(likeliest.order):
         events, before = likeliest.of[subject], likeliest.order[:place]
         for kind in KINDS:
-            for body in np.nonzero(events.happens(kind)[0])[0].tolist():
+            times = (events.partly if partly else events.times)[kind][0]
+            for body in np.nonzero(np.isfinite(times))[0].tolist():
                 if body in before:
                     continue
-                frame = math.ceil(events.times[kind][0, body] * fps - 1e-6)
+                frame = math.ceil(times[body] * fps - 1e-6)
                 found.append(
                     Encounter(
                         object=bodies[body].name,

@@ -122,18 +122,27 @@ def _per_body(query: Query, events: WorldEvents) -> Floats:
     relation, of_subject = query.asked.relation, events.of[query.subject]
     bodies = np.arange(len(of_subject.eligible))
     if relation == "leaves":
-        return np.where(bodies[None] == query.subject, events.gone, NEVER)
+        return _in_time(query, np.where(bodies[None] == query.subject, events.gone, NEVER))
+    if relation == "lands":
+        return _in_time(query, np.where(bodies[None] == query.subject, events.landed, NEVER))
     if relation == "inside":
         times = np.full_like(events.moved, NEVER) if events.placed is None else events.placed[:, None]
     elif relation in ("tips", "moves"):
         times = events.tipped if relation == "tips" else events.moved
     else:
-        times = of_subject.times[KIND_OF[relation]]
+        kinds = of_subject.partly if query.asked.partly else of_subject.times
+        times = kinds[KIND_OF[relation]]
     if query.target is not None:
         meant = bodies == query.target
     else:
         meant = np.isin(bodies, query.among) if query.among else of_subject.eligible
-    return np.where(meant[None], times, NEVER)
+    return _in_time(query, np.where(meant[None], times, NEVER))
+
+
+def _in_time(query: Query, times: Floats) -> Floats:
+    """What happens later than asked about does not happen."""
+    limit = query.asked.within
+    return times if limit is None else np.where(times <= limit, times, NEVER)
 
 
 def _depends_on(same: Mask, draws: Floats) -> tuple[Doubt, ...]:

@@ -12,7 +12,7 @@ from cow_service.readers.question.facts import facts_of
 from cow_service.records import Asked, Grounding, Intervention, Outcome, Trajectory
 from cow_service.stages.imagining import Imagined
 
-BY_ENCOUNTERS = (*KIND_OF, "tips", "moves", "leaves")  # relations that encounters and paths decide
+BY_ENCOUNTERS = (*KIND_OF, "tips", "moves", "leaves", "lands")  # relations that encounters and paths decide
 
 
 def can_tell(query: Query, present: int, placed: bool) -> bool:

@@ -158,6 +158,7 @@ def _record(
     else:
         paths = (_free_record(world.bodies[0], grounding, request, free),)
     paths = with_times(paths, imagined.events)
+    partly = imagined.query is not None and imagined.query.asked.partly
     given = request.trajectory
     anchors = _anchors(bodies, grounding, paths, shown) if given is None or given.anchors is None else given.anchors
     return Trajectory(
@@ -170,7 +171,7 @@ def _record(
         light=_light(world, shown.scene.light),
         moving_until=moving_until(paths, request.fps),
         anchors=anchors,
-        encounters=encounters(imagined.events, imagined.around_events, bodies, request.fps, request.num_frames),
+        encounters=encounters(imagined.events, imagined.around_events, bodies, request.fps, request.num_frames, partly),
         encounters_known=known,
         placement=placement_of(grounding.object, shown.placements, imagined.around and imagined.around.placements),
         placed=placed,

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from cow_service.readers.base import AnswerReading
+from cow_service.readers.question.accounting import Unread
 from cow_service.readers.question.choices import not_sure_option, says_not_sure
 from cow_service.readers.question.numbers_said import count_of, seconds_of, spans
 from cow_service.readers.question.options_said import may_name, names_none, names_several, says_it_happens
@@ -19,11 +20,12 @@ from cow_service.records import AnswerOption, Asked, Doubt, Outcome
 HAPPENS = 0.5  # probability from which what is asked happens
 
 NOT_ASKED = (
-    "Not sure, because the embedded reader understands only plain questions: whether the mover hits, lands on, hides, "
-    "misses or is hidden by one thing or any, which thing it hits first, when, and how many. Set COW_MLLM to ask a "
+    "Not sure, because the embedded reader did not understand '{words}'. It reads questions in English of whether, "
+    "when or where something hits, lands on, hides, enters, leaves, misses or is hidden by something, what it hits "
+    "first, how many things it hits, whether something is moved or tips, and what changes. Set COW_MLLM to ask a "
     "multimodal LLM."
 )
-NOT_READ = " What it did not understand: '{words}'."
+ALL_READ = Unread()
 MAX_UNREAD = 200  # characters
 NO_SIMULATION = "Not sure, because without a simulation there is nothing for the embedded reader to judge by."
 NO_OUTCOME = "Not sure, because the simulation does not tell what the question asks."
@@ -49,17 +51,12 @@ def answer_from(
     outcome: Outcome | None,
     simulated: bool,
     alternatives: Sequence[ObjectPhrase] = (),
-    unread: str = "",
+    unread: Unread = ALL_READ,
 ) -> AnswerReading:
-    """The answer, and why it is not sure. `asked`, `alternatives` and the `unread` words are read in the question."""
+    """The answer, and why it is not sure. `asked` and `alternatives` are read in the question, `unread` was not."""
     if asked is None or not simulated or outcome is None:
-        why = (
-            f"{NOT_ASKED}{NOT_READ.format(words=unread[:MAX_UNREAD]) if unread else ''}"
-            if asked is None
-            else NO_OUTCOME
-            if simulated
-            else NO_SIMULATION
-        )
+        words = "', '".join(unread.turning or unread.beside)[:MAX_UNREAD] or "what it asks"
+        why = NOT_ASKED.format(words=words) if asked is None else NO_OUTCOME if simulated else NO_SIMULATION
         return _unsure(options, why)
     first = outcome.first
     if outcome.sure and first is not None and alternatives and not any(may_name(each, first) for each in alternatives):

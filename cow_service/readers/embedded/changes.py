@@ -8,10 +8,11 @@ from cow_service.errors import CannotGround
 from cow_service.readers.embedded.matching import describe, match_both, match_one
 from cow_service.readers.question.interventions import InterventionWords
 from cow_service.readers.question.phrases import ObjectPhrase
+from cow_service.readers.question.relations import read_asked
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.wording import same_name
 from cow_service.readers.remedies import GIVE_OBJECT
-from cow_service.records import BBox, Intervention, LocatedObject
+from cow_service.records import Asked, BBox, Intervention, LocatedObject
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region
 from cow_service.vision.scene import Scene
@@ -26,9 +27,25 @@ def check_changes(question: Question) -> None:
             raise CannotGround(
                 f"The question takes '{change.object.text}' away and says that it moves: ask one of both."
             )
+        asked = read_asked(question)
+        if change.kind == "remove" and asked is not None and _is_asked_about(change.object, asked):
+            raise CannotGround(
+                f"The question takes '{change.object.text}' away and asks what becomes of it: ask one of both."
+            )
         if change.object in change.targets:
             relation = change.relation or "beside"
             raise CannotGround(f"The question puts '{change.object.text}' {relation} itself: name another thing.")
+
+
+def _is_plural(phrase: ObjectPhrase) -> bool:
+    """ "Both mugs", "the mugs"."""
+    last = phrase.text.lower().split()[-1]
+    return phrase.text.lower().startswith("both ") or (last != phrase.head and last == f"{phrase.head}s")
+
+
+def _is_asked_about(removed: ObjectPhrase, asked: Asked) -> bool:
+    names = (asked.subject, asked.target, *asked.among)
+    return any(name is not None and same_name(name, removed.text) for name in names)
 
 
 def find_removed(scene: Scene, question: Question, given: Sequence[LocatedObject] = ()) -> tuple[Intervention, ...]:
@@ -37,7 +54,7 @@ def find_removed(scene: Scene, question: Question, given: Sequence[LocatedObject
     taken: list[LocatedObject] = []
     for phrase in removed:
         left = [each for each in scene.regions if all(each.bbox != one.bbox for one in taken)]
-        found = _both(left, phrase) if phrase.text.lower().startswith("both ") else _one(left, phrase, given)
+        found = _both(left, phrase) if _is_plural(phrase) else _one(left, phrase, given)
         if not found:
             raise _not_found(scene, f"takes '{phrase.text}' away", phrase)
         taken += found

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.readers.embedded.outlines import clearest, contradicts
-from cow_service.readers.embedded.singling import singled_out
+from cow_service.readers.embedded.singling import at_place, singled_out
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.records import BBox
 from cow_service.vision.regions import Region
@@ -26,6 +27,19 @@ WHOLE = 0.7  # share of a region that must lie inside a drawn box to be the thin
 
 
 def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase] = ()) -> list[Region]:
+    """Regions that fit a phrase, all equally well, also in where it says that the thing is."""
+    place = phrase.place
+    if place is None:
+        return _fitting(regions, phrase, others)
+    beside = None if place.of is None else match_one(regions, place.of)
+    left = [region for region in regions if region is not beside]
+    fitting = _fitting(left, replace(phrase, place=None), others)
+    if len(fitting) < 2 or (place.of is not None and beside is None):
+        return fitting
+    return at_place(fitting, place.relation, beside)
+
+
+def _fitting(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[Region]:
     """Regions that fit a phrase, all equally well; those that the other phrases claim by colour are left out.
 
     Where several fit, and the outline of one is clearly the noun's, that one is taken.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -9,16 +10,16 @@ from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
-from cow_service.readers.embedded.answers import answer_from
+from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
 from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
+from cow_service.readers.embedded.outlines import OUTLINES
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
-from cow_service.readers.question.accounting import unread_warnings
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.relations import read_alternatives, read_asked, unread_clause
+from cow_service.readers.question.relations import read_alternatives, read_asked, unread
 from cow_service.readers.question.sentences import Question, parse
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
@@ -50,9 +51,12 @@ class EmbeddedReader:
         """The region that fits the mover's words. Raises `CannotGround` where none or several do."""
         scene, question = given.scene, parse(given.question)
         if question.mover is None or not _names_motion(question.motion):
+            words = unread(question)
+            named = ("', '".join((*words.turning, *words.beside)) or given.question)[:MAX_UNREAD]
             raise CannotGround(
-                'The question does not say in words what moves. Ask like "If the red ball moves to the left, '
-                f'will it hit the vase?". {GIVE_PLACE}'
+                "The question does not say in words what moves, as far as the embedded reader understands it; it reads "
+                f"English. It did not understand '{named}'. "
+                f'Ask like "If the red ball moves to the left, will it hit the vase?". {GIVE_PLACE}'
             )
         with given.cpu():
             check_changes(question)
@@ -67,7 +71,7 @@ class EmbeddedReader:
             missing = [_not_found(scene, each.text) for each in unseen if given_as(each, given.known) is None]
             boxes = {other.object: other.bbox for other in others} | {question.mover.text: bbox}
             things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
-            doubts = [*noun_warnings(scene, things), *unread_warnings(question)]
+            doubts = [*noun_warnings(scene, things), *_unread_warnings(question)]
         return GroundingReading(
             question.mover.text, bbox, others=others, warnings=(*missing, *doubts), interventions=(*removed, *placed)
         )
@@ -96,7 +100,7 @@ class EmbeddedReader:
         outcome = None if imagined is None else imagined.simulation.trajectory.outcome
         alternatives = read_alternatives(question)
         reading = answer_from(
-            options, read_asked(question), outcome, imagined is not None, alternatives, unread_clause(question)
+            options, read_asked(question), outcome, imagined is not None, alternatives, unread(question)
         )
         if votes > 1:
             again = "The embedded reader gives the same answer every time: more votes say no more."
@@ -104,9 +108,20 @@ class EmbeddedReader:
         return (reading,) * votes
 
 
+AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
+_ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # what does so keeps touching what it stands on
+_SEVERAL = frozenset({"both", "two", "three", "all", "four", "several"})
+
+
 def create(settings: Settings) -> EmbeddedReader:
     """Factory for the registry."""
     return EmbeddedReader()
+
+
+def _unread_warnings(question: Question) -> list[str]:
+    words = unread(question)
+    said = [f"The words '{each}' were not understood, so no answer is given." for each in words.turning]
+    return said + [f"The words '{each}' were not understood and changed nothing." for each in words.beside]
 
 
 def _names_motion(words: MotionWords) -> bool:
@@ -116,6 +131,8 @@ def _names_motion(words: MotionWords) -> bool:
 
 
 def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: ObjectPhrase) -> BBox:
+    if phrase.text.lower().split()[0] in _SEVERAL:
+        raise CannotGround(f"The question moves '{phrase.text}' at once: ask of one thing, or name each. {GIVE_PLACE}")
     if phrase.inside_box:
         return inside_drawn_box(scene, phrase, GIVE_PLACE)
     if not scene.regions:
@@ -134,7 +151,7 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
             f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. "
             f"Seen in all: {seen}. {GIVE_PLACE}"
         )
-    if phrase.colour is None and not is_known(phrase) and len(scene.regions) > 1:
+    if phrase.colour is None and not is_known(phrase) and phrase.head not in OUTLINES and len(scene.regions) > 1:
         raise CannotGround(
             f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
             f"Seen: {seen}. {GIVE_PLACE}"
@@ -188,7 +205,17 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
     if words.arrow is not None:
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
         along = words.arrow == "along"
-        return MotionReading(kind, (x, y) if along else (-x, -y), "arrow", along_arrow=along)
+        x, y = (x, y) if along else (-x, -y)
+        said = words.direction or (x, y)
+        if x * said[0] + y * said[1] < AGREES * math.hypot(x, y) * math.hypot(*said):
+            raise CannotReadDirection(
+                "The question names the arrow and another direction, and the arrow does not point there. "
+                f"{GIVE_DIRECTION}"
+            )
+        return MotionReading(kind, (x, y), "arrow", along_arrow=along)
+    if words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth:
+        direction, depth = depth_motion(-math.copysign(1.0, words.direction[1]))  # up the image is away on the floor
+        return MotionReading(kind, direction, "text", depth=depth)
     if words.direction is not None:
         return MotionReading(kind, words.direction, "text", depth=words.depth)
     if words.depth:

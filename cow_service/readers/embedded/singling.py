@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from cow_service.readers.question.phrases import ObjectPhrase
@@ -39,6 +40,38 @@ def singled_out(regions: Sequence[Region], phrase: ObjectPhrase) -> list[Region]
             ratio = (ordered[0].mask.area / ordered[1].mask.area) ** sign
             return [ordered[0]] if ratio >= LARGER else list(regions)
     return list(regions)
+
+
+def at_place(regions: Sequence[Region], relation: str, beside: Region | None) -> list[Region]:
+    """The one region that is where a relation to another region says; all of them where that does not decide.
+
+    Without another region the relation is to the camera: what is lower in the image is nearer.
+    """
+    lead = CLEAR * _size(regions)
+    if beside is None:
+        return _first(regions, (2, -1 if relation == "far" else 1), lead)
+    x, y = beside.centre
+    possible = [region for region in regions if _is_there(region, relation, beside)]
+    if len(possible) < 2:
+        return possible
+    sign = -1 if relation == "far" else 1
+    ranked = sorted(possible, key=lambda region: sign * math.dist(region.centre, (x, y)))
+    gap = abs(math.dist(ranked[1].centre, (x, y)) - math.dist(ranked[0].centre, (x, y)))
+    return ranked[:1] if gap >= lead else possible
+
+
+def _is_there(region: Region, relation: str, beside: Region) -> bool:
+    """Whether a region is on the side of another one that a relation names; near and far are on every side."""
+    (x, y), (x0, _, x1, y1) = beside.centre, beside.bbox
+    own_x, own_y = region.centre
+    overlaps = region.bbox[0] < x1 and region.bbox[2] > x0
+    sides = {
+        "behind": overlaps and region.bbox[3] < y1, "front_of": overlaps and region.bbox[3] > y1,
+        "left_of": own_x < x, "right_of": own_x > x,
+        "above": own_y < y and x0 < own_x < x1, "on": own_y < y and x0 < own_x < x1,
+        "below": own_y > y and x0 < own_x < x1,
+    }  # fmt: skip
+    return sides.get(relation, True)
 
 
 def _first(regions: Sequence[Region], measure: tuple[int, int], lead: float) -> list[Region]:

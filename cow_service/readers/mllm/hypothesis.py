@@ -19,8 +19,10 @@ EVENTS: dict[AskedRelation, tuple[str, str]] = {
     "tips": ("is knocked over", ""),
     "moves": ("is set in motion", ""),
     "leaves": ("leaves the image", "leave the image"),
+    "lands": ("lands on the floor", "land on the floor"),
 }  # what the subject does, and what follows "does not"
 OF_TARGET: tuple[AskedRelation, ...] = ("tips", "moves")  # what is asked about does these
+OF_ITSELF: tuple[AskedRelation, ...] = ("leaves", "lands")  # nothing else is part of these
 DOUBTS: dict[Doubt, str] = {
     "speed": "the speed",
     "heading": "the heading in depth",
@@ -123,7 +125,8 @@ def _event(outcome: Outcome, mover: str) -> str:
     if asked.relation in OF_TARGET:
         event = f"{thing} {doing}"
     else:
-        event = f"{subject} {doing}" + ("" if asked.relation == "leaves" else f" {thing}")
+        event = f"{subject} {doing}" + ("" if asked.relation in OF_ITSELF else f" {thing}")
+    event += f" within {asked.within:g} s" if asked.within is not None else ""
     if asked.form != "when" or outcome.time is None:
         return event
     early, late = outcome.time_band or (outcome.time, outcome.time)

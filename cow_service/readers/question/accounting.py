@@ -1,74 +1,145 @@
-"""Which words of a question no rule has read: a warning names them, so that none is passed over in silence."""
+"""Which words of a question no rule has read, so that none is passed over in silence.
+
+A word is read by the rule of a change, a trail, a quantity, a motion or of what is asked, or it changes nothing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+from lark import Tree
 
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at
-from cow_service.readers.question.relations import covered_items
+from cow_service.readers.question.asked_words import means_mover
+from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.phrases import PUNCTUATION, Item, key_at
 from cow_service.readers.question.sentences import Question
+from cow_service.readers.question.words import words_of
 
-# Words of a motion that lead past, over or round a thing: its path is not bent by them.
-_PATHS = lex.words(
-    "around over under below above beneath past behind between through across beside near by off without with among"
-)
-_PLAIN_ADVERBS = lex.words(
-    "directly exactly slightly straight freely horizontally vertically simply only suddenly currently initially",
-    "originally diagonally completely entirely fully really actually possibly immediately accidentally",
-)
+# Words that hold a sentence together; what they join is read, or is named.
+_STRUCTURE = (
+    PUNCTUATION | lex.AUXILIARIES | lex.BE | lex.MOVER_PRONOUNS | lex.CAUSATIVES | (lex.CONDITIONALS - {"unless"})
+    | lex.words("to that which who and but then so i you we us me there also have has had please now here go come get")
+    | lex.words("someone somebody ok either")
+    | lex.words("what happens happen tell know will keep keeps continue continues start starts begin begins s yes")
+)  # fmt: skip
+_NAMING = lex.words(", and there is are we see you have here with in on")
+_NEGATIVE = lex.words("no none nothing neither nor unless except")
 _END = frozenset(".?!;")
+_NO_MATTER = frozenset({"", "marked", "told"})  # adverbials that say nothing of a motion
+_TRIES = 8  # of one question
+MAX_TEXT = 200  # characters of unread words that are named
 
 
-def unread_warnings(question: Question) -> list[str]:
-    """What was passed over of the motion and of further sentences, each named."""
-    said = [f"The words '{words}' were not understood and changed nothing." for words in _unread(question)]
-    return list(dict.fromkeys(said))
+@dataclass(frozen=True)
+class Unread:
+    """Words that were not understood: `turning`, where they may change what is asked or how it moves."""
+
+    turning: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
 
 
-def _unread(question: Question) -> Iterator[str]:
-    covered = covered_items(question)
-    for at, item in enumerate(question.items):
-        if item.quantity is not None and not _is_read(item, question):
-            yield " ".join(item.words)
-        if at in covered or item not in question.clause:
-            continue
-        phrase = phrase_at(question.items, at + 1)
-        if item.key in _PATHS and phrase is not None and _is_further(phrase, question):
-            yield f"{item.key} {phrase.text}"
-        elif lex.is_adverb(item.key) and item.key not in _PLAIN_ADVERBS:
-            yield item.key
-        elif item.phrase is not None and lex.is_adverb(item.phrase.text) and item.phrase.text not in _PLAIN_ADVERBS:
-            yield item.phrase.text
-    yield from _statements(question, covered)
+def unread_words(question: Question, covered: frozenset[int]) -> Unread:
+    """The words that no rule read, sentence by sentence. `covered` are the places of the items that ask."""
+    items = question.items
+    turning = [words for words in (question.pronoun, question.beyond) if words]
+    beside: list[str] = []
+    for sentence in _sentences(items):
+        runs = [" ".join(_text(items[at]) for at in run) for run in _runs(question, sentence, covered)]
+        told = any(at in covered or items[at].start in question.read for at in sentence)
+        (beside if not told and _describes(items, sentence) else turning).extend(run[:MAX_TEXT] for run in runs)
+    return Unread(tuple(dict.fromkeys(turning)), tuple(dict.fromkeys(beside)))
 
 
-def _is_further(phrase: ObjectPhrase, question: Question) -> bool:
-    """Whether a phrase is a thing that the motion neither moves nor aims at."""
-    read = [question.mover, question.motion.towards, *(other.object for other in question.motion.others)]
-    return phrase.is_thing and phrase.head not in lex.AGENTS and phrase not in read
-
-
-def _is_read(item: Item, question: Question) -> bool:
-    motion = question.motion
-    legs = [motion.quantities, *(step.quantities for step in motion.steps)]
-    legs += [other.motion.quantities for other in motion.others]
-    return any(item.quantity in quantities for quantities in legs)
-
-
-def _statements(question: Question, covered: frozenset[int]) -> Iterator[str]:
-    """Sentences that say of a thing how it is: "The floor is slippery."."""
+def _sentences(items: tuple[Item, ...]) -> Iterator[range]:
     start = 0
-    for at in range(len(question.items) + 1):
-        if key_at(question.items, at) not in _END:
+    for at in range(len(items) + 1):
+        if key_at(items, at) in _END:
+            if at > start:
+                yield range(start, at)
+            start = at + 1
+
+
+def _describes(items: tuple[Item, ...], sentence: range) -> bool:
+    """Whether a sentence only says how something is: nothing happens in it, and nothing is denied."""
+    keys = [items[at].key for at in sentence]
+    verbs = [lex.VERBS[key] for key in keys if key in lex.VERBS]
+    acting = any(verb.kind not in {None, "static"} or verb.lemma in lex.TOUCH | lex.OCCLUDE for verb in verbs)
+    states = not lex.BE.isdisjoint(keys) or any(verb.kind == "static" for verb in verbs)
+    return states and not acting and (lex.NEGATIONS | _NEGATIVE).isdisjoint(keys)
+
+
+def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Iterator[list[int]]:
+    """The places of unread items, those together that stand together."""
+    harmless = _harmless(question, sentence, covered)
+    run: list[int] = []
+    for at in sentence:
+        item = question.items[at]
+        read = at in covered or item.start in question.read or at in harmless or _leads_on(question, at)
+        structure = item.phrase is None and (item.key in _STRUCTURE or (item.key == "first" and at == sentence.start))
+        if not read and (run or not structure) and item.key not in PUNCTUATION:
+            run.append(at)
+        elif run:
+            yield from _trimmed(question, run)
+            run = []
+    yield from _trimmed(question, run)
+
+
+def _leads_on(question: Question, at: int) -> bool:
+    """ "By rolling left", "of sliding": before a verb of the motion that was read."""
+    if question.items[at].key not in {"by", "of", "when"} or at + 1 == len(question.items):
+        return False
+    after = question.items[at + 1]
+    rolling = after.key in lex.VERBS and lex.VERBS[after.key].form == "ing"
+    return rolling and after.start in question.read
+
+
+def _trimmed(question: Question, run: list[int]) -> Iterator[list[int]]:
+    while run and question.items[run[-1]].phrase is None and question.items[run[-1]].key in _STRUCTURE:
+        run = run[:-1]
+    if run:
+        yield run
+
+
+def _harmless(question: Question, sentence: range, covered: frozenset[int]) -> set[int]:
+    """The places of what changes nothing: a floor where it moves, "please", the mover named again."""
+    items = question.items
+    found = {at for at in sentence if _names_known(question, items[at])}
+    if _only_names([items[at] for at in sentence]):
+        return set(sentence)
+    words, tries = words_of(items[sentence.start : sentence.stop]), 0
+    for place, word in enumerate(words):
+        at = sentence.start + word.at
+        begins = not place or words[place - 1].at != word.at
+        if not begins or at in found or at in covered or items[at].start in question.read or tries >= _TRIES:
             continue
-        sentence = range(start, at)
-        start = at + 1
-        told = [question.items[place] for place in sentence]
-        if covered.isdisjoint(sentence) and not any(item in question.clause for item in told):
-            words = [_text(item) for item in told]
-            if any(word in lex.BE for word in words) and "there" not in words and "arrow" not in words:
-                yield " ".join(words)
+        parsed = parse_from("adverbial", words[place : place + 8])
+        tries += 1
+        if parsed is None:
+            continue
+        node = next(iter(parsed[0].children), None)
+        end = words[place + parsed[1]].at if place + parsed[1] < len(words) else words[-1].at + 1
+        if (str(node.data) if isinstance(node, Tree) else "") in _NO_MATTER:
+            found |= set(range(at, sentence.start + end))
+    return found
+
+
+def _only_names(sentence: list[Item]) -> bool:
+    """ "There is a ball and a mug.", "A ball, a mug." """
+    plain = all(item.key in _NAMING if item.phrase is None else item.phrase.is_thing for item in sentence)
+    plain = plain and not any(one.phrase and two.phrase for one, two in pairwise(sentence))  # "Replace the ball"
+    return plain and (lex.BE.isdisjoint(item.key for item in sentence) or sentence[0].key in {"there", "here"})
+
+
+def _names_known(question: Question, item: Item) -> bool:
+    """Whether a noun phrase names what moves, or a hand that moves it."""
+    if item.phrase is None:
+        return False
+    if item.phrase.head in lex.AGENTS or means_mover(item.phrase, question):
+        return True
+    return any(item.phrase == other.object for other in question.motion.others)
 
 
 def _text(item: Item) -> str:

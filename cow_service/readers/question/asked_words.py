@@ -32,7 +32,7 @@ _PLURAL = lex.words("objects things items ones obstacles bodies")
 _PLAIN_WORDS = lex.words(
     "take takes taking long soon clear free untouched visible unobstructed unoccluded uncovered unhidden unblocked",
     "first elapse elapses pass passes seconds whole entire total overall altogether",
-    "number least all short",
+    "number least all short able",
 )
 _OF_GENERIC = lex.words("first other different all")
 _TRAILING = lex.words("hard fast slow alone anyway whatsoever second third last twice once again")  # more is asked
@@ -60,10 +60,14 @@ def sentences(question: Question) -> list[Sentence]:
             found[-1].asks = item.key == "?"
             found.append(Sentence())
             continue
+        limit = item.quantity is not None and item.quantity.within is not None
+        if limit or (item.start in question.read and item.quantity is not None and item not in question.clause):
+            continue
         if item.phrase is None:
             tokens = ["," if item.key in _PAUSES else _word(item.key)]
         else:
-            tokens = _phrase_tokens(item, item.phrase, question, found[-1].phrases)
+            of_kind = found[-1].tokens[-2:] in (["which", "of"], ["what", "of"])
+            tokens = _phrase_tokens(item, item.phrase, question, found[-1].phrases, of_kind)
         found[-1].tokens += tokens
         said = tuple(word.lower() for word in (item.words or (item.key,)))
         found[-1].words += [said] * len(tokens)
@@ -81,7 +85,9 @@ def _word(key: str) -> str:
     return f"{verb.lemma}-ing" if verb.form == "ing" else verb.lemma
 
 
-def _phrase_tokens(item: Item, phrase: ObjectPhrase, question: Question, known: dict[str, ObjectPhrase]) -> list[str]:
+def _phrase_tokens(
+    item: Item, phrase: ObjectPhrase, question: Question, known: dict[str, ObjectPhrase], of_kind: bool
+) -> list[str]:
     words = [word.lower() for word in item.words]
     determiners = words[: _count_determiners(words)]
     content = words[len(determiners) :]
@@ -89,19 +95,36 @@ def _phrase_tokens(item: Item, phrase: ObjectPhrase, question: Question, known: 
         return [_word(word) for word in words]
     if question.motion.others and words in (["the", "two"], ["both"]):
         return ["they"]
+    if of_kind and phrase.noun is not None and phrase.head not in _GENERIC and "other" not in content:
+        known[f"K{len(known)}"] = phrase
+        return [list(known)[-1]]
     asked = words[0] in {"which", "what"}
-    if means_mover(phrase, question) and not asked:
-        return ["M"]
+    return ["M"] if means_mover(phrase, question) and not asked else _named(determiners, content, phrase, asked, known)
+
+
+def _named(
+    determiners: Sequence[str],
+    content: Sequence[str],
+    phrase: ObjectPhrase,
+    asked: bool,
+    known: dict[str, ObjectPhrase],
+) -> list[str]:
     named = phrase.inside_box or phrase.colour is not None or phrase.number is not None
     if not named and _GENERIC.intersection(content) and set(content) <= _GENERIC | _OF_GENERIC:
         return _generic(determiners, content)
-    vague = not asked and not lex.VAGUE_DETERMINERS.isdisjoint(determiners)
-    counted = content[0].isdecimal() and phrase.number is None  # "3 balls"
-    if vague or counted or set(content) & _COUNTING or content[-1] in _TRAILING:
+    if _is_several(determiners, content, phrase, asked):
         return ["X"]
     name = f"{'K' if asked else 'T'}{len(known)}"
     known[name] = phrase
     return ["which", name] if asked else [name]
+
+
+def _is_several(determiners: Sequence[str], content: Sequence[str], phrase: ObjectPhrase, asked: bool) -> bool:
+    """Whether a phrase is of no one thing, or has a word of counting or of order in it."""
+    vague = not asked and not lex.VAGUE_DETERMINERS.isdisjoint(determiners)
+    counted = content[0].isdecimal() and phrase.number is None  # "3 balls"
+    single = determiners == ["the"] and content[0] == "other" and lex.singular(content[-1]) == content[-1]
+    return vague or counted or bool(set(content[single:]) & _COUNTING) or content[-1] in _TRAILING
 
 
 def _count_determiners(words: Sequence[str]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lark import Token, Tree
 
@@ -28,11 +28,17 @@ _ACTS: dict[str, tuple[AskedRelation, bool]] = {
     "hides": ("covers", False), "what_hides": ("covers", False), "hidden": ("covers", True), "stays": ("covers", True),
     "passes_behind": ("covered", False), "what_passes_behind": ("covered", False),
     "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False),
-    "tips_it": ("tips", False), "tips": ("tips", True), "tipped": ("tips", True),
+    "lands": ("lands", False), "disappears": ("covers", True),
+    "stays_up": ("tips", True), "tips_it": ("tips", False), "tips": ("tips", True), "tipped": ("tips", True),
     "moves_it": ("moves", False), "moves": ("moves", True), "moved": ("moves", True), "still": ("moves", True),
 }  # fmt: skip
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
-_NEGATIONS = frozenset({"no", "none", "misses", "missed", "avoids", "stays", "no_contact", "sticks_out", "stops_short"})
+_NEGATIONS = frozenset(
+    {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"}
+)
+
+
+_ANY_PART = frozenset({"any_part", "partly", "wholly", "at_some_time"})  # hidden in part or once
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,7 @@ class Asking:
     subject: str | None
     target: str | None
     among: tuple[str, ...] = ()
+    partly: bool = False
 
 
 def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
@@ -60,13 +67,16 @@ def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
     things = list(dict.fromkeys(str(t) for t in _tokens(tree) if t.type == "T" and t not in (*subject, *listed)))
     if negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
-    asking = Asking(form, relation, negations == 1, None, things[0] if things else None, tuple(map(str, listed)))
+    partly = relation in {"covers", "covered"} and any(node.data in _ANY_PART for node in tree.iter_subtrees())
+    target = things[0] if things else None
+    asking = Asking(form, relation, negations == 1, None, target, tuple(map(str, listed)), partly)
     if any(token.type == "M" for token in subject) and _speaks_of_it(tree):
-        asking = Asking(form, relation, negations == 1, None, IT, asking.among)
+        asking = replace(asking, target=IT)
+    alone = next(tree.find_data("meet_bare"), None) is not None
     pronoun = next((str(token) for token in subject if token.type == "PRONOUN"), None)
     if pronoun == "they":
         return _together(asking, beside)
-    if pronoun is not None and beside is not None:
+    if alone or (pronoun is not None and beside is not None):
         return None  # which of the two movers is meant is open
     return asking if listed and form == "which-first" else _with_subject(asking, tree, subject, done_to)
 
@@ -92,7 +102,7 @@ def _together(asking: Asking, beside: str | None) -> Asking | None:
     """ "Will they collide?": the two things that move."""
     if beside is None or asking.target is not None:
         return None
-    return Asking(asking.form, asking.relation, asking.negated, None, beside)
+    return replace(asking, subject=None, target=beside)
 
 
 def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_to: bool) -> Asking:
@@ -118,4 +128,4 @@ def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_
     elif mover_acted and target is None:
         target, doer = thing, None
         relation = "covered" if relation == "covers" else relation
-    return Asking(asking.form, relation, asking.negated, doer, target, asking.among)
+    return replace(asking, relation=relation, subject=doer, target=target)

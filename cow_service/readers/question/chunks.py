@@ -20,6 +20,8 @@ _LINKS = lex.words(
     "circled boxed surrounded enclosed bounded outlined encircled indicated shown drawn number saying bearing",
     "carrying called",
 )
+# Behind a noun they are no part of it: "the ball and the mug both move".
+_BEHIND = lex.words("both twice earlier later last hard all each together neither either nearest closest able farthest")
 _CLOSED = lex.FUNCTION_WORDS | lex.DETERMINERS
 _NUMBERED = lex.words("with labeled labelled marked numbered bearing carrying saying called")
 _FINITE_BE = lex.words("be is are was were 's")
@@ -37,7 +39,7 @@ def _chunked(text: str, found: Sequence[Item]) -> Iterator[Item]:
         first, end = _phrase_span(found, at, asked)
         if end == first or at == verb:
             yield found[at]
-            asked = at != verb and _still_asked(found[at].key, asked)
+            asked = at != verb and (_still_asked(found[at].key, asked) or _asks_state(found, at))
             at += 1
             continue
         if _ends_in_unknown_verb(found, at, first, end, asked):
@@ -83,15 +85,20 @@ def _still_asked(key: str, asked: bool) -> bool:
     return asked and not done
 
 
+def _asks_state(found: Sequence[Item], at: int) -> bool:
+    """ "Is the mug hit?": a form of "be" that opens a clause waits for a participle."""
+    return found[at].key in {"is", "are", "was", "were"} and (at == 0 or found[at - 1].key in PUNCTUATION)
+
+
 def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: bool, asked: bool) -> bool:
     key, determined, inside = key_at(found, at), first > start, at > first
     if key == "and":
         return inside and not has_noun and key_at(found, at - 1) in lex.COLOURS and key_at(found, at + 1) in lex.COLOURS
     if key == "a" and (inside or key_at(found, at - 1) in _NUMBERED):
         return not _is_determiner(found, at)
-    if key in lex.PLACES or key == "one":
+    if key in lex.PLACES or key in {"one", "far"}:
         return determined and not has_noun
-    if key in PUNCTUATION or key in _CLOSED or _is_measure(found, at, has_noun):
+    if key in PUNCTUATION or key in _CLOSED or (has_noun and key in _BEHIND) or _is_measure(found, at, has_noun):
         return False
     if lex.is_adverb(key) or key == "first":  # "will it hit the mug first?"
         return determined and not has_noun
@@ -108,7 +115,7 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
     """Whether a verb's form is read as a noun or an adjective: "the travel mug", "the red block"."""
     verb, after = lex.VERBS[key_at(found, at)], key_at(found, at + 1)
     closed = after in lex.PLACES or after in _CLOSED or after in PUNCTUATION
-    if begun and closed and key_at(found, at - 1) in lex.PLACES:
+    if begun and (closed or asked) and key_at(found, at - 1) in lex.PLACES:
         return False  # "the balls to the left move up"
     if not has_noun:
         before = key_at(found, at - 1)
@@ -119,8 +126,10 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
         begun = begun or (verb.form == "base" and _is_label(found, at + 1))
         # "orange" is the one colour that is also a thing that moves: "the orange falls".
         return begun and not (verb.form == "s" and verb.kind is not None and before == "orange")
+    going = after == "put" or (after in lex.VERBS and lex.VERBS[after].form == "ing")
+    goes_on = going and (verb.kind == "static" or verb.lemma in lex.WEAK)  # "will the mug remain standing?"
     if verb.form == "base":
-        return not asked or after in lex.VERBS or after in _FINITE_BE
+        return not asked or (not goes_on and (after in lex.VERBS or after in _FINITE_BE))
     return verb.form == "s" and after in {"are", "were"}
 
 

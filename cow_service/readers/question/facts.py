@@ -118,7 +118,8 @@ def _asked_about(trajectory: Trajectory) -> Encounter | None:
     if outcome is None or body is None or outcome.asked.relation not in _KINDS:
         return None
     kind = _KINDS[outcome.asked.relation]
-    fitting = [each for each in trajectory.encounters if each.kind == kind and _happened(each)]
+    partly = outcome.asked.partly
+    fitting = [each for each in trajectory.encounters if each.kind == kind and (partly or _happened(each))]
     own = [each for each in fitting if each.subject == body]
     if outcome.asked.target is not None:
         pair = {trajectory.bodies[body].object, outcome.object} if trajectory.bodies else set[str | None]()
@@ -255,10 +256,11 @@ def _missed(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> str:
     touched = any(each.kind == "touches" for each in met)
     if outcome is None or outcome.asked.relation not in _KINDS or (outcome.asked.target and not outcome.object):
         return "" if body or touched else _NOTHING_MET["touches"]
-    if asked != body:
+    if asked != body or _asked_about(trajectory) is not None:
         return ""
-    if _asked_about(trajectory) is not None:
-        return ""
+    if outcome.asked.partly and ((outcome.probability or 0.0) >= 0.5) != outcome.asked.negated:
+        name = named(outcome.object, "the") if outcome.object else "something"  # less than an encounter tells of
+        return f"hides a part of {name}" if outcome.asked.relation == "covers" else f"is partly hidden by {name}"
     if outcome.asked.target is None or outcome.object is None:
         return _NOTHING_MET[outcome.asked.relation]
     return _NOT_MET[outcome.asked.relation].format(named(outcome.object, "the"))
@@ -284,7 +286,7 @@ def _agreement(trajectory: Trajectory) -> float | None:
         met = _told(trajectory, 0)
         return met[0].probability if met else None
     asked, first = outcome.asked, _asked_about(trajectory)
-    if asked.relation not in _KINDS:
+    if asked.relation not in _KINDS or asked.within is not None or asked.partly:
         return None
     agreeing: dict[str, float | None] = {
         "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,

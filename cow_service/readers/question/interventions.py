@@ -19,7 +19,7 @@ _BEFORE = lex.CONDITIONALS | lex.words(". ! ? ; : , and but then also that with"
 _ANYWHERE = lex.words("without with remove taking in")
 _TELLING = lex.words(
     "remove delete erase eliminate exclude withdraw discard take rid not gone go absent missing no disappear vanish",
-    "without absence put place insert set position drop lower throw release",
+    "without absence out put place insert set position drop lower throw release",
 )
 THINGS = frozenset({"NP", "PRONOUN"})  # terminals of what is named
 _RELATIONS: dict[str, PlaceRelation] = {
@@ -77,8 +77,8 @@ def _goes_on(found: Sequence[Item], start: int, end: int) -> bool:
     return joined and verb is not None and verb.kind not in {None, "static"} and verb.form != "ing"
 
 
-def implied_placing(found: Sequence[Item]) -> tuple[InterventionWords, ...]:
-    """ "Will the apple fit into the bowl?": where nothing moves, the apple is put there."""
+def implied_placing(found: Sequence[Item]) -> tuple[tuple[InterventionWords, ...], frozenset[int]]:
+    """ "Will the apple fit into the bowl?": where nothing moves, the apple is put there; and which places say so."""
     words = words_of(found)
     for place, word in enumerate(words):
         if word.text != "fit":
@@ -88,8 +88,9 @@ def implied_placing(found: Sequence[Item]) -> tuple[InterventionWords, ...]:
             if parsed is None or parsed[1] <= place - start:
                 continue
             named = [phrase for token in named_in(parsed[0]) if (phrase := _phrase(found, token.line or 0))]
-            return (_placing(parsed[0], named),) if named else ()
-    return ()
+            said = frozenset(found[each.at].start for each in words[start : start + parsed[1]])
+            return ((_placing(parsed[0], named),), said) if named else ((), frozenset())
+    return (), frozenset()
 
 
 def _placing(tree: Tree[Token], named: Sequence[ObjectPhrase]) -> InterventionWords:

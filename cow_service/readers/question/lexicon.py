@@ -50,7 +50,7 @@ ADJECTIVES = words(
     "glass rubber paper ceramic stone leather steel cardboard soft hard smooth rough old new other same different",
     "nearest closest farthest furthest nearby leftmost rightmost topmost first second third last single main",
     "whole entire own current original constant lone fuzzy larger smaller bigger taller shorter largest smallest",
-    "biggest tallest shortest latest newest oldest earliest fast slow central front rear distant",
+    "biggest tallest shortest far latest newest oldest earliest fast slow central front rear distant",
 )
 # Nouns that stand before a noun: they stay in a compound, but do not yet make it whole ("toy racing car").
 NOUN_MODIFIERS = words("toy model billiard pool snooker tennis")
@@ -102,6 +102,7 @@ FUNCTION_WORDS = (
     | CAUSATIVES
     | MOVER_PRONOUNS
     | words(
+        "except rather neither nor versus whereas apart",
         "i you we us me him someone somebody anyone anybody anything something nothing everything there here who",
         "whom in inside within on onto upon into at to toward towards from of off over under below above beneath",
         "beside near by with along across through around past behind before between among against via per about",
@@ -110,7 +111,7 @@ FUNCTION_WORDS = (
         "next close now still think believe predict expect tell know suppose also ever just straight already",
         "always instead soon again away closer nearer farther further far together too very much only even",
         "perhaps maybe else finally opposite according due parallel perpendicular ahead forward forwards backward",
-        "backwards onward onwards sideways yes no please ok has have had having following contrary",
+        "backwards onward onwards sideways yes no please pls ok has have had having following contrary",
     )
 )
 AGENTS = words(

@@ -17,6 +17,7 @@ class Listed(NamedTuple):
     lettered: bool = True  # the letters stand in the question
 
 
+MAX_LISTS = 12  # the last so many of a text are looked at
 _MARKER = re.compile(
     r"[(\[]([A-Za-z])[)\]]\s?[:.]?|\b([A-Z])[.):）](?=[\s*])|(?:(?<=\n)|^)[ \t]*([a-z])[.)](?=\s)", re.ASCII
 )
@@ -49,7 +50,7 @@ def split_options(question: str) -> Listed:
     and none that asks; of several such lists the longest counts, and of those the last.
     """
     best: tuple[list[re.Match[str]], int, Options] | None = None
-    for chain in _chains(question):
+    for chain in _chains(question)[-MAX_LISTS:]:
         end = _end(question, chain)
         options = _read(question, chain, end)
         if options and (best is None or len(options) >= len(best[2])):

@@ -1,38 +1,38 @@
-"""Reads how something moves from the words behind its verb: kind, direction, depth, arrow, forward or backward.
+"""Reads how something moves from the words around its verb, by the `adverbial` of the grammar, one after another.
 
-Places are not motion: "to the left of the vase" and "the ball on the left" say where something is.
+What is no adverbial is left unread: it may be part of what is asked, or turn the meaning.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from lark import Token, Tree
 
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.arrow_words import ArrowSense, has_opposite, is_arrow
-from cow_service.readers.question.phrases import Item, ObjectPhrase, QuantityWords, flatten, key_at, phrase_at
+from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.phrases import Item, ObjectPhrase, QuantityWords, key_at
 from cow_service.readers.question.trail_words import TrailWords
+from cow_service.readers.question.words import ARROWS, words_of
 from cow_service.records import MotionKind, Vector
 
+ArrowSense = Literal["along", "against"]
+
 SLIGHTLY = math.tan(math.pi / 8)  # "slightly up": half of a diagonal's 45 degrees
-_AIMS = lex.words("to toward towards into for and or then")
-_SIDES = lex.words("side hand direction corner edge half part end border far very most extreme")
-_NOT_AIMED = lex.words("parallel perpendicular relative next close opposite orthogonal according due contrary")
-_RIGHT_IDIOMS = lex.words("now away next behind in above below beside into at onto before after under off")
-_FAR_ENDS = lex.words("background distance depth depths horizon back rear")
-_NEAR_ENDS = lex.words("foreground front")
-_INSIDE_PICTURE = lex.words("scene picture image screen photo photograph")
+_WINDOW = 14  # words of one adverbial
+_MAX_TRIES = 16  # of one motion: each takes a part of a ms
+_FIRST_LEG_ONLY = frozenset({"along", "against", "reversed", "towards", "forward", "backward"})
+_THEN = lex.words("then afterwards finally")
 _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
 _SINKING = lex.words("lower descend sink")
 _FALLING = lex.words("fall drop plummet plunge descend sink")
 _CLIMBING = lex.words("rise ascend")
-_FACES = lex.words("face head point")
 _GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
-_FORWARD = lex.words("forward forwards ahead onward onwards")
-_BACKWARD = lex.words("backward backwards back")
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,9 @@ class MotionWords:
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
     form, empty where no known verb of motion stands in the question. `towards` is the object that the motion aims at;
     the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
-    `contradictory`: it is said to fall upwards or to rise downwards.
-    `steps` are the legs behind the first, `others` what moves at the same time.
+    `contradictory`: two of its words are opposites, such as to fall upwards, or left and right in one leg.
+    `steps` are the legs behind the first, `others` what moves at the same time. `read` are the places in the text of
+    the items that were understood.
     """
 
     kind: MotionKind | None
@@ -77,170 +78,227 @@ class MotionWords:
     steps: tuple[StepWords, ...] = ()
     contradictory: bool = False
     others: tuple[OtherWords, ...] = ()
+    read: frozenset[int] = field(default_factory=frozenset[int], compare=False)
+
+
+@dataclass
+class _Leg:
+    """What the adverbials of one leg say."""
+
+    verb: str
+    ways: list[Vector] = field(default_factory=list[Vector])
+    depths: set[int] = field(default_factory=set[int])
+    senses: set[ArrowSense] = field(default_factory=set[ArrowSense])
+    ahead: set[bool] = field(default_factory=set[bool])
+    towards: ObjectPhrase | None = None
+    marks: set[str] = field(default_factory=set[str])
+    quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
+
+    def way(self, kind: MotionKind | None) -> Vector | None:
+        """A unit vector in the image."""
+        x, y = (sum(way[axis] for way in self.ways) for axis in (0, 1))
+        if kind == "fall":
+            y = 0.0  # down is what a fall does; only what leads away from it is a direction
+        elif x == y == 0.0 and not self.ways:
+            y = -1.0 if self.verb in _RISING else 1.0 if self.verb in _SINKING else 0.0
+        length = math.hypot(x, y)
+        return (x / length, y / length) if length > 1e-9 else None
+
+    def depth(self) -> float:
+        return float(sum(self.depths))
+
+    def contradicts(self) -> bool:
+        """Whether two of its words are opposites."""
+        up = [way[1] for way in self.ways]
+        turned = (self.verb in _FALLING and min(up, default=0) < 0) or (
+            self.verb in _CLIMBING and max(up, default=0) > 0
+        )
+        opposed = any(a[0] * b[0] < 0 or a[1] * b[1] < 0 for a in self.ways for b in self.ways)
+        moved = bool(self.ways or self.depths) and "at_rest" in self.marks
+        return turned or opposed or moved or any(len(each) > 1 for each in (self.depths, self.senses, self.ahead))
 
 
 def read_motion(
     found: Sequence[Item],
     verb: str,
     kind: MotionKind | None,
-    arrow: ArrowSense | None,
     mover: ObjectPhrase | None,
     asked: bool = False,
+    arrow: bool = False,
 ) -> MotionWords:
-    """The motion in a clause; `found` begins at its verb, `arrow` is what the whole question says of an arrow.
+    """The motion in a clause whose verb is the first of `found`.
 
     `asked`: the verb itself is in question, so where it gets to is not given ("will the ball roll into the vase?").
+    `arrow`: the question names an arrow elsewhere, so "the opposite direction" is opposite to it.
     """
-    kind = _kind(found, verb, kind)
-    if arrow == "along" and _turns_around(found):
-        arrow = "against"
-    legs = _legs(found, verb, arrow)
-    direction, depth = _way(legs[0], verb, kind)
-    steps = [StepWords(*_way(leg, "", None), _quantities(leg)) for leg in legs[1:]]
-    forward = _forward(found, verb, arrow)
-    towards = _towards(found, asked or kind == "fall", mover)
-    return MotionWords(
-        kind, arrow, direction, depth, forward, verb, towards,
-        quantities=_quantities(legs[0]), steps=tuple(steps), contradictory=_contradicts_verb(legs[0], verb),
+    read = {found[0].start} if found and found[0].phrase is None else set[int]()
+    legs = [_Leg(verb)]
+    if verb == "let go":
+        read |= {item.start for item in found[1:3] if item.key in {"go", "loose", "of"}}
+    for tree, items in _adverbials(found, 0 if verb == "follow" else 1):
+        node = None if tree is None else next(iter(tree.children), None)
+        if tree is None:
+            leg = legs[-1]
+            if items[0].quantity is not None and items[0].quantity.within is not None:
+                continue
+            if items[0].quantity is not None:
+                leg.quantities.append(items[0].quantity)
+            elif items[0].key in _THEN:
+                if _says_more(legs[-1]):
+                    legs.append(_Leg(""))
+            elif items[0].key in lex.VERBS and len(legs) > 1 and not leg.verb:
+                leg.verb = lex.lemma(items[0].key)
+        elif isinstance(node, Tree):
+            later = len(legs) > 1 and str(node.data) in _FIRST_LEG_ONLY
+            if later or not _apply(legs[-1], node, found, mover, asked or kind == "fall", arrow):
+                continue
+        read |= {item.start for item in items}
+    first, *rest = [leg for at, leg in enumerate(legs) if not at or leg.way(None) is not None or leg.depths]
+    return _motion(first, rest, _kind(first, kind), frozenset(read))
+
+
+def with_front(motion: MotionWords, before: Sequence[Item], told: frozenset[int]) -> MotionWords:
+    """The motion with what stands in front of its verb: "along the arrow, the ball ...", "at 20 px/s it would ..."."""
+    leg, read = _Leg(""), set(told)
+    for tree, items in _adverbials(before, 0):
+        node = None if tree is None else next(iter(tree.children), None)
+        name = str(node.data) if isinstance(node, Tree) else ""
+        if tree is None and items[0].quantity is not None and items[0].quantity.within is None:
+            leg.quantities.append(items[0].quantity)
+        elif name in {"along", "against"}:
+            leg.senses |= {"along"} if name == "along" else {"against"}
+        elif tree is None or name not in {"", "marked", "told"}:
+            continue
+        read |= {item.start for item in items}
+    said = motion.direction is not None or motion.depth or motion.forward is not None or motion.towards is not None
+    arrow = motion.arrow or next(iter(leg.senses), None) or ("along" if told and not said else None)
+    contradictory = motion.contradictory or len({motion.arrow, *leg.senses} - {None}) > 1
+    return replace(
+        motion, arrow=arrow, quantities=(*leg.quantities, *motion.quantities), contradictory=contradictory,
+        read=motion.read | read,
     )  # fmt: skip
 
 
-def _contradicts_verb(found: Sequence[Item], verb: str) -> bool:
-    """ "Falls upwards", "rises downwards"."""
-    ways = [_word_step(found, at)[1] for at in range(1, len(found))] if verb in _FALLING | _CLIMBING else []
-    return any(way > 0 if verb in _CLIMBING else way < 0 for way in ways)
+def arrow_statement(found: Sequence[Item]) -> frozenset[int]:
+    """The places of "The arrow shows the way" where the question says so."""
+    words = words_of(found)
+    for place, word in enumerate(words):
+        opens = key_at(found, word.at - 1) in {".", "?", "!", ";", ":", ",", "that", "and"} and not (
+            place and words[place - 1].at == word.at
+        )
+        if not opens or all(each.text not in ARROWS for each in words[place : place + 4]):
+            continue
+        parsed = parse_from("adverbial", words[place : place + _WINDOW])
+        if parsed is not None and isinstance(parsed[0].children[0], Tree) and parsed[0].children[0].data == "told":
+            return frozenset(found[each.at].start for each in words[place : place + parsed[1]])
+    return frozenset()
 
 
-def _legs(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> list[Sequence[Item]]:
-    """The words of a motion cut at each "then" that a way to go follows."""
-    legs: list[Sequence[Item]] = [found]
-    for at in range(len(found) - 1, 0, -1):
-        if found[at].key in {"then", "afterwards"} and _way(found[at:], "", None) != (None, 0.0):
-            first = legs.pop(0)
-            legs = [first[:at], first[at:], *legs]
-    along = arrow is not None and any(is_arrow(legs[0], at) for at in range(len(legs[0])))
-    return legs if along or _way(legs[0], verb, None) != (None, 0.0) else [found]
+def _says_more(leg: _Leg) -> bool:
+    return bool(leg.ways or leg.depths or leg.senses or leg.quantities or leg.verb in _FALLING | _RISING | _SINKING)
 
 
-def _way(found: Sequence[Item], verb: str, kind: MotionKind | None) -> tuple[Vector | None, float]:
+def _motion(first: _Leg, rest: Sequence[_Leg], kind: MotionKind | None, read: frozenset[int]) -> MotionWords:
+    arrow = next(iter(first.senses), None)
+    forward = next(iter(first.ahead), None)
+    if forward is None and arrow is None and first.verb == "reverse":
+        forward = False
+    if forward is None and "straight_on" in first.marks and first.verb in _GOES_STRAIGHT:
+        forward = True
+    if forward is False and arrow is not None:
+        forward = None
+    steps = tuple(StepWords(*_way(leg, None), tuple(leg.quantities)) for leg in rest)
+    return MotionWords(
+        kind, arrow, *_way(first, kind), forward, first.verb, first.towards,
+        quantities=tuple(first.quantities), steps=steps, contradictory=any(leg.contradicts() for leg in (first, *rest)),
+        read=read,
+    )  # fmt: skip
+
+
+def _way(leg: _Leg, kind: MotionKind | None) -> tuple[Vector | None, float]:
     """The direction in the image and the depth of a leg."""
-    direction, depth = _direction(found, verb, kind), _depth(found)
+    direction, depth = leg.way(kind), leg.depth()
     return direction, depth * math.sqrt(0.5) if direction is not None else depth
 
 
-def _quantities(found: Sequence[Item]) -> tuple[QuantityWords, ...]:
-    return tuple(item.quantity for item in found if item.quantity is not None)
-
-
-def _kind(found: Sequence[Item], verb: str, kind: MotionKind | None) -> MotionKind | None:
-    flat = flatten(found[:12])
-    if verb == "come" and "down" in flat[:3]:
+def _kind(leg: _Leg, kind: MotionKind | None) -> MotionKind | None:
+    if leg.verb == "come" and any(way[1] > 0 for way in leg.ways):
         return "fall"
-    if verb in _TIPPED and "over" in flat[1:3] and not any(item.phrase for item in found[2:3]):
+    if leg.verb in _TIPPED and "over" in leg.marks:
         return "fall"
-    if verb in _KICKED and "air" in flat:
+    if leg.verb in _KICKED and "airborne" in leg.marks:
         return "projectile"
     return kind
 
 
-def _turns_around(found: Sequence[Item]) -> bool:
-    """ "The arrow shows the way. If the ball moves in the opposite direction ..."."""
-    return not any(is_arrow(found, at) for at in range(len(found))) and has_opposite(flatten(found))
+def _adverbials(found: Sequence[Item], start: int) -> Iterator[tuple[Tree[Token] | None, Sequence[Item]]]:
+    """The adverbials of a clause with their items; None for a quantity, a "then" or a further verb alone."""
+    words = words_of(found)
+    begins = {word.at: place for place, word in reversed(list(enumerate(words)))}
+    at, tries = start, 0
+    while at < len(found):
+        item = found[at]
+        if item.quantity is not None or item.key in _THEN or _is_next_verb(found, at):
+            yield None, (item,)
+            at += 1
+            continue
+        ahead = words[begins[at] : begins[at] + _WINDOW] if at in begins and tries < _MAX_TRIES else []
+        parsed = parse_from("adverbial", ahead)
+        tries += parsed is not None or bool(ahead)
+        end = at
+        if parsed is not None:
+            last = parsed[1]
+            end = ahead[last].at if last < len(ahead) else ahead[-1].at + 1
+            if end > at:
+                yield parsed[0], found[at:end]
+        at = max(end, at + 1)
 
 
-def _direction(found: Sequence[Item], verb: str, kind: MotionKind | None) -> Vector | None:
-    x = y = 0.0
-    for at in range(1, len(found)):
-        step = _place_step(found, at) if found[at].phrase else _word_step(found, at)
-        x, y = x + step[0], y + step[1]
-    if kind == "fall":
-        y = 0.0  # down is what a fall does; only what leads away from it is a direction
-    elif x == y == 0.0:
-        y = -1.0 if verb in _RISING else 1.0 if verb in _SINKING else 0.0
-    length = math.hypot(x, y)
-    return (x / length, y / length) if length > 1e-9 else None
+def _is_next_verb(found: Sequence[Item], at: int) -> bool:
+    """ "And then drops", "then it rolls": the verb of a further leg."""
+    verb = lex.VERBS.get(found[at].key)
+    before = at - 1
+    while key_at(found, before) in lex.MOVER_PRONOUNS | lex.BE | {"to"}:
+        before -= 1
+    return verb is not None and verb.kind is not None and key_at(found, before) in _THEN | {"and"}
 
 
-def _word_step(found: Sequence[Item], at: int) -> Vector:
-    key, before, after = found[at].key, key_at(found, at - 1), key_at(found, at + 1)
-    if key not in lex.DIRECTIONS or before in {"from", "on", "at"} or before in lex.BE:
-        return (0.0, 0.0)
-    if (key == "right" and after in _RIGHT_IDIOMS) or _is_beside(found, at):
-        return (0.0, 0.0)
-    along = at + 1 if after != "to" else at + 2
-    if key in {"up", "down"} and phrase_at(found, along) and not _place_words(found[along]):
-        return (0.0, 0.0)  # "down the ramp", "up to the vase"
-    return _weighed(found, at, lex.DIRECTIONS[key])
+def _apply(
+    leg: _Leg, node: Tree[Token], found: Sequence[Item], mover: ObjectPhrase | None, open_end: bool, arrow: bool
+) -> bool:
+    """Takes one adverbial into a leg; false where it says nothing there."""
+    name = str(node.data)
+    match name:
+        case "heading":
+            weight = SLIGHTLY if next(node.find_data("slight"), None) is not None else 1.0
+            said = [lex.DIRECTIONS[str(token)] for ways in node.find_data("ways") for token in ways.children]
+            leg.ways += [(weight * x, weight * y) for x, y in said]
+        case "away" | "near":
+            leg.depths.add(1 if name == "away" else -1)
+        case "along" | "against":
+            leg.senses.add(name)
+        case "reversed":
+            if arrow:
+                leg.senses.add("against")
+            return arrow
+        case "forward" | "backward":
+            leg.ahead.add(name == "forward")
+        case "beside_it":
+            return False
+        case "stops":
+            return bool(leg.quantities)
+        case "towards":
+            return _aim(leg, node, found, mover, open_end)
+        case _:
+            leg.marks.add(name)
+    return True
 
 
-def _is_beside(found: Sequence[Item], at: int) -> bool:
-    """ "to the left of the vase" is a place; "to the left of the image" is a direction."""
-    beside = phrase_at(found, at + 2)
-    return key_at(found, at + 1) == "of" and (beside is None or beside.head not in lex.NO_THINGS)
-
-
-def _place_words(item: Item) -> list[str]:
-    words = [word for word in item.words if word not in lex.DETERMINERS and word != "and"]
-    return words if all(word in lex.PLACES or word in _SIDES for word in words) else []
-
-
-def _place_step(found: Sequence[Item], at: int) -> Vector:
-    words, before = _place_words(found[at]), key_at(found, at - 1)
-    aimed = before in _AIMS or lex.is_adverb(before)
-    aimed = aimed or (bool(words) and words[-1] == "direction" and before in {"in", "along"})
-    if not aimed or _is_beside(found, at):
-        return (0.0, 0.0)
-    steps = [lex.DIRECTIONS[word] for word in words if word in lex.DIRECTIONS]
-    return _weighed(found, at, (sum(step[0] for step in steps), sum(step[1] for step in steps)))
-
-
-def _weighed(found: Sequence[Item], at: int, step: Vector) -> Vector:
-    slight = "slightly" in {key_at(found, at - 1), key_at(found, at - 2)}
-    return (step[0] * SLIGHTLY, step[1] * SLIGHTLY) if slight else step
-
-
-def _depth(found: Sequence[Item]) -> float:
-    for at, item in enumerate(found):
-        viewer = item.key in {"us", "me", "you"} or (item.phrase and item.phrase.head in lex.VIEWERS)
-        before = [key_at(found, at - 1), key_at(found, at - 2), key_at(found, at - 3)]
-        if viewer and before[0] == "from" and {"away", "farther", "further", "far", "back"}.intersection(before):
-            return 1.0
-        approached = before[0] in {"to", "toward", "towards", "at"} or before[0].startswith("approach")
-        if viewer and approached and before[1] not in _NOT_AIMED:
-            return -1.0
-        head = item.words[-1] if item.words and before[0] in {"to", "toward", "towards", "into"} else ""
-        if head in _FAR_ENDS or (head in _INSIDE_PICTURE and before[0] == "into"):
-            return 1.0
-        if head in _NEAR_ENDS:
-            return -1.0
-    return 0.0
-
-
-def _forward(found: Sequence[Item], verb: str, arrow: ArrowSense | None) -> bool | None:
-    flat = flatten(found)
-    if not _FORWARD.isdisjoint(flat):
-        return True
-    back = not _BACKWARD.isdisjoint(flatten(item for item in found if not item.phrase))
-    if arrow is None and (back or verb == "reverse" or "reverse" in flat):
+def _aim(leg: _Leg, node: Tree[Token], found: Sequence[Item], mover: ObjectPhrase | None, open_end: bool) -> bool:
+    phrase = next((found[token.line or 0].phrase for token in node.scan_values(lambda v: isinstance(v, Token))), None)
+    if phrase is None or phrase == mover or (open_end and next(node.find_data("to_goal"), None) is not None):
         return False
-    if arrow is None and not _FACES.isdisjoint(map(lex.lemma, flat[1:])):
-        return not has_opposite(flat)
-    return True if verb in _GOES_STRAIGHT and flat[-1:] == ["straight"] else None
-
-
-def _is_one(phrase: ObjectPhrase) -> bool:
-    """ "The pink one"."""
-    return phrase.noun is None and phrase.colour is not None
-
-
-def _towards(found: Sequence[Item], open_end: bool, mover: ObjectPhrase | None) -> ObjectPhrase | None:
-    preps = {"toward", "towards"} if open_end else {"toward", "towards", "to", "at", "into"}
-    for at, item in enumerate(found):
-        before, earlier = key_at(found, at - 1), phrase_at(found, at - 2)
-        if before == "of":  # "in the direction of the vase"
-            aimed = earlier is not None and earlier.noun == "direction" and not has_opposite(flatten(found))
-        else:
-            aimed = before in preps and key_at(found, at - 2) not in _NOT_AIMED
-        if item.phrase and aimed and item.phrase != mover and (item.phrase.is_thing or _is_one(item.phrase)):
-            return item.phrase
-    return None
+    if phrase.is_thing or (phrase.noun is None and phrase.colour is not None):
+        leg.towards = leg.towards or phrase
+        return leg.towards == phrase
+    return False

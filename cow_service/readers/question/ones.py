@@ -8,20 +8,45 @@ from dataclasses import replace
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
 
+_REFERRING = frozenset([("the", "latter"), ("the", "former")])
+_OTHER = frozenset([("the", "other", "one"), ("the", "other")])
+
 
 def with_nouns(found: Sequence[Item]) -> list[Item]:
-    """The items, where "the red one" has the noun of the kind that is asked for, or that of all things before it."""
+    """The items, where a reference has what it means.
+
+    "The latter" is what was named last, "the other one" is of the kind named, and "the red one" of the kind that is
+    asked for, or of that of all things before it.
+    """
     kinds = {_kind_of(item.phrase) for at, item in enumerate(found) if item.phrase and _is_asked_for(found, at)} - {""}
     before: set[str] = set()
     said: list[Item] = []
+    things: list[Item] = []
     for item in found:
         nouns, phrase = kinds or before, item.phrase
-        if phrase is not None and phrase.noun is None and phrase.colour is not None and len(nouns) == 1:
+        if item.words in _REFERRING and len(things) > 1:
+            meant = things[-1] if item.words == ("the", "latter") else things[-2]
+            said.append(replace(item, phrase=meant.phrase, words=meant.words))
+            continue
+        if item.words in _OTHER and len(nouns) == 1:
+            noun = next(iter(nouns))
+            other = ObjectPhrase(f"other {noun}", None, noun)
+            said.append(replace(item, phrase=other, words=("the", "other", *noun.split())))
+            continue
+        if phrase is not None and phrase.is_thing and phrase.noun and all(phrase != each.phrase for each in things):
+            things.append(item)
+        if phrase is not None and phrase.noun is None and _singles_out(item, phrase) and len(nouns) == 1:
             said.append(replace(item, phrase=_of_kind(phrase, next(iter(nouns)))))
         else:
             said.append(item)
             before |= {_kind_of(phrase)} - {""}
     return said
+
+
+def _singles_out(item: Item, phrase: ObjectPhrase) -> bool:
+    """ "The red one", "the left one", "the one on the left"."""
+    words = phrase.text.lower().split()
+    return phrase.colour is not None or (item.words[-1:] == ("one",) and len(words) > 1)
 
 
 def _is_asked_for(found: Sequence[Item], at: int) -> bool:
@@ -39,5 +64,6 @@ def _kind_of(phrase: ObjectPhrase | None) -> str:
 
 def _of_kind(phrase: ObjectPhrase, noun: str) -> ObjectPhrase:
     words = phrase.text.split()
-    kept = words[:-1] if words[-1].lower() == "one" else words
-    return replace(phrase, text=" ".join([*kept, noun]), noun=noun)
+    if "one" not in words:
+        return replace(phrase, text=" ".join([*words, noun]), noun=noun)
+    return replace(phrase, text=" ".join(noun if word == "one" else word for word in words), noun=noun)

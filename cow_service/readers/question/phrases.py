@@ -16,10 +16,18 @@ _TOKEN = re.compile(r"\d+\.\d+|no\.(?=\s{0,3}\d)|n't\b|'s\b|#\d+|\w+?(?=n't\b)|\
 
 
 @dataclass(frozen=True)
+class PlaceWords:
+    """Where a thing is in the image: behind, in front of or nearest to another one, or to the camera (`of` is None)."""
+
+    relation: str
+    of: ObjectPhrase | None
+
+
+@dataclass(frozen=True)
 class ObjectPhrase:
     """An object as the question words it: `text` has no determiner, `noun` is the head noun, or a compound, singular.
 
-    It says nothing about where the object is in the image.
+    `place` is where the image shows it, as far as the question says so by another thing.
     """
 
     text: str
@@ -27,6 +35,7 @@ class ObjectPhrase:
     noun: str | None
     inside_box: bool = False
     number: int | None = None
+    place: PlaceWords | None = None
 
     @property
     def head(self) -> str | None:
@@ -48,6 +57,7 @@ class QuantityWords:
     share: float | None = None  # of the way to what it moves towards
     duration: float | None = None  # s
     until: Until | None = None
+    within: float | None = None  # s: a limit of what is asked about, not of the motion
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from lark import Token, Tree
 
-from cow_service.readers.base import Quantity, Unit
+from cow_service.readers.base import Quantity, SpeedWord, Unit
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.parsing import parse_from
 from cow_service.readers.question.phrases import QUANTITY, Item, QuantityWords
@@ -16,8 +16,9 @@ from cow_service.readers.question.words import PRONOUNS, Word, base_forms
 _WINDOW = 12  # words
 _MAX_TRIES = 5  # of one question: each takes some ms
 _STARTS = lex.words(
-    "at with by for during lasting over only exactly very really quite rather slowly slow gently softly lightly fast",
-    "quickly rapidly swiftly hard forcefully halfway midway half but until till a an stops stopping",
+    "within in after at with by for during lasting over only exactly very really quite rather slowly slow gently",
+    "softly lightly fast quickly rapidly swiftly hard forcefully halfway midway half but until till a an",
+    "stops stopping",
 )
 _PACES = lex.words("slowly slow gently softly lightly fast quickly rapidly swiftly hard forcefully halfway midway")
 _MEASURES = _PACES | lex.words(
@@ -90,22 +91,27 @@ def _quantity(tree: Tree[Token]) -> QuantityWords:
     kind = tree.children[0]
     assert isinstance(kind, Tree)
     number, length = _number(kind), _length(kind)
+    until = "contact" if list(kind.find_data("contact")) else "out-of-view"
     match kind.data:
         case "speed":
-            if length is not None:
-                value, unit = length
-                per_second: dict[str, Unit] = {"px": "px/s", "m": "m/s", "widths": "widths/s"}
-                return QuantityWords(speed=Quantity(number * value, per_second[unit]))
-            return QuantityWords(speed="slow" if list(kind.find_data("slow")) else "fast")
+            return QuantityWords(speed=_speed(kind, number, length))
+        case "limit":
+            return QuantityWords(within=number)
         case "duration":
             return QuantityWords(duration=number)
         case "distance":
             value, unit = length or (1.0, "widths")
             return QuantityWords(distance=Quantity(number * value, unit))
-        case "share":
-            return QuantityWords(share=number)
         case _:
-            return QuantityWords(until="contact" if list(kind.find_data("contact")) else "out-of-view")
+            return QuantityWords(share=number) if kind.data == "share" else QuantityWords(until=until)
+
+
+def _speed(kind: Tree[Token], number: float, length: tuple[float, Unit] | None) -> SpeedWord | Quantity:
+    if length is None:
+        return "slow" if list(kind.find_data("slow")) else "fast"
+    value, unit = length
+    per_second: dict[str, Unit] = {"px": "px/s", "m": "m/s", "widths": "widths/s"}
+    return Quantity(number * value, per_second[unit])
 
 
 def _number(tree: Tree[Token]) -> float:

@@ -1,7 +1,7 @@
 """Reads which event a question asks about: that the mover hits, lands on, hides or is hidden by something.
 
-The question is taken at its word, by the grammar of `asked_grammar`. Anything beside it (an order of events, a number,
-a thing that is taken away, another thing that moves) leaves it unread: a wrong yes is worse than "not sure".
+The question is taken at its word: one that has a word which no rule reads, where that may turn its meaning, is not
+read at all. A wrong yes is worse than "not sure".
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
+from cow_service.readers.question.accounting import Unread, unread_words
 from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
 from cow_service.readers.question.asking import IT, Asking, read_clause
 from cow_service.readers.question.phrases import ObjectPhrase
@@ -27,24 +28,10 @@ _OPENERS = lex.words(", and then so but now please")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
 _SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
 _CONDITIONS = lex.words("if when once after as while upon assuming given provided suppose supposing")
-_SUBJECT = r"(?:it|M|T\d+|they|there)(?: .*)?"
-_INVERTED = re.compile(rf"(?:.* )?(?:will|would|do|does|did|can|could) {_SUBJECT}|be {_SUBJECT}")
-# They set something else in motion, take it away, put it in, or turn the condition round.
-_INTERVENTIONS = lex.words(
-    "remove removes removed removing delete deleted erase erased taken without absent gone missing put puts putting",
-    "insert inserted add added replace replaced swap swapped exchange exchanged trail unless instead otherwise except",
-    "rather no",
-)
-_NOT_THERE = re.compile(r".*\b(?:not|n't|never) (?:there|here|present|exist|existed)\b.*")
-_SHORT_ANSWER = lex.words(
-    "please answer reply respond say just only with by in a single word yes no or not sure either"
-)
-_TIMED = re.compile(rf".*\b(?:after|within|before|in) (?:[\d.]+|{'|'.join(lex.NUMBER_WORDS)}) (?:s|secs?|seconds?)\b.*")
 _MAX_TRIES = 8  # of one sentence: each takes some ms
 MAX_SENTENCES = 12  # of one question; more are not read
 _LIST = re.compile(r"(?P<list>T\d+(?: , T\d+)*(?: ,)? or T\d+)")
 _LIST_AT_END = re.compile(r".*?, " + _LIST.pattern)
-_BEFORE_PLACES = lex.words("to of by near behind beside in on at from under above below with toward towards into")
 _HOLLOW = lex.words("bowl basket hole pocket goal bin bucket pit hoop net drawer gap garage tunnel cave tray pan pot")
 
 
@@ -57,6 +44,7 @@ class _Reading:
     covered: frozenset[int]
     items: frozenset[int] = frozenset()
     listed: tuple[ObjectPhrase, ...] = ()
+    within: float | None = None  # s
 
 
 def read_asked(question: Question) -> Asked | None:
@@ -66,8 +54,9 @@ def read_asked(question: Question) -> Asked | None:
     `read_alternatives`.
     """
     reading = _read(question)
-    if reading is None:
-        return None
+    falls = question.motion.kind in {"fall", "projectile"}
+    if reading is None or unread(question).turning or (reading.asking.relation == "lands" and not falls):
+        return None  # what stands on the floor lands on it by nothing that the worlds tell
     asking = reading.asking
     target = None if asking.target is None else _named(asking.target, reading, question)
     subject = None if asking.subject is None else _named(asking.subject, reading, question)
@@ -76,8 +65,9 @@ def read_asked(question: Question) -> Asked | None:
     kinds = [phrase for token, phrase in reading.phrases.items() if token.startswith("K")]
     among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question) if phrase not in kinds)
     return Asked(
-        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among
-    )
+        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among,
+        within=reading.within, partly=asking.partly,
+    )  # fmt: skip
 
 
 def _named(token: str, reading: _Reading, question: Question) -> str | None:
@@ -96,20 +86,11 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     return tuple(listed or named.values())
 
 
-def unread_clause(question: Question) -> str:
-    """The words of the question from where it asks on, where they are not understood."""
-    for sentence in sentences(question) if _read(question) is None else []:
-        starts = [at for at, token in enumerate(sentence.tokens) if token in _STARTS and _opens(sentence.tokens[:at])]
-        if starts and not _INVERTED.fullmatch(" ".join(sentence.tokens[: starts[0]])):
-            items = list(dict.fromkeys(sentence.items[starts[0] :]))
-            return " ".join(" ".join(question.items[at].words) or question.items[at].key for at in items)
-    return ""
-
-
-def covered_items(question: Question) -> frozenset[int]:
-    """The places in `Question.items` of the clause that asks, as far as it was read."""
+@lru_cache(maxsize=64)
+def unread(question: Question) -> Unread:
+    """The words of the question that no rule has read."""
     reading = _read(question)
-    return frozenset() if reading is None else reading.items
+    return unread_words(question, frozenset() if reading is None else reading.items)
 
 
 @lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
@@ -122,23 +103,34 @@ def _read(question: Question) -> _Reading | None:
     if len(readings) != 1:
         return None
     at, reading = readings[0]
-    for place, sentence in enumerate(found):
-        covered = reading.covered if place == at else frozenset[int]()
-        if place != at and _INVERTED.fullmatch(" ".join(sentence.tokens)):
-            return None
-        if not _leaves_world(sentence, covered, question):
-            return None
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
         return None
-    return replace(reading, listed=listed, items=frozenset(found[at].items[place] for place in reading.covered))
+    named = {found[at].items[place] for place in reading.covered}
+    named |= {place for place, item in enumerate(question.items) if item.phrase in listed}
+    if listed:
+        named |= {place for place, item in enumerate(question.items) if item.key == "or"}
+    limits = {at: item.quantity.within for at, item in enumerate(question.items) if item.quantity}
+    limits = {at: limit for at, limit in limits.items() if limit is not None}
+    if not all(_limits(question, named, at) for at in limits):
+        return None
+    within = min(limits.values(), default=None)
+    return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within)
+
+
+def _limits(question: Question, asking: set[int], at: int) -> bool:
+    """Whether a time limits what is asked: not the motion, and "after 2 s" only where it is asked what has happened."""
+    items = question.items
+    have = not {"has", "have", "had"}.isdisjoint(items[place].key for place in asking)
+    moves = items[at] in question.clause and not any(items[place] in question.clause for place in asking)
+    return not moves and (have or "after" not in items[at].words)
 
 
 def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
     """The longest part of a sentence, up to its end or to a condition, that a pattern covers."""
     tokens = sentence.tokens
     tries = 0
-    ends = [len(tokens), *(at for at, token in enumerate(tokens) if token in _CONDITIONS)]
+    ends = [len(tokens), *(at for at in range(len(tokens)) if _ends(tokens, at, question))]
     for start in (at for at in range(len(tokens)) if _starts(sentence, at)):
         for end in (end for end in ends if end > start):
             tries += 1
@@ -148,6 +140,13 @@ def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
             if reading is not None:
                 return reading
     return None
+
+
+def _ends(tokens: Sequence[str], at: int, question: Question) -> bool:
+    """Whether a condition begins at a token: "if it rolls", "by rolling"."""
+    return tokens[at] in _CONDITIONS or (
+        tokens[at] == "by" and tokens[at + 1 : at + 2] == [f"{question.motion.verb}-ing"]
+    )
 
 
 def _starts(sentence: Sentence, at: int) -> bool:
@@ -220,43 +219,6 @@ def _relates(token: str, after: str) -> bool:
     """Whether a clause follows on "which", "when" or "where": then nothing is asked with them."""
     subject = after[:1] in {"M", "T", "X"} or after in _SUBJECTS or after.startswith("OBJ")
     return subject or (token == "when" and after.removesuffix("-ing") in lex.VERBS)
-
-
-def _leaves_world(sentence: Sentence, covered: frozenset[int], question: Question) -> bool:
-    """Whether the words around a question leave its world as it is: one thing moves, and hits nothing yet."""
-    tokens, rest = sentence.tokens, [at for at in range(len(sentence.tokens)) if at not in covered]
-    words = [word for at in rest for word in sentence.words[at]]
-    if set(words) <= _SHORT_ANSWER:
-        return True
-    if not _INTERVENTIONS.isdisjoint(words) or _NOT_THERE.fullmatch(" ".join(words)):
-        return False
-    if _TIMED.fullmatch(" ".join(words)):
-        return False  # "will it have hit the cup after 2 seconds?"
-    return not any(_moves_another(sentence, at, question) or _hits(tokens, at) for at in rest)
-
-
-def _moves_another(sentence: Sentence, at: int, question: Question) -> bool:
-    """Whether another thing than the mover, or a hand that moves it, is the subject of a verb of motion at a place."""
-    tokens = sentence.tokens
-    verb = lex.VERBS.get(tokens[at])
-    subject = at - 2 if at > 1 and tokens[at - 1] == "be" else at - 1
-    if verb is None or verb.kind in {None, "static"} or subject < 0 or tokens[subject] not in sentence.phrases:
-        return False
-    known = [other.object for other in question.motion.others]
-    if sentence.phrases[tokens[subject]] in known:
-        return False
-    if sentence.phrases[tokens[subject]].head in lex.AGENTS and tokens[at + 1 : at + 2] == ["M"]:
-        return False
-    return subject == 0 or tokens[subject - 1] not in _BEFORE_PLACES
-
-
-def _hits(words: Sequence[str], at: int) -> bool:
-    """Whether something is said to hit, hide or reach another thing than the mover."""
-    lemma = words[at].removesuffix("-ing")
-    if lemma not in lex.TOUCH | lex.OCCLUDE or lemma in {"contact", "impact"}:
-        return False
-    after = [word for word in words[at + 1 : at + 3] if word not in {"into", "against", "with"}]
-    return words[at - 1 : at] != ["be"] and after[:1] not in (["M"], ["it"])
 
 
 def _into_hollow(asking: Asking, tokens: Sequence[str], phrases: dict[str, ObjectPhrase]) -> Asking | None:

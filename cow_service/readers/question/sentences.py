@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+from cow_service.readers.base import Quantity
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.arrow_words import read_arrow
 from cow_service.readers.question.chunks import items
 from cow_service.readers.question.clauses import (
     SENTENCE_END,
@@ -24,14 +24,17 @@ from cow_service.readers.question.clauses import (
 )
 from cow_service.readers.question.interventions import InterventionWords, implied_placing, split_interventions
 from cow_service.readers.question.listed_options import split_options
-from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
+from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
 from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
+from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.reply_forms import without_reply_form
 from cow_service.readers.question.trail_words import TrailWords, split_trail
+from cow_service.records import MotionKind
 
+MAX_WORDS = 240  # of a question that are read
 _INSTRUCTIONS = lex.words(
-    "answer choose select pick option options choices explain respond reply provide return output"
+    "think reason answer choose select pick option options choices explain respond reply provide return output"
 )
 _PICTURES = lex.words("image images frame frames picture pictures photo photos")
 _SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
@@ -50,7 +53,7 @@ class Question:
     `others` are the further objects it names, in order, without the mover and without what is taken away; `items`, all
     its words and noun phrases, but for the options that it lists, its `interventions` and its trail.
     `clause` are the items that tell the motion. `names_direction`: some word says which way, whether or not it was
-    understood.
+    understood. `read` are the places in the text of the items that tell the motion and were understood.
     """
 
     mover: ObjectPhrase | None
@@ -61,46 +64,92 @@ class Question:
     clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
+    beyond: str = ""  # how what is not read any more begins
+    pronoun: str = ""  # that stands for the mover where it may stand for two things
+    read: frozenset[int] = frozenset()
 
 
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    interventions, everything = split_interventions(with_nouns(items(without_reply_form(split_options(question).rest))))
-    trail, everything = split_trail(_at_the_same_time(everything))
-    found = _without_instructions(everything)
+    text, beyond = _cut(without_reply_form(split_options(question).rest))
+    changes, found = split_interventions(with_places(with_nouns(items(text))))
+    trail, found = split_trail(_at_the_same_time(found))
+    found = _without_instructions(found)
     clauses = read_clauses(found)
     best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
     at = best.at if best else len(found)
-    end = clause_end(found, at) if best else at
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
-    verb, kind = (best.verb, best.kind) if best else ("fall", "fall") if _on_its_way_down(found) else ("", None)
-    end = min([end, *(other.start for other in _movers_beside(clauses, best))])
-    shared = _sharing(found, at, end)
-    motion = read_motion(
-        found[at : shared or end], verb, kind, read_arrow(found), mover, asked=best is not None and best.asked
-    )
-    first = found[0].quantity if found and at > 0 else None  # "At 100 px/s, would the ball hit ...?"
-    motion = motion if first is None else replace(motion, quantities=(first, *motion.quantities))
-    motion = replace(motion, trail=trail, others=_other_motions(found, clauses, best, shared, end))
-    if not interventions and (best is None or (best.asked and not _says_way(motion))):
-        interventions = implied_placing(found)
-    put = next((change for change in interventions if change.kind == "place"), None)
-    if put is not None and (best is None or best.asked or best.kind == "static" or _is_carried(best, put)):
+    arrow = any(token.key.startswith("arrow") for token in tokens(question))
+    clause, motion = _motion(found, clauses, best, mover, arrow, changes)
+    motion, fitted = replace(motion, trail=_ending(trail, motion)), frozenset[int]()
+    if not changes and (best is None or (best.asked and not _says_way(motion))):
+        changes, fitted = implied_placing(found)
+    read = motion.read.union(fitted, *(other.motion.read for other in motion.others))
+    put = next((change for change in changes if change.kind == "place"), None)
+    carried = put is not None and best is not None and _is_carried(best, put)
+    if put is not None and (best is None or best.asked or best.kind == "static" or carried):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
-    clause = range(best.start if best else at, end)
-    words = {token.key for token in tokens(question)}
     return Question(
         mover=mover,
         motion=motion,
-        others=_others(found, mover, clause, interventions, trail),
-        items=tuple(everything),
-        interventions=interventions,
+        others=_others(found, mover, clause, changes, trail),
+        items=tuple(found),
+        interventions=changes,
         clause=tuple(found[clause.start : clause.stop]),
-        mentions_arrow=any(word.startswith("arrow") for word in words),
+        mentions_arrow=arrow,
         names_direction=_DIRECTION_WORDS.search(question) is not None,
+        beyond=beyond,
+        pronoun=_open_pronoun(found, best, mover),
+        read=read.union(item.start for item in found[clause.start : clause.stop]) if carried else read,
     )
+
+
+def _cut(text: str) -> tuple[str, str]:
+    """So much of a text as is read, and how the rest begins."""
+    found = tokens(text)
+    if len(found) <= MAX_WORDS:
+        return text, ""
+    rest = text[found[MAX_WORDS].start : found[min(MAX_WORDS + 6, len(found) - 1)].end]
+    return text[: found[MAX_WORDS].start], " ".join(rest.split())
+
+
+def _motion(
+    found: Sequence[Item],
+    clauses: Clauses,
+    best: MotionCandidate | None,
+    mover: ObjectPhrase | None,
+    arrow: bool,
+    changes: Sequence[InterventionWords],
+) -> tuple[range, MotionWords]:
+    """The places of the clause that tells the motion, and what it tells."""
+    at = best.at if best else len(found)
+    beside = _movers_beside(found, clauses, best)
+    end = min([clause_end(found, at) if best else at, *(other.start for other in beside)])
+    shared = _sharing(found, at, end)
+    verb, kind = (best.verb, best.kind) if best else _falling(found, changes)
+    motion = read_motion(
+        found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
+    )
+    start = best.start if best else 0
+    motion = with_front(motion, found[start:at] if best else found, arrow_statement(found))
+    speeds = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
+    speeds = [(place, said) for place, said in speeds if isinstance(said.speed, Quantity)]
+    motion = replace(
+        motion,
+        quantities=(*motion.quantities, *(said for _, said in speeds)),
+        read=motion.read.union(place for place, _ in speeds),
+        others=_other_motions(found, clauses, best, shared, end),
+    )
+    return range(start if best else at, end), motion
+
+
+def _ending(trail: TrailWords | None, motion: MotionWords) -> TrailWords | None:
+    """ "On along its trail to the right": its last end is on the right."""
+    if trail is None or trail.near is not None or trail.side is not None or motion.direction is None:
+        return trail
+    return replace(trail, side=motion.direction)
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
@@ -112,11 +161,14 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     return phrase
 
 
-def _on_its_way_down(found: Sequence[Item]) -> bool:
-    return any(
+def _falling(found: Sequence[Item], changes: Sequence[InterventionWords]) -> tuple[str, MotionKind | None]:
+    """ "What does it touch on its way down?", and "where would it land?" of what loses its support."""
+    removed = any(change.kind == "remove" for change in changes)
+    falls = any(removed and lex.lemma(item.key) == "land" for item in found) or any(
         item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
         for at, item in enumerate(found)
     )
+    return ("fall", "fall") if falls else ("", None)
 
 
 def _says_way(motion: MotionWords) -> bool:
@@ -143,14 +195,27 @@ def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhras
     return next(iter(before + [phrase for _, phrase in asked + named]), None)
 
 
-def _movers_beside(clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
+def _open_pronoun(found: Sequence[Item], best: MotionCandidate | None, mover: ObjectPhrase | None) -> str:
+    """The pronoun that moves where two things were named alike before it: "the ball and the mug ... if it rolls"."""
+    if best is None or best.subject is not None:
+        return ""
+    for at in range(best.at - 2):
+        two = found[at].phrase, found[at + 2].phrase
+        if found[at + 1].key == "and" and mover in two and all(each is not None and each.is_thing for each in two):
+            return next((item.key for item in found[at + 3 : best.at] if item.key in lex.MOVER_PRONOUNS), "")
+    return ""
+
+
+def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
     """Motions of other things than the mover's, said in the same way: "the ball moves left and the car goes right"."""
     if best is None or best.asked or best.subject is None or best.subject.head in lex.AGENTS:
         return []
+    while_it = found[best.start].key == "while"  # "while the ball rolls right, the mug slides left"
     return [
         each
         for each in clauses.candidates
-        if each.rank == best.rank and each.at > best.at and each.kind not in {None, "static"}
+        if (each.rank == best.rank or (while_it and not each.asked)) and each.at > best.at
+        and each.kind not in {None, "static"}
         and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 
@@ -160,7 +225,7 @@ def _sharing(found: Sequence[Item], at: int, end: int) -> int | None:
     for place in range(at + 1, end - 2):
         phrase = found[place + 1].phrase
         if found[place].key in {"and", "while"} and phrase is not None and phrase.is_thing:
-            way = read_motion(found[place + 1 : end], "", None, None, None)
+            way = read_motion(found[place + 1 : end], "", None, None)
             if way.direction is not None or way.depth:
                 return place
     return None
@@ -172,12 +237,12 @@ def _other_motions(
     """What else moves at the same time, and how."""
     others: list[OtherWords] = []
     if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
-        motion = read_motion(found[shared + 1 : end], best.verb, best.kind, None, thing)
+        motion = read_motion(found[shared + 1 : end], best.verb, best.kind, thing)
         others.append(OtherWords(thing, motion))
-    for each in _movers_beside(clauses, best):
+    for each in _movers_beside(found, clauses, best):
         if each.subject is not None and all(each.subject != other.object for other in others):
             words = found[each.at : clause_end(found, each.at)]
-            others.append(OtherWords(each.subject, read_motion(words, each.verb, each.kind, None, each.subject)))
+            others.append(OtherWords(each.subject, read_motion(words, each.verb, each.kind, each.subject)))
     return tuple(others)
 
 
@@ -209,7 +274,7 @@ def _without_instructions(found: list[Item]) -> list[Item]:
             if not _is_instruction(flatten(sentence)):
                 kept += sentence
             sentence = []
-    return kept
+    return [item for item in kept if item.end]  # without the full stop added
 
 
 def _is_instruction(words: Sequence[str]) -> bool:
@@ -230,8 +295,9 @@ def _others(
     removed = [change.object for change in interventions if change.kind == "remove"]
     named = [phrase for change in interventions for phrase in change.targets]
     named += [] if trail is None or trail.near is None else [trail.near]
-    for at, item in enumerate(found):
-        phrase = item.phrase
+    things = [(at, item, item.phrase) for at, item in enumerate(found)]
+    things += [(at, item, item.phrase.place.of) for at, item, _ in things if item.phrase and item.phrase.place]
+    for at, item, phrase in sorted(things, key=lambda each: each[0]):
         if phrase is None or is_vague(item) or not _is_object(phrase) or (at in clause and phrase.head in lex.AGENTS):
             continue
         if phrase.noun in lex.ADJECTIVES and item.words[0] not in lex.DETERMINERS:

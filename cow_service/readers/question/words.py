@@ -22,6 +22,7 @@ _SAME: dict[str, tuple[str, ...]] = {
     "leaves": ("leave",),
     "leaving": ("leave", "-ing"),
 }
+ARROWS = frozenset(["arrow", "arrowhead"])
 PRONOUNS = frozenset(["it", "itself", "they", "them", "he", "she"])
 
 
@@ -50,6 +51,8 @@ def _of_item(item: Item, at: int) -> list[Word]:
 
 def _is_words(item: Item, phrase: ObjectPhrase) -> bool:
     """Whether a noun phrase names no object: a place, the trail, or an adjective alone as in "the last of which"."""
+    if phrase.head in ARROWS:
+        return True
     if phrase.colour is not None or phrase.number is not None or phrase.inside_box:
         return False
     content = [word for word in item.words if word not in lex.DETERMINERS]

@@ -1,0 +1,143 @@
+"""Every word of a question is read, changes nothing, or is named; where it may turn the meaning, no answer is given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from drawn import ball, block, floor, jpeg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cow_service.errors import CannotGround, CannotReadDirection
+from cow_service.readers.base import ReaderInput
+from cow_service.readers.embedded.answers import answer_from
+from cow_service.readers.embedded.reader import EmbeddedReader
+from cow_service.readers.question.relations import read_asked, unread
+from cow_service.readers.question.sentences import parse
+from cow_service.records import Grounding
+from cow_service.vision.scene import Scene
+
+RED, BLUE, GREEN = (200, 30, 30), (50, 80, 200), (50, 150, 50)
+
+# Words that no rule reads, in the part that asks or moves; of the second group, beside it.
+TURNING = """
+If the ball rolls anywhere but left, does it hit the mug? | anywhere
+If the ball does not roll left but hops, does it hit the mug? | not
+If the ball rolls right around the mug, does it hit the cone? | around mug
+If the ball rolls right twice as fast, does it hit the mug? | twice as fast
+If the ball rolls right, does it hit the mug and the cube? | hit mug and cube
+If the ball rolls right, does it hit the mug before the cube? | hit mug before cube
+If the ball rolls right, will it hit the cone after 2 seconds? | hit cone after 2 seconds
+If the ball rolls left for the first second, does it hit the mug? | for the first second
+If the ball rolls right, does it hit both mugs? | hit both mugs
+The ball and the mug are on the table. If it rolls left, does it hit the cone? | it
+The ball moves right, but the mug is glued to the floor. Does the mug move? | mug is glued
+Replace the ball with the cube. If the mug slides left, does it hit the vase? | Replace ball with cube
+Unless the ball rolls right, does it hit the mug? | unless
+If the red ball hits the white ball, where will the white ball go? | hits white ball
+Only if the ball rolls right: will it touch the cube? | only
+The camera moves left. Does the ball hide the mug? | camera moves left
+"""
+BESIDE = """
+The floor is icy. If the ball rolls right, does it hit the mug? | floor is icy
+The vase is very old. If the ball rolls right, does it hit the mug? | vase is very old
+"""
+PLAIN = """
+If the ball rolls right, does it hit the mug?
+There is a red ball and a blue mug. If the ball rolls right, does it hit the mug?
+Please tell me: would the ball, rolling freely along the arrow on the floor, hit the mug?
+Remove the vase and then roll the ball gently to the right by 20 px. Does it still hit the mug?
+Is the ball able to reach the mug by rolling left?
+First the ball rolls left, then down. Does it hit the mug?
+Within 2 seconds, will the ball rolling right reach the mug that is nearer to the camera?
+"""
+
+
+def rows(table: str) -> list[tuple[str, str]]:
+    return [
+        (text.strip(), words.strip()) for text, _, words in (row.partition("|") for row in table.strip().splitlines())
+    ]
+
+
+@pytest.mark.parametrize(("text", "words"), rows(TURNING))
+def test_words_that_may_turn_the_meaning_are_named_and_not_answered(text: str, words: str) -> None:
+    question = parse(text)
+    assert words in unread(question).turning
+    assert read_asked(question) is None
+    (note,) = answer_from((), None, None, True, unread=unread(question)).notes
+    assert words in note
+    assert "English" in note
+
+
+@pytest.mark.parametrize(("text", "words"), rows(BESIDE))
+def test_words_beside_are_named_only(text: str, words: str) -> None:
+    assert (unread(parse(text)).turning, unread(parse(text)).beside) == ((), (words,))
+    assert read_asked(parse(text)) is not None
+
+
+@pytest.mark.parametrize("text", PLAIN.strip().splitlines())
+def test_of_plain_questions_every_word_is_read(text: str) -> None:
+    assert (unread(parse(text)).turning, unread(parse(text)).beside) == ((), ())
+    assert read_asked(parse(text)) is not None
+
+
+WORDS = sorted({word for text, _ in rows(TURNING + BESIDE + PLAIN) for word in text.split()})
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.one_of(st.text(max_size=80), st.lists(st.sampled_from(WORDS), max_size=30).map(" ".join)))
+def test_never_raises(text: str) -> None:
+    question = parse(text)
+    assert not (unread(question).turning and read_asked(question) is not None)
+
+
+def scene() -> Scene:
+    image = ball(ball(floor(), (110, 200), 40, RED), (300, 200), 40, GREEN)
+    return Scene(jpeg(block(image, (430, 150, 520, 250), BLUE)))
+
+
+@pytest.mark.parametrize(
+    ("said", "left"),
+    [
+        ("ball nearest to the cube", 260),
+        ("ball to the left of the green ball", 70),
+        ("ball that is farthest from the cube", 70),
+        ("ball on the far left", 70),
+        ("thing between", None),
+    ],
+)
+def test_a_thing_is_singled_out_by_where_it_is(said: str, left: int | None) -> None:
+    given = ReaderInput(scene(), f"If the {said} rolls down, will it hit the cube?")
+    if left is None:
+        with pytest.raises(CannotGround):
+            EmbeddedReader().ground(given)
+    else:
+        assert EmbeddedReader().ground(given).bbox[0] == pytest.approx(left, abs=4)
+
+
+def test_the_other_one_and_the_latter() -> None:
+    question = parse("There is a red ball and a blue cube. If the latter slides left, does it hit the former?")
+    assert question.mover is not None
+    assert (question.mover.text, [each.text for each in question.others]) == ("blue cube", ["red ball"])
+    asked: Any = read_asked(parse("If the red ball rolls right, does it hit the other one?"))
+    assert asked.target == "other ball"
+
+
+@pytest.mark.parametrize("way", ["up and down", "left to the right", "left and stays still"])
+def test_contradictions_are_refused(way: str) -> None:
+    given = ReaderInput(scene(), f"If the red ball moves {way}, does it hit the cube?")
+    grounding = Grounding(object="red ball", bbox=(70, 160, 150, 240), point=(110, 200), source="embedded")
+    with pytest.raises(CannotReadDirection, match="contradict"):
+        EmbeddedReader().read_motion(given, grounding, None)
+
+
+def test_what_is_taken_away_is_not_asked_about() -> None:
+    given = ReaderInput(scene(), "The blue cube is removed. The red ball rolls right. Does it hit the blue cube?")
+    with pytest.raises(CannotGround, match="'blue cube' away and asks"):
+        EmbeddedReader().ground(given)
+
+
+def test_several_movers_at_once_are_refused() -> None:
+    with pytest.raises(CannotGround, match="at once"):
+        EmbeddedReader().ground(ReaderInput(scene(), "If both balls roll right, is the cube hit?"))
