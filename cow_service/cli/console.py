@@ -15,10 +15,10 @@ from rich.table import Table
 
 from cow_service.cli.errors import HINTS
 from cow_service.cli.options import read_file
-from cow_service.client.wording import contacts_words, encounters_words, outcome_words
+from cow_service.client.wording import asked_words, contacts_words, encounters_words, outcome_words
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.images import DecodedImage
-from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Verdict
+from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Gate, Models, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.service import Service
 
@@ -201,9 +201,10 @@ def _answer_table(answer: Answer) -> Table:
         table.add_row("votes", _votes(answer))
     if answer.baseline is not None:
         table.add_row("without frames", f"{_verdict(answer.baseline)}, votes {_votes(answer.baseline)}")
-    usage = answer.usage
-    asked = f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out" if usage.calls else "none"
-    table.add_row("tokens", asked)
+    if answer.gate is not None:
+        table.add_row("before looking", _gate(answer.gate))
+    usage, total = answer.usage, answer.usage_total
+    table.add_row("tokens", asked_words(usage) + ("" if usage == total else f"; without reuse {asked_words(total)}"))
     table.add_row("time", f"{sum(answer.timings.values()):.2f} s")
     model = answer.reader.model
     table.add_row("reader", escape(answer.reader.name if model is None else f"{answer.reader.name} ({model})"))
@@ -217,5 +218,9 @@ def _verdict(verdict: Verdict) -> str:
     return f"[yellow]{escape(text)}[/]" if verdict.not_sure else f"[green]{escape(text)}[/]"
 
 
-def _votes(verdict: Verdict) -> str:
+def _votes(verdict: Verdict | Gate) -> str:
     return ", ".join(f"{escape(name)}: {count}" for name, count in verdict.votes.items())
+
+
+def _gate(gate: Gate) -> str:
+    return f"{_votes(gate) or 'no vote'}; {gate.reason}: {'imagined' if gate.imagined else 'not imagined'}"

@@ -1,10 +1,17 @@
-"""What a trajectory comes to, in words: encounters, contacts, the outcome, and how sure each is."""
+"""What a result comes to, in words: encounters, contacts, the outcome, how sure each is, and what was asked for it."""
 
 from __future__ import annotations
 
-from cow_service.records import MEETINGS, Contact, Encounter, Outcome, Trajectory
+from cow_service.records import MEETINGS, Contact, Encounter, Outcome, Trajectory, Usage
 
 MAX_CONTACTS = 6  # that are told
+
+
+def asked_words(usage: Usage) -> str:
+    """What a multimodal LLM was asked."""
+    if not usage.calls:
+        return "none"
+    return f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out"
 
 
 def worlds(probability: float) -> str:
