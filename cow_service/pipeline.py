@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cow_service.errors import Canceled, CowError, InvalidRequest, MllmUnavailable, ReaderUnavailable
-from cow_service.readers.question.choices import read_choices
+from cow_service.readers.question.choices import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.answering import answer_question
@@ -67,6 +67,7 @@ def answer(run: Run[AnswerRequest]) -> Answer:
         created_at=run.created_at,
         question=run.request.question,
         options=read_choices(run.request.question, run.request.options),
+        options_source=choices_source(run.request.question, run.request.options),
         image=run.image.info,
         simulation=simulation,
         simulation_problem=None if failure is None else Problem(**failure.as_problem()),

@@ -16,13 +16,19 @@ from hypothesis import strategies as st
 from cow_service.media.images import encode_png
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.answers import answer_from, choose_option
-from cow_service.readers.question.choices import not_sure_option, option_saying, read_choices, says_not_sure
+from cow_service.readers.question.choices import (
+    choices_source,
+    not_sure_option,
+    option_saying,
+    read_choices,
+    says_not_sure,
+)
 from cow_service.readers.question.numbers_said import count_of, seconds_of
 from cow_service.readers.question.options_said import says_it_happens
 from cow_service.readers.question.relations import read_alternatives, read_asked
 from cow_service.readers.question.sentences import parse
 from cow_service.records import Answer, Asked, Outcome
-from cow_service.requests import AnswerRequest
+from cow_service.requests import AnswerRequest, OptionRequest
 from cow_service.service import Service
 
 YES_NO = read_choices("Will it? (A) Yes (B) No (C) Not sure", None)
@@ -350,6 +356,14 @@ def test_an_option_is_found_by_its_text_alone_only_where_it_is_one() -> None:
     )
 
 
+def test_options_come_with_letters_of_their_own_and_say_where_from() -> None:
+    pairs = [OptionRequest(letter="C", text="It  hits"), OptionRequest(letter="D", text="No")]
+    assert [(each.letter, each.text) for each in read_choices("?", pairs)] == [("C", "It hits"), ("D", "No")]
+    asked = "Will it hit the vase? "
+    sources = [choices_source(asked + tail, None) for tail in ("(A) Yes (B) No", "Options: yes or no", "Yes or no?")]
+    assert [*sources, choices_source(asked, pairs)] == ["question-letters", "question-list", "none", "request"]
+
+
 HIT = Asked(relation="touches", target="vase")
 MISS = Asked(relation="touches", target="vase", negated=True)
 FIRST, COUNT = Asked(form="which-first", relation="touches"), Asked(form="how-many", relation="touches")
@@ -521,6 +535,8 @@ def test_what_is_wrong_with_the_request_is_not_fallen_back_from(service: Service
     [
         ({"options": ["Yes"]}, "two or more"),
         ({"options": ["Yes", " yes "]}, "two or more"),
+        ({"options": [{"letter": "A", "text": "Yes"}, {"letter": "A", "text": "No"}]}, "different letters"),
+        ({"options": [{"letter": "A", "text": "Yes"}, "No"]}, "valid"),
         ({"votes": 0}, "greater than or equal to 1"),
         ({"votes": 33}, "less than or equal to 32"),
         ({"imagine": "maybe"}, "'always', 'auto' or 'never'"),

@@ -165,6 +165,21 @@ def test_what_harnesses_send_is_answered_with_a_letter(chat: Any, payload: Any) 
     assert bare.cow["simulation"] is None
 
 
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        (
+            "\nThe entire content of your response should be of the format 'ANSWER: $LETTER' (without quotes).",
+            "ANSWER: A",
+        ),
+        (" Write your response into this json template: {'Answer': '<Your answer>'}", '{"Answer": "A"}'),
+    ],
+)
+def test_the_embedded_reader_replies_in_the_form_that_is_asked_for(chat: Any, form: str, said: str) -> None:
+    messages = [user(image(SCENE_URL), text(SCENE.meta["question"] + form))]
+    assert chat(model="cow/embedded", messages=messages).choices[0].message.content == said
+
+
 def test_it_is_the_same_as_answer_says(served: Served, chat: Any) -> None:
     told = chat(model="cow/embedded", messages=vlmevalkit("")["messages"], seed=4, extra_body={"cow": {"votes": 2}})
     job = served.http.get(f"/jobs/{told.cow['id']}").json()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable
 from http import HTTPStatus
@@ -17,18 +16,16 @@ from starlette.requests import ClientDisconnect
 
 from cow_service.errors import (
     CowError,
-    FieldError,
     InternalError,
     InvalidRequest,
     MalformedBody,
     MethodNotAllowed,
     NotFound,
-    pointer_part,
     shortened,
 )
+from cow_service.requests.faults import SHOWN_CHARACTERS, field_errors
 
 MEDIA_TYPE = "application/problem+json"
-SHOWN_CHARACTERS = 80  # of what the caller sent
 
 log = logging.getLogger("cow_service")
 
@@ -37,14 +34,11 @@ def invalid(
     error: ValidationError | RequestValidationError, placed: Callable[[str], str] = lambda pointer: pointer
 ) -> InvalidRequest:
     """A pydantic error as ours, with a JSON Pointer per field; `placed` says where that stands in the request."""
-    fields: dict[str, FieldError] = {}
     if any(item["type"] in ("json_invalid", "model_type") and not item["loc"] for item in error.errors()):
         return MalformedBody(f"The body is no JSON object: {error.errors()[0]['msg']}.")
-    for item in error.errors():
-        pointer = placed("".join("/" + pointer_part(part) for part in _location(item["loc"])))
-        fields.setdefault(pointer, FieldError(pointer, _with_value(str(item["msg"]), item["input"])))
-    summary = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in list(fields.values())[:5])
-    return InvalidRequest(f"{summary}. See /openapi.json for what the request may hold.", errors=tuple(fields.values()))
+    fields = field_errors(error.errors(), placed)
+    summary = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in fields[:5])
+    return InvalidRequest(f"{summary}. See /openapi.json for what the request may hold.", errors=fields)
 
 
 def respond(error: CowError) -> JSONResponse:
@@ -114,24 +108,3 @@ def _translated(error: HTTPException, request: Request) -> CowError:
 
 def _path(request: Request) -> str:
     return shortened(request.url.path, SHOWN_CHARACTERS)
-
-
-def _with_value(message: str, value: Any) -> str:
-    """A validator's message with the value; our own messages name it where it helps."""
-    ours = message.removeprefix("Value error, ")
-    if ours != message or not isinstance(value, str | int | float):
-        return ours
-    reason = message.partition(", got ")[0]  # a kind of number, in place of the number
-    if isinstance(value, str) and len(value) > SHOWN_CHARACTERS:
-        return f"{reason}, got {len(value)} characters"
-    return f"{reason}, got {shortened(json.dumps(value), SHOWN_CHARACTERS)}"
-
-
-def _location(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
-    """A pydantic location without the names of union branches and validators, which callers cannot see."""
-    hidden = ("function-", "constrained-", "is-instance")
-    shown = [p for p in loc if not (isinstance(p, str) and (p.startswith(hidden) or p in _UNION_BRANCHES))]
-    return tuple(shown)
-
-
-_UNION_BRANCHES = frozenset({"ImageArtifact", "ImageUrl", "str"})

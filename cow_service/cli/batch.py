@@ -179,14 +179,15 @@ def _check(question: Question, kind: JobKind) -> None:
     from pydantic import ValidationError  # noqa: PLC0415
 
     from cow_service.requests import AnswerRequest, SimulateRequest  # noqa: PLC0415
+    from cow_service.requests.faults import field_errors  # noqa: PLC0415
 
     model = AnswerRequest if kind == "answer" else SimulateRequest
     image = dict(question.image) if isinstance(question.image, Mapping) else "data:"
     try:
         model.model_validate({**question.options, "image": image, "question": question.question})
     except ValidationError as error:
-        wrong = error.errors()[0]
-        raise InvalidRequest(f"/{'/'.join(str(part) for part in wrong['loc'])}: {wrong['msg']}.") from error
+        wrong = field_errors(error.errors())[0]
+        raise InvalidRequest(f"{wrong.pointer}: {wrong.detail}.") from error
 
 
 def _print_summary(out: Path) -> int:

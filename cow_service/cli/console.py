@@ -20,6 +20,7 @@ from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.images import DecodedImage
 from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Gate, Models, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
+from cow_service.requests.faults import field_errors
 from cow_service.service import Service
 
 Body = TypeVar("Body", bound=SimulateRequest)
@@ -77,8 +78,9 @@ def read_request(service: Service, image: Path, body: dict[str, Any], model: typ
     try:
         return model.model_validate({"image": {"artifact": artifact.sha256}, **body}), decoded
     except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'request'}: {item['msg']}" for item in error.errors())
-        raise InvalidRequest(faults) from error
+        fields = field_errors(error.errors())
+        faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
+        raise InvalidRequest(f"{faults}.", errors=fields) from error
 
 
 @contextmanager

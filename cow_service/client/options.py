@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         InterventionRequest,
         MotionRequest,
         ObjectRequest,
+        OptionRequest,
         TrajectoryRequest,
     )
 
@@ -30,7 +31,7 @@ class SimulateOptions(TypedDict, total=False):
     `law` stands for `motion.law`. The `mask` of an object may be whatever an image may be, and an array of booleans.
     """
 
-    options: Sequence[str] | None
+    options: Sequence[str] | Sequence[OptionRequest | Given] | None
     grounding: GroundingRequest | Given | None
     motion: MotionRequest | Given | None
     trajectory: TrajectoryRequest | Given | None

@@ -155,6 +155,9 @@ class Problem(BaseModel):
         return self.type.rpartition(":")[2]
 
 
+OptionsSource = Literal["request", "question-letters", "question-list", "none"]
+
+
 class AnswerOption(Record):
     """One of the answers that a question offers."""
 
@@ -210,6 +213,11 @@ class Answer(Verdict):
     created_at: str = Field(description="RFC 3339, UTC.")
     question: str
     options: tuple[AnswerOption, ...] = Field(description="From the request or the question; empty where it is open.")
+    options_source: OptionsSource = Field(
+        default="none",
+        description="Where they stand: in the request, in the question with letters, or there as a list without (which "
+        "get A, B, C...).",
+    )
     image: ImageInfo
     simulation: Simulation | None = Field(description="Null where nothing was imagined, or that failed.")
     simulation_problem: Problem | None = Field(default=None, description="Why imagining failed, where it did.")

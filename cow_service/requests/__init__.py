@@ -9,7 +9,7 @@ from cow_service.requests.motion import (
     TrajectoryRequest,
 )
 from cow_service.requests.places import GroundingRequest, ObjectRequest, PlaceRequest
-from cow_service.requests.simulation import AnswerRequest, FramesRequest, SimulateRequest, Stage
+from cow_service.requests.simulation import AnswerRequest, FramesRequest, OptionRequest, SimulateRequest, Stage
 from cow_service.requests.values import Finite, Flag, ImageArtifact, ImageRef, ImageUrl, MaskRef, Whole
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "MotionRequest",
     "MotionStepRequest",
     "ObjectRequest",
+    "OptionRequest",
     "OtherMotionRequest",
     "PlaceRequest",
     "SimulateRequest",

@@ -3,18 +3,41 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Discriminator, Field, Tag, field_validator
 
-from cow_service.records import FramePolicy, Law, Record
+from cow_service.records import AnswerOption, FramePolicy, Law, Record
 from cow_service.requests.interventions import InterventionRequest
 from cow_service.requests.motion import CameraRequest, MotionRequest, TrajectoryRequest
 from cow_service.requests.places import MAX_OBJECTS, GroundingRequest, ObjectRequest
 from cow_service.requests.values import Finite, Flag, ImageRef, MaskRef, Name, Whole, Words, writable
 
 MAX_FRAMES = 481
+MAX_OPTIONS = 26
 MAX_OPTION_LEVELS = 8
+
+
+class OptionRequest(AnswerOption):
+    """An answer to choose from, with its letter."""
+
+    text: Words = Field(min_length=1, max_length=400)
+
+
+def _kind_of_options(options: Any) -> str:
+    """Which of the two forms they have, by the first of them."""
+    first = options[0] if isinstance(options, list | tuple) and options else None
+    return "pairs" if isinstance(first, Mapping | OptionRequest) else "texts"
+
+
+Options = Annotated[
+    Annotated[
+        tuple[Annotated[Words, Field(min_length=1, max_length=400)], ...], Field(max_length=MAX_OPTIONS), Tag("texts")
+    ]
+    | Annotated[tuple[OptionRequest, ...], Field(min_length=1, max_length=MAX_OPTIONS), Tag("pairs")],
+    Discriminator(_kind_of_options),
+]
 
 
 class FramesRequest(Record):
@@ -44,11 +67,10 @@ class SimulateRequest(Record):
 
     image: ImageRef
     question: Words = Field(min_length=1, max_length=4000)
-    options: tuple[Annotated[Words, Field(min_length=1, max_length=400)], ...] | None = Field(
+    options: Options | None = Field(
         default=None,
-        max_length=26,
-        description="Answers to choose from, lettered A, B, C...; by default those that the question lists. "
-        "Used by `/answer`.",
+        description="Answers to choose from: texts, which get the letters A, B, C..., or each with a letter of its "
+        "own; by default those that the question lists. Used by `/answer`.",
     )
     grounding: GroundingRequest | None = None
     motion: MotionRequest | None = None
@@ -125,10 +147,14 @@ class SimulateRequest(Record):
 
     @field_validator("options")
     @classmethod
-    def _differ(cls, options: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        plain = [" ".join(option.lower().split()) for option in options or ()]
+    def _differ(cls, options: Options | None) -> Options | None:
+        texts = [option.text if isinstance(option, OptionRequest) else option for option in options or ()]
+        letters = [option.letter for option in options or () if isinstance(option, OptionRequest)]
+        plain = [" ".join(text.lower().split()) for text in texts]
         if len(plain) == 1 or len(set(plain)) < len(plain):
-            raise ValueError(f"options must be two or more different texts, got {list(options or ())}")
+            raise ValueError(f"options must be two or more different texts, got {texts}")
+        if len(set(letters)) < len(letters):
+            raise ValueError(f"options must have different letters, got {letters}")
         return options or None
 
     @field_validator("generator_options")

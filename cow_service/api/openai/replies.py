@@ -10,6 +10,7 @@ from typing import Any
 
 from cow_service.api.openai.parsing import ParsedChat
 from cow_service.api.openai.records import ChatChoice, ChatDelta, ChatProgress, ChatReply, ChatUsage, ChunkChoice
+from cow_service.readers.question.reply_forms import Reply, reply_text
 from cow_service.records import Job
 
 NOT_SURE = "Not sure"
@@ -101,4 +102,7 @@ def _progress(job: Job) -> dict[str, Any]:
 
 
 def _content(answer: dict[str, Any]) -> str:
-    return NOT_SURE if answer["answer"] is None else answer["answer"]
+    """The answer in the form that the question asks for: a letter, a text, a line or JSON."""
+    said = NOT_SURE if answer["answer"] is None else answer["answer"]
+    reply = Reply(said, answer["option"], answer["reasoning"], answer["options_source"])
+    return reply_text(answer["question"], reply)

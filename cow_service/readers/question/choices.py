@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 
 from cow_service.readers.question.listed_options import split_options
-from cow_service.records import AnswerOption
+from cow_service.records import AnswerOption, OptionsSource
 
 _NOT_SURE = re.compile(
     r"\b(not (quite |really )?(sure|certain)|unsure|uncertain|(can(no|'|’)?t|cannot|can not|could not|impossible to) "
@@ -16,20 +16,33 @@ _NOT_SURE = re.compile(
 )
 
 
-def read_choices(question: str, given: Sequence[str] | None) -> tuple[AnswerOption, ...]:
+def read_choices(question: str, given: Sequence[str | AnswerOption] | None) -> tuple[AnswerOption, ...]:
     """The options of the request, lettered A, B, C..., else those that the question lists; empty where it is open."""
     if not given:
-        return tuple(AnswerOption(letter=letter, text=text) for letter, text in split_options(question)[0])
-    plain_texts = [" ".join(text.split()) for text in given]
+        return tuple(AnswerOption(letter=letter, text=text) for letter, text in split_options(question).options)
+    plain_texts = [" ".join(text.split()) for text in given if isinstance(text, str)]
+    if not plain_texts:
+        pairs = (option for option in given if isinstance(option, AnswerOption))
+        return tuple(AnswerOption(letter=pair.letter, text=" ".join(pair.text.split())) for pair in pairs)
     bare = [_unlettered(text, place) for place, text in enumerate(plain_texts)]
     # Letters are taken off where every option has its own: "A. M." may be a text.
     texts = bare if all(a != b for a, b in zip(bare, plain_texts, strict=True)) else plain_texts
     return tuple(AnswerOption(letter=chr(ord("A") + place), text=text) for place, text in enumerate(texts))
 
 
+def choices_source(question: str, given: Sequence[str | AnswerOption] | None) -> OptionsSource:
+    """Where the options of `read_choices` stand."""
+    if given:
+        return "request"
+    listed = split_options(question)
+    if not listed.options:
+        return "none"
+    return "question-letters" if listed.lettered else "question-list"
+
+
 def question_without(question: str, options: Sequence[AnswerOption]) -> str:
     """The question for these options: without those that it lists itself where they are others."""
-    listed, rest = split_options(question)
+    listed, rest, _ = split_options(question)
     same = [(option.letter, plain(option.text)) for option in options] == [(a, plain(text)) for a, text in listed]
     return question if same or not listed or not options else " ".join(rest.replace(" . ", " ").split())
 

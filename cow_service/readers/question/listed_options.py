@@ -1,23 +1,49 @@
-"""The lettered options that a question lists, (A) Yes, (B) No, and the question without them."""
+"""The options that a question lists, (A) Yes, (B) No, or "Options: yes or no", and the question without them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
-Options = tuple[tuple[str, str], ...]
+Options = tuple[tuple[str, str], ...]  # letter and text
+
+
+class Listed(NamedTuple):
+    """What a question offers, and the question without it."""
+
+    options: Options
+    rest: str
+    lettered: bool = True  # the letters stand in the question
+
 
 _MARKER = re.compile(
     r"[(\[]([A-Za-z])[)\]]\s?[:.]?|\b([A-Z])[.):）](?=[\s*])|(?:(?<=\n)|^)[ \t]*([a-z])[.)](?=\s)", re.ASCII
 )
-_OPTION_END = re.compile(r"\n|[.?!;](?=\s|$)")
+_OPTION_END = re.compile(r"\n|[.?!;](?=\s|$|[A-Z][a-z])")  # "C. Not sure.Note that ...": a space may be missing
+# A list without letters needs words that say that it is one.
+_ANNOUNCED = re.compile(
+    r"\b(?:(?:choose|select|pick|decide) (?:one )?(?:of|from|between|among)(?: (?:the|these))?(?: following)?"
+    r"(?: (?:options?|answers?|choices))?"
+    r"|(?:the )?(?:possible |following )?(?:options|choices|answers)(?: are)?"
+    r"|(?:please )?(?:answer|reply|respond)(?: only| just| simply)? with(?: either)?"
+    r"|(?:please )?(?:answer|reply|respond)(?: only| just| simply)?(?=:? (?:yes|no|true)\b))"
+    r"\s*:?\s+(?P<list>[^\n.?!;:]+)",
+    re.IGNORECASE,
+)
+_PARTS = re.compile(r",? or |,? and (?=[^,]*$)|, ", re.IGNORECASE)
+_ONLY = re.compile(r"\s+(?:only|please|alone)\W*$", re.IGNORECASE)
+_QUOTES = "\"'`\u2018\u2019\u201c\u201d"
+_FORM = re.compile(r"\b(?:letters?|words?|numbers?|sentences?|json|options?|choices?|explanations?)\b", re.IGNORECASE)
+_LONGEST = 6  # words of an option without a letter
 _WORDS = re.compile(r"[\w+−±-]")
 _ASKS = re.compile(r"(?:will|would|does|do|is|are|can|could) ", re.IGNORECASE)
 _EDGES = " ,;.*-•–"
+_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
-def split_options(question: str) -> tuple[Options, str]:
-    """The lettered options of a question, and the question without them.
+def split_options(question: str) -> Listed:
+    """The options of a question, and the question without them. Those without letters get A, B, C...
 
     Letters that follow one another from A may also name things ("car (A) hits car (B)"): a list has texts that differ
     and none that asks; of several such lists the longest counts, and of those the last.
@@ -29,9 +55,21 @@ def split_options(question: str) -> tuple[Options, str]:
         if options and (best is None or len(options) >= len(best[2])):
             best = chain, end, options
     if best is None:
-        return (), question
+        return _split_announced(question)
     chain, end, options = best
-    return options, question[: chain[0].start()] + " . " + question[end:]
+    return Listed(options, question[: chain[0].start()] + " . " + question[end:])
+
+
+def _split_announced(question: str) -> Listed:
+    """The options of a list without letters that says that it is one: "Options: yes, no or not sure"."""
+    for found in reversed(list(_ANNOUNCED.finditer(question))):
+        listed = _ONLY.sub("", found["list"])
+        texts = [part.strip(_EDGES + _QUOTES) for part in _PARTS.split(listed)]
+        short = all(text and len(text.split()) <= _LONGEST and not _FORM.search(text) for text in texts)
+        if short and 1 < len({text.lower() for text in texts}) == len(texts) <= len(_LETTERS):
+            options = tuple(zip(_LETTERS, texts, strict=False))
+            return Listed(options, question[: found.start()] + " . " + question[found.end() :], lettered=False)
+    return Listed((), question)
 
 
 def _chains(question: str) -> list[list[re.Match[str]]]:

@@ -27,11 +27,13 @@ from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, read_motion
 from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
+from cow_service.readers.question.reply_forms import without_reply_form
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 
 _INSTRUCTIONS = lex.words(
     "answer choose select pick option options choices explain respond reply provide return output"
 )
+_PICTURES = lex.words("image images frame frames picture pictures photo photos")
 _SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
@@ -64,7 +66,7 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    interventions, everything = split_interventions(with_nouns(items(split_options(question)[1])))
+    interventions, everything = split_interventions(with_nouns(items(without_reply_form(split_options(question).rest))))
     trail, everything = split_trail(_at_the_same_time(everything))
     found = _without_instructions(everything)
     clauses = read_clauses(found)
@@ -204,11 +206,18 @@ def _without_instructions(found: list[Item]) -> list[Item]:
     for item in [*found, Item(".", 0, 0)]:
         sentence.append(item)
         if item.key in SENTENCE_END:
-            first = next((word for word in flatten(sentence[:2]) if word != "please"), None)
-            if first is not None and first not in _INSTRUCTIONS:
+            if not _is_instruction(flatten(sentence)):
                 kept += sentence
             sentence = []
     return kept
+
+
+def _is_instruction(words: Sequence[str]) -> bool:
+    """Whether a sentence says how to answer, or what the images are, not what happens in them."""
+    first = next((word for word in words[:2] if word != "please"), None)
+    if first is None or first in _INSTRUCTIONS:
+        return True
+    return first == "note" and not _PICTURES.isdisjoint(words)
 
 
 def _others(
