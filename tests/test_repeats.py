@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import random
 import statistics
@@ -19,11 +20,19 @@ from conftest import SCALE, example
 from drawn import ball, floor, png_bytes
 from engines import app_for
 from mllm_server import MllmServer
+from rich.console import Console
 from servers import data_url
+from typer.testing import CliRunner
 
+from cow_service.cli.batch import _print_summary
+from cow_service.cli.console import _answer_table
+from cow_service.cli.main import app as cli
+from cow_service.client.display import answer_html
 from cow_service.errors import MllmUnavailable
 from cow_service.jobs.database import Database
 from cow_service.jobs.stage_cache import KeyLocks, StoredStep
+from cow_service.mcp.results import answer_result
+from cow_service.mcp.text import answer_text
 from cow_service.pipeline import answer
 from cow_service.records import Answer, Usage
 from cow_service.requests import AnswerRequest, Stage
@@ -232,6 +241,42 @@ def test_the_embedded_reader_is_asked_once_before_it_looks(tmp_path: Path) -> No
 def test_a_gate_of_no_votes_looks() -> None:
     gate = gate_of(FirstAnswers(verdict=None, asked=3), 0.5)
     assert (gate.imagined, gate.reason, gate.agreement) == (True, "unreadable", 0)
+
+
+def test_what_the_gate_saw_and_what_it_cost_is_shown_everywhere(
+    service: Service, mllm: MllmServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers(mllm, list("AAA"))
+    found = told(service, imagine="auto")
+    words = "A 3 of 3; agreed: not imagined"
+    assert f"before looking: {words}" in answer_html(found, lambda _: None)
+    assert f"Before looking: {words}." in answer_text(answer_result(found, None))
+    reused = found.model_copy(update={"usage_total": found.usage + COST})
+    console = Console(width=200)
+    console.print(_answer_table(reused))
+    printed = capsys.readouterr().out
+    assert words in printed
+    assert "3 calls, 300 tokens in, 30 out; without reuse 4 calls, 400 tokens in, 40 out" in printed
+    lines = [{"id": str(n), "status": "succeeded", "result": each.model_dump(mode="json")}
+             for n, each in enumerate((found, reused))]  # fmt: skip
+    (tmp_path / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert _print_summary(tmp_path) == 0
+    said = "asked of the MLLM: 6 calls, 600 tokens in, 60 out; without reuse 7 calls, 700 tokens in, 70 out"
+    assert said in capsys.readouterr().out
+
+
+def test_the_command_line_passes_the_gate_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COW_DATA_DIR", str(tmp_path))
+    image = tmp_path / "image.png"
+    image.write_bytes(base64.b64decode(IMAGE.partition(",")[2]))
+    command = ["answer", str(image), QUESTION, "--json", "--num-frames", "5", "--ensemble", "0"]
+    auto = ["--imagine", "auto", "--imagine-votes", "2", "--imagine-threshold", "0.5"]
+    for given, gated, imagined in ((auto, True, True), (["--no-imagine"], False, False)):
+        found = CliRunner().invoke(cli, [*command, *given])
+        assert found.exit_code == 0, found.output
+        told_there = Answer.model_validate_json(found.stdout)
+        assert (told_there.gate is not None, told_there.simulation is not None) == (gated, imagined)
+        assert told_there.gate is None or told_there.gate.threshold == 0.5
 
 
 class _Crash(BaseException):

@@ -15,10 +15,10 @@ from rich.table import Table
 
 from cow_service.cli.errors import HINTS
 from cow_service.cli.options import read_file
-from cow_service.client.wording import asked_words, contacts_words, encounters_words, outcome_words
+from cow_service.client.wording import asked_words, contacts_words, encounters_words, gate_words, outcome_words
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.images import DecodedImage
-from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Gate, Models, Simulation, Verdict
+from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.requests.faults import field_errors
 from cow_service.service import Service
@@ -204,7 +204,7 @@ def _answer_table(answer: Answer) -> Table:
     if answer.baseline is not None:
         table.add_row("without frames", f"{_verdict(answer.baseline)}, votes {_votes(answer.baseline)}")
     if answer.gate is not None:
-        table.add_row("before looking", _gate(answer.gate))
+        table.add_row("before looking", escape(gate_words(answer.gate)))
     usage, total = answer.usage, answer.usage_total
     table.add_row("tokens", asked_words(usage) + ("" if usage == total else f"; without reuse {asked_words(total)}"))
     table.add_row("time", f"{sum(answer.timings.values()):.2f} s")
@@ -220,9 +220,5 @@ def _verdict(verdict: Verdict) -> str:
     return f"[yellow]{escape(text)}[/]" if verdict.not_sure else f"[green]{escape(text)}[/]"
 
 
-def _votes(verdict: Verdict | Gate) -> str:
+def _votes(verdict: Verdict) -> str:
     return ", ".join(f"{escape(name)}: {count}" for name, count in verdict.votes.items())
-
-
-def _gate(gate: Gate) -> str:
-    return f"{_votes(gate) or 'no vote'}; {gate.reason}: {'imagined' if gate.imagined else 'not imagined'}"

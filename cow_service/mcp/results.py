@@ -10,7 +10,7 @@ from cow_service import records
 from cow_service.client.wording import body_name, first_contacts, outcome_words
 from cow_service.mcp.images import ARTIFACTS
 from cow_service.mcp.inputs import lean
-from cow_service.records import Doubt, EncounterKind, GateReason, Law, MotionKind
+from cow_service.records import Doubt, EncounterKind, Law, MotionKind
 
 
 class Result(BaseModel):
@@ -126,16 +126,6 @@ class Usage(Result):
     output_tokens: int
 
 
-class Gate(Result):
-    """The answers before looking."""
-
-    answer: str | None
-    votes: dict[str, int]
-    agreement: float = Field(description="Share of the votes asked for that the leading answer has.")
-    imagined: bool
-    reason: GateReason
-
-
 class AnswerResult(Result):
     """What `answer` returns."""
 
@@ -147,7 +137,7 @@ class AnswerResult(Result):
     not_sure: bool
     reasoning: str = Field(description="The answerer's own; empty where nobody reasons.")
     votes: dict[str, int]
-    gate: Gate | None = Field(description="Of `imagine` auto: what decided whether to imagine.")
+    gate: records.Gate | None = Field(description="Of `imagine` auto: what decided whether to imagine.")
     baseline: Verdict | None
     warnings: list[str] = Field(description="What was assumed or could be meant otherwise.")
     simulation: SimulateResult | None = Field(description="What was imagined; null where nothing was, or that failed.")
