@@ -93,7 +93,7 @@ def test_what_is_taken_away_and_how_far_it_goes(tmp_path: Path, picture: Path) -
     assert [(each.kind, each.object.object) for each in simulation.grounding.interventions] == [("remove", "blue cube")]
     assert simulation.trajectory.factual is not None
     assert simulation.motion.distance == 60
-    wrong = cow(tmp_path, "simulate", str(picture), QUESTION, "--place", "the ball in the box")
+    wrong = cow(tmp_path, "simulate", str(picture), QUESTION, "--place", "the ball near the box")
     assert "--place takes a thing, a relation (into, onto," in wrong.stderr
 
 

@@ -26,6 +26,7 @@ from engines import FRESH, app_for, running_engine
 from hypothesis import given
 from hypothesis import strategies as st
 from mllm_server import MllmServer
+from servers import eventually
 
 from cow_service.errors import ReaderUnavailable
 from cow_service.media.images import encode_png
@@ -380,9 +381,14 @@ def test_a_job_that_a_test_leaves_behind_asks_nobody_in_the_next_one(mllm: MllmS
 
 
 def test_closing_while_a_call_waits_is_a_typed_error(mllm: MllmServer, tmp_path: Path) -> None:
-    mllm.say(say.slow(3))
+    mllm.say(say.slow(5))
     service = Service(Settings(data_dir=tmp_path, mllm="qwen3-vl-8b", mllm_base_url=mllm.address))
-    closing = threading.Timer(0.7, service.close)
+
+    def close() -> None:
+        eventually(lambda: mllm.asked)
+        service.close()
+
+    closing = threading.Thread(target=close)
     closing.start()
     problem = post(service, "/answer", image=blank(64, 64), question=OPTIONS, imagine="never")
     closing.join()
@@ -435,7 +441,7 @@ def test_a_simulation_takes_two_calls_and_says_with_what(mllm: MllmServer, make)
         "name": "mllm",
         "model": "Qwen/Qwen3-VL-8B-Instruct",
         "revision": None,
-        "prompts": {"identify": 2, "locate": 2, "looking": 1},
+        "prompts": {"identify": 3, "locate": 2, "looking": 1},
         "stages": ["grounding", "motion"],
     }
     assert (told["grounding"]["source"], told["motion"]["source"], told["motion"]["cue"]) == (
@@ -676,7 +682,7 @@ def test_the_frames_follow_the_image_and_encounters_are_a_hypothesis(mllm: MllmS
     assert "hypothesis" in words
     assert "The yellow ball rolls" in words
     assert "The simulation came to this" in words or "meets these on its way" in words
-    assert told["reader"]["prompts"] == {"answer-with-frames": 3, "identify": 2, "locate": 2, "looking": 1}
+    assert told["reader"]["prompts"] == {"answer-with-frames": 4, "identify": 3, "locate": 2, "looking": 1}
     assert told["usage"]["calls"] == 3
 
 

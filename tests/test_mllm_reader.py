@@ -13,7 +13,7 @@ import pytest
 from drawn import ball, floor
 from mllm_server import MllmServer
 
-from cow_service.errors import Canceled, MllmUnavailable, ObjectNotFound
+from cow_service.errors import Canceled, CannotReadDirection, MllmUnavailable, ObjectNotFound
 from cow_service.readers.base import CallLog, MotionHints, Quantity, ReaderInput
 from cow_service.readers.mllm.changes import read_changes
 from cow_service.readers.mllm.client import MllmClient
@@ -87,6 +87,36 @@ def test_what_is_taken_away_is_located_and_how_far_it_goes_is_kept(
     mllm.say(json.dumps(said), json.dumps(PLACE))
     with pytest.raises(ObjectNotFound, match="'blue vase' in the image, which the question changes"):
         reader.ground(ReaderInput(scene, QUESTION))
+
+
+def test_further_legs_and_other_movers_are_kept(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
+    then = [
+        {"way": "down", "distance": "30 px"},
+        {"way": "somewhere"},
+        "the right",
+        {"direction": "away", "duration": "1 s"},
+    ]
+    also = [
+        {"object": "blue car", "kind": "linear", "way": "left"},
+        {"object": "cup", "kind": "fall"},
+        {"kind": "fall"},
+    ]
+    boxes = [{"label": "blue car", "bbox_2d": [600, 400, 700, 600]}, {"label": "cup", "bbox_2d": [800, 100, 850, 200]}]
+    mllm.say(json.dumps(BALL | {"then": then, "also_moving": also}), json.dumps(PLACE | {"others": boxes}))
+    reading = reader.ground(ReaderInput(scene, QUESTION))
+    assert "> blue car" in mllm.text(1)
+    assert reading.hints is not None
+    hints = MotionHints.model_validate_json(reading.hints.model_dump_json())
+    found = grounding("mllm").model_copy(update={"others": reading.others})
+    motion = reader.read_motion(ReaderInput(scene, QUESTION), found, hints)
+    assert [(each.direction, each.distance, each.duration) for each in motion.steps] == [
+        ((0, 1), Quantity(30, "px"), None), ((1, 0), None, None), ((0, -1), None, 1.0),
+    ]  # fmt: skip
+    assert [(each.object.object, each.kind, each.direction) for each in motion.others] == [
+        ("blue car", "linear", (-1, 0)), ("cup", "fall", None),
+    ]  # fmt: skip
+    with pytest.raises(CannotReadDirection, match="'blue car' moves, too, and was not found"):
+        reader.read_motion(ReaderInput(scene, QUESTION), grounding("mllm"), hints)
 
 
 @pytest.mark.parametrize(

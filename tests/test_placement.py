@@ -205,19 +205,6 @@ class TestWhatCannotBe:
         with pytest.raises(CannotGround, match="at one place"):
             put(blocks(NEAR), "between", located("blue cube", NEAR), located("cube", NEAR))
 
-    def test_before_another_motion(self) -> None:
-        run = run_of(blocks(NEAR), motion={"kind": "linear", "direction": (1, 0)}, num_frames=FRAMES)
-        moved = Intervention(
-            kind="place", object=located("blue cube", NEAR), relation="behind", targets=(located("red ball", SMALL),)
-        )
-        grounding = Grounding(
-            object="red ball", point=(150, 290), bbox=SMALL, others=(located("blue cube", NEAR),),
-            interventions=(moved,), source="request",
-        )  # fmt: skip
-        motion = read_motion(run, grounding, None).value
-        with pytest.raises(CannotGround, match="'blue cube' is put somewhere before something else happens"):
-            compute_trajectory(run, grounding, motion)
-
     def test_nowhere(self) -> None:
         run = run_of(with_bowl(SMALL), motion={"kind": "place"}, num_frames=FRAMES)
         grounding = Grounding(object="red ball", point=(150, 290), bbox=SMALL, source="request")

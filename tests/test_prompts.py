@@ -57,7 +57,7 @@ SAMPLES: dict[str, object] = {
     "sentence": "The ball moves.",
     "times": "0.06 s",
     "law": "contact",
-    "removed": "the vase",
+    "changed": "With the vase removed",
     "as_it_is": "As it is",
     "facts": ("The ball touches the vase after 0.5 s.",),
     "encounters_known": True,

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import get_args
 
 from cow_service.errors import InvalidRequest
-from cow_service.records import PlaceRelation
+from cow_service.readers.question.place_relations import PREPOSITIONS, RELATION_WORDS
 
-_RELATIONS = "|".join(get_args(PlaceRelation))
-_PLACED = re.compile(rf"\s*(?P<object>.+?)\s+(?P<relation>{_RELATIONS})\s+(?P<targets>.+?)\s*", re.IGNORECASE)
+_WORDS = "|".join(sorted(RELATION_WORDS, key=len, reverse=True))  # "in front of" before "in"
+_PLACED = re.compile(rf"\s*(?P<object>.+?)\s+(?P<relation>{_WORDS})\s+(?P<targets>.+?)\s*", re.IGNORECASE)
 
 
 def intervention_fields(removed: Sequence[str], placed: Sequence[str]) -> list[dict[str, object]]:
@@ -22,9 +21,9 @@ def _placement(text: str) -> dict[str, object]:
     found = _PLACED.fullmatch(text)
     if found is None:
         raise InvalidRequest(
-            f"--place takes a thing, a relation ({_RELATIONS.replace('|', ', ')}) and what it is put to, such as "
+            f"--place takes a thing, a relation ({', '.join(PREPOSITIONS)}) and what it is put to, such as "
             f"'apple into bowl' or 'cube between mug and vase'; got '{text}'."
         )
-    relation = found["relation"].lower()
+    relation = RELATION_WORDS[found["relation"].lower()]
     targets = re.split(r"\s+and\s+", found["targets"]) if relation == "between" else [found["targets"]]
     return {"kind": "place", "object": found["object"], "relation": relation, "targets": targets}

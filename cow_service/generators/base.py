@@ -26,6 +26,9 @@ class GeneratorInput:
     obstacles: tuple[Obstacle, ...]  # the other objects of the scene
     seed: int
     options: BaseModel  # an instance of the generator's own `options_model`
+    before: GeneratorInput | None = None
+    """Where things were put elsewhere: the same from the scene as the image shows it, from which they can be cut. Its
+    trajectory has one frame more, the first, in which they are still there."""
 
 
 class Generator(Protocol):

@@ -39,7 +39,7 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
     eye = 0.0 if ground is None else ground.camera.height
     lit = take_shadows(leaving, clean, moving, still, ground, size[0] / scene.width)
     erased = without_bodies(lit, moving, still, eye, resized_mask(scene.cues, size))
-    image = _at_full_size(scene.clean, clean, erased)
+    image = at_full_size(scene.clean, clean, erased)
     drawn = np.where(scene.cues[..., None], scene.image, image)
     gone = np.logical_or.reduce([as_it_is.obstacles[index - 1].mask.full() for index in removed])
     behind = {each.index for each in still if _is_behind(each, moving, eye)}
@@ -101,7 +101,7 @@ def _completed(mask: CroppedMask, gone: Mask) -> CroppedMask:
     return CroppedMask.of(full | (hull(full) & gone))
 
 
-def _at_full_size(full: Image, before: Image, after: Image) -> Image:
+def at_full_size(full: Image, before: Image, after: Image) -> Image:
     """An image [H, W, 3] with what was changed in a smaller copy of it."""
     if full.shape == after.shape:
         return after

@@ -87,7 +87,7 @@ class ToolInput(BaseModel):
         default=None, description="Things that are taken away before anything moves, in words ('vase')."
     )
     place: Annotated[list[PlaceInput] | None, FromJson] = Field(
-        default=None, description="Things that are put somewhere before anything else moves."
+        default=None, description="Things that are put somewhere: before anything else moves, or as all that happens."
     )
     law: Law | None = Field(
         default=None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ OUTLINE, PATH, ARROW, LIGHT, DARK = (255, 196, 0), (0, 229, 255), (255, 64, 129)
 PUSHED = (255, 150, 60)  # the paths of other bodies
 ENCOUNTERS = {"touches": (255, 82, 82), "occludes": (190, 120, 255), "occluded-by": (120, 200, 255)}  # RGB
 REMOVED = (255, 120, 120)  # what is taken away
+PLACED = (130, 255, 130)  # what is put somewhere before the motion
 HATCH, DASH = 9, 6  # line widths from one line of a hatching to the next, and of a dash
 BAND_OPACITY = 0.3
 AT_REST = 0.25  # px per frame: what moves less rests
@@ -27,6 +29,18 @@ Mask = NDArray[np.bool_]
 Colour = tuple[int, int, int]
 
 
+@dataclass(frozen=True)
+class Replaced:
+    """What is put somewhere before the motion: its box and mask [H, W] there, and where the image shows it."""
+
+    name: str
+    place: str  # as in: next to the blue mug
+    old_bbox: BBox
+    old_mask: Mask
+    bbox: BBox
+    mask: Mask
+
+
 def draw_overlay(
     image: Image,
     grounding: Grounding,
@@ -34,17 +48,21 @@ def draw_overlay(
     trajectory: Trajectory,
     mask: Mask | None = None,
     removed: Sequence[tuple[str, BBox, Mask]] = (),
+    placed: Sequence[Replaced] = (),
 ) -> Image:
     """A copy of the RGB image [H, W, 3] with the records drawn on it; sizes follow the image's.
 
     `mask` [H, W] is the mover's: its outline is drawn, and its box where there is none. What is `removed`, by name, box
-    and mask, is hatched.
+    and mask, is hatched; so is the old place of what is `placed`, whose outline is drawn at the new one.
     """
     canvas = np.ascontiguousarray(image).copy()
     unit = max(1.0, max(canvas.shape[:2]) / 640)
     thin = max(1, round(unit))
     for _, _, gone in removed:
-        _draw_removed(canvas, gone, thin)
+        _draw_removed(canvas, gone, REMOVED, thin)
+    for each in placed:
+        _draw_removed(canvas, each.old_mask, PLACED, thin)
+        _draw_outline(canvas, each.mask, PLACED, thin)
     for number, path in reversed(list(enumerate(trajectory.paths))):
         _draw_band(canvas, path, PUSHED if number else PATH)
     for encounter in trajectory.encounters:
@@ -70,6 +88,8 @@ def draw_overlay(
         for encounter in trajectory.encounters
     ]
     labels += [Label(f"{name}, taken away", bbox, REMOVED, below=False) for name, bbox, _ in removed]
+    labels += [Label(f"{each.name}, as it is", each.old_bbox, PLACED, below=False) for each in placed]
+    labels += [Label(f"{each.name}, put {each.place}", each.bbox, PLACED, below=False) for each in placed]
     points = [grounding.point, *(contact.point for contact in trajectory.contacts)]
     for path in trajectory.paths:
         points += [point for point, visible in zip(path.points, path.visible, strict=True) if visible]
@@ -77,19 +97,19 @@ def draw_overlay(
     return canvas
 
 
-def _draw_removed(canvas: Image, mask: Mask, thin: int) -> None:
+def _draw_removed(canvas: Image, mask: Mask, colour: Colour, thin: int) -> None:
     """Hatches a mask, with a dashed outline."""
     if not mask.any():
         return
     rows, columns = np.indices(mask.shape, np.int32)
     lines = mask & ((rows + columns) % (HATCH * thin) < thin)
-    canvas[lines] = REMOVED
+    canvas[lines] = colour
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     edge = np.zeros(mask.shape, np.uint8)
     cv2.drawContours(edge, outlines, -1, 1, 2 * thin, cv2.LINE_8)
     dashed = (edge > 0) & ((rows // (DASH * thin) + columns // (DASH * thin)) % 2 == 0)
     canvas[edge > 0] = DARK
-    canvas[dashed] = REMOVED
+    canvas[dashed] = colour
 
 
 def _words(encounter: Encounter, fps: float) -> str:

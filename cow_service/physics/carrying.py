@@ -1,4 +1,4 @@
-"""Puts the first body of a world somewhere: it is carried there in an arc, through everything, and let go."""
+"""Where a body is put and let go; the mover is carried there in an arc, through everything."""
 
 from __future__ import annotations
 
@@ -30,12 +30,14 @@ LEAST_RISE = 0.3  # of the way that it is carried
 
 @dataclass(frozen=True)
 class Put:
-    """To what the first body is put, and how."""
+    """To what a body is put, and how."""
 
     relation: PlaceRelation
     targets: tuple[int, ...]  # which of the bodies: two for `between`, else one
     opening: SeenOpening | None = None  # of the target, where the body is put into it
     side: int = 1  # of `next-to`: 1 to the right as the camera sees it, -1 to the left
+    body: int = 0  # which of the bodies is put there
+    by_heading: bool = False  # the target sets out: in front of it is where it goes
 
 
 def frames_carried(num_frames: int, fps: float) -> int:
@@ -49,7 +51,7 @@ def frames_to_run(num_frames: int, fps: float) -> int:
 
 
 def let_go(put: Put, shapes: Sequence[RigidShape], row: Floats) -> tuple[RigidShape, ...]:
-    """The bodies of one world at the moment at which the first is let go; `row` [P] is the draw of it.
+    """The bodies of one world at the moment at which one is let go; `row` [P] is the draw of the world.
 
     A container that it is put into becomes hollow.
     """
@@ -58,14 +60,14 @@ def let_go(put: Put, shapes: Sequence[RigidShape], row: Floats) -> tuple[RigidSh
         target = _whole(bodies[put.targets[0]], put.opening)
         hollow = hollow_of(put.opening, target.half_width, target.half_height, row)
         bodies[put.targets[0]] = replace(target, hollow=hollow)
-    mover = bodies[0]
+    mover = bodies[put.body]
     x, y, z = _end(put, bodies)
     aim = mover.half_width * AIM_SIGMA
     tip = put.relation == "onto" and bodies[put.targets[0]].shape in ("sphere", "cone")
     x += mover.half_width * (OFF_TOP if tip else AIM_OFF) + aim * float(row[COLUMN["let_go_right"]])
     z += aim * float(row[COLUMN["let_go_ahead"]])
     still = (0.0, 0.0, 0.0)
-    bodies[0] = replace(mover, position=(x, y, z), velocity=still, starts=True, falls=True, glides=False)
+    bodies[put.body] = replace(mover, position=(x, y, z), velocity=still, starts=True, falls=True, glides=False)
     return tuple(bodies)
 
 
@@ -77,8 +79,8 @@ def _whole(target: RigidShape, seen: SeenOpening) -> RigidShape:
 
 
 def _end(put: Put, bodies: Sequence[RigidShape]) -> tuple[float, float, float]:
-    """Where the middle of the first body is let go (m)."""
-    mover, target = bodies[0], bodies[put.targets[0]]
+    """Where the middle of a body is let go (m)."""
+    mover, target = bodies[put.body], bodies[put.targets[0]]
     up = mover.half_height + DROP * mover.half_width
     x, y, z = target.position
     if put.relation in ("into", "onto"):
@@ -87,13 +89,18 @@ def _end(put: Put, bodies: Sequence[RigidShape]) -> tuple[float, float, float]:
     if put.relation == "between":
         other = bodies[put.targets[1]].position
         return (x + other[0]) / 2, bottom + up, (z + other[2]) / 2
-    right, ahead = _side(put, x, z)
+    right, ahead = _side(put, target)
     away = _reach(target, right, ahead) + _reach(mover, right, ahead) + BESIDE_GAP * mover.half_width
     return x + away * right, bottom + up, z + away * ahead
 
 
-def _side(put: Put, x: float, z: float) -> tuple[float, float]:
-    """The unit vector right and ahead on which side of a target at (x, z) a body is put, as the camera sees it."""
+def _side(put: Put, target: RigidShape) -> tuple[float, float]:
+    """The unit vector right and ahead on which side of a target a body is put: as the camera sees it, or as it goes."""
+    x, _, z = target.position
+    speed = math.hypot(target.velocity[0], target.velocity[2])
+    if put.by_heading and speed > 0:
+        sign = 1.0 if put.relation == "in-front-of" else -1.0
+        return sign * target.velocity[0] / speed, sign * target.velocity[2] / speed
     distance = max(math.hypot(x, z), 1e-9)
     sight, across = (x / distance, z / distance), (z / distance, -x / distance)
     if put.relation in ("in-front-of", "behind"):

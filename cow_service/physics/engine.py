@@ -61,6 +61,7 @@ class RigidShape:
     half_height: float  # m: of a sphere, its radius
     position: tuple[float, float, float]  # of its centre
     yaw: float = 0.0  # radians about the vertical
+    turn: tuple[float, float, float, float] | None = None  # quaternion x, y, z, w, where it is not turned by yaw alone
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s
     density: float = 1.0  # against that of the others
     friction: float = 0.5
@@ -190,7 +191,7 @@ class _Engine:
         x, y, z = (np.array(body.position) * self.scale + self.origin[k]).tolist()
         builder = RigidBody.kinematic_position_based() if body.follows is not None else RigidBody.dynamic()
         lift = GAP if body.falls and not body.ghost else 0.0
-        builder = builder.translation((x, y + lift, z)).rotation((0.0, body.yaw, 0.0))
+        builder = builder.translation((x, y + lift, z)).rotation(_rotation(body))
         builder = builder.gravity_scale(1.0 if body.falls else 0.0)
         if _acts(body):
             x, y, z = (v * self.scale for v in body.velocity)
@@ -344,6 +345,16 @@ def _empty_world(dt: float, gravity: float) -> PhysicsWorld:
 
 def _acts(body: RigidShape) -> bool:
     return body.starts or body.follows is not None
+
+
+def _rotation(body: RigidShape) -> tuple[float, float, float]:
+    """Axis times angle (radians)."""
+    if body.turn is None:
+        return 0.0, body.yaw, 0.0
+    x, y, z, w = body.turn
+    length = math.sqrt(x * x + y * y + z * z)
+    angle = 2 * math.atan2(length, w) / max(length, 1e-12)
+    return x * angle, y * angle, z * angle
 
 
 def _passes(body: RigidShape) -> bool:

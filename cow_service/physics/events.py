@@ -98,7 +98,7 @@ def _events_of(
     path, step = paths[subject], worlds.every / fps
     clock = np.arange(path.depth.shape[1]) * step
     for other in range(count):
-        if other in (subject, on):
+        if other in (subject, on) or other in worlds.scene.loads_of(subject):
             continue
         found = shares(bodies[subject].mask, path, bodies[other].mask, paths[other])
         before = clock[None] <= times["touches"][:, other : other + 1] + step
@@ -117,7 +117,7 @@ def _touches(subject: int, worlds: Worlds, count: int, on: int | None) -> Floats
         for meeting in run.meetings:
             if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
                 other = meeting.b if meeting.a == subject else meeting.a
-                if other != on:
+                if other != on and other not in worlds.scene.loads_of(subject):
                     times[k, other] = min(times[k, other], meeting.time)
     return times
 

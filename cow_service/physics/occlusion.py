@@ -26,7 +26,7 @@ class Shares:
 
 
 def shares(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path: SeenPaths) -> Shares:
-    """By the silhouettes of the first frame; what is nearer covers what is farther."""
+    """By the silhouettes of the image; what is nearer covers what is farther."""
     covers, covered = np.zeros(path.depth.shape), np.zeros(path.depth.shape)
     seen = ~path.passed & ~other_path.passed
     draws, frames = np.nonzero(_boxes_meet(subject, path, other, other_path) & seen)
@@ -41,14 +41,14 @@ def shares(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path
 
 
 def _moved(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:
-    """Points [S, 2] of the first frame, where a path has them [N, S, 2] in draws and frames [N]."""
-    first, now, scale = path.points[k, 0], path.points[k, f], path.scale[k, f][:, None, None]
+    """Points [S, 2] of the image, where a path has them [N, S, 2] in draws and frames [N]."""
+    first, now, scale = path.seen[k], path.points[k, f], path.scale[k, f][:, None, None]
     return now[:, None] + (points[None] - first[:, None]) * scale
 
 
 def _moved_back(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:
     """Where points [N, S, 2] of draws and frames [N] were at the first frame."""
-    first, now, scale = path.points[k, 0], path.points[k, f], path.scale[k, f][:, None, None]
+    first, now, scale = path.seen[k], path.points[k, f], path.scale[k, f][:, None, None]
     return first[:, None] + (points - now[:, None]) / scale
 
 
@@ -62,7 +62,7 @@ def _corners(mask: CroppedMask, path: SeenPaths) -> tuple[Floats, Floats]:
     """Upper left and lower right corners [K, F, 2] of the box of a moved silhouette."""
     x0, y0, x1, y1 = mask.bbox
     low, high = (
-        path.points + (np.array(corner) - path.points[:, :1]) * path.scale[..., None] for corner in ((x0, y0), (x1, y1))
+        path.points + (np.array(corner) - path.seen[:, None]) * path.scale[..., None] for corner in ((x0, y0), (x1, y1))
     )
     return low, high
 

@@ -26,12 +26,13 @@ TIPPED = math.cos(math.radians(45))  # upright component of an axis that was upr
 SUNK = 0.1  # of the smaller half height: how far below a top the lower end of what lies on it may seem to be
 OVERLAPPING = 0.02  # of the half width: so much too close, bodies are taken to touch, not to overlap
 
+STAYING: tuple[PlacementResult, ...] = ("inside", "sticks-out", "on-the-rim", "on-top", "beside")
 Turn = Floats  # [4] quaternion x, y, z, w
 
 
 @dataclass(frozen=True)
 class Placements:
-    """Per draw [K], how the first body ends where it was put."""
+    """Per draw [K], how a body ends where it was put."""
 
     relation: PlaceRelation
     results: tuple[PlacementResult, ...]
@@ -43,6 +44,11 @@ class Placements:
     def fits(self) -> Mask:
         """[K]: whether it ends as it was meant to."""
         return np.array([result == meant(self.relation) for result in self.results])
+
+    @property
+    def stays(self) -> Mask:
+        """[K]: whether it comes to rest where it was put, if not as it was meant to."""
+        return np.array([result in STAYING for result in self.results])
 
     @property
     def times(self) -> Floats:
@@ -60,28 +66,27 @@ def classify(
 ) -> tuple[PlacementResult, float, float]:
     """Result, clearance and share above the rim in one world.
 
-    `let_go` are its bodies as the first is let go, `lying` as they were before; `run` is what they did from then on.
+    `let_go` are its bodies as one is let go, `lying` as they were before; `run` is what they did from then on.
     """
-    target = put.targets[0]
+    target, body = put.targets[0], put.body
     if put.relation in ("into", "onto"):
         tipped = _upright(run.turns[target, -1]) < TIPPED
         if let_go[target].hollow is not None and put.relation == "into":
-            return _into(let_go[0], let_go[target], run, target, tipped)
-        return _onto(let_go[0], let_go[target], run, target, tipped), math.nan, math.nan
+            return _into(put, let_go, run, tipped)
+        return _onto(put, let_go, run, tipped), math.nan, math.nan
     clearance = gap(put, let_go) if put.relation == "between" else math.nan
-    overlaps = (not math.isnan(clearance) and clearance < 0) or _overlaps_any(let_go, lying)
-    tips = let_go[0].shape != "sphere" and _upright(run.turns[0, -1]) < TIPPED
+    overlaps = (not math.isnan(clearance) and clearance < 0) or _overlaps_any(body, let_go, lying)
+    tips = let_go[body].shape != "sphere" and _upright(run.turns[body, -1]) < TIPPED
     return ("overlaps" if overlaps else "tips" if tips else "beside"), clearance, math.nan
 
 
-def _into(
-    body: RigidShape, container: RigidShape, run: WorldRun, target: int, tipped: bool
-) -> tuple[PlacementResult, float, float]:
+def _into(put: Put, let_go: Sequence[RigidShape], run: WorldRun, tipped: bool) -> tuple[PlacementResult, float, float]:
+    body, container = let_go[put.body], let_go[put.targets[0]]
     hollow = container.hollow
     assert hollow is not None  # the caller has looked
     clearance = 1 - width_through(body, hollow) / hollow.opening
-    there, middle = run.positions[0, -1], run.positions[target, -1]
-    rim, tall = middle[1] + container.half_height, extent(body, run.turns[0, -1])
+    there, middle = run.positions[put.body, -1], run.positions[put.targets[0], -1]
+    rim, tall = middle[1] + container.half_height, extent(body, run.turns[put.body, -1])
     low, high = there[1] - tall, there[1] + tall
     above = float(np.clip((high - rim) / max(high - low, 1e-9), 0.0, 1.0))
     off = math.hypot(there[0] - middle[0], there[2] - middle[2])
@@ -94,14 +99,16 @@ def _into(
     return ("sticks-out" if high - rim > STICKS_OUT * hollow.depth else "inside"), clearance, above
 
 
-def _onto(body: RigidShape, target: RigidShape, run: WorldRun, index: int, tipped: bool) -> PlacementResult:
-    there, middle = run.positions[0, -1], run.positions[index, -1]
-    low = there[1] - extent(body, run.turns[0, -1])
+def _onto(put: Put, let_go: Sequence[RigidShape], run: WorldRun, tipped: bool) -> PlacementResult:
+    index = put.targets[0]
+    body, target = let_go[put.body], let_go[index]
+    there, middle, turn = run.positions[put.body, -1], run.positions[index, -1], run.turns[put.body, -1]
+    low = there[1] - extent(body, turn)
     top = middle[1] + extent(target, run.turns[index, -1])
     off = math.hypot(there[0] - middle[0], there[2] - middle[2])
     if low < top - SUNK * min(body.half_height, target.half_height) or off > target.half_width + body.half_width:
         return "tips" if tipped and target.shape != "sphere" else "falls-off"
-    if (tipped and target.shape != "sphere") or (body.shape != "sphere" and _upright(run.turns[0, -1]) < TIPPED):
+    if (tipped and target.shape != "sphere") or (body.shape != "sphere" and _upright(turn) < TIPPED):
         return "tips"
     return "on-top"
 
@@ -122,7 +129,8 @@ def gap(put: Put, bodies: Sequence[RigidShape]) -> float:
     first, second = (bodies[i] for i in put.targets)
     way = np.array(second.position) - np.array(first.position)
     free = math.hypot(way[0], way[2]) - first.half_width - second.half_width
-    return (free - 2 * bodies[0].half_width) / max(free, 1e-3 * bodies[0].half_width)
+    half = bodies[put.body].half_width
+    return (free - 2 * half) / max(free, 1e-3 * half)
 
 
 def extent(body: RigidShape, turn: Turn) -> float:
@@ -143,10 +151,10 @@ def _upright(turn: Turn) -> float:
     return 1 - 2 * (x * x + z * z)
 
 
-def _overlaps_any(bodies: Sequence[RigidShape], lying: Sequence[RigidShape]) -> bool:
-    """Whether the first body is put where another one is."""
-    mover = bodies[0]
-    for other in lying[1:]:
+def _overlaps_any(body: int, bodies: Sequence[RigidShape], lying: Sequence[RigidShape]) -> bool:
+    """Whether a body is put where another one is."""
+    mover = bodies[body]
+    for other in (*lying[:body], *lying[body + 1 :]):
         away = math.hypot(*(mover.position[i] - other.position[i] for i in (0, 2)))
         level = abs(mover.position[1] - other.position[1]) < mover.half_height + other.half_height
         if level and away < mover.half_width + other.half_width - OVERLAPPING * mover.half_width:

@@ -42,7 +42,8 @@ class PlacedScene:
     further: tuple[Floats, ...]  # [K, 3] m/s, of the mover in each further leg
     others: dict[int, Floats]  # [K, 3] m/s, of other bodies that are set moving
     light: Floats  # [K, 2]: metres that a shadow lies to the right and ahead, per metre of height
-    unsupported: frozenset[int] = frozenset()  # bodies whose support was taken away
+    unsupported: frozenset[int] = frozenset()  # bodies whose support was taken away, or put elsewhere
+    put: frozenset[int] = frozenset()  # bodies that were put where they are
 
     def first(self, count: int) -> PlacedScene:
         """Without the bodies behind the first ones, which are taken away: what stood on them has no support."""
@@ -51,6 +52,20 @@ class PlacedScene:
             loose |= {i for i in range(count) if (on := self.supports[i]) is not None and (on >= count or on in loose)}
         supports = tuple(None if on is None or on >= count else on for on in self.supports[:count])
         return replace(self, bodies=self.bodies[:count], supports=supports, unsupported=frozenset(loose))
+
+    def loads_of(self, body: int) -> frozenset[int]:
+        """What was put into or onto a body: that it is there is no encounter of the body that carries it."""
+        return frozenset(i for i in self.put if self.supports[i] == body)
+
+    def rearranged(self, on: Mapping[int, int | None]) -> PlacedScene:
+        """With some bodies put elsewhere, where they stand `on` others or the floor: what stood on them falls."""
+        loose: set[int] = set()
+        for _ in self.supports:
+            loose |= {i for i, at in enumerate(self.supports) if i not in on and (at in on or at in loose)}
+        supports = tuple(None if i in loose else on.get(i, at) for i, at in enumerate(self.supports))
+        bodies = tuple(replace(body, stands=True) if i in on else body for i, body in enumerate(self.bodies))
+        unsupported = (self.unsupported - on.keys()) | loose
+        return replace(self, bodies=bodies, supports=supports, unsupported=unsupported, put=frozenset(on))
 
 
 def place(

@@ -9,6 +9,7 @@ import numpy as np
 from cow_service.physics.world import Worlds
 from cow_service.vision.types import Floats, Mask
 
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion x, y, z, w
 MOST_LEAN = np.radians(25)
 PASSED = 0.08  # of its first depth: closer than this, a body has passed the camera
 
@@ -19,16 +20,27 @@ class SeenPaths:
 
     points: Floats  # [K, F, 2] px
     depth: Floats  # [K, F] m
-    scale: Floats  # [K, F]: apparent size, 1 at the first frame
+    scale: Floats  # [K, F]: apparent size, 1 as the image shows it
     passed: Mask  # [K, F]: it is at or behind the camera
+    before: Floats | None = None  # [K, 2] px: where the image shows it, if it begins elsewhere
+
+    @property
+    def seen(self) -> Floats:
+        """Points [K, 2] (px) at which the image shows it."""
+        return self.points[:, 0] if self.before is None else self.before
 
 
 def seen_paths(worlds: Worlds, body: int) -> SeenPaths:
     """A body's path in the image of every draw."""
     positions = np.stack([run.positions[body] for run in worlds.runs])
     points, depth = worlds.scene.cameras.project(positions)
-    first = np.maximum(depth[:, :1], 1e-9)
-    return SeenPaths(points, depth, first / np.maximum(depth, PASSED * first), depth <= PASSED * first)
+    before, first = None, depth[:, :1]
+    if worlds.seen is not None:
+        shown = np.array([bodies[body].position for bodies in worlds.seen])
+        before, first = worlds.scene.cameras.project(shown[:, None])
+        before = before[:, 0]
+    first = np.maximum(first, 1e-9)
+    return SeenPaths(points, depth, first / np.maximum(depth, PASSED * first), depth <= PASSED * first, before)
 
 
 def states(worlds: Worlds, body: int) -> Floats:
@@ -52,10 +64,25 @@ def rotation(worlds: Worlds, body: int) -> Floats:
         # Right, up and ahead are a left-handed frame: there a positive turn about the line of sight is anticlockwise.
         about = -np.einsum("fi,fi->f", _steps(turns), sight[1:])
         return np.concatenate([[0.0], np.degrees(np.cumsum(about))])
+    return _leaned(worlds, run.positions[body], turns)
+
+
+def rotation_where_put(worlds: Worlds, body: int) -> float:
+    """Degrees, clockwise, that a body of the first draw is turned at its first frame against how the image shows it.
+
+    A sphere looks the same wherever it is put.
+    """
+    if worlds.seen is None or worlds.shapes[0][body].shape == "sphere":
+        return 0.0
+    positions = np.array([worlds.seen[0][body].position, worlds.shapes[0][body].position])
+    turn = worlds.shapes[0][body].turn
+    return float(_leaned(worlds, positions, np.array([UPRIGHT, UPRIGHT if turn is None else turn]))[1])
+
+
+def _leaned(worlds: Worlds, positions: Floats, turns: Floats) -> Floats:
+    """Degrees [F], clockwise, that an upright axis has leaned since the first of positions [F, 3] and turns [F, 4]."""
     upright = np.tile(np.array([0.0, 1.0, 0.0]), (len(turns), 1))
-    leaning, plumb = (
-        np.unwrap(_lean(worlds, run.positions[body], axis)) for axis in (turned(turns, upright[0]), upright)
-    )
+    leaning, plumb = (np.unwrap(_lean(worlds, positions, axis)) for axis in (turned(turns, upright[0]), upright))
     angle = np.unwrap(leaning - plumb)
     # Verticals lean in the image as they come to its side; close to the camera they lean without bounds.
     return np.degrees(angle - angle[0] + np.clip(plumb - plumb[0], -MOST_LEAN, MOST_LEAN))

@@ -19,6 +19,7 @@ from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
 from cow_service.physics.lift import BOX_SIDE, FARTHEST, Cameras, Placed
 from cow_service.physics.placement import Placements, classify
 from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place, speed_factors
+from cow_service.physics.settling import settle, standing_on
 from cow_service.records import FALLING_KINDS, Motion
 from cow_service.vision.types import Floats, Mask
 
@@ -54,10 +55,16 @@ class WorldInput:
     taken: tuple[SeenBody, ...] = ()  # placed with the others, then taken away before anything moves
     turns_wanted: bool = False  # how bodies turn is recorded of an ensemble, too
     put: Put | None = None  # the mover is carried somewhere and let go
+    put_before: tuple[Put, ...] = ()  # what is put somewhere before anything moves, in this order
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether something is taken away, or put somewhere before anything moves."""
+        return bool(self.taken or self.put_before)
 
     def as_it_is(self) -> WorldInput:
-        """With nothing taken away: those things are then the last bodies."""
-        return replace(self, bodies=(*self.bodies, *self.taken), taken=())
+        """With nothing put elsewhere and nothing taken away: those things are then the last bodies."""
+        return replace(self, bodies=(*self.bodies, *self.taken), taken=(), put_before=())
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,9 @@ class Worlds:
     runs: tuple[WorldRun, ...]  # per draw
     every: int  # frames between recorded ones
     fps: float  # of the clip
-    placements: Placements | None = None  # where something is put somewhere
+    placements: Placements | None = None  # where the mover is put somewhere
+    before: tuple[Placements, ...] = ()  # of what is put somewhere before anything moves
+    seen: tuple[tuple[RigidShape, ...], ...] | None = None  # per draw, then: bodies as the image shows them
 
 
 def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
@@ -77,7 +86,20 @@ def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     bodies = (*given.bodies, *given.taken)
     everything = place(bodies, given.motion, given.fit, given.size, draws, given.asked, given.others)
     scene = everything.first(len(given.bodies))
-    shapes = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
+    if not given.put_before:
+        return _run(given, scene, tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws))), draws, every)
+    scene = scene.rearranged(standing_on(given.put_before, scene.supports))
+    seen = tuple(_rigid_bodies(given, scene, draws, k) for k in range(len(draws)))
+    flying = [i for i, body in enumerate(scene.bodies) if not body.stands]
+    settled = settle(given.put_before, seen, draws, given.fps, flying)
+    run = _run(given, scene, settled.shapes, draws, every)
+    return replace(run, before=settled.placements, seen=seen)
+
+
+def _run(
+    given: WorldInput, scene: PlacedScene, shapes: tuple[tuple[RigidShape, ...], ...], draws: Floats, every: int
+) -> Worlds:
+    """Runs worlds from where their bodies are."""
     if given.put is not None:
         return _run_put(given, given.put, scene, shapes, draws, every)
     left = partial(_has_left, scene.cameras, given.size[0])

@@ -95,6 +95,15 @@ class ReaderInput:
     cpu: Callable[[], AbstractContextManager[None]] = nullcontext  # to be held around work on the CPU; not reentrant
 
 
+class OtherMotionHint(Record):
+    """As `OtherMotionReading`, by name: it is located with the other objects."""
+
+    object: str
+    kind: MotionKind
+    direction: Vector | None = None
+    depth: float = 0.0
+
+
 class MotionHints(Record):
     """What a reader learned of the motion while it looked for the object, so that stage 2 needs no second look."""
 
@@ -107,6 +116,8 @@ class MotionHints(Record):
     distance: Quantity | None = None
     duration: float | None = Field(default=None, gt=0)  # s
     until: Until | None = None
+    then: tuple[StepReading, ...] = ()  # further legs
+    also: tuple[OtherMotionHint, ...] = ()
     cue: Cue | None = None
     along_arrow: bool | None = None
     metres_per_pixel: MetresPerPixel | None = None

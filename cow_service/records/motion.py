@@ -49,7 +49,7 @@ class LocatedObject(Record):
 
 
 class Intervention(Record):
-    """A change of the scene before anything moves."""
+    """A change of the scene before anything moves; where the mover is put somewhere, that can be the motion."""
 
     kind: InterventionKind
     object: LocatedObject = Field(description="What is taken away or put somewhere.")

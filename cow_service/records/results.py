@@ -83,7 +83,7 @@ class Clip(Record):
 
     frames: tuple[Frame, ...]
     factual_frames: tuple[Frame, ...] = Field(
-        default=(), description="The same frames of the scene as it is, where something is taken away."
+        default=(), description="The same frames of the scene as it is, where something is taken away or put elsewhere."
     )
     video: Video | None = None
     overlay: Artifact
@@ -103,7 +103,7 @@ class Simulation(Record):
     trajectory: Trajectory
     frames: tuple[Frame, ...] = Field(description="The frames chosen for reasoning.")
     factual_frames: tuple[Frame, ...] = Field(
-        default=(), description="The same frames of the scene as it is, where something is taken away."
+        default=(), description="The same frames of the scene as it is, where something is taken away or put elsewhere."
     )
     video: Video | None = Field(description="Null where the request said `video: false`.")
     overlay: Artifact = Field(description="The input with box, point, arrow and path drawn.")

@@ -50,6 +50,11 @@ class Body(Record):
     size: tuple[float, float, float] = Field(description="Width, height and depth, m.")
     position: Position = Field(description="[x, y, z] of its centre in the frame of the camera, m.")
     support: str = Field(description="`floor`, `air`, or the name of the body that it stands on.")
+    rotation: float = Field(
+        default=0.0,
+        description="Degrees, clockwise, that it leans in the image against how the input shows it: of what was put "
+        "somewhere before the motion.",
+    )
     source: Literal["embedded", "mllm", "request"] = Field(description="Who says that it is there.")
     confidence: float = Field(ge=0, le=1, description="How sure it is that this is one separate thing.")
 
@@ -171,6 +176,19 @@ class Placement(Record):
     )
 
 
+class PlacedBefore(Placement):
+    """What becomes of an object that is put somewhere before the motion."""
+
+    body: int = Field(ge=0, description="Which of `Trajectory.bodies`: there is its new place.")
+    place: str = Field(description="Where it is put, in words.")
+    by_heading: bool = Field(
+        default=False, description="In front of or behind the mover by the way that it goes, not as the camera sees it."
+    )
+    visible: float = Field(
+        ge=0, le=1, description="Share of it that is seen there at the first frame: 0 behind others or off the image."
+    )
+
+
 class TrajectoryUnits(Record):
     """Units of `Path.states`."""
 
@@ -212,10 +230,16 @@ class Trajectory(Record):
     outcome: Outcome | None = Field(
         default=None, description="Null where the question asks for nothing that the world can tell."
     )
-    placement: Placement | None = Field(default=None, description="Null where nothing is put anywhere.")
+    placement: Placement | None = Field(
+        default=None, description="Of the mover that is seen going somewhere; null where it is put nowhere."
+    )
+    placed: tuple[PlacedBefore, ...] = Field(
+        default=(), description="What is put somewhere before the motion, in its order."
+    )
     factual: Trajectory | None = Field(
         default=None,
-        description="The same motion in the scene as it is, where something is taken away; null where nothing is.",
+        description="The same motion in the scene as it is, where something is taken away, or put somewhere before; "
+        "null where nothing is.",
     )
 
     @property

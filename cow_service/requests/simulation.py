@@ -57,8 +57,8 @@ class FramesRequest(Record):
     )
     factual: Flag | None = Field(
         default=None,
-        description="Where something is taken away: also the same frames of the scene as it is. By default only of a "
-        "generator on the CPU: a video model takes as long for them as for the clip.",
+        description="Where something is taken away, or put elsewhere first: also the same frames of the scene as it "
+        "is. By default only of a generator on the CPU: a video model takes as long for them as for the clip.",
     )
 
 
@@ -81,7 +81,9 @@ class SimulateRequest(Record):
         description="Other objects of the image: they come before what the reader finds there.",
     )
     interventions: tuple[InterventionRequest, ...] = Field(
-        default=(), max_length=8, description="What is taken away or put in before the motion, beside the question's."
+        default=(),
+        max_length=8,
+        description="What is taken away or put somewhere before the motion, beside the question's.",
     )
     camera: CameraRequest | None = None
     ensemble: Whole = Field(

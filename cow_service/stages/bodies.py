@@ -47,13 +47,19 @@ def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ..
 
 
 def others_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
-    """The other objects of a grounding, those that something is put to among them."""
+    """The other objects of a grounding, what is put somewhere and what it is put to among them."""
     found = list(grounding.others)
     for each in grounding.interventions:
-        for target in each.targets:
-            if not any(iou(target.bbox, other.bbox) >= SAME_OBJECT_IOU for other in found):
-                found.append(target)
+        moved = [each.object] if each.kind == "place" and not is_mover(each.object, grounding) else []
+        for thing in (*moved, *each.targets):
+            if not any(iou(thing.bbox, other.bbox) >= SAME_OBJECT_IOU for other in found):
+                found.append(thing)
     return tuple(found)
+
+
+def is_mover(thing: LocatedObject, grounding: Grounding) -> bool:
+    """Whether a thing is the grounded object."""
+    return iou(thing.bbox, grounding.bbox) >= SAME_OBJECT_IOU
 
 
 def removed_objects(grounding: Grounding) -> tuple[LocatedObject, ...]:

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.generators.base import Generator, GeneratorInput
+from cow_service.generators.rearranging import with_put
 from cow_service.generators.removal import without_removed
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import encode_png, fit_within
-from cow_service.media.overlay import draw_overlay
+from cow_service.media.overlay import Replaced, draw_overlay
 from cow_service.media.video import write_mp4
-from cow_service.records import Clip, Frame, Grounding, Motion, Trajectory, Video
+from cow_service.records import BBox, Clip, Frame, Grounding, Motion, PlacedBefore, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.bodies import obstacles_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
+from cow_service.vision.types import Mask
 
 MIN_GAP = 0.2  # s between a contact and another chosen frame: closer ones show the same
 
@@ -82,10 +85,12 @@ def generate(
         frames, video = _render(given, run.generator, request, artifacts, run.report_share)
         factual = _factual_frames(as_it_is, frames, run.generator, request, artifacts, run.report_share)
     with run.cpu():
-        mover, factual_given = scene.silhouette(grounding.bbox), as_it_is or given
+        seen = scene if given.before is None else given.scene
+        mover, factual_given = seen.silhouette(given.grounding.bbox), as_it_is or given
         gone = factual_given.obstacles[len(given.obstacles) :]
         removed = [(each.name, each.bbox, each.mask.full()) for each in gone]
-        drawn = draw_overlay(scene.image, grounding, motion, trajectory, mover, removed)
+        placed = [_replaced(given, factual_given, each) for each in trajectory.placed]
+        drawn = draw_overlay(scene.image, given.grounding, motion, trajectory, mover, removed, placed)
         overlay = artifacts.put(encode_png(drawn), "image/png")
     clip = Clip(
         frames=frames,
@@ -101,15 +106,29 @@ def generate(
 def _inputs(
     run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory
 ) -> tuple[GeneratorInput, GeneratorInput | None]:
-    """What the generator is given and, where something is taken away, what it is given for the scene as it is."""
+    """What the generator is given and, where something is changed first, what it is given for the scene as it is."""
     obstacles, taken = obstacles_of(run.scene, grounding)
     options, seed = run.generator_options, run.request.clip_seed
-    if trajectory.factual is None or not taken:
+    if trajectory.factual is None:
         return GeneratorInput(run.scene, grounding, motion, trajectory, obstacles, seed, options), None
     everything = (*obstacles, *taken)
     as_it_is = GeneratorInput(run.scene, grounding, motion, trajectory.factual, everything, seed, options)
     removed = range(len(obstacles) + 1, len(everything) + 1)
-    return without_removed(as_it_is, removed, trajectory), as_it_is
+    given = without_removed(as_it_is, removed, trajectory) if taken else replace(as_it_is, trajectory=trajectory)
+    return with_put(given, trajectory.factual), as_it_is
+
+
+def _replaced(given: GeneratorInput, as_it_is: GeneratorInput, placed: PlacedBefore) -> Replaced:
+    """Where something was, and where it is put."""
+    (old_bbox, old), (bbox, mask) = (_seen_in(each, placed.body) for each in (as_it_is, given))
+    return Replaced(placed.object, placed.place, old_bbox, old, bbox, mask)
+
+
+def _seen_in(given: GeneratorInput, body: int) -> tuple[BBox, Mask]:
+    """Box and mask [H, W] of a body."""
+    if body == 0:
+        return given.grounding.bbox, given.scene.silhouette(given.grounding.bbox)
+    return given.obstacles[body - 1].bbox, given.obstacles[body - 1].mask.full()
 
 
 def _factual_frames(

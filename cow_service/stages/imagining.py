@@ -40,13 +40,13 @@ class Imagined:
 
 
 def imagine(world: WorldInput, query: Query | None, size: int) -> tuple[Imagined, ...]:
-    """Runs the likeliest world and an ensemble of `size` worlds around it; where something is taken away, also the
-    world as it is, with the same draws, as the second.
+    """Runs the likeliest world and an ensemble of `size` worlds around it; where something is changed first, also
+    the world as it is, with the same draws, as the second.
 
     What is shown must not contradict what is answered: where an answer is sure and the likeliest world differs from
     it, the likeliest world of those that agree is shown.
     """
-    given = (world, world.as_it_is()) if world.taken else (world,)
+    given = (world, world.as_it_is()) if world.is_changed else (world,)
     shown = [_run(each, likeliest()) for each in given]
     queries = [query if len(given) == 1 else _as_it_is(query, place) for place in range(len(given))]
     if size == 0:
@@ -108,12 +108,15 @@ def _agreeing(
 
 
 def _verdicts(query: Query, sure: Sequence[bool], ran: Sequence[Ran]) -> list[tuple[int, ...]]:
-    """Per draw, the answers that are sure: of each world, or whether they differ where that is asked."""
+    """Per draw, the answers that are sure: of each world, or whether they differ where that is asked. Then whether
+    each thing stays where it is put before."""
     answers = [answers_of(query, each.events) for each in ran]
     if query.asked.form == "changes":
-        return [(int(one != other),) for one, other in zip(*answers, strict=True)]
-    told = [each for each, is_sure in zip(answers, sure, strict=True) if is_sure]
-    return list(zip(*told, strict=True))
+        told = [[int(one != other) for one, other in zip(*answers, strict=True)]]
+    else:
+        told = [each for each, is_sure in zip(answers, sure, strict=True) if is_sure]
+    stays = [placements.stays.astype(int).tolist() for placements in ran[0].worlds.before]
+    return list(zip(*told, *stays, strict=True))
 
 
 def _run(world: WorldInput, draws: Floats, every: int = 1) -> Ran:

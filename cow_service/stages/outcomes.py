@@ -1,5 +1,5 @@
-"""What the worlds say to the question, as records: of the world asked about and, where something is taken away, of the
-scene as it is."""
+"""What the worlds say to the question, as records: of the world asked about and, where something is changed first, of
+the scene as it is."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.outcome import KIND_OF, Decided, Query
 from cow_service.readers.question.both_worlds import facts_of_both
 from cow_service.readers.question.facts import facts_of
-from cow_service.records import Asked, Grounding, Outcome, Trajectory
-from cow_service.stages.bodies import removed_objects
+from cow_service.records import Asked, Grounding, Intervention, Outcome, Trajectory
 from cow_service.stages.imagining import Imagined
 
 BY_ENCOUNTERS = (*KIND_OF, "tips", "moves", "leaves")  # relations that encounters and paths decide
@@ -29,6 +28,7 @@ def with_outcomes(
     asked: Asked | None,
     query: Query | None,
     grounding: Grounding,
+    changes: Sequence[Intervention],
 ) -> list[Trajectory]:
     """The trajectories with their outcomes and, in the first, the facts of them all in a sentence."""
     if asked is None:
@@ -40,9 +40,7 @@ def with_outcomes(
         outcome = _outcome(asked_here, query, bodies, each.decided)
         told.append(_with_facts(trajectory.model_copy(update={"outcome": outcome}), grounding))
     if len(told) > 1:
-        removed = [each.object for each in removed_objects(grounding)]
-        both = facts_of_both(removed, grounding.object, *told)
-        told[0] = _with(told[0], both)
+        told[0] = _with(told[0], facts_of_both(changes, grounding.object, *told))
     return told
 
 

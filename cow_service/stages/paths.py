@@ -12,9 +12,10 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera_fit import CameraFit
 from cow_service.physics.events import WorldEvents
 from cow_service.physics.floor_camera import FloorCamera
-from cow_service.physics.projection import SeenPaths, rotation, seen_paths, states
+from cow_service.physics.projection import SeenPaths, rotation, rotation_where_put, seen_paths, states
 from cow_service.physics.world import Worlds
 from cow_service.records import Body, CameraDeviations, CameraEstimate, Contact, Path, Point
+from cow_service.stages.shown import shown_body, was_put
 from cow_service.vision.types import Floats
 
 MOVED = 0.5  # px: what moves less in the image stays where it is
@@ -47,12 +48,12 @@ def camera_record(fit: CameraFit, worlds: Worlds, around: Worlds | None) -> Came
 def body_records(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[Body, ...]:
     """Where the first draw has each body."""
     cameras, records = worlds.scene.cameras, []
-    for seen, shape, placed, on in zip(
-        bodies, worlds.shapes[0], worlds.scene.bodies, worlds.scene.supports, strict=True
+    for index, (seen, shape, placed, on) in enumerate(
+        zip(bodies, worlds.shapes[0], worlds.scene.bodies, worlds.scene.supports, strict=True)
     ):
         centre = np.array(shape.position) - np.array([0.0, cameras.height[0], 0.0])
         x, y, z = (float(v) for v in centre @ cameras.axes[0])
-        stands = placed.stands and len(records) not in worlds.scene.unsupported
+        stands = placed.stands and index not in worlds.scene.unsupported
         support = bodies[on].name if on is not None else "floor" if stands else "air"
         records.append(
             Body(
@@ -62,6 +63,7 @@ def body_records(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[Body, ...]
                 size=(2 * shape.half_width, 2 * shape.half_height, 2 * shape.half_depth),
                 position=(x, y, z),
                 support=support,
+                rotation=rotation_where_put(worlds, index) if was_put(index, worlds) else 0.0,
                 source=seen.source,
                 confidence=seen.confidence,
             )
@@ -72,7 +74,10 @@ def body_records(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[Body, ...]
 def path_records(
     bodies: Sequence[SeenBody], start: Point, worlds: Worlds, size: tuple[int, int], around: Worlds | None
 ) -> tuple[Path, ...]:
-    """Paths of the mover, from its grounded point, and of what it set in motion; `around` are the ensemble's worlds."""
+    """Paths of the mover, from its grounded point, and of what it set in motion; `around` are the ensemble's worlds.
+
+    `bodies` are as the image shows them; of what was put elsewhere, the path begins there.
+    """
     records: list[Path] = []
     moved = MOVED if worlds.placements is None else PUSHED
     for body in sorted({0} | worlds.runs[0].moved):
@@ -104,7 +109,10 @@ def _path(
 ) -> Path:
     # The body's centre as placed and where its silhouette is differ a little: what is drawn starts where it is.
     points, scale, turned = path.points[0], path.scale[0], rotation(worlds, body)
-    points = points + scale[:, None] * (start - points[0])
+    points = points + scale[:, None] * (start - path.seen[0])
+    if worlds.seen is not None:
+        seen = shown_body(seen, body, worlds)
+        start, scale = points[0], scale / scale[0]
     visible = np.all((points >= 0) & (points < np.array(size)), axis=1) & ~path.passed[0]
     return Path(
         body=body,

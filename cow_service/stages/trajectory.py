@@ -16,7 +16,7 @@ from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.outcome import Query
 from cow_service.physics.placing import flies
 from cow_service.physics.sweeping import swept
-from cow_service.physics.world import Led, WorldInput
+from cow_service.physics.world import Led, WorldInput, Worlds
 from cow_service.readers.question.relations import read_asked
 from cow_service.readers.question.sentences import parse
 from cow_service.records import Asked, Grounding, Motion, Path, Trajectory
@@ -36,9 +36,10 @@ from cow_service.stages.paths import (
     tracks,
     with_times,
 )
-from cow_service.stages.placing import placement_of, put_of
+from cow_service.stages.placing import placed_before, placed_mover, placed_records, placement_of, put_before, put_of
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
+from cow_service.stages.shown import shown_bodies, was_put
 from cow_service.stages.warnings import warnings_of
 from cow_service.vision.obstacles import Obstacle
 from cow_service.vision.scene import Scene
@@ -72,13 +73,17 @@ def trajectory_of(
     kept = len(bodies) - len(taken)
     world = _world(scene, (bodies[:kept], bodies[kept:]), motion, request, free, grounding, query)
     put = put_of(scene, grounding, motion, bodies[:kept])
-    world = replace(world, put=put)
+    before = put_before(scene, grounding, motion, bodies[:kept], led=free is not None)
+    # People aim at what they ask about; where that is put elsewhere, not at its place in the image.
+    asked_about = None if world.asked in [each.body for each in before] else world.asked
+    world = replace(world, put=put, put_before=before, asked=asked_about)
     tellable = query if known and query is not None and can_tell(query, kept, put is not None) else None
     if put is not None and asked is None:  # what is shown is what most worlds do
         tellable = Query(Asked(relation="inside"), put.targets[0])
     imagined = imagine(world, tellable, request.ensemble)
     trajectories = [_record(scene, grounding, motion, request, each, free, known) for each in imagined]
-    told = with_outcomes(trajectories, imagined, asked, query, grounding)
+    changes = tuple(each for each in grounding.interventions if put is None or each is not placed_mover(grounding))
+    told = with_outcomes(trajectories, imagined, asked, query, grounding, changes)
     factual = told[1].model_copy(update={"anchors": ()}) if len(told) > 1 else None
     return told[0].model_copy(update={"factual": factual})
 
@@ -146,27 +151,29 @@ def _record(
     known: bool,
 ) -> Trajectory:
     world, shown, size = imagined.given, imagined.shown, (scene.width, scene.height)
-    camera = camera_record(world.fit, shown, imagined.around)
+    placed = placed_records(placed_before(grounding, motion), world, shown, imagined.around)
+    camera, bodies = camera_record(world.fit, shown, imagined.around), shown_bodies(world.bodies, shown)
     if free is None:
         paths = path_records(world.bodies, grounding.point, shown, size, imagined.around)
     else:
         paths = (_free_record(world.bodies[0], grounding, request, free),)
     paths = with_times(paths, imagined.events)
     given = request.trajectory
-    anchors = _anchors(world.bodies, grounding, paths) if given is None or given.anchors is None else given.anchors
+    anchors = _anchors(bodies, grounding, paths, shown) if given is None or given.anchors is None else given.anchors
     return Trajectory(
         law="ballistic" if free is not None else "contact",
         fps=request.fps,
         camera=camera,
-        bodies=body_records(world.bodies, shown),
+        bodies=body_records(bodies, shown),
         paths=paths,
         contacts=contact_records(shown, FloorCamera.of(camera, *size)),
         light=_light(world, shown.scene.light),
         moving_until=moving_until(paths, request.fps),
         anchors=anchors,
-        encounters=encounters(imagined.events, imagined.around_events, world.bodies, request.fps, request.num_frames),
+        encounters=encounters(imagined.events, imagined.around_events, bodies, request.fps, request.num_frames),
         encounters_known=known,
         placement=placement_of(grounding.object, shown.placements, imagined.around and imagined.around.placements),
+        placed=placed,
         ensemble=request.ensemble,
     )
 
@@ -202,10 +209,13 @@ def _seen(given: TrajectoryRequest | None, times: Floats) -> tuple[tuple[bool, .
 
 
 def _anchors(
-    bodies: Sequence[SeenBody], grounding: Grounding, paths: Sequence[Path]
+    bodies: Sequence[SeenBody], grounding: Grounding, paths: Sequence[Path], worlds: Worlds
 ) -> tuple[tuple[float, float], ...]:
     """Points off every body and off the way of all that moves."""
-    starts = [np.array(start_of(bodies, path.body, grounding.point)) for path in paths]
+    starts = [
+        np.array(path.points[0] if was_put(path.body, worlds) else start_of(bodies, path.body, grounding.point))
+        for path in paths
+    ]
     movable = swept([bodies[path.body].mask for path in paths], starts, paths)
     for body in bodies:
         body.mask.add_to(movable)

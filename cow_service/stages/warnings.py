@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from cow_service.readers.question.placement_facts import doubts_of
 from cow_service.records import Grounding, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.vision.scene import Scene
@@ -22,7 +23,30 @@ def warnings_of(
         _path_off_object(request, grounding),
         _path_of_another_length(request),
     )
-    return tuple(told for told in found if told is not None)
+    doubts = [doubt for placed in trajectory.placed for doubt in doubts_of(placed)]
+    return (*(told for told in found if told is not None), *doubts, *_by_heading(trajectory), *_made_room(trajectory))
+
+
+def _by_heading(trajectory: Trajectory) -> tuple[str, ...]:
+    """Where things are in front of or behind the mover, by the way that it goes."""
+    return tuple(
+        f"'{each.object}', put {each.place}, was put there by the way in which that moves, not as the camera sees it."
+        for each in trajectory.placed
+        if each.by_heading
+    )
+
+
+def _made_room(trajectory: Trajectory) -> tuple[str, ...]:
+    """What is not put anywhere, and does not begin where the image shows it."""
+    if trajectory.factual is None or not trajectory.placed:
+        return ()
+    put = {each.body for each in trajectory.placed}
+    pairs = enumerate(zip(trajectory.bodies, trajectory.factual.bodies, strict=False))
+    return tuple(
+        f"'{body.object}' makes room for what is put there: it does not begin where the image shows it."
+        for index, (body, seen) in pairs
+        if index not in put and body.bbox != seen.bbox
+    )
 
 
 def _no_surroundings(trajectory: Trajectory) -> str | None:

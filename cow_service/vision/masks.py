@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from cow_service.records import BBox
-from cow_service.vision.types import Floats32, Image, Mask
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 _FIRST_PIXEL = slice(0, 1), slice(0, 1)  # the window that stands for an empty mask
 
@@ -122,9 +123,32 @@ class CroppedMask:
         inside = self.rows.start <= y < self.rows.stop and self.columns.start <= x < self.columns.stop
         return inside and bool(self.patch[y - self.rows.start, x - self.columns.start])
 
+    def moved(self, start: Floats, to: Floats, scale: float, degrees: float) -> CroppedMask:
+        """The mask when its point `start` [2] (px) has gone `to`, scaled and turned clockwise; inside the image."""
+        turn = turning(scale, degrees)
+        x0, y0, x1, y1 = self.bbox
+        corners = to + (np.array([[x0, y0], [x1, y0], [x0, y1], [x1, y1]]) - start) @ turn.T
+        low = np.clip(np.floor(corners.min(axis=0)), 0, self.shape[::-1]).astype(int)
+        high = np.clip(np.ceil(corners.max(axis=0)), 0, self.shape[::-1]).astype(int)
+        if (high <= low).any():
+            return CroppedMask.of(np.zeros(self.shape, bool))
+        shift = to + turn @ (np.array([x0, y0]) + 0.5 - start) - 0.5 - low
+        size = int(high[0] - low[0]), int(high[1] - low[1])
+        values = cv2.warpAffine(self.patch.astype(np.float32), np.column_stack([turn, shift]), size)
+        found = np.zeros(self.shape, bool)
+        found[low[1] : high[1], low[0] : high[0]] = np.asarray(values) > 0.5
+        return CroppedMask.of(found)
+
     def add_to(self, mask: Mask) -> None:
         """Sets its pixels in a mask [H, W]."""
         mask[self.rows, self.columns] |= self.patch
+
+
+def turning(scale: float, degrees: float) -> Floats:
+    """Matrix [2, 2] that scales and turns clockwise in the image, whose y points down."""
+    angle = math.radians(degrees)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return scale * np.array([[cosine, -sine], [sine, cosine]])
 
 
 def enlarged(soft: Floats32, shape: tuple[int, int]) -> CroppedMask:

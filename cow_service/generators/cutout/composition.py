@@ -41,6 +41,9 @@ class Compositor:
                 window[:] = cv2.multiply(window, left, dtype=cv2.CV_8U)
         for body, sprite in self._far_to_near(index):
             self._draw(frame, body, sprite, index)
+            for container in layers.containers:
+                if container.moving is not None and container.sprite is not None and container.covers(body, index):
+                    self._draw(frame, container.moving, container.sprite, index)
         return frame
 
     def _seen(self, surface: int | None, window: Window) -> Floats32 | float:
@@ -63,11 +66,9 @@ class Compositor:
                 there.append((body, sprite))
         eye = self.layers.eye
 
-        container = self.layers.container
-
         def order(a: tuple[MovingBody, Sprite], b: tuple[MovingBody, Sprite]) -> int:
             for one, other, sign in ((a[0], b[0], 1), (b[0], a[0], -1)):
-                if container is not None and other.path.body == container.index and container.takes(one, index):
+                if any(each.index == other.path.body and each.takes(one, index) for each in self.layers.containers):
                     return sign  # the container first, then what is in it
             return 1 if a[0].placed(index).in_front_of(b[0].placed(index), eye) else -1
 
@@ -90,13 +91,14 @@ class Compositor:
 
     def _before(self, body: MovingBody, index: int) -> list[StillBody]:
         """What hides a body at a frame: of the container that it goes into, the front wall alone."""
-        placed, container = body.placed(index), self.layers.container
-        taken = container is not None and container.takes(body, index)
+        placed = body.placed(index)
         hiding = [other for other in self.layers.still if not placed.in_front_of(other.placed, self.layers.eye)]
-        if container is None or not taken:
-            return hiding
-        hiding = [other for other in hiding if other.index != container.index]
-        return [*hiding, container.front] if container.covers(body, index) else hiding
+        for container in self.layers.containers:
+            if container.takes(body, index):
+                hiding = [other for other in hiding if other.index != container.index]
+                if container.moving is None and container.covers(body, index):
+                    hiding.append(container.front)
+        return hiding
 
 
 def _three(values: Floats32) -> Floats32:

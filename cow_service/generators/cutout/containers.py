@@ -10,6 +10,8 @@ import numpy as np
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import MovingBody, StillBody
 from cow_service.generators.cutout.ground import Ground, Placed
+from cow_service.generators.cutout.sprites import Sprite, cut
+from cow_service.records import BBox
 from cow_service.vision.masks import CroppedMask, iou
 from cow_service.vision.openings import SeenOpening, measure_opening
 from cow_service.vision.types import Image, Mask
@@ -20,20 +22,23 @@ DEEPER = 0.02  # of the container's height: so far below the rim something is in
 
 @dataclass(frozen=True)
 class Container:
-    """The container that the mover is put into, and the part of it that is drawn over what is inside."""
+    """A container that a body is put into, and the part of it that is drawn over what is inside."""
 
     index: int  # of `Trajectory.bodies`
-    holds: bool  # the mover goes in; else it lies on the rim
+    content: int  # the body that is put into it, of `Trajectory.bodies`
+    holds: bool  # the body goes in; else it lies on the rim
     front: StillBody  # the wall below the nearer edge of the opening, at the first frame
     ground: Ground
+    moving: MovingBody | None  # the container, where it moves
+    sprite: Sprite | None  # of its front, where it moves
 
     def takes(self, body: MovingBody, frame: int) -> bool:
         """Whether a body is over or in the container at a frame: then the container as a whole does not hide it."""
-        if body.path.body != 0:
+        if body.path.body != self.content:
             return False
         it, ground = self.ground.bodies[self.index], self.ground
-        here = ground.camera.to_floor(np.array([body.path.states[frame][:3]]))[0]
-        there = ground.camera.to_floor(np.array([it.position]))[0]
+        position = it.position if self.moving is None else self.moving.path.states[frame][:3]
+        here, there = ground.camera.to_floor(np.array([body.path.states[frame][:3], position]))
         return bool(np.hypot(here[0] - there[0], here[2] - there[2]) < AROUND * it.size[0] / 2)
 
     def covers(self, body: MovingBody, frame: int) -> bool:
@@ -43,25 +48,56 @@ class Container:
         return self.holds and inside and self.takes(body, frame)
 
 
-def container_of(
+def containers_of(
     given: GeneratorInput, image: Image, moving: Sequence[MovingBody], still: Sequence[StillBody], ground: Ground | None
+) -> tuple[Container, ...]:
+    """The containers of a clip image [h, w, 3] into which bodies are put."""
+    if ground is None:
+        return ()
+    results = {each.body: each.result for each in given.trajectory.placed}
+    if given.trajectory.placement is not None:
+        results[0] = given.trajectory.placement.result
+    found: list[Container] = []
+    for each in given.grounding.interventions:
+        if each.relation != "into":
+            continue
+        content, index = (_body_at(given, thing.bbox) for thing in (each.object, each.targets[0]))
+        if content in results and index != content:
+            holds = results[content] in ("inside", "sticks-out")
+            container = _container(image, moving, still, ground, index, content, holds=holds)
+            found += [] if container is None else [container]
+    return tuple(found)
+
+
+def _body_at(given: GeneratorInput, bbox: BBox) -> int:
+    """The body that is seen in a box."""
+    shared = [iou(bbox, given.grounding.bbox), *(iou(bbox, obstacle.bbox) for obstacle in given.obstacles)]
+    return int(np.argmax(shared))
+
+
+def _container(
+    image: Image,
+    moving: Sequence[MovingBody],
+    still: Sequence[StillBody],
+    ground: Ground,
+    index: int,
+    content: int,
+    *,
+    holds: bool,
 ) -> Container | None:
-    """The container of a clip image [h, w, 3] into which the mover is put; None where there is none."""
-    placement = given.trajectory.placement
-    targets = [each.targets[0].bbox for each in given.grounding.interventions if each.relation == "into"]
-    if placement is None or ground is None or not targets:
-        return None
-    index = 1 + int(np.argmax([iou(targets[0], obstacle.bbox) for obstacle in given.obstacles]))
     masks = {body.path.body: body.mask for body in moving} | {body.index: body.mask for body in still}
     if index not in masks:
         return None
-    mask = masks[index]
-    seen = measure_opening(image, CroppedMask.of(mask))
-    middle, half = ground.height(np.array(ground.bodies[index].position)), ground.bodies[index].size[1] / 2
-    bbox = given.obstacles[index - 1].bbox
-    placed = Placed(bbox, False, ground.bodies[index].position[2], middle - half, middle + half)
-    front = StillBody(index, mask & _below_rim(mask, seen), placed)
-    return Container(index, placement.result in ("inside", "sticks-out"), front, ground)
+    mask, it = masks[index], ground.bodies[index]
+    front_mask = mask & _below_rim(mask, measure_opening(image, CroppedMask.of(mask)))
+    middle, half = ground.height(np.array(it.position)), it.size[1] / 2
+    placed = Placed(it.bbox, False, it.position[2], middle - half, middle + half)
+    goes = next((body for body in moving if body.path.body == index), None)
+    sprite = None
+    if goes is not None:
+        x, y = (ground.factor * float(v) for v in goes.start)
+        sprite = cut(image, front_mask, None, (x, y), it.shape)
+    return Container(index, content, holds, StillBody(index, front_mask, placed), ground, goes, sprite)
 
 
 def _below_rim(mask: Mask, seen: SeenOpening) -> Mask:

@@ -39,10 +39,11 @@ class CutoutGenerator:
         self, given: GeneratorInput, indices: Sequence[int], progress: Callable[[float], None]
     ) -> Iterator[Image]:
         """The frames of these indices, RGB [h, w, 3]; only the windows of what moves are composed."""
-        compositor = Compositor.of(given)
+        source, earlier = (given, 0) if given.before is None else (given.before, 1)
+        compositor = Compositor.of(source)
         for done, index in enumerate(indices):
             progress(done / len(indices))
-            yield compositor.frame(index)
+            yield compositor.frame(index + earlier)
 
 
 def create(settings: Settings) -> CutoutGenerator:

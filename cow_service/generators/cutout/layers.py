@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import MovingBody, StillBody, moving_body, still_bodies
-from cow_service.generators.cutout.containers import Container, container_of
+from cow_service.generators.cutout.containers import Container, containers_of
 from cow_service.generators.cutout.ground import Ground
 from cow_service.generators.cutout.measuring import Lit, take_shadows
 from cow_service.generators.cutout.shadows import Shadow
@@ -44,7 +44,7 @@ class Layers:
     sprites: tuple[Sprite, ...]  # of the moving bodies
     shadows: tuple[Shadow, ...]
     still: tuple[StillBody, ...]
-    container: Container | None  # into which the mover is put
+    containers: tuple[Container, ...]  # into which bodies are put
     eye: float  # m: the camera's height above the floor, 0 where unknown
     factor: float  # clip px per image px
 
@@ -68,8 +68,8 @@ def take_apart(given: GeneratorInput) -> Layers:
         shape = None if ground is None else ground.bodies[body.path.body].shape
         start = (factor * float(body.start[0]), factor * float(body.start[1]))
         sprites.append(cut(image, body.mask, hidden, start, shape))
-    container = container_of(given, image, moving, still, ground)
-    return Layers(image, background, moving, tuple(sprites), lit.shadows, still, container, eye, factor)
+    containers = containers_of(given, image, moving, still, ground)
+    return Layers(image, background, moving, tuple(sprites), lit.shadows, still, containers, eye, factor)
 
 
 def without_bodies(

@@ -10,7 +10,7 @@ import numpy as np
 
 from cow_service.records.motion import Shape
 from cow_service.vision.inpainting import push_pull
-from cow_service.vision.masks import window_of
+from cow_service.vision.masks import turning, window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge
@@ -101,17 +101,10 @@ def soft(mask: Mask) -> Floats32:
     return np.asarray(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), EDGE_SIGMA), np.float32)
 
 
-def _turn(scale: float, degrees: float) -> Floats:
-    """Matrix [2, 2] that scales and turns clockwise in the image, whose y points down."""
-    angle = math.radians(degrees)
-    cosine, sine = math.cos(angle), math.sin(angle)
-    return scale * np.array([[cosine, -sine], [sine, cosine]])
-
-
 def _corners(sprite: Sprite, shape: tuple[int, ...], point: Floats, scale: float, degrees: float) -> Floats:
     offset = np.array(sprite.origin) - np.array(sprite.start)
     corners = offset + np.array([[0, 0], [shape[1], 0], [0, shape[0]], [shape[1], shape[0]]])
-    return point + corners @ _turn(scale, degrees).T
+    return point + corners @ turning(scale, degrees).T
 
 
 def _warped(sprite: Sprite, part: Floats32, point: Floats, scale: float, degrees: float, window: Window) -> Floats32:
@@ -122,7 +115,7 @@ def _warped(sprite: Sprite, part: Floats32, point: Floats, scale: float, degrees
         half = cv2.resize(part[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
         part = np.asarray(half, np.float32)
         cell *= 2
-    turn = _turn(scale, degrees)
+    turn = turning(scale, degrees)
     rows, columns = window
     first = np.array(sprite.origin) + 0.5 * cell - np.array(sprite.start)
     shift = point + turn @ first - 0.5 - np.array([columns.start, rows.start])

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 from cow_service.media.strips import named_strip
 from cow_service.readers.base import Imagined
-from cow_service.records import MEETINGS, AskedRelation, Doubt, Encounter, Grounding, Outcome, Trajectory
+from cow_service.readers.question.placement_facts import state_words
+from cow_service.records import MEETINGS, AskedRelation, Doubt, Encounter, Outcome, Simulation, Trajectory
 
-AS_IT_IS = "As it is"  # the name of the frames with nothing taken away
+AS_IT_IS = "As it is"  # the name of the frames with nothing changed
 EVENTS: dict[AskedRelation, tuple[str, str]] = {
     "touches": ("touches", "touch"),
     "covers": ("hides", "hide"),
@@ -34,7 +35,7 @@ def pictures(imagined: Imagined) -> tuple[NDArray[np.uint8], ...]:
     """What is shown of a simulation: its frames or, of two worlds, a named strip of each."""
     if not imagined.factual_frames:
         return imagined.frames
-    name = f"With {_removed(imagined.simulation.grounding)} removed"
+    name = _changed(imagined.simulation)
     return named_strip(imagined.frames, name), named_strip(imagined.factual_frames, AS_IT_IS)
 
 
@@ -43,14 +44,14 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
     simulation = imagined.simulation
     trajectory, mover = simulation.trajectory, simulation.grounding.object
     facts = _outcome_words(trajectory, mover)
-    removed = _removed(simulation.grounding)
+    changed = _changed(simulation)
     if trajectory.factual is not None:
-        facts = _of_both(trajectory, trajectory.factual, mover, removed)
+        facts = _of_both(trajectory, trajectory.factual, mover, changed)
     return {
         "sentence": simulation.motion.sentence,
         "times": ", ".join(f"{frame.time:.2f} s" for frame in simulation.frames),
         "law": trajectory.law,
-        "removed": removed,
+        "changed": changed,
         "as_it_is": AS_IT_IS if imagined.factual_frames else "",
         "facts": facts,
         "encounters": () if facts else tuple(_encounter_words(each, trajectory) for each in trajectory.encounters),
@@ -58,18 +59,22 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
     }
 
 
-def _removed(grounding: Grounding) -> str:
-    """What is taken away, in words; empty where nothing is."""
-    names = [each.object.object for each in grounding.interventions if each.kind == "remove"]
-    return " and ".join(f"the {_bare(name)}" for name in names)
+def _changed(simulation: Simulation) -> str:
+    """What is changed before the motion, as in: With the vase removed; empty where nothing is."""
+    changes = simulation.grounding.interventions
+    removed = " and ".join(f"the {_bare(each.object.object)}" for each in changes if each.kind == "remove")
+    put = {each.object for each in simulation.trajectory.placed}
+    placed = [_one_line(state_words(each)) for each in changes if each.kind == "place" and each.object.object in put]
+    told = [*([f"{removed} removed"] if removed else []), *placed]
+    return f"With {' and '.join(told)}" if told else ""
 
 
-def _of_both(changed: Trajectory, factual: Trajectory, mover: str, removed: str) -> tuple[str, ...]:
+def _of_both(changed: Trajectory, factual: Trajectory, mover: str, named: str) -> tuple[str, ...]:
     """The outcomes of both worlds, the facts of both in one line."""
     if changed.outcome is None or factual.outcome is None:
         return ()
     lines = [_one_line(changed.outcome.facts)] if changed.outcome.facts else []
-    for trajectory, where in ((changed, f"With {removed} removed"), (factual, AS_IT_IS)):
+    for trajectory, where in ((changed, named), (factual, AS_IT_IS)):
         told = _probability(trajectory, mover)
         lines += [f"{where}, {told[0].lower()}{told[1:]}"] if told else []
     return (*lines, *_dependence(changed.outcome))

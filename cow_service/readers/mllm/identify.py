@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast, get_args
 
-from cow_service.readers.mllm.changes import CHANGE_FIELDS, NOT_SAID, Change, Lengths, read_changes, read_lengths
+from cow_service.readers.mllm.changes import CHANGE_FIELDS, Change, read_changes
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.free_text import is_broken_json, names_nothing
 from cow_service.readers.mllm.images import EncodedImage
+from cow_service.readers.mllm.legs import LEG_FIELDS, NO_LEGS, Legs, read_legs
+from cow_service.readers.mllm.lengths import LENGTH_FIELDS, NOT_SAID, Lengths, read_lengths
 from cow_service.readers.mllm.replies import (
     ReplyError,
     fields_of,
@@ -50,6 +52,7 @@ class Identified:
     sentence: str | None = None
     changes: tuple[Change, ...] = ()
     lengths: Lengths = NOT_SAID
+    legs: Legs = NO_LEGS
 
 
 def identify_call(question: str, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
@@ -59,14 +62,15 @@ def identify_call(question: str, image: EncodedImage, reasoning_length: int) -> 
 
 def schema(reasoning_length: int) -> Schema:
     """JSON schema of the reply."""
+    optional = CHANGE_FIELDS | LENGTH_FIELDS | LEG_FIELDS
     return object_of(
-        CHANGE_FIELDS,
+        optional,
         reasoning=words(reasoning_length),
         object=nullable(words(MAX_OBJECT)),
         others={"type": "array", "items": words(MAX_OBJECT), "maxItems": MAX_OTHERS},
         kind=one_of(*KINDS),
         sentence=words(MAX_SENTENCE),
-        **CHANGE_FIELDS,
+        **optional,
     )
 
 
@@ -112,6 +116,7 @@ def _named(value: object) -> Iterator[Identified]:
                 sentence=sentence if MIN_SENTENCE <= len(sentence) <= MAX_SENTENCE else None,
                 changes=changes,
                 lengths=read_lengths(fields),
+                legs=read_legs(fields),
             )
 
 

@@ -22,13 +22,15 @@ from cow_service.readers.base import (
     ReaderInput,
 )
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
-from cow_service.readers.mllm.changes import Lengths, located_changes, names_of
+from cow_service.readers.mllm.changes import located_changes, names_of
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.directions import Line
 from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.mllm.identify import Identified, identify_call
 from cow_service.readers.mllm.images import EncodedImage, encode
+from cow_service.readers.mllm.legs import NO_LEGS, located_others
+from cow_service.readers.mllm.lengths import NOT_SAID
 from cow_service.readers.mllm.locate import Located, locate_call
 from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.others import separate_objects
@@ -138,7 +140,8 @@ class MllmReader:
             located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
             warnings = () if located is None else located.warnings
         kind = hints.kind or _kind(given, None)
-        reading = MotionReading(kind, None, "text", sentence=hints.sentence, warnings=warnings)
+        others = located_others(hints.also, grounding.others)
+        reading = MotionReading(kind, None, "text", sentence=hints.sentence, warnings=warnings, others=others)
         if kind in FALLING_KINDS:
             reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
             if hints.scale_error:
@@ -179,7 +182,8 @@ class MllmReader:
         kind = _kind(given, identified)
         others: tuple[str, ...] = ()
         if identified is not None and bbox is None:
-            others = tuple(dict.fromkeys((*names_of(identified.changes, name), *identified.others)))
+            moving = (each.object for each in identified.legs.also)
+            others = tuple(dict.fromkeys((*names_of(identified.changes, name), *moving, *identified.others)))
         wants_direction = given.motion_wanted and kind in DIRECTED_KINDS
         wants_place = bbox is None or wants_direction
         wants_scale = given.motion_wanted and kind in FALLING_KINDS
@@ -195,7 +199,7 @@ class MllmReader:
             raise located
         line = Line() if located is None or located.line is None else located.line
         scale = scaled if isinstance(scaled, Scaled) else Scaled()
-        lengths = Lengths() if identified is None else identified.lengths
+        lengths, legs = (NOT_SAID, NO_LEGS) if identified is None else (identified.lengths, identified.legs)
         return located, MotionHints(
             kind=kind,
             sentence=identified.sentence if identified else None,
@@ -206,6 +210,8 @@ class MllmReader:
             distance=lengths.distance,
             duration=lengths.duration,
             until=lengths.until,
+            then=legs.then,
+            also=legs.also,
             cue=line.cue,
             along_arrow=line.along_arrow,
             metres_per_pixel=scale.metres_per_pixel,
@@ -222,7 +228,9 @@ class MllmReader:
                 f"{self._subject} found nothing in the image or the question that tells which way the "
                 f"{grounding.object} moves. {GIVE_DIRECTION}"
             )
-        reading = replace(reading, distance=hints.distance, duration=hints.duration, until=hints.until)
+        reading = replace(
+            reading, distance=hints.distance, duration=hints.duration, until=hints.until, steps=hints.then
+        )
         if isinstance(hints.speed, Quantity):
             reading = replace(reading, speed=hints.speed)
         elif hints.speed is not None:
