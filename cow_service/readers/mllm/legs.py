@@ -77,7 +77,7 @@ def _listed(held: object) -> list[object]:
     return cast("list[object]", held)[:MAX_LEGS] if isinstance(held, list) else [] if held is None else [held]
 
 
-def _way(fields: Mapping[str, Any]) -> tuple[Vector, float] | None:
+def _way(fields: dict[str, Any]) -> tuple[Vector, float] | None:
     said = "-".join(text_of(first_of(fields, "way", "direction")).lower().replace("the ", "").split())
     known = WAYS.get(said) or next((WAYS[key] for key in ("towards", "away") if said.startswith(key)), None)
     if known is None:
@@ -98,7 +98,7 @@ def _other(value: object) -> OtherMotionHint | None:
     fields = fields_of(value)
     name, way = text_of(first_of(fields, "object", "name", "label"))[:MAX_NAME], _way(fields)
     said = text_of(fields.get("kind")).lower()
-    kind: MotionKind = next((known for known in _KINDS if known == said), "linear")
+    kind = next((known for known in _KINDS if known == said), cast("MotionKind", "linear"))
     if not name or kind == "place" or (kind in DIRECTED_KINDS and way is None):
         return None
     direction, depth = way if way is not None and kind in DIRECTED_KINDS else (None, 0.0)
