@@ -5,13 +5,17 @@ from __future__ import annotations
 from cow_service.errors import Canceled, CowError, InvalidRequest, MllmUnavailable, ReaderUnavailable
 from cow_service.readers.question.choices import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
-from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.answering import answer_question
+from cow_service.stages.gating import ask_first, gate_of
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground, use_stored_masks
 from cow_service.stages.motion import read_motion
+from cow_service.stages.results import FirstAnswers, Verdicts
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
+
+SIMULATION_STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation")
 
 
 def simulate(run: Run[SimulateRequest]) -> Simulation:
@@ -40,21 +44,23 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
         overlay=clip.overlay,
         generator=clip.generator,
         reader=run.reader_info("grounding", "motion"),
-        usage=run.usage,
-        timings=dict(run.timings),
-        reused=tuple(run.reused),
+        **run.accounts(*SIMULATION_STAGES),
         warnings=run.warnings("grounding", "motion", "trajectory"),
     )
 
 
 def answer(run: Run[AnswerRequest]) -> Answer:
-    """Imagines, unless the request says never, then answers.
+    """Imagines, unless the request says never or the gate sees no need, then answers.
 
     A simulation that fails does not lose the answer: it is then given from the image alone, with a warning.
     Raises `InvalidRequest`, `Canceled`, `ReaderUnavailable`, `MllmBadReply`, `MllmUnavailable`.
     """
-    simulation, failure = _imagine(run) if run.request.imagine == "always" else (None, None)
-    verdicts = run.stage("answering", answer_question, run.grounding, simulation)
+    request = run.request
+    first = run.stage("gating", ask_first) if request.imagine == "auto" else None
+    gate = None if first is None else gate_of(first, request.imagine_threshold)
+    wanted = request.imagine == "always" if gate is None else gate.imagined
+    simulation, failure = _imagine(run) if wanted else (None, None)
+    verdicts, warnings = _verdicts(run, first, simulation)
     return Answer(
         **dict(verdicts.verdict),
         id=run.id,
@@ -65,13 +71,23 @@ def answer(run: Run[AnswerRequest]) -> Answer:
         image=run.image.info,
         simulation=simulation,
         simulation_problem=None if failure is None else Problem(**failure.as_problem()),
+        gate=gate,
         baseline=verdicts.baseline,
-        reader=run.reader_info("grounding", "motion", "answering"),
-        usage=run.usage,
-        timings=dict(run.timings),
-        reused=tuple(run.reused),
-        warnings=(*_not_imagined(failure), *run.warnings("answering")),
+        reader=run.reader_info("gating", "grounding", "motion", "answering"),
+        **run.accounts("gating", *SIMULATION_STAGES, "answering"),
+        warnings=(*_not_imagined(failure), *warnings),
     )
+
+
+def _verdicts(
+    run: Run[AnswerRequest], first: FirstAnswers | None, simulation: Simulation | None
+) -> tuple[Verdicts, tuple[str, ...]]:
+    """The answer and its warnings. Where there is nothing to look at it is that of the gate: asked once is enough."""
+    if simulation is None and first is not None and first.verdict is not None:
+        baseline = first.verdict if run.request.baseline else None
+        return Verdicts(verdict=first.verdict, baseline=baseline), run.warnings("gating")
+    verdicts = run.stage("answering", answer_question, run.grounding, simulation, first)
+    return verdicts, run.warnings("answering")
 
 
 def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, CowError | None]:

@@ -554,7 +554,7 @@ def test_what_is_wrong_with_the_request_is_not_fallen_back_from(service: Service
         ({"options": [{"letter": "A", "text": "Yes"}, "No"]}, "valid"),
         ({"votes": 0}, "greater than or equal to 1"),
         ({"votes": 33}, "less than or equal to 32"),
-        ({"imagine": "maybe"}, "'always' or 'never'"),
+        ({"imagine": "maybe"}, "'always', 'auto' or 'never'"),
     ],
 )
 def test_requests_that_cannot_be_meant(body, told: str) -> None:

@@ -564,6 +564,23 @@ def test_one_key_is_one_job(client: Any, connect: Connect) -> None:
     assert not client.simulate(IMAGE, QUESTION, fresh=True, **SMALL).reused
 
 
+def test_minimal_results_lack_the_long_lists_alone(client: Any, address: str, tmp_path: Path) -> None:
+    whole = client.simulate(IMAGE, QUESTION, **SMALL)
+    lean = [
+        client.simulate(IMAGE, QUESTION, minimal=True, **SMALL),
+        client.simulate(IMAGE, QUESTION, minimal=True, progress=lambda job: None, **SMALL),
+        client.submit(IMAGE, QUESTION, **SMALL).wait(minimal=True),
+    ]
+    with Client(address) as plain:
+        (outcome,) = plain.map([(IMAGE, QUESTION)], kind="simulate", out=tmp_path, minimal=True, **SMALL)
+    assert whole.trajectory.path.states
+    for told in (*lean, outcome.result):
+        assert (told.trajectory.path.states, told.trajectory.path.tracks) == ((), ())
+        assert (told.trajectory.path.points, told.frames) == (whole.trajectory.path.points, whole.frames)
+    (line,) = (tmp_path / "results.jsonl").read_text().splitlines()
+    assert json.loads(line)["result"]["trajectory"]["paths"][0]["tracks"] == []
+
+
 # --- progress, and callers who leave ---
 
 

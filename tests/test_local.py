@@ -318,6 +318,12 @@ def test_a_seed_gives_the_same_reply_in_any_company(toy: LocalModel) -> None:
     assert len({text(found) for found in unseeded}) > 1
 
 
+def test_only_full_precision_promises_the_same_reply(toy: LocalModel) -> None:
+    assert toy.deterministic
+    model, processor = make_tiny(load_manifests()[NAME].architecture)
+    assert not LocalModel("half", BatchGenerator(model.to(torch.bfloat16), processor)).deterministic
+
+
 def test_a_checkpoints_own_advice_counts_where_nothing_is_said() -> None:
     model, processor = make_tiny(load_manifests()[NAME].architecture)
     model.generation_config.update(do_sample=True, temperature=0.7, top_p=0.8, top_k=20)

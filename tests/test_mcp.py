@@ -273,7 +273,9 @@ def test_the_server_introduces_itself_and_its_tools(here: tuple[Session, Path]) 
     given |= {"distance", "duration", "until", "remove", "place"}
     given |= {"law", "objects", "frames_policy", "frames_count", "generator", "reader"}
     assert set(tools["simulate"].input_schema["properties"]) == given | {"video"}
-    assert set(tools["answer"].input_schema["properties"]) == given | {"options", "votes", "baseline"}
+    assert set(tools["answer"].input_schema["properties"]) == given | {
+        "options", "votes", "baseline", "imagine", "imagine_votes", "imagine_threshold"
+    }  # fmt: skip
 
 
 def test_simulate_over_stdio_returns_pictures_words_and_data(here: tuple[Session, Path]) -> None:

@@ -32,6 +32,7 @@ from cow_service.errors import ReaderUnavailable
 from cow_service.media.images import encode_png
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.mllm.answer import read_answer
+from cow_service.readers.mllm.client import seed_of_vote
 from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.identify import read_identified
 from cow_service.readers.mllm.locate import read_located
@@ -691,7 +692,7 @@ def test_votes_are_counted_and_a_tie_is_told(mllm: MllmServer, make) -> None:
     told = _vote(mllm, make, ["A", "B"])
     assert told["votes"] == {"A": 1, "B": 1}
     assert "tied" in told["warnings"][0]
-    assert {call["seed"] for call in mllm.asked} == {0, 1}
+    assert {call["seed"] for call in mllm.asked} == {seed_of_vote(0, 0), seed_of_vote(0, 1)}
     assert {call["temperature"] for call in mllm.asked} == {0.7}
 
 
@@ -704,13 +705,25 @@ def test_a_vote_that_cannot_be_read_does_not_count(mllm: MllmServer, make) -> No
 def _vote(mllm: MllmServer, make, answers: list[str]) -> dict[str, Any]:
     """Each vote has its seed, which says what it gets, however often it is asked again."""
 
+    seeds = [seed_of_vote(0, vote) for vote in range(len(answers))]
+
     def reply(handler) -> None:
-        seed = mllm.asked[-1]["seed"]
-        handler.send(200, say.completion(json.dumps({"answer": answers[seed]})))
+        vote = seeds.index(mllm.asked[-1]["seed"])
+        handler.send(200, say.completion(json.dumps({"answer": answers[vote]})))
 
     mllm.say(reply)
     service = make(mllm_concurrency=1)
-    return post(service, "/answer", image=blank(64, 64), question=OPTIONS, imagine="never", votes=len(answers))
+    body = {"image": blank(64, 64), "question": OPTIONS, "imagine": "never", "votes": len(answers), "seed": 0}
+    return post(service, "/answer", **body)
+
+
+def test_requests_with_other_seeds_have_no_votes_in_common_and_without_a_seed_none_is_sent(mllm, make) -> None:
+    seeds = [seed_of_vote(seed, vote) for seed in range(20) for vote in range(32)]
+    assert len(set(seeds)) == len(seeds)
+    assert [seed_of_vote(seed, 0) for seed in (0, 7)] == [0, 7]
+    mllm.say('{"answer": "B"}')
+    post(make(), "/answer", image=blank(64, 64), question=OPTIONS, imagine="never", votes=3)
+    assert all("seed" not in call for call in mllm.asked)
 
 
 def test_the_baseline_is_asked_without_frames(mllm: MllmServer, make) -> None:

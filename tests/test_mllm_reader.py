@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 
 import mllm_server as say
 import pytest
@@ -15,6 +16,7 @@ from mllm_server import MllmServer
 from cow_service.errors import Canceled, CannotReadDirection, MllmUnavailable, ObjectNotFound
 from cow_service.readers.base import CallLog, MotionHints, Quantity, ReaderInput
 from cow_service.readers.mllm.changes import read_changes
+from cow_service.readers.mllm.client import MllmClient
 from cow_service.readers.mllm.reader import MllmReader, create
 from cow_service.records import Grounding
 from cow_service.settings import Settings
@@ -153,6 +155,28 @@ def test_a_motion_that_the_request_gives_is_not_asked_for(mllm: MllmServer, read
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
     assert reader.ground(ReaderInput(scene, QUESTION, motion_wanted=False)).hints is None
     assert "direction" not in mllm.asked[-1]["response_format"]["json_schema"]["schema"]["properties"]
+
+
+@pytest.mark.parametrize(
+    ("deterministic", "defaults", "votes", "repeats"),
+    [
+        (False, {"temperature": 0}, 1, False),  # no provider promises the same reply
+        (True, {"temperature": 0}, 1, True),
+        (True, {"temperature": 0}, 3, False),  # votes are drawn
+        (True, {"temperature": 0.2}, 1, False),
+        (True, {}, 1, False),
+    ],
+)
+def test_answers_are_the_same_each_time_of_a_deterministic_model_at_temperature_0_alone(
+    deterministic: bool, defaults: dict[str, float], votes: int, repeats: bool, reader: MllmReader, mllm: MllmServer
+) -> None:
+    model = reader._client.model
+    manifest = model.manifest.model_copy(update={"defaults": defaults})
+    client = MllmClient(replace(model, manifest=manifest, deterministic=deterministic), Settings())
+    try:
+        assert MllmReader("local", client).repeats_answers(votes) is repeats
+    finally:
+        client.close()
 
 
 def test_calls_that_fail_count_too(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:

@@ -14,10 +14,10 @@ from runs import run_of
 from cow_service.errors import InvalidRequest
 from cow_service.readers.base import MotionReading
 from cow_service.records import Contact, Encounter, Grounding, Motion, Path, Trajectory
-from cow_service.requests import FramesRequest, SimulateRequest, TrajectoryRequest
+from cow_service.requests import AnswerRequest, FramesRequest, SimulateRequest, TrajectoryRequest
 from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
-from cow_service.stages.keys import key_of
+from cow_service.stages.keys import KEY_FIELDS, key_of
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import trajectory_of
 from cow_service.vision.masks import CroppedMask
@@ -310,9 +310,12 @@ def test_a_reader_is_asked_where_the_request_is_silent(scene: Scene) -> None:
 class TestKeys:
     """What decides a stage's key, and what does not."""
 
-    def key(self, scene: Scene, stage="generation", inputs=(), identity=lambda role: {"name": role}, **request):
+    def key(
+        self, scene: Scene, stage="generation", inputs=(), identity=lambda role: {"name": role}, repeats=True, **request
+    ):
         one = run(scene, **request)
-        return key_of(stage, one.image.info.sha256, one.request, inputs, identity)
+        one.request = AnswerRequest.model_validate(one.request.model_dump())
+        return key_of(stage, one.image.info.sha256, one.request, inputs, identity, lambda votes: repeats)
 
     def test_another_wording_renders_no_clip_again(self, scene: Scene) -> None:
         assert self.key(scene, question="a") == self.key(scene, question="b")
@@ -351,3 +354,8 @@ class TestKeys:
         assert not one.shareable
         assert one.digest != other.digest
         assert self.key(scene).shareable
+
+    def test_sampled_answers_are_not_shared_and_what_was_seen_is(self, scene: Scene) -> None:
+        shared = {stage: self.key(scene, stage, repeats=False).shareable for stage in KEY_FIELDS}
+        assert shared == {stage: stage not in ("gating", "answering") for stage in KEY_FIELDS}
+        assert all(self.key(scene, stage).shareable for stage in KEY_FIELDS)

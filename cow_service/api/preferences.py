@@ -13,6 +13,9 @@ MAX_WAIT_SECONDS = 600
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
 
 
+MINIMAL_APPLIED = {"Preference-Applied": "return=minimal"}
+
+
 @dataclass(frozen=True)
 class Preferences:
     """How a caller wants to be answered."""
@@ -21,10 +24,11 @@ class Preferences:
     wait: int | None = None  # seconds
     key: str | None = None  # the idempotency key
     fresh: bool = False  # no results of earlier requests
+    minimal: bool = False  # results without their long lists
 
     @property
     def applied(self) -> str:
-        """`Preference-Applied` of the response."""
+        """`Preference-Applied` of a response that is the job."""
         applied = ("respond-async",) if self.respond_async else ()
         return ", ".join(applied if self.wait is None else (*applied, f"wait={self.wait}"))
 
@@ -49,4 +53,5 @@ def preferences_of(headers: Headers) -> Preferences:
         wait=min(int(wait), MAX_WAIT_SECONDS) if wait.isascii() and wait.isdigit() else None,
         key=key,
         fresh=bool(cached & {"no-cache", "no-store"}),
+        minimal=stated.get("return", "").lower() == "minimal",
     )

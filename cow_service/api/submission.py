@@ -13,7 +13,8 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Request, Response
 
 from cow_service.api.body import Body, parse, receive
-from cow_service.api.preferences import Preferences, preferences_of
+from cow_service.api.minimal import minimal_result
+from cow_service.api.preferences import MINIMAL_APPLIED, Preferences, preferences_of
 from cow_service.errors import Canceled, CowError, JobNotFound
 from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
@@ -53,7 +54,7 @@ class Submission:
     @property
     def may_return(self) -> bool:
         """Whether a header says that the caller may ask for the job later."""
-        return self.prefer != Preferences(fresh=self.prefer.fresh)
+        return self.prefer != Preferences(fresh=self.prefer.fresh, minimal=self.prefer.minimal)
 
 
 @dataclass
@@ -73,7 +74,11 @@ class Submitter:
         submission = self.submission(request, kind)
         raw = await receive(request)
         result = await self.result(request, submission, lambda: parse(raw, model, self.engine.service))
-        return await self.accepted(submission) if result is None else json_response(result)
+        if result is None:
+            return await self.accepted(submission)
+        if not submission.prefer.minimal:
+            return json_response(result)
+        return json_response(await to_thread.run_sync(minimal_result, result), headers=MINIMAL_APPLIED)
 
     def submission(self, request: Request, kind: JobKind) -> Submission:
         """What the request's headers say. Raises `QueueFull` and `ShuttingDown` where no job can be taken."""

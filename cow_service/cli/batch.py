@@ -50,6 +50,10 @@ def batch(
         float | None, typer.Option(min=0.001, help="Longest wait for one question, s.", show_default="none")
     ] = None,
     save: Annotated[bool, typer.Option("--save", help="Keep the pictures of each in OUT/items.")] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Draw everything afresh: take no results of earlier requests.")
+    ] = False,
+    minimal: Annotated[bool, typer.Option("--minimal", help="Leave out the long lists of trajectories.")] = False,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Ask those again that failed.")] = False,
     url: Annotated[
         str | None, typer.Option(help="The server.", show_default="COW_BASE_URL, http://127.0.0.1:8000")
@@ -73,6 +77,8 @@ def batch(
             concurrency=concurrency,
             timeout=timeout,
             save=save,
+            fresh=fresh,
+            minimal=minimal,
             retry_failed=retry_failed,
         )
     except KeyboardInterrupt:
@@ -186,18 +192,29 @@ def _check(question: Question, kind: JobKind) -> None:
 
 def _print_summary(out: Path) -> int:
     """Prints what the folder holds of the batch; returns the exit code."""
+    from cow_service.client.wording import asked_words  # noqa: PLC0415
+    from cow_service.records import Usage  # noqa: PLC0415
+
     results = out / "results.jsonl"
     codes: Counter[str] = Counter()
     failures: list[str] = []
     count = without_simulation = 0
+    usage = total = Usage()
     with results.open("rb") as lines:
         for line in map(json.loads, lines):
             count += 1
+            if line["status"] == "succeeded":
+                cost = Usage.model_validate(line["result"]["usage"])
+                usage += cost
+                total += Usage.model_validate(line["result"].get("usage_total", cost))
             without_simulation += "result" in line and line["result"].get("simulation", ...) is None
             if line["status"] == "failed":
                 code = line["problem"]["code"]
                 codes[code] += 1
                 failures.append(f"  {line['id']}: {code}: {line['problem']['detail']}")
+    if total.calls:
+        saved = "" if usage == total else f"; without reuse {asked_words(total)}"
+        typer.echo(f"asked of the MLLM: {asked_words(usage)}{saved}")
     without = f" ({without_simulation} without a simulation)" if without_simulation else ""
     typer.echo(f"{count - len(failures)} succeeded{without}, {len(failures)} failed: {results}")
     if not failures:

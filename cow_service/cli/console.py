@@ -15,7 +15,7 @@ from rich.table import Table
 
 from cow_service.cli.errors import HINTS
 from cow_service.cli.options import read_file
-from cow_service.client.wording import contacts_words, encounters_words, outcome_words
+from cow_service.client.wording import asked_words, contacts_words, encounters_words, gate_words, outcome_words
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.images import DecodedImage
 from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Verdict
@@ -203,9 +203,10 @@ def _answer_table(answer: Answer) -> Table:
         table.add_row("votes", _votes(answer))
     if answer.baseline is not None:
         table.add_row("without frames", f"{_verdict(answer.baseline)}, votes {_votes(answer.baseline)}")
-    usage = answer.usage
-    asked = f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out" if usage.calls else "none"
-    table.add_row("tokens", asked)
+    if answer.gate is not None:
+        table.add_row("before looking", escape(gate_words(answer.gate)))
+    usage, total = answer.usage, answer.usage_total
+    table.add_row("tokens", asked_words(usage) + ("" if usage == total else f"; without reuse {asked_words(total)}"))
     table.add_row("time", f"{sum(answer.timings.values()):.2f} s")
     model = answer.reader.model
     table.add_row("reader", escape(answer.reader.name if model is None else f"{answer.reader.name} ({model})"))

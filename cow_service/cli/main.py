@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -87,7 +87,15 @@ def answer(
             show_default="those in the question",
         ),
     ] = None,
-    imagine: Annotated[bool, typer.Option(help="Simulate first, or answer from the image alone.")] = True,
+    imagine: Annotated[
+        Literal["always", "auto", "never"],
+        typer.Option(help="Simulate first; auto: only where answers from the image alone disagree or are not sure."),
+    ] = "always",
+    no_imagine: Annotated[bool, typer.Option("--no-imagine", help="The same as --imagine never.")] = False,
+    imagine_votes: Annotated[int, typer.Option(help="Of --imagine auto: votes before anything is imagined.")] = 3,
+    imagine_threshold: Annotated[
+        float, typer.Option(help="Of --imagine auto: share of them that agrees, for nothing to be imagined.")
+    ] = 1.0,
     votes: Annotated[int, typer.Option(help="How often to ask; the most frequent answer is taken.")] = 1,
     baseline: Annotated[bool, typer.Option("--baseline", help="Answer without frames, too, for comparison.")] = False,
     out: Annotated[
@@ -107,7 +115,9 @@ def answer(
         **request,
         "question": question,
         "options": choice,
-        "imagine": "always" if imagine else "never",
+        "imagine": "never" if no_imagine else imagine,
+        "imagine_votes": imagine_votes,
+        "imagine_threshold": imagine_threshold,
         "votes": votes,
         "baseline": baseline,
         "video": out is not None,

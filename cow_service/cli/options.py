@@ -77,7 +77,9 @@ def request_body(
     ] = None,
     num_frames: Annotated[int, typer.Option(help="Frames of the clip.")] = 81,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 16,
-    seed: Annotated[int, typer.Option(help="For what draws random numbers.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(help="For what draws random numbers.", show_default="0, and none for an MLLM")
+    ] = None,
     frames: Annotated[Policy, typer.Option(help="Which frames to keep as pictures.")] = "initial",
     count: Annotated[int, typer.Option(help="How many of them.")] = 3,
     max_side: Annotated[int, typer.Option(help="Their longest side, px; 0 for the clip's own size.")] = 512,

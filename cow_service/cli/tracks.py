@@ -40,6 +40,8 @@ def export_tracks(
         record = Simulation.model_validate_json(simulation.read_bytes())
     except ValidationError as error:
         raise _invalid(f"{simulation.name} is not a simulation", error, "the file") from error
+    if not record.trajectory.path.states:
+        raise InvalidRequest(f"{simulation.name} is a minimal result, without tracks: get it without `return=minimal`.")
     tracks = tracks_of(record.trajectory, record.image.width, record.image.height)
     written = _written(out, lambda: write_tracks(tracks, out))
     still = len(record.trajectory.anchors)

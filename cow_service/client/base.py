@@ -89,15 +89,17 @@ class BaseClient(
         progress: ProgressLike = False,
         idempotency_key: str | None = None,
         fresh: bool = False,
+        minimal: bool = False,
         **options: Unpack[SimulateOptions],
     ) -> SimulationT:
         """Imagines the future of an image.
 
         `image` is a path, bytes, a PIL image, an array (height, width, 3) of uint8, a URL, or an artifact. `timeout` is
-        in seconds, for everything together. `fresh` takes no results of earlier requests. An interrupt cancels the job.
-        Raises the errors of `errors.py`, `WaitTimeout` among them.
+        in seconds, for everything together. `fresh` takes no results of earlier requests; `minimal` leaves out the long
+        lists of the trajectory (`states`, `tracks`, `band`...). An interrupt cancels the job. Raises the errors of
+        `errors.py`, `WaitTimeout` among them.
         """
-        return self._completed("simulate", image, question, options, timeout, progress, idempotency_key, fresh)
+        return self._completed("simulate", image, question, options, timeout, progress, idempotency_key, fresh, minimal)
 
     def answer(
         self,
@@ -108,10 +110,11 @@ class BaseClient(
         progress: ProgressLike = False,
         idempotency_key: str | None = None,
         fresh: bool = False,
+        minimal: bool = False,
         **options: Unpack[AnswerOptions],
     ) -> AnswerT:
         """Imagines the future of an image, looks at it, then answers. Arguments and errors as for `simulate`."""
-        return self._completed("answer", image, question, options, timeout, progress, idempotency_key, fresh)
+        return self._completed("answer", image, question, options, timeout, progress, idempotency_key, fresh, minimal)
 
     @overload
     def submit(
@@ -163,6 +166,7 @@ class BaseClient(
         save: bool = False,
         timeout: float | None = None,
         fresh: bool = False,
+        minimal: bool = False,
         progress: bool = False,
         **options: Unpack[AnswerOptions],
     ) -> AnswersT: ...
@@ -180,6 +184,7 @@ class BaseClient(
         save: bool = False,
         timeout: float | None = None,
         fresh: bool = False,
+        minimal: bool = False,
         progress: bool = False,
         **options: Unpack[SimulateOptions],
     ) -> SimulationsT: ...
@@ -196,6 +201,7 @@ class BaseClient(
         save: bool = False,
         timeout: float | None = None,
         fresh: bool = False,
+        minimal: bool = False,
         progress: bool = False,
         **options: Any,
     ) -> Any:
@@ -208,7 +214,8 @@ class BaseClient(
 
         With `out` every outcome is a line of `results.jsonl` in that folder, and the same call resumes a batch that was
         killed: nothing is asked twice. Earlier outcomes come last, or not at all with `only_new`. `retry_failed` asks
-        those again that failed. `save` writes the pictures of each into `items/` there.
+        those again that failed. `save` writes the pictures of each into `items/` there, and `minimal` keeps the lines
+        small.
 
         >>> question = "If the yellow ball falls, will it hit the blue mug?"
         >>> questions = [{"id": "q1", "image": "image.jpg", "question": question}]
@@ -217,7 +224,7 @@ class BaseClient(
         """
         from cow_service.client.batches import Batch, BatchOptions  # noqa: PLC0415 - not needed to call a server once
 
-        settings = BatchOptions(kind, concurrency, timeout, fresh, out, retry_failed, only_new, save, progress)
+        settings = BatchOptions(kind, concurrency, timeout, fresh, minimal, out, retry_failed, only_new, save, progress)
         return self._connection.map(Batch(self._connection, questions, options, settings))
 
     def job(self, id: str) -> HandleT:

@@ -143,6 +143,7 @@ class BatchOptions:
     concurrency: int
     timeout: float | None
     fresh: bool
+    minimal: bool
     out: str | PathLike[str] | None
     retry_failed: bool
     only_new: bool
@@ -251,9 +252,9 @@ class Batch:
 
         Raises `ImageUnreadable` where its file cannot be read, and `InvalidRequest` where its image is none.
         """
-        fresh = self._options.fresh
+        kind, fresh, minimal = self._options.kind, self._options.fresh, self._options.minimal
         try:
-            request = job_request(self._options.kind, question.image, question.question, question.options, None, fresh)
+            request = job_request(kind, question.image, question.question, question.options, None, fresh, minimal)
         except OSError as error:
             raise ImageUnreadable(f"'{question.image}' cannot be read: {error.strerror or error}.") from error
         if self._journal is None:

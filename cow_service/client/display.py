@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from cow_service.client.wording import contacts_words, encounters_words, outcome_words
+from cow_service.client.wording import contacts_words, encounters_words, gate_words, outcome_words
 from cow_service.records import Answer, Frame, Simulation, Verdict
 
 if TYPE_CHECKING:
@@ -67,6 +67,8 @@ def answer_html(answer: Answer, get: GetBytes) -> str:
     if sum(answer.votes.values()) > 1:
         votes = ", ".join(f"{name} {count}" for name, count in answer.votes.items())
         parts.append(f'<div style="{_DIM}">votes: {escape(votes)}</div>')
+    if answer.gate is not None:
+        parts.append(f'<div style="{_DIM}">before looking: {escape(gate_words(answer.gate))}</div>')
     if answer.baseline is not None:
         parts.append(f'<div style="{_DIM}">without frames: {escape(describe_answer(answer.baseline))}</div>')
     if answer.simulation is not None:

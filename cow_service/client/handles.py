@@ -37,12 +37,14 @@ class BaseJobHandle(Generic[ResultT_co, JobT_co, NoneT_co, EventsT_co]):
         """Gets the state of the job. Raises `JobNotFound` where it was deleted."""
         return self._connection.run(self._connection.refresh(self))
 
-    def wait(self, timeout: float | None = None, *, progress: ProgressLike = False) -> ResultT_co:
-        """The job's result, once it has ended.
+    def wait(
+        self, timeout: float | None = None, *, progress: ProgressLike = False, minimal: bool = False
+    ) -> ResultT_co:
+        """The job's result, once it has ended; `minimal` as for `Client.simulate`.
 
         Raises what it failed with (`errors.py`), `Canceled`, and `WaitTimeout` after `timeout` seconds.
         """
-        return self._connection.run(self._connection.wait(self, timeout, progress))
+        return self._connection.run(self._connection.wait(self, timeout, progress, minimal))
 
     def cancel(self) -> JobT_co:
         """Cancels the job; work on it stops at the next step. One that has ended stays as it is."""

@@ -18,6 +18,7 @@ from cow_service.client.steps import Send
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.records import JobKind
 
+MINIMAL = "return=minimal"  # the preference of RFC 7240
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
 
 
@@ -30,17 +31,24 @@ class JobRequest:
     media_type: str
     key: str
     fresh: bool = False
+    minimal: bool = False  # the result without its long lists
 
     def send(self, prefer: str, limit: float | None = None) -> Send:
         """The step that sends it."""
-        headers = {"Idempotency-Key": self.key, "Prefer": prefer}
+        headers = {"Idempotency-Key": self.key, "Prefer": f"{prefer}, {MINIMAL}" if self.minimal else prefer}
         if self.fresh:
             headers["Cache-Control"] = "no-cache"
         return Send("POST", f"/{self.kind}", headers, {}, self.content, self.media_type, limit)
 
 
 def job_request(
-    kind: JobKind, image: ImageLike, question: str, options: Mapping[str, Any], key: str | None, fresh: bool
+    kind: JobKind,
+    image: ImageLike,
+    question: str,
+    options: Mapping[str, Any],
+    key: str | None,
+    fresh: bool,
+    minimal: bool = False,
 ) -> JobRequest:
     """A request for work; without a key it gets a random one.
 
@@ -57,7 +65,7 @@ def job_request(
     except UnicodeEncodeError as error:
         detail = f"holds half of a surrogate pair ({error.object[error.start]!r}), which is no text"
         raise InvalidRequest(f"The request {detail}.", errors=(FieldError("", detail),)) from error
-    return JobRequest(kind, content, media_type, key or secrets.token_urlsafe(18), fresh)
+    return JobRequest(kind, content, media_type, key or secrets.token_urlsafe(18), fresh, minimal)
 
 
 def _body_of(sent: Upload | Reference, question: str, rest: Mapping[str, Any]) -> tuple[bytes, str]:

@@ -24,7 +24,7 @@ from cow_service.client.errors import (
 )
 from cow_service.client.events import EventCursor
 from cow_service.client.inputs import ImageLike
-from cow_service.client.job_request import JobRequest, job_request
+from cow_service.client.job_request import MINIMAL, JobRequest, job_request
 from cow_service.client.progress import ProgressLike, reporting
 from cow_service.client.retries import pause_before_retry
 from cow_service.client.serialization import job_in, object_in, plain, read
@@ -87,9 +87,10 @@ class Operations:
         progress: ProgressLike,
         key: str | None,
         fresh: bool,
+        minimal: bool,
     ) -> Steps[Any]:
         """The result of a request. A caller who leaves in between cancels its job."""
-        request = job_request(kind, image, question, options, key, fresh)
+        request = job_request(kind, image, question, options, key, fresh, minimal)
         server_wait = self.endpoint.server_wait(timeout) if progress is False else 0
         with reporting(progress) as on_update:
             return (yield from self.complete_request(request, server_wait, timeout, on_update))
@@ -116,7 +117,7 @@ class Operations:
             if response.status_code != ACCEPTED:
                 return self.result(request.kind, object_in(response))
             job_id = job_in(response).id
-            return (yield from self._poll(job_id, timeout, until, on_update))
+            return (yield from self._poll(job_id, timeout, until, on_update, request.minimal))
         except (CowError, GeneratorExit):
             raise
         except BaseException:
@@ -153,7 +154,7 @@ class Operations:
         """Removes a job and what only it holds."""
         yield from self._exchange(Send("DELETE", _path(handle.id)))
 
-    def wait(self, handle: Any, timeout: float | None, progress: ProgressLike) -> Steps[Any]:
+    def wait(self, handle: Any, timeout: float | None, progress: ProgressLike, minimal: bool) -> Steps[Any]:
         """The result of a job; the handle holds the job's last known state."""
         with reporting(progress) as report:
 
@@ -162,7 +163,7 @@ class Operations:
                 if report is not None:
                     report(job)
 
-            return (yield from self._poll(handle.id, timeout, _deadline(timeout), on_update))
+            return (yield from self._poll(handle.id, timeout, _deadline(timeout), on_update, minimal))
 
     def page_of_jobs(self, filters: Mapping[str, Any], cursor: str | None) -> Steps[JobPage]:
         """Some jobs, and the cursor of the next ones."""
@@ -206,11 +207,14 @@ class Operations:
             raise error_of(outcome)
         return outcome
 
-    def _poll(self, job_id: str, timeout: float | None, until: float | None, on_update: OnUpdate | None) -> Steps[Any]:
+    def _poll(
+        self, job_id: str, timeout: float | None, until: float | None, on_update: OnUpdate | None, minimal: bool
+    ) -> Steps[Any]:
         """The result of a job, once it has ended. Raises what it failed with, and `WaitTimeout` after `until`."""
         pause = FIRST_POLL_SECONDS
+        send = Send("GET", _path(job_id), {"Prefer": MINIMAL} if minimal else {})
         while True:
-            response = yield from self._exchange(Send("GET", _path(job_id)), until)
+            response = yield from self._exchange(send, until)
             job = job_in(response)
             if on_update is not None:
                 on_update(job)

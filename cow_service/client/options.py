@@ -44,7 +44,7 @@ class SimulateOptions(TypedDict, total=False):
     generator: str | None
     num_frames: int
     fps: float
-    seed: int
+    seed: int | None
     video: bool
     frames: FramesRequest | Given
     generator_options: Given
@@ -54,6 +54,8 @@ class SimulateOptions(TypedDict, total=False):
 class AnswerOptions(SimulateOptions, total=False):
     """As for a simulation, and how to answer from it."""
 
-    imagine: Literal["always", "never"]
+    imagine: Literal["always", "auto", "never"]
+    imagine_votes: int
+    imagine_threshold: float
     baseline: bool
     votes: int

@@ -1,10 +1,23 @@
-"""What a trajectory comes to, in words: encounters, contacts, the outcome, and how sure each is."""
+"""What a result comes to, in words: encounters, contacts, the outcome, how sure each is, and what was asked for it."""
 
 from __future__ import annotations
 
-from cow_service.records import MEETINGS, Contact, Encounter, Outcome, Trajectory
+from cow_service.records import MEETINGS, Contact, Encounter, Gate, Outcome, Trajectory, Usage
 
 MAX_CONTACTS = 6  # that are told
+
+
+def asked_words(usage: Usage) -> str:
+    """What a multimodal LLM was asked."""
+    if not usage.calls:
+        return "none"
+    return f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out"
+
+
+def gate_words(gate: Gate) -> str:
+    """What was answered before looking, and what came of it."""
+    votes = ", ".join(f"{name} {count}" for name, count in gate.votes.items()) or "no vote"
+    return f"{votes} of {gate.asked}; {gate.reason}: {'imagined' if gate.imagined else 'not imagined'}"
 
 
 def worlds(probability: float) -> str:

@@ -19,7 +19,7 @@ from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.state import JobState
 from cow_service.records import TERMINAL, Job
 
-NUMBERED_STAGES = ("grounding", "generation", "answering")  # motion and trajectory take milliseconds
+NUMBERED_STAGES = ("gating", "grounding", "generation", "answering")  # motion and trajectory take milliseconds
 QUEUED, RUNNING, FIRST_STAGE, END = 1, 2, 3, 100
 POLL_SECONDS = 1.0  # another process may run the job
 

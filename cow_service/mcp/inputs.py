@@ -160,6 +160,19 @@ class AnswerInput(ToolInput):
     votes: int | None = Field(
         default=None, description="Ask so often and take the most frequent answer; by default 1, at most 32."
     )
+    imagine: Literal["always", "auto", "never"] | None = Field(
+        default=None,
+        description="always (the default); never: answer from the image alone; auto: imagine only where the first "
+        "answers from the image alone disagree, or are not sure.",
+    )
+    imagine_votes: int | None = Field(
+        default=None, description="With `imagine` auto: how often to ask first; by default 3."
+    )
+    imagine_threshold: Number | None = Field(
+        default=None,
+        description="With `imagine` auto: the share of those votes that must agree for nothing to be imagined; by "
+        "default 1.",
+    )
     baseline: bool | None = Field(default=None, description="Answer without imagined frames, too, for comparison.")
     frames_policy: FramePolicy | None = Field(
         default=None,
@@ -169,7 +182,8 @@ class AnswerInput(ToolInput):
 
     def request_fields(self) -> dict[str, Any]:
         """The same, and how to answer."""
-        return super().request_fields() | _given(options=self.options, votes=self.votes, baseline=self.baseline)
+        names = ("options", "votes", "imagine", "imagine_votes", "imagine_threshold", "baseline")
+        return super().request_fields() | _given(**{name: getattr(self, name) for name in names})
 
 
 Input = TypeVar("Input", bound=ToolInput)

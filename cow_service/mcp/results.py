@@ -137,12 +137,14 @@ class AnswerResult(Result):
     not_sure: bool
     reasoning: str = Field(description="The answerer's own; empty where nobody reasons.")
     votes: dict[str, int]
+    gate: records.Gate | None = Field(description="Of `imagine` auto: what decided whether to imagine.")
     baseline: Verdict | None
     warnings: list[str] = Field(description="What was assumed or could be meant otherwise.")
-    simulation: SimulateResult | None = Field(description="What was imagined; null where that failed.")
+    simulation: SimulateResult | None = Field(description="What was imagined; null where nothing was, or that failed.")
     image_sha256: str = Field(description="Give this as `image` to ask about the same image again.")
     reader: str
-    usage: Usage
+    usage: Usage = Field(description="What it cost.")
+    usage_total: Usage = Field(description="What it would have cost if nothing had been known from earlier calls.")
 
 
 def simulate_result(simulation: records.Simulation, base_url: str | None) -> SimulateResult:

@@ -92,7 +92,8 @@ Example:
 }
 TITLES: dict[ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
 OUTPUTS: dict[ToolName, type[Result]] = {"simulate": SimulateResult, "answer": AnswerResult}
-# It only looks; the same arguments come to the same result; images may be fetched, and shown to a provider's model.
+# It only looks; asking again changes nothing, though a model that samples may answer otherwise; images may be fetched,
+# and shown to a provider's model.
 HINTS = {"read_only_hint": True, "destructive_hint": False, "idempotent_hint": True, "open_world_hint": True}
 
 log = logging.getLogger("cow_service")

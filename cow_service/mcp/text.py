@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from cow_service.client.wording import worlds
+from cow_service.client.wording import gate_words, worlds
 from cow_service.mcp.results import AnswerResult, Encounter, SimulateResult, Verdict
 from cow_service.records import MEETINGS
 
@@ -21,6 +21,8 @@ def answer_text(answer: AnswerResult) -> str:
         lines.append(f"Reasoning: {answer.reasoning}")
     if sum(answer.votes.values()) > 1:
         lines.append(f"Votes: {_votes(answer.votes)}.")
+    if answer.gate is not None:
+        lines.append(f"Before looking: {gate_words(answer.gate)}.")
     if answer.baseline is not None:
         lines.append(f"Without imagined frames: {_baseline(answer.baseline)}.")
     warnings = list(answer.warnings)

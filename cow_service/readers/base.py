@@ -87,7 +87,7 @@ class ReaderInput:
 
     scene: Scene
     question: str
-    seed: int = 0
+    seed: int | None = None  # None: an MLLM is sent none, and draws as it likes
     motion_wanted: bool = True  # stage 2 is left to the reader, too
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: nobody need look for them
     calls: CallLog = field(default_factory=CallLog)
@@ -190,6 +190,13 @@ class Reader(Protocol):
     """Name, model and revision. The run adds prompts and stages."""
     fingerprint: str
     """All that decides what it reads, besides what it is given: model, revision, prompts, options."""
+
+    def repeats_answers(self, votes: int) -> bool:
+        """Whether `answer` with so many votes gives the same ones each time that it is asked the same.
+
+        Where not, its answers are samples: none is handed to two requests. Readers without this method are sampled.
+        """
+        ...
 
     def ground(self, given: ReaderInput) -> GroundingReading:
         """Which object moves and where it is. Raises `CannotGround` where that cannot be told."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
@@ -42,7 +42,7 @@ class ReaderInfo(Record):
     model: str | None = Field(default=None, description="The multimodal LLM, as it is served.")
     revision: str | None = None
     prompts: dict[str, int] = Field(default_factory=dict, description="Version of each prompt that it was sent.")
-    stages: tuple[Literal["grounding", "motion", "answering"], ...] = Field(
+    stages: tuple[Literal["gating", "grounding", "motion", "answering"], ...] = Field(
         default=(), description="The stages it was asked for; the others came with the request."
     )
 
@@ -60,6 +60,11 @@ class Usage(Record):
             input_tokens=self.input_tokens + other.input_tokens,
             output_tokens=self.output_tokens + other.output_tokens,
         )
+
+
+def _usage_of(fields: dict[str, Any]) -> Usage:
+    """The usage of a result of a version that had no total."""
+    return fields.get("usage", Usage())
 
 
 class GeneratorInfo(Record):
@@ -104,7 +109,11 @@ class Simulation(Record):
     overlay: Artifact = Field(description="The input with box, point, arrow and path drawn.")
     generator: GeneratorInfo
     reader: ReaderInfo
-    usage: Usage = Usage()
+    usage: Usage = Field(default=Usage(), description="What this request cost: not of stages that are `reused`.")
+    usage_total: Usage = Field(
+        default_factory=_usage_of,
+        description="What it would have cost without reuse; of results of earlier versions, what it cost.",
+    )
     timings: dict[str, float] = Field(description="Seconds per stage.")
     reused: tuple[str, ...] = Field(
         default=(), description="Stages whose result was found again: an earlier request had asked for the same."
@@ -170,6 +179,32 @@ class Verdict(Record):
     )
 
 
+GateReason = Literal["agreed", "disagreed", "not-sure", "unreadable"]
+
+
+class Gate(Record):
+    """What decided whether to imagine, where the request leaves that to the answers from the image alone."""
+
+    answer: str | None = Field(
+        description="The leading answer, as in `Verdict`; null where it is not sure and no option says so, or there is "
+        "none."
+    )
+    votes: dict[str, int] = Field(description="How often each was answered, as in `Verdict`.")
+    asked: int = Field(
+        ge=1, description="Votes asked for; 1 where the reader gives the same answer however often it is asked."
+    )
+    agreement: float = Field(ge=0, le=1, description="Share of the votes asked for that the leading answer has.")
+    threshold: float = Field(gt=0, le=1, description="`imagine_threshold` of the request.")
+    imagined: bool = Field(
+        description="Whether imagining followed; where that failed, `simulation_problem` says why, and the leading "
+        "answer is taken."
+    )
+    reason: GateReason = Field(
+        description="Why: agreed: the leading answer reached the threshold, and is the answer; disagreed: it did not, "
+        "or was tied; not-sure: it is that the reader is not sure; unreadable: no vote could be read."
+    )
+
+
 class Answer(Verdict):
     """The way from image and question to an answer: what `POST /answer` returns."""
 
@@ -186,9 +221,19 @@ class Answer(Verdict):
     image: ImageInfo
     simulation: Simulation | None = Field(description="Null where nothing was imagined, or that failed.")
     simulation_problem: Problem | None = Field(default=None, description="Why imagining failed, where it did.")
-    baseline: Verdict | None = Field(description="The answer without frames, where it was asked for.")
+    gate: Gate | None = Field(default=None, description="Of `imagine: auto`; else null.")
+    baseline: Verdict | None = Field(
+        description="The answer without frames, where it was asked for; of `imagine: auto`, that of the gate."
+    )
     reader: ReaderInfo
-    usage: Usage = Field(description="Of everything together: simulation, votes and baseline.")
+    usage: Usage = Field(
+        description="What this request cost, everything together: gate, simulation, votes and baseline, but not stages "
+        "that are `reused`."
+    )
+    usage_total: Usage = Field(
+        default_factory=_usage_of,
+        description="What it would have cost without reuse; of results of earlier versions, what it cost.",
+    )
     timings: dict[str, float] = Field(description="Seconds per stage.")
     reused: tuple[str, ...] = Field(
         default=(), description="Stages whose result was found again: an earlier request had asked for the same."

@@ -59,32 +59,40 @@ class Body(Record):
     confidence: float = Field(ge=0, le=1, description="How sure it is that this is one separate thing.")
 
 
+_MINIMAL = "; not in minimal results"  # `Prefer: return=minimal`
+
+
 class Path(Record):
     """What one body does, per frame of the clip."""
 
     body: int = Field(default=0, ge=0, description="Which of `Trajectory.bodies`.")
-    states: tuple[State, ...] = Field(description="[x, y, z, vx, vy, vz] per frame: the 6-D state of the body.")
+    states: tuple[State, ...] = Field(
+        default=(), description=f"[x, y, z, vx, vy, vz] per frame: the 6-D state of the body{_MINIMAL}."
+    )
     points: tuple[Point, ...] = Field(description="[x, y] per frame, px.")
     visible: tuple[bool, ...] = Field(description="Per frame: the point is inside the image.")
-    scale: tuple[float, ...] = Field(description="Per frame: apparent size, 1 at the first frame.")
+    scale: tuple[float, ...] = Field(
+        default=(), description=f"Per frame: apparent size, 1 at the first frame{_MINIMAL}."
+    )
     rotation: tuple[float, ...] = Field(
         default=(),
-        description="Per frame: degrees turned in the image since the first frame, clockwise; empty: not turned.",
+        description="Per frame: degrees turned in the image since the first frame, clockwise; empty: not turned"
+        f"{_MINIMAL}.",
     )
     band: tuple[BBox, ...] = Field(
         default=(),
         description="Per frame: [x0, y0, x1, y1], px, the 10th and 90th percentile of the point over the ensemble; "
-        "empty without one.",
+        f"empty without one{_MINIMAL}.",
     )
     moved_at: float | None = Field(default=None, ge=0, description="Seconds until it is set in motion; null: never.")
     tipped_at: float | None = Field(
         default=None, ge=0, description="Seconds until its upright axis leans by more than 45 degrees; null: never."
     )
     tracks: tuple[tuple[Point, ...], ...] = Field(
-        description="Several points inside the body's mask, each [x, y] per frame, px."
+        default=(), description=f"Several points inside the body's mask, each [x, y] per frame, px{_MINIMAL}."
     )
     tracks_visible: tuple[tuple[bool, ...], ...] | None = Field(
-        default=None, description="Per track and frame, where it was given: the point can be seen."
+        default=None, description=f"Per track and frame, where it was given: the point can be seen{_MINIMAL}."
     )
 
 

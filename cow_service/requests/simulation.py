@@ -96,7 +96,11 @@ class SimulateRequest(Record):
     generator: Name | None = Field(default=None, description="By default the server's.")
     num_frames: Whole = Field(default=81, ge=2, le=MAX_FRAMES)
     fps: Finite = Field(default=16, ge=1, le=60)
-    seed: Whole = Field(default=0, ge=0, le=2**32 - 1)
+    seed: Annotated[Whole, Field(ge=0, le=2**32 - 1)] | None = Field(
+        default=None,
+        description="Of all random numbers. By default 0 for the clip, and none for a multimodal LLM: a provider that "
+        "heeds seeds would give every repeat the same reply.",
+    )
     video: Flag = Field(default=True, description="Whether to make the mp4 of the whole clip.")
     frames: FramesRequest = FramesRequest()
     generator_options: dict[str, Any] = Field(default_factory=dict, description="As the generator defines them.")
@@ -121,6 +125,11 @@ class SimulateRequest(Record):
         needed = {"grounding"} if self.place is None else set[str]()
         given = self.stated_motion is not None or self.trajectory is not None
         return frozenset(needed if given else needed | {"motion"})
+
+    @property
+    def clip_seed(self) -> int:
+        """The seed of the generator."""
+        return self.seed or 0
 
     @property
     def law(self) -> Law:
@@ -172,11 +181,23 @@ class AnswerRequest(SimulateRequest):
 
     video: Flag = Field(default=False, description="Whether to make the mp4 of the whole clip, too.")
 
-    imagine: Literal["always", "never"] = Field(
-        default="always", description="never: answer from the image alone, without a simulation."
+    imagine: Literal["always", "auto", "never"] = Field(
+        default="always",
+        description="never: answer from the image alone, without a simulation; auto: only where the first answers from "
+        "the image alone disagree, or are not sure.",
+    )
+    imagine_votes: Whole = Field(
+        default=3, ge=1, le=32, description="Of `imagine: auto`: how often to ask before anything is imagined."
+    )
+    imagine_threshold: Finite = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="Of `imagine: auto`: the share of those votes that the leading answer must have to be taken as it "
+        "is.",
     )
     baseline: Flag = Field(default=False, description="Answer without frames, too, for comparison.")
     votes: Whole = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer is taken.")
 
 
-Stage = Literal["grounding", "motion", "trajectory", "generation", "answering"]
+Stage = Literal["gating", "grounding", "motion", "trajectory", "generation", "answering"]

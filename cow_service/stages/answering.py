@@ -13,18 +13,19 @@ from cow_service.readers.base import AnswerReading, Imagined, Reader, ReaderInpu
 from cow_service.readers.question.choices import read_choices
 from cow_service.records import AnswerOption, Grounding, Simulation, Verdict
 from cow_service.requests import AnswerRequest
-from cow_service.stages.results import StageResult, Verdicts
+from cow_service.stages.results import FirstAnswers, StageResult, Verdicts
 from cow_service.stages.run import Run
 
 NOT_SURE = "not sure"  # the name of that vote where no option says so
 
 
 def answer_question(
-    run: Run[AnswerRequest], grounding: Grounding | None, simulation: Simulation | None
+    run: Run[AnswerRequest], grounding: Grounding | None, simulation: Simulation | None, first: FirstAnswers | None
 ) -> StageResult[Verdicts]:
     """The answer after looking at a simulation, or from the image alone; and the baseline where it is wanted.
 
-    Raises what the reader raises where it gives no answer at all.
+    `first` are the answers of the gate: where it has any, they are the baseline. Raises what the reader raises where it
+    gives no answer at all.
     """
     request = run.request
     options = read_choices(request.question, request.options)
@@ -33,12 +34,12 @@ def answer_question(
     if simulation is not None:
         with run.cpu():
             imagined = _with_frames(simulation, run.backends.artifacts)
-    answer = partial(_answer, run.reader, given, options, grounding, votes=request.votes)
+    answer = partial(ask, run.reader, given, options, grounding, votes=request.votes)
     verdict, warnings = answer(imagined)
-    baseline = None
+    baseline = None if first is None or not request.baseline else first.verdict
     if request.baseline and imagined is None:
         baseline = verdict
-    elif request.baseline:
+    elif request.baseline and baseline is None:
         try:
             baseline, _ = answer(None)
         except MllmBadReply as error:
@@ -46,7 +47,7 @@ def answer_question(
     return StageResult(value=Verdicts(verdict=verdict, baseline=baseline), warnings=warnings)
 
 
-def _answer(
+def ask(
     reader: Reader,
     given: ReaderInput,
     options: Sequence[AnswerOption],

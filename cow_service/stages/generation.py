@@ -108,7 +108,7 @@ def _inputs(
 ) -> tuple[GeneratorInput, GeneratorInput | None]:
     """What the generator is given and, where something is changed first, what it is given for the scene as it is."""
     obstacles, taken = obstacles_of(run.scene, grounding)
-    options, seed = run.generator_options, run.request.seed
+    options, seed = run.generator_options, run.request.clip_seed
     if trajectory.factual is None:
         return GeneratorInput(run.scene, grounding, motion, trajectory, obstacles, seed, options), None
     everything = (*obstacles, *taken)

@@ -1,7 +1,8 @@
 """What decides a stage's result: the table from which the key of each stored result is made.
 
 A result is decided by the image, the results of the stages before it, the fields of the request in the table, and the
-backend that does the work. Two runs with the same key come to the same result.
+backend that does the work. Two runs with the same key come to the same result, or to two samples of it where a
+multimodal LLM reads: its reading of the image may be taken by other jobs, its answers never are.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from cow_service.requests import SimulateRequest, Stage
 from cow_service.stages.results import digest_of
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 5  # of stored results; raised where what a stage means or stores changes
+FORMAT = 6  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class StageKey:
     """Names a stage's result."""
 
     digest: str  # SHA-256, hexadecimal
-    shareable: bool = True  # False where a backend does not say what decides its work: then it is this job's alone
+    shareable: bool = True  # False: this job's alone, since it is sampled, or its backend does not say what decides it
 
 
 @dataclass(frozen=True)
@@ -39,11 +40,13 @@ class KeyFields:
     set_by_request: tuple[str, ...] = ()  # where the request sets one of these, no reader is asked: they decide ...
     always: tuple[str, ...] = ()  # ... together with these, which decide in either case
     prompt: str | None = None  # whose version decides, too
+    votes: str | None = None  # the field that says how many answers are drawn, of the stages that draw answers
 
 
 READER_FIELDS = ("question", "seed", "left_to_reader")
 TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "ensemble", "question", "num_frames", "fps")
 KEY_FIELDS: dict[Stage, KeyFields] = {
+    "gating": KeyFields(("question", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
     "grounding": KeyFields(READER_FIELDS, "reader", set_by_request=("place",), always=("objects", "interventions")),
     "motion": KeyFields(
         READER_FIELDS,
@@ -53,8 +56,8 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
         prompt="motion-sentence",
     ),
     "trajectory": KeyFields(TRAJECTORY_FIELDS),
-    "generation": KeyFields(("seed", "frames", "video"), "generator"),
-    "answering": KeyFields(("question", "seed", "options", "votes", "baseline", "imagine"), "reader"),
+    "generation": KeyFields(("clip_seed", "frames", "video"), "generator"),
+    "answering": KeyFields(("question", "seed", "options", "votes", "baseline", "imagine"), "reader", votes="votes"),
 }
 # Of a simulation its id and times do not decide an answer.
 _SIMULATION_FIELDS = {"grounding", "motion", "trajectory", "frames", "factual_frames"}
@@ -66,11 +69,12 @@ def key_of(
     request: SimulateRequest,
     inputs: tuple[Record | None, ...],
     identity_of: Callable[[BackendRole], Mapping[str, Any] | None],
+    repeats_answers: Callable[[int], bool],
 ) -> StageKey:
     """The key of a stage's result. `inputs` are the results of stages before it.
 
     `identity_of` a backend is all that decides its work, as JSON values, or None where it does not say; it is asked
-    only where the table names a backend.
+    only where the table names a backend. `repeats_answers` is that of the reader, asked where answers are drawn.
     """
     decided = KEY_FIELDS[stage]
     parts: dict[str, Any] = {
@@ -89,7 +93,8 @@ def key_of(
     if decided.backend is None:
         return StageKey(digest_of(parts))
     identity = identity_of(decided.backend)
-    return StageKey(digest_of(parts | {"backend": identity}), shareable=identity is not None)
+    sampled = decided.votes is not None and not repeats_answers(getattr(request, decided.votes))
+    return StageKey(digest_of(parts | {"backend": identity}), shareable=identity is not None and not sampled)
 
 
 def _digest(value: Record | None) -> str | None:

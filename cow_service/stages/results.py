@@ -34,7 +34,15 @@ class Verdicts(Record):
     baseline: Verdict | None = None
 
 
+class FirstAnswers(Record):
+    """The value of the gate: the answer from the image alone, and how many votes it was asked for with."""
+
+    verdict: Verdict | None  # null where no vote could be read
+    asked: int
+
+
 RESULT_TYPES: dict[Stage, type[StageResult[Any]]] = {
+    "gating": StageResult[FirstAnswers],
     "grounding": StageResult[Grounding],
     "motion": StageResult[Motion],
     "trajectory": StageResult[Trajectory],

@@ -131,7 +131,7 @@ class Run(Generic[Request_co]):
         """Runs one stage, `function(run, *inputs)`, through `step`, with its time, warnings and usage noted."""
         started = time.perf_counter()
         self.report(name, 0.0)
-        key = key_of(name, self.image.info.sha256, self.request, inputs, self._identity)
+        key = key_of(name, self.image.info.sha256, self.request, inputs, self._identity, self.repeats_answers)
         result, reused = self.step(name, key, lambda: self._compute(name, function, inputs))
         self.results[name] = result
         if reused:
@@ -184,15 +184,27 @@ class Run(Generic[Request_co]):
         """What stage 1 learned for stage 2."""
         return self.results["grounding"].hints if "grounding" in self.results else None
 
-    @property
-    def usage(self) -> Usage:
-        """What this request asked of a multimodal LLM, failed stages of this process included."""
-        before = [
-            result.usage
-            for stage, result in self.results.items()
-            if stage not in self._calls and stage not in self.reused
-        ]
-        return sum(before, sum((calls.usage for calls in self._calls.values()), Usage()))
+    def repeats_answers(self, votes: int) -> bool:
+        """Whether the reader's answers are the same each time; one of another package that does not say is sampled."""
+        repeats = getattr(self.reader, "repeats_answers", None)
+        return repeats is not None and repeats(votes)
+
+    def usage(self, *stages: Stage) -> Usage:
+        """What some stages of this request asked of a multimodal LLM, failed ones of this process included."""
+        return sum((self._usage_of(stage) for stage in stages if stage not in self.reused), Usage())
+
+    def usage_total(self, *stages: Stage) -> Usage:
+        """The same without reuse: results of other requests count as if they had been computed for this one."""
+        return sum((self._usage_of(stage) for stage in stages), Usage())
+
+    def accounts(self, *stages: Stage) -> dict[str, Any]:
+        """What some stages cost and took, and which of them were reused: fields of a result."""
+        return {
+            "usage": self.usage(*stages),
+            "usage_total": self.usage_total(*stages),
+            "timings": {stage: seconds for stage, seconds in self.timings.items() if stage in stages},
+            "reused": tuple(stage for stage in self.reused if stage in stages),
+        }
 
     def reader_info(self, *stages: Stage) -> ReaderInfo:
         """Who read for some stages; a reader that none of them needed is named but was never loaded."""
@@ -206,6 +218,11 @@ class Run(Generic[Request_co]):
     def warnings(self, *stages: Stage) -> tuple[str, ...]:
         """The warnings of some stages."""
         return tuple(warning for stage in stages for warning in self.results[stage].warnings)
+
+    def _usage_of(self, stage: Stage) -> Usage:
+        if stage in self._calls:
+            return self._calls[stage].usage
+        return self.results[stage].usage if stage in self.results else Usage()
 
     def _identity(self, backend: BackendRole) -> dict[str, Any] | None:
         """All that decides the work of a backend; None where one of another package does not say."""

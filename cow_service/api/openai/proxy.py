@@ -168,6 +168,7 @@ class Proxy:
                 frames=simulation.factual_frames + simulation.frames,
                 prompts=frames.prompts,
                 usage=simulation.usage,
+                usage_total=simulation.usage_total,
                 reused=simulation.reused,
                 warnings=simulation.warnings,
             )

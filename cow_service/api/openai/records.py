@@ -88,6 +88,7 @@ class ChatImagination(Record):
     frames: tuple[Frame, ...] = Field(default=(), description="The frames that were added, in their order.")
     prompts: dict[str, int] = Field(default_factory=dict, description="Version of the note that introduces them.")
     usage: Usage = Field(default=Usage(), description="Of imagining alone; the reply's own is `usage` beside `cow`.")
+    usage_total: Usage = Field(default=Usage(), description="What imagining would have cost without reuse.")
     reused: tuple[str, ...] = Field(default=(), description="Stages of the simulation that were found again.")
     warnings: tuple[str, ...] = ()
 

@@ -11,7 +11,10 @@ from pydantic import AwareDatetime
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from cow_service import errors
+from cow_service.api.minimal import minimal_job
+from cow_service.api.preferences import MINIMAL_APPLIED, preferences_of
 from cow_service.api.problems import documented
+from cow_service.api.routes.simulate import RETURN
 from cow_service.api.submission import json_response, owner_of
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.events import END, follow
@@ -61,10 +64,20 @@ def job_routes(engine: JobEngine) -> APIRouter:
         filters = JobFilters(tuple(status or ()), kind, created_after, created_before, limit, cursor)
         return engine.page(owner_of(request), filters)
 
-    @router.get("/jobs/{id}", operation_id="job", summary="A job", response_model=Job, responses=documented(*GONE))
+    @router.get(
+        "/jobs/{id}",
+        operation_id="job",
+        summary="A job",
+        response_model=Job,
+        responses=documented(*GONE),
+        openapi_extra={"parameters": [RETURN]},
+    )
     def job(request: Request, id: JobId) -> Response:
         """How far it is; its result or problem once it has ended."""
-        return json_response(engine.find(id, owner_of(request)).as_json())
+        found = engine.find(id, owner_of(request)).as_json()
+        if not preferences_of(request.headers).minimal:
+            return json_response(found)
+        return json_response(minimal_job(found), headers=MINIMAL_APPLIED)
 
     @router.post(
         "/jobs/{id}/cancel",

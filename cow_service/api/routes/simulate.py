@@ -40,11 +40,13 @@ def _header(name: str, description: str) -> dict[str, Any]:
     return {"name": name, "in": "header", "required": False, "description": description, "schema": {"type": "string"}}
 
 
-PREFERENCES = [
-    _header("Prefer", "`respond-async`: answer with the job at once; `wait=N`: after N seconds (RFC 7240)."),
-    _header("Idempotency-Key", "The same key and body come to the same job, however often they are sent."),
-    _header("Cache-Control", "`no-cache`: take no results of earlier requests."),
-]
+KEY = _header("Idempotency-Key", "The same key and body come to the same job, however often they are sent.")
+FRESH = _header("Cache-Control", "`no-cache`: take no results of earlier requests.")
+WAIT = "`respond-async`: answer with the job at once; `wait=N`: after N seconds"
+MINIMAL = "`return=minimal`: leave out what `Path` has per frame, but for `points` and `visible`"
+PREFERENCES = [_header("Prefer", f"{WAIT} (RFC 7240)."), KEY, FRESH]
+RESULT_PREFERENCES = [_header("Prefer", f"{WAIT}; {MINIMAL} (RFC 7240)."), KEY, FRESH]
+RETURN = _header("Prefer", f"{MINIMAL} (RFC 7240).")
 
 
 def simulate_routes(submitter: Submitter) -> APIRouter:
@@ -58,7 +60,7 @@ def simulate_routes(submitter: Submitter) -> APIRouter:
         tags=["simulation"],
         summary="Imagine the future of an image",
         responses={**ACCEPTED, **documented(*FAILURES)},
-        openapi_extra={"requestBody": body_of(SimulateRequest), "parameters": PREFERENCES},
+        openapi_extra={"requestBody": body_of(SimulateRequest), "parameters": RESULT_PREFERENCES},
     )
     async def simulate(request: Request) -> Response:
         """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once.
@@ -75,7 +77,7 @@ def simulate_routes(submitter: Submitter) -> APIRouter:
         tags=["answering"],
         summary="Look, then answer",
         responses={**ACCEPTED, **documented(*FAILURES)},
-        openapi_extra={"requestBody": body_of(AnswerRequest), "parameters": PREFERENCES},
+        openapi_extra={"requestBody": body_of(AnswerRequest), "parameters": RESULT_PREFERENCES},
     )
     async def answer(request: Request) -> Response:
         """Imagines the future of the image, then has the reader answer the question from the image and those frames.

@@ -54,6 +54,8 @@ def _fitting(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[O
         near = [region for region in possible if phrase.colour in region.colours and region.colour not in claimed]
         fitting = exact or [region for region in near if _looks_like(region, phrase)]
     fitting = [region for region in fitting if _looks_like(region, phrase)] or fitting
+    if phrase.colour is None:
+        fitting = [region for region in fitting if not contradicts(region, phrase.head)] or fitting
     return clearest(fitting, phrase.head) or singled_out(fitting, phrase)
 
 

@@ -47,6 +47,10 @@ class EmbeddedReader:
     info = ReaderInfo(name="embedded", revision=__version__)  # rules change with the version alone
     fingerprint = f"embedded {__version__}"
 
+    def repeats_answers(self, votes: int) -> bool:
+        """Always: rules draw no random numbers."""
+        return True
+
     def ground(self, given: ReaderInput) -> GroundingReading:
         """The region that fits the mover's words. Raises `CannotGround` where none or several do."""
         scene, question = given.scene, parse(given.question)

@@ -93,6 +93,11 @@ class BatchGenerator:
         self.grammars = Grammars(self._tokenizer, self._model.get_output_embeddings().weight.shape[0], self._ends)
 
     @property
+    def is_float32(self) -> bool:
+        """Whether it computes in full precision."""
+        return self._model.dtype == torch.float32
+
+    @property
     def device(self) -> torch.device:
         """Where its inputs go."""
         return self._model.device

@@ -72,6 +72,11 @@ class LocalModel(Model[None]):
         return self._name
 
     @property
+    def deterministic(self) -> bool:
+        """Whether temperature 0 gives the same reply in whatever company it is written: so in float32 alone."""
+        return self._generator.is_float32
+
+    @property
     def system(self) -> str:
         """Who serves it: this process."""
         return "local"

@@ -15,5 +15,7 @@ def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable`, `WeightsUnavailable`, `CheckpointInvalid`."""
     model = load_local(settings)
     manifest = resolve_model(settings).manifest
-    configured = ConfiguredModel(model, manifest.name, manifest, load_families()[manifest.family or ""])
+    configured = ConfiguredModel(
+        model, manifest.name, manifest, load_families()[manifest.family or ""], model.deterministic
+    )
     return MllmReader("local", MllmClient(configured, settings), weights_identity(manifest, settings))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ from cow_service.settings import Settings
 
 MAX_REASKS = 2  # times that a model is told what was wrong with its reply
 CANCEL_POLL_SECONDS = 0.2
+MAX_SEED = 2**31  # what every provider takes is below
 SYSTEM_PROMPT = "looking"
 
 _PARSER_BUGS = (ArithmeticError, LookupError, TypeError, ValueError, RecursionError)
@@ -52,7 +54,7 @@ class PromptCall(Generic[T]):
     images: tuple[bytes, ...]
     schema: Schema
     parse: Callable[[str], T]
-    vote: int = 0  # added to the request's seed
+    vote: int = 0  # each has a seed of its own
     temperature: float | None = None  # by default that of the manifest
 
 
@@ -207,7 +209,7 @@ class MllmClient:
     def _closed(self) -> MllmUnavailable:
         return MllmUnavailable(f"{self._name} is asked no more: this server is stopping.")
 
-    def _settings(self, call: PromptCall[Any], seed: int) -> ModelSettings:
+    def _settings(self, call: PromptCall[Any], seed: int | None) -> ModelSettings:
         defaults = self.model.manifest.defaults
         settings = ModelSettings(
             max_tokens=int(defaults.get("max_tokens", 4096)),
@@ -217,10 +219,22 @@ class MllmClient:
         )
         if "temperature" in defaults:
             wanted = defaults["temperature"] if call.temperature is None else call.temperature
-            settings |= ModelSettings(temperature=float(wanted), seed=(seed + call.vote) % 2**31)
+            settings |= ModelSettings(temperature=float(wanted))
+            if seed is not None:
+                settings |= ModelSettings(seed=seed_of_vote(seed, call.vote))
         for name in self.model.model.unsupported_settings & settings.keys():
             del settings[name]
         return settings
+
+
+def seed_of_vote(seed: int, vote: int) -> int:
+    """The seed that a vote is sent with: the request's for the first one, a digest of both for the others.
+
+    Seeds in a row would give requests with neighbouring seeds votes in common.
+    """
+    if vote == 0:
+        return seed % MAX_SEED
+    return int.from_bytes(hashlib.sha256(f"{seed} {vote}".encode()).digest()[:8]) % MAX_SEED
 
 
 def _parsed(context: RunContext[_ReplyParser], reply: str) -> Any:

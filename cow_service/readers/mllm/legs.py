@@ -98,7 +98,7 @@ def _other(value: object) -> OtherMotionHint | None:
     fields = fields_of(value)
     name, way = text_of(first_of(fields, "object", "name", "label"))[:MAX_NAME], _way(fields)
     said = text_of(fields.get("kind")).lower()
-    kind = next((known for known in _KINDS if known == said), cast("MotionKind", "linear"))
+    kind: MotionKind = _KINDS[_KINDS.index(said)] if said in _KINDS else "linear"
     if not name or kind == "place" or (kind in DIRECTED_KINDS and way is None):
         return None
     direction, depth = way if way is not None and kind in DIRECTED_KINDS else (None, 0.0)

@@ -30,6 +30,7 @@ class ConfiguredModel:
     name: str  # as it is served
     manifest: Manifest
     family: Family
+    deterministic: bool = False  # temperature 0 gives the same reply each time: no provider promises that
 
     @property
     def supports_schema(self) -> bool:

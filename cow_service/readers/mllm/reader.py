@@ -22,7 +22,7 @@ from cow_service.readers.base import (
     ReaderInput,
 )
 from cow_service.readers.chat import ChatTurn, Upstream
-from cow_service.readers.mllm.answer import answer_calls
+from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.changes import located_changes, names_of
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
 from cow_service.readers.mllm.client import MllmClient, PromptCall
@@ -83,6 +83,11 @@ class MllmReader:
             self._model.family.model_dump_json(), *map(PROMPTS.read, PROMPTS.names()),
         )  # fmt: skip
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+    def repeats_answers(self, votes: int) -> bool:
+        """Only of a model that is deterministic at temperature 0, where that is what it is asked with."""
+        temperature = VOTING_TEMPERATURE if votes > 1 else self._model.manifest.defaults.get("temperature")
+        return self._model.deterministic and temperature == 0
 
     def close(self) -> None:
         """Closes its connections."""

@@ -27,6 +27,7 @@ _STRUCTURE = (
 )  # fmt: skip
 _NAMING = lex.words(", and there is are we see you have here with in on")
 _NEGATIVE = lex.words("no none nothing neither nor unless except")
+_ALL_OF_IT = lex.words("whole entire")  # "is the whole mug hidden": how much is hidden at most is not asked anywhere
 _END = frozenset(".?!;")
 _NO_MATTER = frozenset({"", "marked", "told"})  # adverbials that say nothing of a motion
 _TRIES = 8  # of one question
@@ -45,6 +46,7 @@ def unread_words(question: Question, covered: frozenset[int]) -> Unread:
     """The words that no rule read, sentence by sentence. `covered` are the places of the items that ask."""
     items = question.items
     turning = [words for words in (question.pronoun, question.beyond) if words]
+    turning += [word for item in items for word in item.words if word in _ALL_OF_IT]
     beside: list[str] = []
     for sentence in _sentences(items):
         runs = [" ".join(_text(items[at]) for at in run) for run in _runs(question, sentence, covered)]

@@ -274,7 +274,11 @@ def _end(trajectory: Trajectory, body: int) -> list[str]:
     last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1) if body == 0 else -1
     if not path.visible[last]:
         return ["leaves the image"]
-    return [f"comes to rest after {until:.1f} s"] if body == 0 and last < trajectory.num_frames - 1 else []
+    if body != 0 or last == trajectory.num_frames - 1:
+        return []
+    met = [each.b for each in trajectory.contacts if each.a == body and each.time <= until]
+    where = " on the floor" if met and met[-1] is None else ""
+    return [f"comes to rest{where} after {until:.1f} s"]
 
 
 def _agreement(trajectory: Trajectory) -> float | None:
