@@ -33,6 +33,7 @@ _ABOUT_REPLY = re.compile(
 )
 _CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
 _LETTER = re.compile(r"\bletters?\b", re.IGNORECASE)
+_HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,8 @@ def reply_text(prompt: str, reply: Reply) -> str:
 
 
 def without_reply_form(prompt: str) -> str:
-    """The prompt without the sentences that say how to reply and nothing else."""
-    sentences = _BETWEEN_SENTENCES.split(prompt)
+    """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
+    sentences = _BETWEEN_SENTENCES.split(_HEADING.sub("", prompt))
     return "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
 
 
