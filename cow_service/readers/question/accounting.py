@@ -23,7 +23,8 @@ _STRUCTURE = (
     PUNCTUATION | lex.AUXILIARIES | lex.BE | lex.MOVER_PRONOUNS | lex.CAUSATIVES | (lex.CONDITIONALS - {"unless"})
     | lex.words("to that which who and but then so i you we us me there also have has had please now here go come get")
     | lex.words("someone somebody ok either")
-    | lex.words("what happens happen tell know will keep keeps kept continue continues continued start starts started begin begins began s yes")
+    | lex.words("what happens happen tell know will keep keeps kept continue continues continued start starts started")
+    | lex.words("begin begins began s yes")
 )  # fmt: skip
 _NAMING = lex.words(", and there is are we see you have here with in on")
 _NEGATIVE = lex.words("no none nothing neither nor unless except")

@@ -19,7 +19,8 @@ _FORMS: dict[str, AskedForm] = {
 }  # fmt: skip
 # By the node of an act: the relation, and whether the subject of the clause is what it is done to.
 _ACTS: dict[str, tuple[AskedRelation, bool]] = {
-    "touches": ("touches", False), "what_touches": ("touches", False), "hit_first": ("touches", False), "touched": ("touches", True),
+    "touches": ("touches", False), "what_touches": ("touches", False), "hit_first": ("touches", False),
+    "touched": ("touches", True),
     "hits_none": ("touches", False), "misses": ("touches", False), "missed": ("touches", True),
     "gets_in_way": ("touches", True),
     "stops_short": ("touches", False),

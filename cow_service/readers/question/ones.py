@@ -53,7 +53,9 @@ def _singles_out(item: Item, phrase: ObjectPhrase) -> bool:
 
 def _is_bare_colour(item: Item) -> bool:
     """ "The blue"; but "the orange" may be the fruit."""
-    return len(item.words) == 2 and item.words[0] == "the" and item.words[1] in lex.COLOURS and item.words[1] != "orange"
+    return (
+        len(item.words) == 2 and item.words[0] == "the" and item.words[1] in lex.COLOURS and item.words[1] != "orange"
+    )
 
 
 def _is_asked_for(found: Sequence[Item], at: int) -> bool:

@@ -46,6 +46,7 @@ class _Reading:
     items: frozenset[int] = frozenset()
     listed: tuple[ObjectPhrase, ...] = ()
     within: float | None = None  # s
+    claim: bool = False  # a statement behind "true or false"
 
 
 def read_asked(question: Question) -> Asked | None:
@@ -91,7 +92,10 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
 def unread(question: Question) -> Unread:
     """The words of the question that no rule has read."""
     reading = _read(question)
-    return unread_words(question, frozenset() if reading is None else reading.items)
+    found = unread_words(question, frozenset() if reading is None else reading.items)
+    if reading is not None and reading.claim:
+        return Unread((*found.turning, *found.beside), ())  # "true or false" is asked of those words, too
+    return found
 
 
 @lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
@@ -100,7 +104,9 @@ def _read(question: Question) -> _Reading | None:
     found, claim = _without_claim(sentences(question))
     if len(found) > MAX_SENTENCES or any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
         return None
-    readings = [(at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question, claim))]
+    readings = [
+        (at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question, claim))
+    ]
     if len(readings) != 1:
         return None
     at, reading = readings[0]
@@ -116,7 +122,7 @@ def _read(question: Question) -> _Reading | None:
     if not all(_limits(question, named, at) for at in limits):
         return None
     within = min(limits.values(), default=None)
-    return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within)
+    return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within, claim=bool(claim))
 
 
 def _without_claim(found: list[Sentence]) -> tuple[list[Sentence], frozenset[int]]:
@@ -193,6 +199,10 @@ def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]
 def _match(sentence: Sentence, places: Sequence[int], question: Question, claim: bool) -> _Reading | None:
     words = [Word("", word, places[0]) for word in _CLAIM] if claim else []
     words += [word for at in places for word in _words(sentence.tokens[at], at, question)]
+    tokens = [sentence.tokens[at] for at in places]
+    senses = {token for token in tokens if token in {"along", "against"}}
+    if "arrow" in tokens and senses and senses != {question.motion.arrow}:
+        return None  # the motion that was read is another
     beside = question.motion.others[0].object if len(question.motion.others) == 1 else None
     phrases = sentence.phrases if beside is None else sentence.phrases | {"+": beside}
     asking = read_clause(words, None if beside is None else "+")
@@ -202,7 +212,7 @@ def _match(sentence: Sentence, places: Sequence[int], question: Question, claim:
         if len(question.others) != 1:
             return None
         phrases = phrases | {IT: question.others[0]}
-    asking = _into_hollow(asking, [sentence.tokens[at] for at in places], phrases)
+    asking = _into_hollow(asking, tokens, phrases)
     return None if asking is None else _Reading(asking, phrases, frozenset(places))
 
 

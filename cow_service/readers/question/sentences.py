@@ -91,7 +91,8 @@ def parse(question: str) -> Question:
     read = motion.read.union(fitted, *(other.motion.read for other in motion.others))
     put = next((change for change in changes if change.kind == "place"), None)
     carried = put is not None and best is not None and _is_carried(best, put)
-    if put is not None and (best is None or best.asked or best.kind == "static" or carried):
+    way = best is None and motion.arrow is not None and bool(clauses.question_subjects)  # "on its way along the arrow"
+    if put is not None and not way and (best is None or best.asked or best.kind == "static" or carried):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
     return Question(
         mover=mover,
@@ -130,7 +131,7 @@ def _motion(
     beside = _movers_beside(found, clauses, best)
     end = min([clause_end(found, at) if best else at, *(other.start for other in beside)])
     shared = _sharing(found, at, end)
-    verb, kind = (best.verb, best.kind) if best else _falling(found, changes)
+    verb, kind = (best.verb, best.kind) if best else _falling(found, changes, mover)
     motion = read_motion(
         found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
     )
@@ -163,13 +164,16 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     return phrase
 
 
-def _falling(found: Sequence[Item], changes: Sequence[InterventionWords]) -> tuple[str, MotionKind | None]:
-    """ "What does it touch on its way down?", and "where would it land?" of what loses its support."""
+def _falling(
+    found: Sequence[Item], changes: Sequence[InterventionWords], mover: ObjectPhrase | None
+) -> tuple[str, MotionKind | None]:
+    """ "What does it touch on its way down?", "the falling ball", and "where would it land?" without its support."""
     removed = any(change.kind == "remove" for change in changes)
     falls = any(removed and lex.lemma(item.key) == "land" for item in found) or any(
         item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
         for at, item in enumerate(found)
     )
+    falls = falls or (mover is not None and "falling" in mover.text.lower().split()[:-1])
     return ("fall", "fall") if falls else ("", None)
 
 
@@ -216,15 +220,13 @@ def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidat
     return [
         each
         for each in clauses.candidates
-        if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while"))) and each.at > best.at
-        and each.kind not in {None, "static"}
+        if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
+        and each.at > best.at and each.kind not in {None, "static"}
         and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 
 
-def _before_while(
-    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None
-) -> MotionCandidate | None:
+def _before_while(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> MotionCandidate | None:
     """The motion in front of "while", where both are told: "the mug slides left by 20 px while the ball drops"."""
     if best is None or best.asked or found[best.start].key != "while":
         return best
