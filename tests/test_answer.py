@@ -176,6 +176,8 @@ What changes for the red ball if it rolls left and the vase is removed? | change
 Will it hit the vase if the red ball keeps rolling left? | whether touches vase
 Will the red ball hit the vase if it kept going to the left? | whether touches vase
 If the red ball rolls off to the left, does it hit the vase? | whether touches vase
+If the red ball keeps on rolling to the left, does it hit the vase? | whether touches vase
+is the vase in its way? | whether touches vase
 will it fly clear of the vase? | whether touches vase not
 will the vase stay in full view? | whether covers vase not
 What is it that it meets if the red ball rolls left? | which-first touches -

@@ -91,8 +91,9 @@ def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Itera
 
 
 def _leads_on(question: Question, at: int) -> bool:
-    """ "By rolling left", "of sliding": before a verb of the motion that was read."""
-    if question.items[at].key not in {"by", "of", "when"} or at + 1 == len(question.items):
+    """ "By rolling left", "of sliding", "keeps on rolling": before a verb of the motion that was read."""
+    on = question.items[at].key == "on" and lex.lemma(key_at(question.items, at - 1)) == "keep"
+    if not (on or question.items[at].key in {"by", "of", "when"}) or at + 1 == len(question.items):
         return False
     after = question.items[at + 1]
     rolling = after.key in lex.VERBS and lex.VERBS[after.key].form == "ing"

@@ -22,7 +22,7 @@ _ACTS: dict[str, tuple[AskedRelation, bool]] = {
     "touches": ("touches", False), "what_touches": ("touches", False), "hit_first": ("touches", False),
     "touched": ("touches", True),
     "hits_none": ("touches", False), "misses": ("touches", False), "missed": ("touches", True),
-    "gets_in_way": ("touches", True),
+    "gets_in_way": ("touches", True), "in_way": ("touches", True),
     "stops_short": ("touches", False),
     "untouched": ("touches", True), "collides": ("touches", False), "contact_event": ("touches", False),
     "together": ("touches", False),
