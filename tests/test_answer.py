@@ -172,6 +172,24 @@ The red ball rolls left and at the same time the blue ball goes up. Will the two
 The red ball rolls left and the blue ball rolls right. Do they meet? | whether touches blue ball
 Were the cup to vanish, would the red ball rolling along the green arrow hit the vase? | whether touches vase
 How would its path change if it rolls left and the vase is removed? | changes touches -
+What changes for the red ball if it rolls left and the vase is removed? | changes touches -
+Will it hit the vase if the red ball keeps rolling left? | whether touches vase
+Will the red ball hit the vase if it kept going to the left? | whether touches vase
+If the red ball rolls off to the left, does it hit the vase? | whether touches vase
+If the red ball keeps on rolling to the left, does it hit the vase? | whether touches vase
+is the vase in its way? | whether touches vase
+will it fly clear of the vase? | whether touches vase not
+will the vase stay in full view? | whether covers vase not
+What is it that it meets if the red ball rolls left? | which-first touches -
+Which mug is hit first by the red ball if it rolls left? | which-first touches -
+How many objects will the red ball hit on its way along the arrow? | how-many touches -
+If the red ball rolls towards the bowl, does it end up inside? | whether inside bowl
+True or false? If the red ball rolls left, it misses the vase. | whether touches vase not
+True or false: the red ball hits the vase if it rolls left. | whether touches vase
+The red ball and the mug both move left. Do they touch each other? | whether touches mug
+If the red ball and the mug move to the left, do they meet? | whether touches mug
+The vase slides left by 20 pixels while the red ball drops. Does the ball land on the vase? | whether touches red ball
+Will the falling ball hit the vase? | whether touches vase
 """
 
 
@@ -217,6 +235,7 @@ def test_limits_of_what_is_asked(question: str, field: str, value: object) -> No
          ["cube", "vase", "mug"]),
         ("Which object does the red ball hit first if it falls? The cube or the mug?", ["cube", "mug"]),
         ("which ball will it hit first?", ["ball"]),
+        ("Which mug is hit first by the ball if it rolls left, the blue or the white?", ["blue mug", "white mug"]),
         ("which cube will it hit first, the red one or the blue one?", ["red cube", "blue cube"]),
         ("which object will it hit first?", []),
         ("will it hit the vase?", []),

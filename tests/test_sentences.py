@@ -78,6 +78,10 @@ If the purple sphere is hit in the direction of the arrow, will it touch the con
     purple sphere | linear | arrow: along | others: cone
 If the couch is moved in the direction of the arrow, will it fit between the wall and the table?
     couch | linear | arrow: along | others:
+The vase slides to the left while the red ball drops. Do they meet?
+    vase | linear | direction: left | others: red ball
+If the ball keeps flying the way it has been flying, its last position being the one on the right, does it hit the mug?
+    ball | projectile | others: mug
 What happens if someone pushes the red cube to the left?
     red cube | linear | direction: left
 Will the green ball hit the vase if it moves to the right?

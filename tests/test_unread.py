@@ -38,6 +38,15 @@ Unless the ball rolls right, does it hit the mug? | unless
 If the red ball hits the white ball, where will the white ball go? | hits white ball
 Only if the ball rolls right: will it touch the cube? | only
 The camera moves left. Does the ball hide the mug? | camera moves left
+If the ball goes right while the mug goes left by 30 pixels, will they collide? | by 30 pixels
+If the ball goes right while the mug goes left and then up, will they collide? | up
+If the ball and the mug both move right by 30 pixels, do they touch? | mug both
+If the ball rolls on the shelf to the left, does it hit the mug? | on shelf
+If the ball rolls off the shelf to the left, does it hit the mug? | off shelf
+If the ball rolls along the arrow, will it hit the mug on its way against the arrow? | hit mug on way against arrow
+Is the mug hit first by the ball if it rolls left? | hit first by ball
+Which mug is hit by the cone first if the ball rolls left? | mug is hit by cone first
+True or false? The mug is on the table. If the ball rolls left, it hits the mug. | mug
 """
 BESIDE = """
 The floor is icy. If the ball rolls right, does it hit the mug? | floor is icy

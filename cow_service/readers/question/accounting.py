@@ -23,7 +23,8 @@ _STRUCTURE = (
     PUNCTUATION | lex.AUXILIARIES | lex.BE | lex.MOVER_PRONOUNS | lex.CAUSATIVES | (lex.CONDITIONALS - {"unless"})
     | lex.words("to that which who and but then so i you we us me there also have has had please now here go come get")
     | lex.words("someone somebody ok either")
-    | lex.words("what happens happen tell know will keep keeps continue continues start starts begin begins s yes")
+    | lex.words("what happens happen tell know will keep keeps kept continue continues continued start starts started")
+    | lex.words("begin begins began s yes")
 )  # fmt: skip
 _NAMING = lex.words(", and there is are we see you have here with in on")
 _NEGATIVE = lex.words("no none nothing neither nor unless except")
@@ -90,8 +91,9 @@ def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Itera
 
 
 def _leads_on(question: Question, at: int) -> bool:
-    """ "By rolling left", "of sliding": before a verb of the motion that was read."""
-    if question.items[at].key not in {"by", "of", "when"} or at + 1 == len(question.items):
+    """ "By rolling left", "of sliding", "keeps on rolling": before a verb of the motion that was read."""
+    on = question.items[at].key == "on" and lex.lemma(key_at(question.items, at - 1)) == "keep"
+    if not (on or question.items[at].key in {"by", "of", "when"}) or at + 1 == len(question.items):
         return False
     after = question.items[at + 1]
     rolling = after.key in lex.VERBS and lex.VERBS[after.key].form == "ing"

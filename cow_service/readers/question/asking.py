@@ -19,9 +19,10 @@ _FORMS: dict[str, AskedForm] = {
 }  # fmt: skip
 # By the node of an act: the relation, and whether the subject of the clause is what it is done to.
 _ACTS: dict[str, tuple[AskedRelation, bool]] = {
-    "touches": ("touches", False), "what_touches": ("touches", False), "touched": ("touches", True),
+    "touches": ("touches", False), "what_touches": ("touches", False), "hit_first": ("touches", False),
+    "touched": ("touches", True),
     "hits_none": ("touches", False), "misses": ("touches", False), "missed": ("touches", True),
-    "gets_in_way": ("touches", True),
+    "gets_in_way": ("touches", True), "in_way": ("touches", True),
     "stops_short": ("touches", False),
     "untouched": ("touches", True), "collides": ("touches", False), "contact_event": ("touches", False),
     "together": ("touches", False),
@@ -38,7 +39,7 @@ _NEGATIONS = frozenset(
 )
 
 
-_ANY_PART = frozenset({"any_part", "partly", "wholly", "at_some_time"})  # hidden in part or once
+_ANY_PART = frozenset({"any_part", "partly", "wholly", "in_full", "at_some_time"})  # hidden in part or once
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,13 @@ def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
     things = list(dict.fromkeys(str(t) for t in _tokens(tree) if t.type == "T" and t not in (*subject, *listed)))
     if negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
+    if form == "which-first" and things:
+        return None  # "which mug is hit by the cone first": of another than the mover
     partly = relation in {"covers", "covered"} and any(node.data in _ANY_PART for node in tree.iter_subtrees())
     target = things[0] if things else None
     asking = Asking(form, relation, negations == 1, None, target, tuple(map(str, listed)), partly)
-    if any(token.type == "M" for token in subject) and _speaks_of_it(tree):
+    inside_it = any(token.type in MOVER for token in subject) and next(tree.find_data("inside_bare"), None) is not None
+    if inside_it or (any(token.type == "M" for token in subject) and _speaks_of_it(tree)):
         asking = replace(asking, target=IT)
     alone = next(tree.find_data("meet_bare"), None) is not None
     pronoun = next((str(token) for token in subject if token.type == "PRONOUN"), None)

@@ -150,11 +150,18 @@ def read_motion(
                 leg.verb = lex.lemma(items[0].key)
         elif isinstance(node, Tree):
             later = len(legs) > 1 and str(node.data) in _FIRST_LEG_ONLY
-            if later or not _apply(legs[-1], node, found, mover, asked or kind == "fall", arrow):
+            aside = str(node.data) == "off" and _stands_before_thing(found, items[-1])
+            if later or aside or not _apply(legs[-1], node, found, mover, asked or kind == "fall", arrow):
                 continue
         read |= {item.start for item in items}
     first, *rest = [leg for at, leg in enumerate(legs) if not at or leg.way(None) is not None or leg.depths]
     return _motion(first, rest, _kind(first, kind), frozenset(read))
+
+
+def _stands_before_thing(found: Sequence[Item], item: Item) -> bool:
+    """ "Rolls on the mug", "off the shelf": not "rolls on", "rolls off"."""
+    after = next((each for each in found if each.start >= item.end), None)
+    return after is not None and after.phrase is not None
 
 
 def with_front(motion: MotionWords, before: Sequence[Item], told: frozenset[int]) -> MotionWords:

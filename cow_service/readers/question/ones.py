@@ -35,6 +35,8 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             continue
         if phrase is not None and phrase.is_thing and phrase.noun and all(phrase != each.phrase for each in things):
             things.append(item)
+        if phrase is not None and kinds and _is_bare_colour(item):
+            phrase = replace(phrase, noun=None)  # "which mug does it hit first, the blue or the white?"
         if phrase is not None and phrase.noun is None and _singles_out(item, phrase) and len(nouns) == 1:
             said.append(replace(item, phrase=_of_kind(phrase, next(iter(nouns)))))
         else:
@@ -47,6 +49,13 @@ def _singles_out(item: Item, phrase: ObjectPhrase) -> bool:
     """ "The red one", "the left one", "the one on the left"."""
     words = phrase.text.lower().split()
     return phrase.colour is not None or (item.words[-1:] == ("one",) and len(words) > 1)
+
+
+def _is_bare_colour(item: Item) -> bool:
+    """ "The blue"; but "the orange" may be the fruit."""
+    return (
+        len(item.words) == 2 and item.words[0] == "the" and item.words[1] in lex.COLOURS and item.words[1] != "orange"
+    )
 
 
 def _is_asked_for(found: Sequence[Item], at: int) -> bool:

@@ -7,7 +7,7 @@ read at all. A wrong yes is worse than "not sure".
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -25,6 +25,7 @@ _STARTS = lex.words(
     "with into on onto true has have had",
 )
 _OPENERS = lex.words(", and then so but now please")
+_CLAIM = ("true", "or", "false")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
 _SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
 _CONDITIONS = lex.words("if when once after as while upon assuming given provided suppose supposing")
@@ -45,6 +46,7 @@ class _Reading:
     items: frozenset[int] = frozenset()
     listed: tuple[ObjectPhrase, ...] = ()
     within: float | None = None  # s
+    claim: bool = False  # a statement behind "true or false"
 
 
 def read_asked(question: Question) -> Asked | None:
@@ -90,16 +92,21 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
 def unread(question: Question) -> Unread:
     """The words of the question that no rule has read."""
     reading = _read(question)
-    return unread_words(question, frozenset() if reading is None else reading.items)
+    found = unread_words(question, frozenset() if reading is None else reading.items)
+    if reading is not None and reading.claim:
+        return Unread((*found.turning, *found.beside), ())  # "true or false" is asked of those words, too
+    return found
 
 
 @lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
 def _read(question: Question) -> _Reading | None:
     """The one clause of the question that asks; None where none is understood, or several ask."""
-    found = sentences(question)
+    found, claim = _without_claim(sentences(question))
     if len(found) > MAX_SENTENCES or any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
         return None
-    readings = [(at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question))]
+    readings = [
+        (at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question, claim))
+    ]
     if len(readings) != 1:
         return None
     at, reading = readings[0]
@@ -107,7 +114,7 @@ def _read(question: Question) -> _Reading | None:
     if listed and reading.asking.form != "which-first":
         return None
     named = {found[at].items[place] for place in reading.covered}
-    named |= {place for place, item in enumerate(question.items) if item.phrase in listed}
+    named |= claim | {place for place, item in enumerate(question.items) if item.phrase in listed}
     if listed:
         named |= {place for place, item in enumerate(question.items) if item.key == "or"}
     limits = {at: item.quantity.within for at, item in enumerate(question.items) if item.quantity}
@@ -115,7 +122,16 @@ def _read(question: Question) -> _Reading | None:
     if not all(_limits(question, named, at) for at in limits):
         return None
     within = min(limits.values(), default=None)
-    return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within)
+    return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within, claim=bool(claim))
+
+
+def _without_claim(found: list[Sentence]) -> tuple[list[Sentence], frozenset[int]]:
+    """The sentences without a "true or false" in front of them all, and the places of its words."""
+    if not found or tuple(found[0].tokens[: len(_CLAIM)]) != _CLAIM:
+        return found, frozenset()
+    first, number = found[0], len(_CLAIM) + (found[0].tokens[len(_CLAIM) : len(_CLAIM) + 1] == [","])
+    rest = replace(first, tokens=first.tokens[number:], words=first.words[number:], items=first.items[number:])
+    return [each for each in (rest, *found[1:]) if each.tokens], frozenset(first.items[:number])
 
 
 def _limits(question: Question, asking: set[int], at: int) -> bool:
@@ -126,17 +142,21 @@ def _limits(question: Question, asking: set[int], at: int) -> bool:
     return not moves and (have or "after" not in items[at].words)
 
 
-def _read_sentence(sentence: Sentence, question: Question) -> _Reading | None:
-    """The longest part of a sentence, up to its end or to a condition, that a pattern covers."""
+def _read_sentence(sentence: Sentence, question: Question, claim: Collection[int]) -> _Reading | None:
+    """The longest part of a sentence, up to its end or to a condition, that a pattern covers.
+
+    Where the question begins with "true or false", a statement asks, too.
+    """
     tokens = sentence.tokens
     tries = 0
     ends = [len(tokens), *(at for at in range(len(tokens)) if _ends(tokens, at, question))]
-    for start in (at for at in range(len(tokens)) if _starts(sentence, at)):
+    claims = {at for at in range(len(tokens)) if claim and _claims(tokens, at)}
+    for start in (at for at in range(len(tokens)) if at in claims or _starts(sentence, at)):
         for end in (end for end in ends if end > start):
             tries += 1
             if tries > _MAX_TRIES:
                 return None
-            reading = _match(sentence, _without_insertion(tokens, start, end), question)
+            reading = _match(sentence, _without_insertion(tokens, start, end), question, start in claims)
             if reading is not None:
                 return reading
     return None
@@ -159,6 +179,12 @@ def _starts(sentence: Sentence, at: int) -> bool:
     return finite and sentence.asks and (at == 0 or tokens[at - 1] == ",")
 
 
+def _claims(tokens: Sequence[str], at: int) -> bool:
+    """Whether a statement may begin at a token: with what does something, at the start or behind a condition."""
+    subject = tokens[at] in PRONOUNS or tokens[at] == "M" or (tokens[at][:1] == "T" and tokens[at][1:].isdecimal())
+    return subject and (at == 0 or tokens[at - 1] in _OPENERS) and _opens(tokens[:at])
+
+
 def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]:
     """The places of a clause without what stands between commas behind its subject: "the car, moving left,"."""
     places = list(range(start, end))
@@ -170,8 +196,13 @@ def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]
     return places[:-1] if commas and commas[-1] == end - 1 else places
 
 
-def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Reading | None:
-    words = [word for at in places for word in _words(sentence.tokens[at], at, question)]
+def _match(sentence: Sentence, places: Sequence[int], question: Question, claim: bool) -> _Reading | None:
+    words = [Word("", word, places[0]) for word in _CLAIM] if claim else []
+    words += [word for at in places for word in _words(sentence.tokens[at], at, question)]
+    tokens = [sentence.tokens[at] for at in places]
+    senses = {token for token in tokens if token in {"along", "against"}}
+    if "arrow" in tokens and senses and senses != {question.motion.arrow}:
+        return None  # the motion that was read is another
     beside = question.motion.others[0].object if len(question.motion.others) == 1 else None
     phrases = sentence.phrases if beside is None else sentence.phrases | {"+": beside}
     asking = read_clause(words, None if beside is None else "+")
@@ -181,7 +212,7 @@ def _match(sentence: Sentence, places: Sequence[int], question: Question) -> _Re
         if len(question.others) != 1:
             return None
         phrases = phrases | {IT: question.others[0]}
-    asking = _into_hollow(asking, [sentence.tokens[at] for at in places], phrases)
+    asking = _into_hollow(asking, tokens, phrases)
     return None if asking is None else _Reading(asking, phrases, frozenset(places))
 
 

@@ -26,7 +26,7 @@ from cow_service.readers.question.interventions import InterventionWords, implie
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
 from cow_service.readers.question.ones import with_nouns
-from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, tokens
+from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, phrase_at, tokens
 from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.reply_forms import without_reply_form
 from cow_service.readers.question.trail_words import TrailWords, split_trail
@@ -36,6 +36,7 @@ MAX_WORDS = 240  # of a question that are read
 _INSTRUCTIONS = lex.words(
     "think reason answer choose select pick option options choices explain respond reply provide return output"
 )
+_EACH_OF_TWO = lex.words("both each together")
 _PICTURES = lex.words("image images frame frames picture pictures photo photos")
 _SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
 # Words that say which way, wherever they stand.
@@ -78,6 +79,7 @@ def parse(question: str) -> Question:
     found = _without_instructions(found)
     clauses = read_clauses(found)
     best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
+    best = _before_while(found, clauses, best)
     at = best.at if best else len(found)
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
@@ -89,7 +91,8 @@ def parse(question: str) -> Question:
     read = motion.read.union(fitted, *(other.motion.read for other in motion.others))
     put = next((change for change in changes if change.kind == "place"), None)
     carried = put is not None and best is not None and _is_carried(best, put)
-    if put is not None and (best is None or best.asked or best.kind == "static" or carried):
+    way = best is None and motion.arrow is not None and bool(clauses.question_subjects)  # "on its way along the arrow"
+    if put is not None and not way and (best is None or best.asked or best.kind == "static" or carried):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
     return Question(
         mover=mover,
@@ -128,7 +131,7 @@ def _motion(
     beside = _movers_beside(found, clauses, best)
     end = min([clause_end(found, at) if best else at, *(other.start for other in beside)])
     shared = _sharing(found, at, end)
-    verb, kind = (best.verb, best.kind) if best else _falling(found, changes)
+    verb, kind = (best.verb, best.kind) if best else _falling(found, changes, mover)
     motion = read_motion(
         found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
     )
@@ -161,13 +164,16 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     return phrase
 
 
-def _falling(found: Sequence[Item], changes: Sequence[InterventionWords]) -> tuple[str, MotionKind | None]:
-    """ "What does it touch on its way down?", and "where would it land?" of what loses its support."""
+def _falling(
+    found: Sequence[Item], changes: Sequence[InterventionWords], mover: ObjectPhrase | None
+) -> tuple[str, MotionKind | None]:
+    """ "What does it touch on its way down?", "the falling ball", and "where would it land?" without its support."""
     removed = any(change.kind == "remove" for change in changes)
     falls = any(removed and lex.lemma(item.key) == "land" for item in found) or any(
         item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
         for at, item in enumerate(found)
     )
+    falls = falls or (mover is not None and "falling" in mover.text.lower().split()[:-1])
     return ("fall", "fall") if falls else ("", None)
 
 
@@ -214,10 +220,24 @@ def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidat
     return [
         each
         for each in clauses.candidates
-        if (each.rank == best.rank or (while_it and not each.asked)) and each.at > best.at
-        and each.kind not in {None, "static"}
+        if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
+        and each.at > best.at and each.kind not in {None, "static"}
         and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
+
+
+def _before_while(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> MotionCandidate | None:
+    """The motion in front of "while", where both are told: "the mug slides left by 20 px while the ball drops"."""
+    if best is None or best.asked or found[best.start].key != "while":
+        return best
+    told = [
+        each
+        for each in clauses.candidates
+        if each.at < best.start and not each.asked and each.kind not in {None, "static"}
+        and each.subject is not None and each.subject.is_thing and each.subject.head not in lex.AGENTS
+        and clause_end(found, each.at) == best.start
+    ]  # fmt: skip
+    return told[-1] if told and best.kind not in {None, "static"} else best
 
 
 def _sharing(found: Sequence[Item], at: int, end: int) -> int | None:
@@ -238,12 +258,38 @@ def _other_motions(
     others: list[OtherWords] = []
     if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
         motion = read_motion(found[shared + 1 : end], best.verb, best.kind, thing)
-        others.append(OtherWords(thing, motion))
+        others.append(OtherWords(thing, _without_lengths(motion, found[shared + 1 : end])))
+    others += _joint_motion(found, best, end)
     for each in _movers_beside(found, clauses, best):
         if each.subject is not None and all(each.subject != other.object for other in others):
             words = found[each.at : clause_end(found, each.at)]
-            others.append(OtherWords(each.subject, read_motion(words, each.verb, each.kind, each.subject)))
+            motion = read_motion(words, each.verb, each.kind, each.subject)
+            others.append(OtherWords(each.subject, _without_lengths(motion, words)))
     return tuple(others)
+
+
+def _without_lengths(motion: MotionWords, words: Sequence[Item]) -> MotionWords:
+    """How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread."""
+    lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
+    return replace(motion, read=frozenset[int]() if motion.steps else motion.read - lengths)
+
+
+def _joint_motion(found: Sequence[Item], best: MotionCandidate | None, end: int) -> list[OtherWords]:
+    """The second of two subjects of one verb: "the ball and the mug both move to the right"."""
+    if best is None or best.asked or best.kind in {None, "static"} or best.subject is None:
+        return []
+    if found[best.at].key in lex.VERBS and lex.VERBS[found[best.at].key].form == "s":
+        return []  # "the ball between the cube and the mug rolls": one thing moves
+    at = best.at - (key_at(found, best.at - 1) in _EACH_OF_TWO)
+    thing, joined = phrase_at(found, at - 1), key_at(found, at - 2) == "and"
+    if thing is None or not thing.is_thing or not joined or phrase_at(found, at - 3) != best.subject:
+        return []
+    words = found[best.at : end]
+    motion = read_motion(words, best.verb, best.kind, thing)
+    if motion.steps or any(item.quantity is not None and item.quantity.speed is None for item in words):
+        return []  # of the first mover alone the reader tells how far it goes
+    both = {found[each].start for each in range(at, best.at)}
+    return [OtherWords(thing, replace(motion, read=motion.read | both))]
 
 
 def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:

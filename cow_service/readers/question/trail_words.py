@@ -15,6 +15,7 @@ from cow_service.readers.question.words import words_of
 from cow_service.records import Vector
 
 _STARTS = lex.words("along on follow follows following continues continuing extends extending extend")
+_THE_WAY = ("the", "way")  # "the way it has been going"
 _SIDES = {"leftmost": "left", "rightmost": "right", "topmost": "up", "lowest": "down", "highest": "up",
           "uppermost": "up"}  # fmt: skip
 
@@ -36,7 +37,7 @@ def split_trail(found: Sequence[Item]) -> tuple[TrailWords | None, list[Item]]:
     words = words_of(found)
     for place, word in enumerate(words):
         first = not place or words[place - 1].at != word.at
-        if first and found[word.at].key in _STARTS:
+        if first and (found[word.at].key in _STARTS or found[word.at].words == _THE_WAY):
             parsed = parse_from("trail", words[place:])
             if parsed is not None and parsed[1] > 1:
                 tree, length = parsed
