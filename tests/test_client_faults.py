@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import email.utils
 import json
+import re
 import signal
 import socket
 import threading
@@ -247,7 +248,7 @@ def _documented() -> set[str]:
     told = (ROOT / "openapi.yaml").read_text()
     operations = [operation for path in yaml.safe_load(told)["paths"].values() for operation in path.values()]
     responses = [r for o in operations for status, r in o.get("responses", {}).items() if str(status) >= "400"]
-    return {code.strip("` ") for response in responses for code in response.get("description", "").split(",")}
+    return {code for response in responses for code in re.findall(r"`([a-z-]+)`", response.get("description", ""))}
 
 
 def test_every_code_of_the_contract_has_its_class() -> None:
