@@ -17,6 +17,7 @@ from typing import Any
 import httpx
 import openai
 import pytest
+from conftest import SCALE
 from openai import AsyncOpenAI, OpenAI
 from random_mllm import RATE, USAGE, RandomMllm, cut, failing, paused, random_mllm, silent
 from servers import BODY, QUESTION, Served, data_url, picture, problem
@@ -220,11 +221,12 @@ def test_nothing_that_moves_is_found(served: Served, mllm: RandomMllm) -> None:
 # --- repeats ---
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("model", [NAME, WITHOUT])
 def test_repeats_have_the_mean_and_variance_of_the_mllm(served: Served, mllm: RandomMllm, model: str) -> None:
     mllm.received.clear()
     body = {"model": model, "messages": what_if(3), "temperature": 1} | ({"cow": COW} if model == NAME else {})
-    count = 200
+    count = 60 if SCALE == 1 else 200
 
     def ask(_: int) -> float:
         reply = told(post(served, body))

@@ -41,7 +41,7 @@ from cow_service.settings import Settings
 from cow_service.stages.gating import gate_of
 from cow_service.stages.results import FirstAnswers
 
-REPEATS = 60 if SCALE == 1 else 200
+REPEATS = 40 if SCALE == 1 else 200
 IMAGE = data_url(png_bytes(ball(floor(96, 64), (30, 40), 8, (210, 20, 20))))
 QUESTION = "If the red ball rolls to the right, will it leave the table? (A) Yes (B) No (C) Not sure"
 BODY: dict[str, Any] = {
@@ -123,6 +123,7 @@ def told(service: Service, **body: Any) -> Answer:
     return service.answer(AnswerRequest.model_validate(BODY | GIVEN | body))
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(("imagine", "rate"), [("always", 0.7), ("never", 0.35)])
 def test_repeats_have_the_mean_and_the_variance_of_the_model(
     imagine: str, rate: float, service: Service, mllm: MllmServer
