@@ -151,5 +151,5 @@ class Jobs(RuleBasedStateMachine):
 
 
 TestJobs = Jobs.TestCase
-TestJobs.settings = settings(max_examples=2 * SCALE, stateful_step_count=12, suppress_health_check=list(HealthCheck))
+TestJobs.settings = settings(max_examples=SCALE, stateful_step_count=12, suppress_health_check=list(HealthCheck))
 TestJobs.pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.timeout(600 * SCALE)]

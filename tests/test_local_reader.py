@@ -13,7 +13,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from conftest import example
+from conftest import SCALE, example
 
 from cow_service.errors import CowError
 from cow_service.records import Answer
@@ -62,7 +62,8 @@ def answers(service: Service) -> list[Answer]:
     return found
 
 
-@pytest.mark.parametrize("place", ["local", "remote"])
+@pytest.mark.soak
+@pytest.mark.parametrize("place", ["remote"] if SCALE == 1 else ["local", "remote"])
 def test_from_grounding_to_answer(place: str, request: pytest.FixtureRequest) -> None:
     service: Service = request.getfixturevalue(place)
     told = answers(service)
