@@ -110,6 +110,12 @@ def test_what_the_caller_has_located_is_not_looked_for() -> None:
     assert placed.targets == (bowl,)
 
 
+def test_what_the_caller_changes_is_looked_for_under_its_name() -> None:
+    asked = "If the red ball rolls right, will it hit the blue cube?"
+    reading = EmbeddedReader().ground(ReaderInput(scene(), asked, sought=("green ball", "The Blue cube", "sofa")))
+    assert {other.object for other in reading.others} == {"blue cube", "green ball"}
+
+
 def test_both_of_a_kind_are_taken_away() -> None:
     image = block(ball(floor(), (110, 200), 40, RED), (250, 150, 330, 230), GREEN)
     image = block(image, (430, 150, 520, 235), BLUE)

@@ -103,8 +103,9 @@ def test_further_legs_and_other_movers_are_kept(mllm: MllmServer, reader: MllmRe
     ]
     boxes = [{"label": "blue car", "bbox_2d": [600, 400, 700, 600]}, {"label": "cup", "bbox_2d": [800, 100, 850, 200]}]
     mllm.say(json.dumps(BALL | {"then": then, "also_moving": also}), json.dumps(PLACE | {"others": boxes}))
-    reading = reader.ground(ReaderInput(scene, QUESTION))
+    reading = reader.ground(ReaderInput(scene, QUESTION, sought=("tall lamp",)))
     assert "> blue car" in mllm.text(1)
+    assert "> tall lamp" in mllm.text(1), "what the request changes is located, too"
     assert reading.hints is not None
     hints = MotionHints.model_validate_json(reading.hints.model_dump_json())
     found = grounding("mllm").model_copy(update={"others": reading.others})

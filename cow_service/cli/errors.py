@@ -34,7 +34,7 @@ class Commands(TyperGroup):
             typer.echo(printable(error.detail), err=True)
             if error.code in HINTS:
                 typer.echo(HINTS[error.code], err=True)
-            for field in error.errors:
+            for field in (field for field in error.errors if field.detail not in error.detail):
                 typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
             raise typer.Exit(1) from error
         except Exception as error:

@@ -90,6 +90,7 @@ class ReaderInput:
     seed: int | None = None  # None: an MLLM is sent none, and draws as it likes
     motion_wanted: bool = True  # stage 2 is left to the reader, too
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: nobody need look for them
+    sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, beside the question's
     calls: CallLog = field(default_factory=CallLog)
     check_canceled: Callable[[], None] = _never_canceled  # to be called while waiting; raises `Canceled`
     cpu: Callable[[], AbstractContextManager[None]] = nullcontext  # to be held around work on the CPU; not reentrant

@@ -142,6 +142,12 @@ class SimulateRequest(Record):
         return None if self.motion is None or self.motion.stated_kind is None else self.motion
 
     @property
+    def changed_names(self) -> tuple[str, ...]:
+        """The names of all objects of its interventions, each once."""
+        named = (name for each in self.interventions for name in (each.object, *each.targets))
+        return tuple(dict.fromkeys(named))
+
+    @property
     def masks(self) -> tuple[MaskRef, ...]:
         """The masks that it gives, the mover's first."""
         places = (*([] if self.grounding is None else [self.grounding]), *self.objects)

@@ -9,6 +9,7 @@ from functools import partial
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import GroundingReading
+from cow_service.readers.question.wording import same_name
 from cow_service.records import Artifact, BBox, Grounding, LocatedObject, Point, Source
 from cow_service.requests import GroundingRequest, SimulateRequest
 from cow_service.stages.interventions import locate_interventions, stated_changes, without_removed
@@ -35,7 +36,8 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     with run.cpu():
         all_given, told_of_given = _given_objects(run)
     if place is None:
-        asked = replace(run.reader_input("grounding"), known=all_given)
+        sought = (name for name in run.request.changed_names if not any(same_name(name, o.object) for o in all_given))
+        asked = replace(run.reader_input("grounding"), known=all_given, sought=tuple(sought))
         reading, source = run.reader.ground(asked), run.reader.source
     else:
         with run.cpu():

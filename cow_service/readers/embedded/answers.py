@@ -20,7 +20,7 @@ from cow_service.records import AnswerOption, Asked, Doubt, Outcome
 HAPPENS = 0.5  # probability from which what is asked happens
 
 NOT_ASKED = (
-    "Not sure, because the embedded reader did not understand '{words}'. It reads questions in English of whether, "
+    "Not sure, because the embedded reader did not understand {words}. It reads questions in English of whether, "
     "when or where something hits, lands on, hides, enters, leaves, misses or is hidden by something, what it hits "
     "first, how many things it hits, whether something is moved or tips, and what changes. Set COW_MLLM to ask a "
     "multimodal LLM."
@@ -55,8 +55,9 @@ def answer_from(
 ) -> AnswerReading:
     """The answer, and why it is not sure. `asked` and `alternatives` are read in the question, `unread` was not."""
     if asked is None or not simulated or outcome is None:
-        words = "', '".join(unread.turning or unread.beside)[:MAX_UNREAD] or "what it asks"
-        why = NOT_ASKED.format(words=words) if asked is None else NO_OUTCOME if simulated else NO_SIMULATION
+        words = "', '".join(unread.turning or unread.beside)[:MAX_UNREAD]
+        named = NOT_ASKED.format(words=f"'{words}'" if words else "the question")
+        why = named if asked is None else NO_OUTCOME if simulated else NO_SIMULATION
         return _unsure(options, why)
     first = outcome.first
     if outcome.sure and first is not None and alternatives and not any(may_name(each, first) for each in alternatives):

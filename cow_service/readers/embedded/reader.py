@@ -20,7 +20,8 @@ from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked, unread
-from cow_service.readers.question.sentences import Question, parse
+from cow_service.readers.question.sentences import Question, parse, parse_noun_phrase
+from cow_service.readers.question.wording import same_name
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,
@@ -69,7 +70,7 @@ class EmbeddedReader:
             regions = without(scene.regions, removed)
             bbox = _mover(scene, regions, question, question.mover)
             placed = find_placed(scene, regions, question, (question.mover, bbox), given.known)
-            others = _others(regions, question, bbox)
+            others = _others(regions, [*question.others, *_sought(given, question)], bbox)
             found = {other.object for other in others}
             unseen = (each for each in question.others if each.text not in found)
             missing = [_not_found(scene, each.text) for each in unseen if given_as(each, given.known) is None]
@@ -124,7 +125,7 @@ def create(settings: Settings) -> EmbeddedReader:
 
 def _unread_warnings(question: Question) -> list[str]:
     words = unread(question)
-    said = [f"The words '{each}' were not understood, so no answer is given." for each in words.turning]
+    said = [f"The words '{each}' were not understood, so no outcome is told." for each in words.turning]
     return said + [f"The words '{each}' were not understood and changed nothing." for each in words.beside]
 
 
@@ -163,10 +164,17 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
     return fitting[0].bbox
 
 
-def _others(regions: Sequence[Region], question: Question, mover: BBox) -> tuple[LocatedObject, ...]:
-    """The other things that the question names, where exactly one region fits; the rest stay unnamed."""
+def _sought(given: ReaderInput, question: Question) -> list[ObjectPhrase]:
+    """What the caller wants located, but for what the question names in the same words."""
+    named = [phrase.text for phrase in (question.mover, *question.others) if phrase is not None]
+    phrases = ((name, parse_noun_phrase(name)) for name in given.sought if not any(same_name(name, n) for n in named))
+    return [replace(phrase, text=name) for name, phrase in phrases if phrase is not None]
+
+
+def _others(regions: Sequence[Region], phrases: Sequence[ObjectPhrase], mover: BBox) -> tuple[LocatedObject, ...]:
+    """The other things of these words, where exactly one region fits; the rest stay unnamed."""
     found: dict[BBox, LocatedObject] = {}
-    for phrase in question.others:
+    for phrase in phrases:
         bbox = _bbox_of(regions, phrase, mover)
         if bbox is not None:
             found.setdefault(bbox, LocatedObject(object=phrase.text, bbox=bbox))

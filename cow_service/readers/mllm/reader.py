@@ -190,7 +190,8 @@ class MllmReader:
         others: tuple[str, ...] = ()
         if identified is not None and bbox is None:
             moving = (each.object for each in identified.legs.also)
-            others = tuple(dict.fromkeys((*names_of(identified.changes, name), *moving, *identified.others)))
+            sought = (each for each in given.sought if name_words(each) != name_words(name))
+            others = tuple(dict.fromkeys((*names_of(identified.changes, name), *moving, *sought, *identified.others)))
         wants_direction = given.motion_wanted and kind in DIRECTED_KINDS
         wants_place = bbox is None or wants_direction
         wants_scale = given.motion_wanted and kind in FALLING_KINDS
