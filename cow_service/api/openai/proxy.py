@@ -71,8 +71,6 @@ class Proxy:
             return await self._sent(request, _without_frames(chat, asked), reader)
         self._submitter.engine.check_capacity()
         simulated, owner = asked.request, owner_of(request)
-        if simulated.reader is None:
-            simulated = simulated.model_copy(update={"reader": answerer.reader})
         submission = Submission("simulate", owner, prefer, new_job_id(owner, None))
         try:
             if chat.stream:
