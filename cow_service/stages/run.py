@@ -13,6 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from pydantic import BaseModel
 
 from cow_service.concurrency import PrioritySemaphore
+from cow_service.errors import CowError
 from cow_service.generators.base import Generator
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import DecodedImage
@@ -132,7 +133,12 @@ class Run(Generic[Request_co]):
         started = time.perf_counter()
         self.report(name, 0.0)
         key = key_of(name, self.image.info.sha256, self.request, inputs, self._identity, self.repeats_answers)
-        result, reused = self.step(name, key, lambda: self._compute(name, function, inputs))
+        try:
+            result, reused = self.step(name, key, lambda: self._compute(name, function, inputs))
+        except CowError as error:
+            spent = self.usage(*self.results, name)
+            error.usage = spent.model_dump() if spent.calls else None
+            raise
         self.results[name] = result
         if reused:
             self.reused.append(name)

@@ -196,7 +196,10 @@ def _why_not(asked: WhatIf, error: CowError) -> NotImagined:
 
 def _without_frames(chat: Chat, why: NotImagined) -> Ready:
     warnings = (UNUSED,) if why is BY_NAME and chat.cow else ()
-    return Ready(chat, None, ChatImagination(imagined=False, reason=why.reason, detail=why.detail, warnings=warnings))
+    told = ChatImagination(
+        imagined=False, reason=why.reason, detail=why.detail, usage=why.usage, usage_total=why.usage, warnings=warnings
+    )
+    return Ready(chat, None, told)
 
 
 def _extended(messages: list[Any], place: int, parts: tuple[dict[str, Any], ...]) -> list[Any]:
