@@ -192,10 +192,12 @@ def test_a_failed_job_keeps_its_problem(served: Served) -> None:
     Job.model_validate(job)
     assert (job["status"], job["result"]) == ("failed", None)
     assert job["problem"] == told
-    key = new_key()
+    key, replayed = new_key(), []
     for _ in range(2):
         again = served.http.post("/simulate", json=LOST, headers={"Idempotency-Key": key})
+        replayed.append(again.headers.get("idempotent-replayed"))
         assert problem(again, 422, "cannot-ground") == told
+    assert replayed == [None, "true"]
 
 
 def test_what_can_be_told_at_once_makes_no_job(served: Served) -> None:

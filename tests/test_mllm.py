@@ -300,6 +300,26 @@ def test_failures_without_end_are_typed_and_bounded(reply, code: str, told: str,
     assert "127.0.0.1" not in problem["detail"]
 
 
+def test_an_outage_is_not_replayed_under_its_key(mllm: MllmServer, make) -> None:
+    """What failed with 503 is tried again under the same Idempotency-Key; what has a result is not."""
+    app = app_for(make())
+    body = QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}
+
+    async def calls() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(
+            transport=transport, base_url="http://cow", headers={"Idempotency-Key": "k"}
+        ) as client:
+            return [await client.post("/answer", json=body) for _ in range(3)]
+
+    mllm.say(say.status(400), '{"answer": "B"}')
+    down, up, again = asyncio.run(calls())
+    assert (down.status_code, up.status_code, again.status_code) == (503, 200, 200)
+    assert again.json() == up.json()
+    assert [each.headers.get("idempotent-replayed") for each in (down, up, again)] == [None, None, "true"]
+    assert len(mllm.asked) == 2
+
+
 @pytest.mark.parametrize(
     ("status", "told"),
     [(401, "COW_MLLM_API_KEY"), (403, "COW_MLLM_API_KEY"), (404, "COW_MLLM_MODEL"), (400, "status 400")],

@@ -29,6 +29,7 @@ from cow_service.stages.run import now
 POLL_SECONDS = 3.0  # another process may have run the job
 MAX_CONCURRENT_BODIES = 4  # decoded at the same time
 RETRY_AFTER = {"Retry-After": "1"}
+REPLAYED = "Idempotent-Replayed"  # as Stripe names it
 
 Made = TypeVar("Made")
 
@@ -42,14 +43,20 @@ def owner_of(request: Request) -> str | None:
 Checked = tuple[SimulateRequest, DecodedImage | None]  # a request, and its image where that is kept and decoded
 
 
-@dataclass(frozen=True)
+@dataclass
 class Submission:
-    """Who submits which job, and how they want to be answered."""
+    """Who submits which job, and how they want to be answered. `replayed` is known once it was submitted."""
 
     kind: JobKind
     owner: str | None
     prefer: Preferences
     job_id: str
+    replayed: bool = False  # the job was there before, under the same Idempotency-Key
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """Of the response to it, errors included."""
+        return {REPLAYED: "true"} if self.replayed else {}
 
     @property
     def may_return(self) -> bool:
@@ -73,12 +80,17 @@ class Submitter:
         """
         submission = self.submission(request, kind)
         raw = await receive(request)
-        result = await self.result(request, submission, lambda: parse(raw, model, self.engine.service))
+        try:
+            result = await self.result(request, submission, lambda: parse(raw, model, self.engine.service))
+        except CowError as error:
+            error.headers |= submission.headers
+            raise
         if result is None:
             return await self.accepted(submission)
         if not submission.prefer.minimal:
-            return json_response(result)
-        return json_response(await to_thread.run_sync(minimal_result, result), headers=MINIMAL_APPLIED)
+            return json_response(result, headers=submission.headers)
+        shorter = await to_thread.run_sync(minimal_result, result)
+        return json_response(shorter, headers=MINIMAL_APPLIED | submission.headers)
 
     def submission(self, request: Request, kind: JobKind) -> Submission:
         """What the request's headers say. Raises `QueueFull` and `ShuttingDown` where no job can be taken."""
@@ -93,7 +105,9 @@ class Submitter:
 
     async def submit(self, submission: Submission, read: Callable[[], Checked]) -> str | None:
         """Makes a job of the request that `read` gives; returns its creation time, or None for one that exists."""
-        return await self.in_thread(lambda: self._submit(submission, *read()))
+        created_at = await self.in_thread(lambda: self._submit(submission, *read()))
+        submission.replayed = created_at is None
+        return created_at
 
     async def result(self, request: Request, submission: Submission, read: Callable[[], Checked]) -> str | None:
         """What the request comes to, as JSON; None where the caller wants the job instead."""
@@ -116,6 +130,7 @@ class Submitter:
             "Location": f"/jobs/{submission.job_id}",
             "Preference-Applied": submission.prefer.applied,
             **RETRY_AFTER,
+            **submission.headers,
         }
         return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers)
 

@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from http import HTTPStatus
 from typing import Any
 
 from dbos import DBOS, DBOSConfig, DBOSContextSetAuth, SetWorkflowAttributes, SetWorkflowID, WorkflowHandle
@@ -167,8 +168,10 @@ class JobEngine:
     def submit(self, job_id: str, spec: JobSpec, owner: str | None, key: str | None, image: DecodedImage) -> bool:
         """Accepts a job; returns whether it is new. It is in the database when this returns.
 
-        `key` is the caller's idempotency key: the same key and spec come to the same job. Raises
-        `IdempotencyKeyReused`, `QueueFull`, `ShuttingDown`, `StorageUnavailable`.
+        `key` is the caller's idempotency key: the same key and spec come to the same job, but for one that was refused
+        with 503 (an MLLM or a disk that was away): that is tried again.
+
+        Raises `IdempotencyKeyReused`, `QueueFull`, `ShuttingDown`, `StorageUnavailable`.
         """
         self.database.check_server()
         if key is None:
@@ -176,7 +179,9 @@ class JobEngine:
             return True
         with self._submit_lock:  # no other request of this process may use the key between the check and the insert
             if self._existing(job_id, spec) is not None:
-                return False
+                if not self._was_refused(job_id):
+                    return False
+                self.open_jobs.remove([job_id], 0)  # its image stays: it was sent just now
             self._submit(job_id, spec, owner, image)
             stored = self._existing(job_id, spec)  # that of another process which was faster with the same key?
             return stored is not None and stored.created_at == spec.created_at
@@ -264,6 +269,11 @@ class JobEngine:
                 "This Idempotency-Key came with another request before. Give every request a key of its own."
             )
         return known
+
+    def _was_refused(self, job_id: str) -> bool:
+        """Whether a job failed for a reason that may be over by now."""
+        found = state.find(job_id, self.active)
+        return found is not None and found.error is not None and found.error.status == HTTPStatus.SERVICE_UNAVAILABLE
 
     def _start(self, job_id: str, spec: JobSpec, owner: str | None) -> None:
         """Starts a job in this process; it is in the database when this returns."""

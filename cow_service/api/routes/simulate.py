@@ -40,7 +40,11 @@ def _header(name: str, description: str) -> dict[str, Any]:
     return {"name": name, "in": "header", "required": False, "description": description, "schema": {"type": "string"}}
 
 
-KEY = _header("Idempotency-Key", "The same key and body come to the same job, however often they are sent.")
+KEY = _header(
+    "Idempotency-Key",
+    "The same key and body come to the same job, however often they are sent, but for one that failed with 503: it is "
+    "tried again. A response of a job that was there before has the header `Idempotent-Replayed: true`.",
+)
 FRESH = _header("Cache-Control", "`no-cache`: take no results of earlier requests.")
 WAIT = "`respond-async`: answer with the job at once; `wait=N`: after N seconds"
 MINIMAL = "`return=minimal`: leave out what `Path` has per frame, but for `points` and `visible`"
