@@ -292,7 +292,7 @@ def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
     answers(mllm, list("ABA"), looking="B")
     database = Database(Settings(data_dir=tmp_path))
     database.create_tables()
-    step = StoredStep("one", False, database, service.artifacts, service.metrics, KeyLocks(), lambda: None)
+    step = StoredStep("one", None, False, database, service.artifacts, service.metrics, KeyLocks(), lambda: None)
     request = AnswerRequest.model_validate(BODY | GIVEN | {"imagine": "auto"})
 
     def crash(stage: Stage | None, done: float) -> None:

@@ -31,8 +31,10 @@ def database(tmp_path: Path) -> Database:
     return database
 
 
-def step(database: Database, tmp_path: Path, job_id: str, fresh: bool = False, check=never) -> StoredStep:
-    return StoredStep(job_id, fresh, database, ArtifactStore(tmp_path), Metrics(), KeyLocks(), check)
+def step(
+    database: Database, tmp_path: Path, job_id: str, fresh: bool = False, check=never, owner: str | None = None
+) -> StoredStep:
+    return StoredStep(job_id, owner, fresh, database, ArtifactStore(tmp_path), Metrics(), KeyLocks(), check)
 
 
 def result(speed: float) -> StageResult[Any]:
@@ -41,6 +43,15 @@ def result(speed: float) -> StageResult[Any]:
         kind="static", direction=None, cue="text", speed=speed, metres_per_pixel=scale, sentence="", source="request"
     )
     return StageResult(value=motion)
+
+
+def test_nobody_finds_what_another_key_asked(database: Database, tmp_path: Path) -> None:
+    def reused(job_id: str, owner: str | None) -> bool:
+        return step(database, tmp_path, job_id, owner=owner)("motion", StageKey("a" * 64), lambda: result(1))[1]
+
+    assert [reused(str(n), owner) for n, owner in enumerate(["alice", "bob", None, "alice", "bob", None])] == [
+        False, False, False, True, True, True,
+    ]  # fmt: skip
 
 
 def test_a_result_is_found_by_other_jobs_only_where_it_may_be(database: Database, tmp_path: Path) -> None:

@@ -53,6 +53,7 @@ class StoredStep:
     """The `Step` of one job: a result is stored as soon as it is there, and this process does not compute it again."""
 
     job_id: str
+    owner: str | None  # whose results of other jobs may be taken: nobody learns what another key asked
     fresh: bool  # results of other jobs are not taken
     database: Database
     artifacts: ArtifactStore
@@ -67,6 +68,8 @@ class StoredStep:
         digest = key.digest
         if self.fresh or not key.shareable:
             digest = digest_of({"job": self.job_id, "key": key.digest})
+        elif self.owner is not None:
+            digest = digest_of({"owner": self.owner, "key": key.digest})
         with self.locks.held(digest, self.check_canceled):
             found = self._find(stage, digest)
             if found is not None:

@@ -105,6 +105,7 @@ class Worker:
 
         step = StoredStep(
             job_id=job_id,
+            owner=DBOS.authenticated_user,
             fresh=spec.fresh,
             database=open_jobs.database,
             artifacts=service.artifacts,
