@@ -55,6 +55,32 @@ def test_put_get_read(store, folder, media_type, extension):
     assert files(folder) == [f"{SHA256[:2]}/{SHA256}.{extension}"]
 
 
+@pytest.mark.parametrize("damage", [DATA[:-1], DATA[:-1] + b"x", b""], ids=["shorter", "changed", "empty"])
+@pytest.mark.parametrize("started_anew", [False, True])
+def test_what_is_damaged_is_not_handed_out_and_heals(store, folder, damage, started_anew):
+    path = store.get(store.put(DATA, "image/png").sha256).path
+    path.write_bytes(damage)
+    if started_anew:
+        store = ArtifactStore(folder)
+    with pytest.raises(ArtifactNotFound):
+        store.get(SHA256)
+    assert files(folder) == []
+    path.write_bytes(damage)
+    assert store.put(DATA, "image/png").size == len(DATA)
+    assert store.read(SHA256) == DATA
+
+
+def test_bytes_are_compared_once(store, folder, monkeypatch):
+    store.put(DATA, "image/png")
+    anew, compared = ArtifactStore(folder), []
+    whole = hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda *given: compared.append(1) or whole(*given))
+    for _ in range(3):
+        anew.touch(SHA256)
+        assert anew.read(SHA256) == DATA
+    assert len(compared) == 1
+
+
 def test_no_bytes_are_an_artifact_too(store):
     assert store.read(store.put(b"", "application/json").sha256) == b""
 

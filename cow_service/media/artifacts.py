@@ -1,12 +1,15 @@
 """Frames, masks and clips as files, named by the SHA-256 of their bytes.
 
-The layout is `<folder>/<first two digits>/<digest>.<extension>`; the extension keeps the media type.
+The layout is `<folder>/<first two digits>/<digest>.<extension>`; the extension keeps the media type. A file whose bytes
+are no longer those of its name is removed when that is seen: it is then as if it had never been kept, and comes back
+when the same bytes are sent or computed again.
 """
 
 from __future__ import annotations
 
 import errno
 import hashlib
+import logging
 import os
 import re
 import threading
@@ -32,6 +35,9 @@ _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _MAX_SHOWN_CHARACTERS = 80
+MAX_VERIFIED = 10_000  # files
+
+log = logging.getLogger("cow_service")
 
 
 def media_type_of(data: bytes) -> str | None:
@@ -61,6 +67,7 @@ class ArtifactStore:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._commit_lock = threading.Lock()
+        self._verified: dict[str, tuple[int, ...]] = {}  # files whose bytes were compared with their names
 
     def put(self, data: bytes, media_type: str) -> Artifact:
         """Stores bytes. Bytes that are stored already keep their first media type.
@@ -70,9 +77,9 @@ class ArtifactStore:
         extension = _extension(media_type)
         sha256 = hashlib.sha256(data).hexdigest()
         with _storage_errors():
-            known = self._find(sha256)
+            known = self._intact(sha256)
             if known is not None:
-                os.utime(known.path)  # it is in use: maintenance deletes by this time
+                self._use(known)
                 return known.artifact
             target = self._target(sha256, extension)
             with _temporary_beside(target) as temporary:
@@ -104,7 +111,7 @@ class ArtifactStore:
                 f"No artifact is named {sha256[:_MAX_SHOWN_CHARACTERS]!r}: give its SHA-256, 64 lower-case hex digits."
             )
         with _storage_errors():
-            stored = self._find(sha256)
+            stored = self._intact(sha256)
         if stored is None:
             raise ArtifactNotFound(
                 f"No artifact has the SHA-256 {sha256}: send the image again, or run the simulation that made it."
@@ -113,9 +120,9 @@ class ArtifactStore:
 
     def touch(self, sha256: str) -> None:
         """Marks an artifact as used now. Raises as `get` does."""
-        path = self.get(sha256).path
+        stored = self.get(sha256)
         with _storage_errors():
-            os.utime(path)
+            self._use(stored)
 
     def delete(self, sha256: str, untouched_since: float) -> bool:
         """Deletes an artifact unless it was used after that time (seconds since 1970). Returns whether it did."""
@@ -153,6 +160,32 @@ class ArtifactStore:
             file.write(b"\0")
             _sync(file)
 
+    def _use(self, stored: StoredArtifact) -> None:
+        os.utime(stored.path)  # it is in use: maintenance deletes by this time
+        self._note_verified(stored)
+
+    def _intact(self, sha256: str) -> StoredArtifact | None:
+        """A stored file that holds what its name says, compared once for as long as it is not changed."""
+        stored = self._find(sha256)
+        try:
+            if stored is None or self._verified.get(sha256) == _state(stored.path):
+                return stored
+            with stored.path.open("rb") as file:
+                found = hashlib.file_digest(file, "sha256").hexdigest()
+            if found == sha256:
+                self._note_verified(stored)
+                return stored
+        except FileNotFoundError:  # it was deleted just now
+            return None
+        log.error("artifact %s is damaged and was removed", sha256)
+        stored.path.unlink(missing_ok=True)
+        return None
+
+    def _note_verified(self, stored: StoredArtifact) -> None:
+        if len(self._verified) >= MAX_VERIFIED:
+            self._verified.clear()
+        self._verified[stored.artifact.sha256] = _state(stored.path)
+
     def _target(self, sha256: str, extension: str) -> Path:
         return self._folder / sha256[:2] / f"{sha256}.{extension}"
 
@@ -170,13 +203,21 @@ class ArtifactStore:
     def _commit(self, temporary: Path, target: Path, sha256: str) -> Artifact:
         # Two threads may store the same bytes under two media types: the first one decides.
         with self._commit_lock:
-            stored = self._find(sha256)
+            stored = self._intact(sha256)
             if stored is None:
                 temporary.replace(target)
                 stored = self._find(sha256)
+                if stored is not None:
+                    self._note_verified(stored)
         if stored is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
         return stored.artifact
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    """What changes with the bytes of a file, unless the disk itself damages them."""
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _extension(media_type: str) -> str:
