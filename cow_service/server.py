@@ -7,6 +7,7 @@ import socket
 import uvicorn
 
 from cow_service.api.app import create_app
+from cow_service.api.connections import Connection, allow_connections
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
@@ -38,7 +39,7 @@ def run_server(service: Service) -> None:
         port=settings.port,
         log_config=None,
         access_log=False,
-        http="h11",  # whatever is installed: parsers differ on which headers they refuse
+        http=Connection,  # h11 whatever is installed: parsers differ on which headers they refuse, and on how long
         timeout_graceful_shutdown=int(settings.shutdown_grace + CLOSE_SECONDS),
     )
     server = Server(config, engine)
@@ -46,6 +47,7 @@ def run_server(service: Service) -> None:
     def failed() -> None:
         server.should_exit = True
 
+    allow_connections()
     readiness.start(failed)
     readiness.wait(LOAD_WAIT_SECONDS)
     engine.start()

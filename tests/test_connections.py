@@ -1,0 +1,73 @@
+"""Connections of a real server: those that say nothing are closed, and lock nobody out."""
+
+from __future__ import annotations
+
+import resource
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+from servers import Served
+
+SECONDS = 2.0  # instead of REQUEST_SECONDS
+FILES = 320  # that the server may have open
+SERVE = f"""
+import resource
+resource.setrlimit(resource.RLIMIT_NOFILE, ({FILES}, {FILES}))
+from cow_service.api import connections
+connections.REQUEST_SECONDS = {SECONDS}
+from cow_service.cli.main import app
+app(["serve"])
+"""
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with Served(tmp_path_factory.mktemp("connections"), SERVE) as one:
+        yield one
+
+
+def opened(served: Served, stack: ExitStack) -> socket.socket:
+    url = served.http.base_url
+    return stack.enter_context(socket.create_connection((url.host, url.port), timeout=15))
+
+
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET /livez HTTP/1.1\r\nHost: x\r\n", b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\nG"]
+)
+def test_a_connection_without_a_whole_request_is_closed(served: Served, sent: bytes) -> None:
+    with ExitStack() as stack:
+        one = opened(served, stack)
+        one.sendall(sent)
+        until = time.monotonic() + 10
+        one.settimeout(0.3)
+        while True:
+            try:
+                if not one.recv(65536):
+                    break
+            except TimeoutError:
+                assert time.monotonic() < until
+                if sent:
+                    one.send(b"x")  # slow bytes give no new time
+            except OSError:
+                break
+
+
+def test_more_idle_connections_than_files_lock_nobody_out(served: Served) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, 2 * FILES + 100)), hard))
+    with ExitStack() as stack:
+        for _ in range(2 * FILES):
+            opened(served, stack)
+            if _ % 40 == 0:
+                assert served.http.get("/livez").status_code == 200
+        assert served.http.get("/livez").status_code == 200
+
+
+def test_headers_of_more_than_64_kb_are_refused(served: Served) -> None:
+    with ExitStack() as stack:
+        one = opened(served, stack)
+        one.sendall(b"GET /livez HTTP/1.1\r\nHost: x\r\n" + b"X: " + b"a" * 70_000)
+        assert b" 400 " in one.recv(65536).split(b"\r\n")[0]
