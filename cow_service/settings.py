@@ -62,6 +62,13 @@ class Settings(BaseSettings):
     max_body_mb: float = Field(
         default=32, gt=0, le=4096, allow_inf_nan=False, description="Largest request body taken, in MB (10^6 bytes)."
     )
+    max_bodies_mb: float = Field(
+        default=256,
+        gt=0,
+        le=65536,
+        allow_inf_nan=False,
+        description="Request bodies that are held at the same time, in MB; more are refused with 503.",
+    )
     allow_image_urls: tuple[str, ...] = Field(
         default=(),
         description="Hosts from which images given by URL are fetched, as JSON: names, name:port, *.name for all below "

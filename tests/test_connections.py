@@ -1,15 +1,17 @@
-"""Connections of a real server: those that say nothing are closed, and lock nobody out."""
+"""Connections of a real server: those that say nothing are closed, and neither they nor bodies lock anybody out."""
 
 from __future__ import annotations
 
+import json
 import resource
+import select
 import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
-from servers import Served
+from servers import BODY, Served
 
 SECONDS = 2.0  # instead of REQUEST_SECONDS
 FILES = 320  # that the server may have open
@@ -25,7 +27,7 @@ app(["serve"])
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with Served(tmp_path_factory.mktemp("connections"), SERVE) as one:
+    with Served(tmp_path_factory.mktemp("connections"), SERVE, COW_MAX_BODY_MB="1", COW_MAX_BODIES_MB="2") as one:
         yield one
 
 
@@ -71,3 +73,24 @@ def test_headers_of_more_than_64_kb_are_refused(served: Served) -> None:
         one = opened(served, stack)
         one.sendall(b"GET /livez HTTP/1.1\r\nHost: x\r\n" + b"X: " + b"a" * 70_000)
         assert b" 400 " in one.recv(65536).split(b"\r\n")[0]
+
+
+def test_bodies_that_are_held_are_bounded(served: Served) -> None:
+    def unfinished(stack: ExitStack) -> socket.socket:
+        one = opened(served, stack)
+        head = "POST /simulate HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 950000\r\n\r\n"
+        one.sendall(head.encode() + b"[" + b" " * 900_000)
+        return one
+
+    padded = json.dumps(BODY).encode() + b" " * 800_000
+    json_type = {"Content-Type": "application/json"}
+    for _ in range(3):  # what was read is held no more
+        assert served.http.post("/simulate", content=padded, headers=json_type).status_code == 200
+    with ExitStack() as stack:
+        held = [unfinished(stack) for _ in range(3)]
+        (answered,), _, _ = select.select(held, [], [], 15)
+        refused = answered.recv(65536)
+        assert b" 503 " in refused.split(b"\r\n")[0]
+        assert b"COW_MAX_BODIES_MB" in refused
+        assert served.http.post("/simulate", json=BODY).status_code == 200, "a small one fits beside the others"
+    assert served.http.post("/simulate", content=padded, headers=json_type).status_code == 200

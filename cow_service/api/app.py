@@ -58,7 +58,8 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
         redirect_slashes=False,
         lifespan=lifespan,
     )
-    app.add_middleware(BodyLimit, megabytes=service.settings.max_body_mb, seconds=service.settings.body_timeout)
+    limits = {"megabytes": service.settings.max_body_mb, "seconds": service.settings.body_timeout}
+    app.add_middleware(BodyLimit, **limits, megabytes_at_once=service.settings.max_bodies_mb)
     install_problem_handlers(app)
     install_layers(app, service.settings, service.metrics)
     layers = app.surround

@@ -88,7 +88,7 @@ async def receive(request: Request) -> RawBody:
             )
         return await _receive_form(request)
     if media_type == "application/json" or media_type.endswith("+json"):
-        return RawBody(json=await request.body())
+        return RawBody(json=b"".join([part async for part in request.stream()]))
     raise BodyTypeUnsupported(
         f"The body has the media type '{media_type or 'none'}'. Send application/json or multipart/form-data."
     )

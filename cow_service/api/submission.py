@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from functools import partial
 from http import HTTPStatus
 from typing import TypeVar
 
@@ -13,6 +14,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Request, Response
 
 from cow_service.api.body import Body, parse, receive
+from cow_service.api.middleware.body_limit import release_body
 from cow_service.api.minimal import minimal_result
 from cow_service.api.preferences import MINIMAL_APPLIED, Preferences, preferences_of
 from cow_service.errors import Canceled, CowError, JobNotFound
@@ -79,9 +81,10 @@ class Submitter:
         Raises what is wrong with the request, and what the job fails with.
         """
         submission = self.submission(request, kind)
-        raw = await receive(request)
+        checked = await self.in_thread(partial(parse, await receive(request), model, self.engine.service))
+        release_body(request)
         try:
-            result = await self.result(request, submission, lambda: parse(raw, model, self.engine.service))
+            result = await self.result(request, submission, lambda: checked)
         except CowError as error:
             error.headers |= submission.headers
             raise

@@ -1,13 +1,16 @@
-"""Refuses a body that is too large, as soon as that is known, also without a Content-Length, or too slow."""
+"""Refuses a body that is too large, as soon as that is known, also without a Content-Length, too slow, or too much."""
 
 from __future__ import annotations
 
 import asyncio
 
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cow_service.api.problems import respond
-from cow_service.errors import BodyTooLarge, BodyTooSlow, CowError, MalformedBody
+from cow_service.errors import BodyTooLarge, BodyTooSlow, CowError, MalformedBody, QueueFull
+
+_RELEASE = "release_body"  # in the state of a request
 
 
 class BodyLimit:
@@ -16,10 +19,12 @@ class BodyLimit:
     How long the headers take is the HTTP server's matter, uvicorn's: the app hears of a request once they are in.
     """
 
-    def __init__(self, app: ASGIApp, megabytes: float, seconds: float) -> None:
+    def __init__(self, app: ASGIApp, megabytes: float, seconds: float, megabytes_at_once: float) -> None:
         self.app = app
         self.megabytes = megabytes
         self.seconds = seconds
+        self.megabytes_at_once = max(megabytes_at_once, megabytes)
+        self._held = 0  # bytes of all bodies that are not read yet
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Passes the request on; past a limit the app gets `BodyTooLarge` or `BodyTooSlow` where it reads the body."""
@@ -32,6 +37,7 @@ class BodyLimit:
             return
         deadline = asyncio.get_running_loop().time() + self.seconds
         seen = 0
+        released = False
         waiting = True  # for more of the body, which the app still wants
 
         async def counted() -> Message:
@@ -44,17 +50,32 @@ class BodyLimit:
             except TimeoutError as error:
                 raise self._too_slow(seen) from error
             waiting = bool(message.get("more_body", False))
-            seen += len(message.get("body", b""))
+            size = len(message.get("body", b""))
+            seen += size
+            if not released:
+                self._held += size
             if seen > limit:
                 raise self._too_large()
+            if self._held > self.megabytes_at_once * 1e6:
+                raise self._too_many()
             return message
+
+        def release() -> None:
+            nonlocal released
+            if not released:
+                released = True
+                self._held -= seen
 
         async def answered(message: Message) -> None:
             nonlocal waiting
             waiting = False  # an app that answers without the whole body must not be disturbed by the rest of it
             await send(message)
 
-        await self.app(scope, counted, answered)
+        scope.setdefault("state", {})[_RELEASE] = release
+        try:
+            await self.app(scope, counted, answered)
+        finally:
+            release()
 
     def _refused(self, scope: Scope, limit: int) -> CowError | None:
         """What the headers alone show to be wrong."""
@@ -75,9 +96,21 @@ class BodyLimit:
             "server."
         )
 
+    def _too_many(self) -> QueueFull:
+        return QueueFull(
+            f"The server holds {self.megabytes_at_once:g} MB of bodies that it has not read yet, all that "
+            "COW_MAX_BODIES_MB lets it. Send the request again in a while.",
+            headers={"Retry-After": "1", "Connection": "close"},
+        )
+
     def _too_slow(self, seen: int) -> BodyTooSlow:
         return BodyTooSlow(
             f"Of the body {seen} bytes came in {self.seconds:g} s, and not its end. Send it at once, or raise "
             "COW_BODY_TIMEOUT on the server.",
             headers={"Connection": "close"},
         )
+
+
+def release_body(request: Request) -> None:
+    """Counts the body of a request no longer: it was read, and its bytes are kept no more."""
+    request.scope.get("state", {}).get(_RELEASE, lambda: None)()
