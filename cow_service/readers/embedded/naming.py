@@ -14,7 +14,7 @@ from cow_service.readers.question.lexicon import words
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.vision.regions import Region
 
-CLEARLY_WORSE = 2.5  # log ratio: what is so much worse than the best is not meant
+CLEARLY_WORSE = 2.5  # log ratio: what is so much less likely than the best, twelve times, is not meant
 EXACT, NEAR = 6.0, 3.0  # log ratios of the name of a region's colour, and of others that people may use for it
 SURE = CLEARLY_WORSE  # log ratio of an outline: more counts no more, so what could be meant too is a rival
 LEAST = -2.0  # log ratio of an outline: less speaks no more against it

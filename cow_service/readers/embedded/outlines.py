@@ -23,6 +23,7 @@ Range = tuple[float, float]
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
 CONTRADICTS = 3.5  # misfit from which a thing is not what it is called; of things in their own name up to 2.4
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
+CIRCLE = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
 ODD = 0.05  # share of outlines that are nobody's: half hidden, or with a shadow
 
 # Rows over which a width is taken, from the upper end, as shares of the height.
@@ -69,8 +70,12 @@ def log_ratio(region: Region, form: str) -> float:
     """Natural logarithm of how much more likely an outline is under a row of `OUTLINES` than under the others."""
     rivals = OUTLINES.keys() - _SAME.get(form, {form, "box"})
     measured = _measures(region)
-    others = [_density(measured, name) for name in rivals]
-    return math.log(_density(measured, form)) - math.log(sum(others) / len(others))
+    densities = {
+        name: _density(measured, name) * (CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
+        for name in (form, *rivals)
+    }
+    own = densities.pop(form)
+    return math.log(own) - math.log(sum(densities.values()) / len(densities))
 
 
 def _density(measured: Sequence[float], form: str) -> float:
