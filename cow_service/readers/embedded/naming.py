@@ -26,6 +26,7 @@ ROUND = 0.76  # roundness from which a region passes for a ball; a cube has abou
 NOT_ROUND = 0.6  # roundness below which nothing passes for a ball, even half hidden
 MAX_OTHERS = 5  # names that are assigned beside one: the work grows fast with their number
 IMPOSSIBLE = -math.inf
+NOWHERE = -1  # place of the region of a name that has none
 
 _SOLID = words("glass chair book lamp robot pencil pen")  # no balls; of their outlines nothing is known
 _ANYTHING = words("object thing item shape one")
@@ -53,12 +54,12 @@ def _best(names: Sequence[ObjectPhrase], rows: Sequence[Row], taken: tuple[tuple
     at = len(taken)
     if at == len(names):
         return 0.0
-    best = UNSEEN + _best(names, rows, (*taken, (at, -1)))
-    ahead = sum(max(0.0, *row) for row in rows[at + 1 :])
+    best = IMPOSSIBLE
+    ahead = sum(max(0.0, max(row, default=0.0)) for row in rows[at + 1 :])
     # Of more regions than there are names, the worse ones are never needed.
-    for region in sorted(range(len(rows[at])), key=lambda region: -rows[at][region])[: len(names)]:
-        sharing = [_shared(names[at], names[name]) for name, other in taken if other == region]
-        ratio = rows[at][region] + sum(sharing)
+    for region in [*sorted(range(len(rows[at])), key=lambda region: -rows[at][region])[: len(names)], NOWHERE]:
+        sharing = [_shared(names[at], names[name]) for name, other in taken if other == region != NOWHERE]
+        ratio = UNSEEN if region == NOWHERE else rows[at][region] + sum(sharing)
         if ratio + ahead > best:
             best = max(best, ratio + _best(names, rows, (*taken, (at, region))))
     return best

@@ -21,7 +21,7 @@ Range = tuple[float, float]
 
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
-CONTRADICTS = 3.5  # misfit from which a thing is not what it is called; of things in their own name up to 2.4
+CONTRADICTS = 7.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
 CIRCLE = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
 ODD = 0.05  # share of outlines that are nobody's: half hidden, or with a shadow
@@ -49,8 +49,6 @@ _ALIKE = {
     "car": "bus truck van taxi lorry train",
 }  # fmt: skip
 _FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALIKE.items() for other in words(said)}
-
-
 # Rows that are no rivals of one: a cube is a box, a mug that hides its handle a cylinder.
 _SAME = {"cube": {"cube", "box"}, "box": {"cube", "box"}, "mug": {"mug", "cylinder", "box"}}
 
@@ -108,7 +106,9 @@ def _measures(region: Region) -> list[float]:
     """What `OUTLINES` has ranges of, the first as a natural logarithm."""
     mask = region.mask.patch
     height, width = mask.shape
-    filled = np.count_nonzero(mask) / np.count_nonzero(hull(mask))
+    sides = mask & ~(np.roll(mask, 1, axis=1) & np.roll(mask, -1, axis=1))  # their hull is that of the mask
+    sides[:, [0, -1]] = mask[:, [0, -1]]
+    filled = np.count_nonzero(mask) / np.count_nonzero(hull(sides))
     return [math.log(height / width), filled, *_widths(mask)]
 
 
