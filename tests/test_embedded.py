@@ -143,6 +143,17 @@ def test_what_is_longer_than_high_is_the_vehicle() -> None:
     assert grounding.point[0] == pytest.approx(470, abs=6)
 
 
+def test_bare_names_are_found_together_and_what_is_not_there_is_refused() -> None:
+    scene = Scene(jpeg(block(block(floor(), (110, 160, 200, 250), GREEN), (430, 130, 505, 250), BLUE)))
+    grounding, _ = read(scene, "If the cube slides right, will it hit the cylinder?")
+    assert grounding.point[0] == pytest.approx(155, abs=3)
+    assert [(other.object, round(other.bbox[0], -1)) for other in grounding.others] == [("cylinder", 430)]
+    given = ReaderInput(scene, "If the cylinder is removed and the cube slides right, what happens?")
+    (removed,) = reader.ground(given).interventions
+    assert removed.object.bbox == grounding.others[0].bbox
+    assert "nothing that fits" in refusal(CannotGround, scene, "If the vase slides right, what happens?")
+
+
 def test_the_only_ball_needs_no_colour() -> None:
     grounding, _ = read(drawn(False), "If the ball moves left, what happens?")
     assert iou(grounding.bbox, (110, 160, 190, 240)) > 0.8

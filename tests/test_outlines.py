@@ -5,13 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from drawn import Image, block, floor, jpeg
+from drawn import Image, ball, block, floor, jpeg
 
 from cow_service.readers.embedded.matching import best_matches, match_one
+from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import parse_noun_phrase
 from cow_service.vision.regions import Region, find_regions
 
-PURPLE = (120, 60, 170)
+PURPLE, GREEN = (120, 60, 170), (50, 150, 50)
 HALF_WIDTHS = {  # at equal steps from the upper end
     "bottle": (8, 8, 14, 26, 26, 26, 26, 26),
     "vase": (30, 28, 16, 16, 28, 34, 32, 22),
@@ -44,10 +45,49 @@ def test_two_of_one_colour_are_told_apart_by_outline(noun: str, other: str) -> N
         assert found == pytest.approx([200] if noun != other else [200, 440], abs=2)
 
 
-def test_an_outline_that_both_could_have_or_the_border_cuts_decides_nothing() -> None:
+def phrase_of(text: str) -> ObjectPhrase:
+    phrase = parse_noun_phrase(text)
+    assert phrase is not None
+    return phrase
+
+
+def test_an_outline_that_both_could_have_decides_nothing() -> None:
     cubes = block(block(floor(), (150, 150, 250, 250), PURPLE), (400, 160, 480, 250), PURPLE)
-    cut = turned(turned(floor(), 200, "bottle"), 620, "vase")
-    for image, text in ((cubes, "the purple mug"), (cut, "the purple bottle")):
-        phrase = parse_noun_phrase(text)
-        assert phrase is not None
-        assert match_one(find_regions(jpeg(image)), phrase) is None
+    twins = turned(turned(floor(), 200, "bottle"), 625, "bottle")  # the image's border cuts one
+    for image, text in ((cubes, "the purple mug"), (twins, "the purple bottle"), (twins, "the bottle")):
+        assert match_one(find_regions(jpeg(image)), phrase_of(text)) is None
+
+
+def test_names_are_told_apart_together_where_one_alone_is_not() -> None:
+    box, tin = (150, 150, 250, 250), (400, 120, 480, 240)
+    regions = find_regions(jpeg(block(block(floor(), box, GREEN), tin, PURPLE)))
+    cube, cylinder = phrase_of("the cube"), phrase_of("the cylinder")
+    assert match_one(regions, cylinder) is None
+    for phrase, other, x in ((cube, cylinder, 200), (cylinder, cube, 440)):
+        found = match_one(regions, phrase, [other])
+        assert found is not None
+        assert found.centre[0] == pytest.approx(x, abs=3)
+
+
+def test_no_region_has_two_names_that_differ() -> None:
+    regions = find_regions(jpeg(ball(block(floor(), (150, 150, 250, 250), GREEN), (440, 200), 50, PURPLE)))
+    assert match_one(regions, phrase_of("the mug"), [phrase_of("the green cube")]) is None
+    shared = match_one(regions, phrase_of("the ball"), [phrase_of("the purple ball")])
+    assert shared is not None
+    assert shared.centre[0] == pytest.approx(440, abs=3)
+
+
+@pytest.mark.parametrize("noun", sorted(HALF_WIDTHS))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_shadow_in_the_outline_names_no_other_thing(noun: str, side: int) -> None:
+    image = turned(turned(floor(), 200, noun), 440, "cone" if noun != "cone" else "vase")
+    cv2.ellipse(image, (440 + 50 * side, 272), (50, 8), 0, 0, 360, PURPLE, -1)
+    found = match_one(find_regions(jpeg(image)), phrase_of(f"the {noun}"))
+    assert found is None or found.centre[0] == pytest.approx(200, abs=3)
+
+
+@pytest.mark.parametrize("noun", ["vase", "cone", "ball", "bottle"])
+def test_a_name_of_what_is_not_there_means_nothing(noun: str) -> None:
+    regions = find_regions(jpeg(block(block(floor(), (150, 150, 250, 250), GREEN), (400, 160, 490, 250), PURPLE)))
+    assert match_one(regions[:1], phrase_of(f"the {noun}")) is None
+    assert match_one(regions, phrase_of(f"the {noun}"), [phrase_of("the green cube")]) is None

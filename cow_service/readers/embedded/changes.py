@@ -51,10 +51,12 @@ def _is_asked_about(removed: ObjectPhrase, asked: Asked) -> bool:
 def find_removed(scene: Scene, question: Question, given: Sequence[LocatedObject] = ()) -> tuple[Intervention, ...]:
     """What is taken away: `given` under that name, or where exactly one region fits. Raises `CannotGround`."""
     removed = [change.object for change in question.interventions if change.kind == "remove"]
+    names = [each for each in (question.mover, *question.others, *removed) if each is not None and not _is_plural(each)]
     taken: list[LocatedObject] = []
     for phrase in removed:
         left = [each for each in scene.regions if all(each.bbox != one.bbox for one in taken)]
-        found = _both(left, phrase) if _is_plural(phrase) else _one(left, phrase, given)
+        others = [each for each in names if all(each.text != one.object for one in taken)]
+        found = _both(left, phrase, others) if _is_plural(phrase) else _one(left, phrase, others, given)
         if not found:
             raise _not_found(scene, f"takes '{phrase.text}' away", phrase)
         taken += found
@@ -66,16 +68,21 @@ def given_as(phrase: ObjectPhrase, given: Sequence[LocatedObject]) -> LocatedObj
     return next((each for each in given if same_name(each.object, phrase.text)), None)
 
 
-def _one(regions: Sequence[Region], phrase: ObjectPhrase, given: Sequence[LocatedObject]) -> list[LocatedObject]:
-    named, region = given_as(phrase, given), match_one(regions, phrase)
+def _one(
+    regions: Sequence[Region],
+    phrase: ObjectPhrase,
+    others: Sequence[ObjectPhrase],
+    given: Sequence[LocatedObject],
+) -> list[LocatedObject]:
+    named, region = given_as(phrase, given), match_one(regions, phrase, others)
     if named is not None:
         return [named]
     return [] if region is None else [_located(phrase.text, region.bbox)]
 
 
-def _both(regions: Sequence[Region], phrase: ObjectPhrase) -> list[LocatedObject]:
+def _both(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[LocatedObject]:
     """ "Both cylinders", each under its colour."""
-    found = match_both(regions, phrase)
+    found = match_both(regions, phrase, others)
     return [_located(f"{region.colour} {phrase.head or 'object'}", region.bbox) for region in found]
 
 
@@ -94,7 +101,7 @@ def find_placed(
 ) -> tuple[Intervention, ...]:
     """What is put somewhere, and where; what is `given` under its name is not looked for. Raises `CannotGround`."""
     changes = [change for change in question.interventions if change.kind == "place"]
-    return tuple(_placed(scene, regions, change, mover, given) for change in changes)
+    return tuple(_placed(scene, regions, change, mover, question.others, given) for change in changes)
 
 
 def _placed(
@@ -102,14 +109,16 @@ def _placed(
     regions: Sequence[Region],
     change: InterventionWords,
     mover: Found,
+    others: Sequence[ObjectPhrase],
     given: Sequence[LocatedObject],
 ) -> Intervention:
-    thing = _find(scene, regions, change.object, f"puts '{change.object.text}' somewhere", [mover], given)
+    others = [*others, change.object]
+    thing = _find(scene, regions, change.object, f"puts '{change.object.text}' somewhere", [mover], others, given)
     known = [mover, (change.object, thing.bbox)]
     targets: list[LocatedObject] = []
     for phrase in change.targets:
         told = f"puts '{change.object.text}' {change.relation} '{phrase.text}'"
-        targets.append(_find(scene, regions, phrase, told, known, given))
+        targets.append(_find(scene, regions, phrase, told, known, others, given))
         known.append((phrase, targets[-1].bbox))
     return Intervention(kind="place", object=thing, relation=change.relation, targets=tuple(targets))
 
@@ -120,6 +129,7 @@ def _find(
     phrase: ObjectPhrase,
     told: str,
     known: Sequence[Found],
+    others: Sequence[ObjectPhrase],
     given: Sequence[LocatedObject],
 ) -> LocatedObject:
     """A thing that is known already or was given, or the one region besides those that fits its words."""
@@ -130,7 +140,7 @@ def _find(
     if named is not None:
         return named
     free = [region for region in regions if all(iou(region.bbox, bbox) < SAME_OBJECT_IOU for _, bbox in known)]
-    region = match_one(free, phrase)
+    region = match_one(free, phrase, [each for each in others if all(each != one for one, _ in known)])
     if region is None:
         raise _not_found(scene, told, phrase)
     return _located(phrase.text, region.bbox)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cow_service.readers.embedded.matching import is_known
-from cow_service.readers.embedded.outlines import OUTLINES, contradicts
+from cow_service.readers.embedded.naming import is_known
+from cow_service.readers.embedded.outlines import contradicts
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.records import BBox
 from cow_service.vision.masks import iou
@@ -21,7 +21,7 @@ def noun_warnings(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> l
         if region is None or phrase.inside_box:
             continue
         place = f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})"
-        if not is_known(phrase) and phrase.head not in OUTLINES:
+        if not is_known(phrase):
             warnings.append(
                 f"'{phrase.text}' was taken for what is {place}: whether '{phrase.head}' is right, the embedded reader "
                 "cannot tell."

@@ -13,9 +13,9 @@ from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, 
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
 from cow_service.readers.embedded.doubts import noun_warnings
-from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, is_known, match_one
+from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
-from cow_service.readers.embedded.outlines import OUTLINES
+from cow_service.readers.embedded.naming import is_known
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
@@ -156,7 +156,7 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
             f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. "
             f"Seen in all: {seen}. {GIVE_PLACE}"
         )
-    if phrase.colour is None and not is_known(phrase) and phrase.head not in OUTLINES and len(scene.regions) > 1:
+    if phrase.colour is None and not is_known(phrase) and len(scene.regions) > 1:
         raise CannotGround(
             f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
             f"Seen: {seen}. {GIVE_PLACE}"
@@ -175,15 +175,17 @@ def _others(regions: Sequence[Region], phrases: Sequence[ObjectPhrase], mover: B
     """The other things of these words, where exactly one region fits; the rest stay unnamed."""
     found: dict[BBox, LocatedObject] = {}
     for phrase in phrases:
-        bbox = _bbox_of(regions, phrase, mover)
+        bbox = _bbox_of(regions, phrase, mover, phrases)
         if bbox is not None:
             found.setdefault(bbox, LocatedObject(object=phrase.text, bbox=bbox))
     return tuple(found.values())
 
 
-def _bbox_of(regions: Sequence[Region], phrase: ObjectPhrase, mover: BBox) -> BBox | None:
+def _bbox_of(
+    regions: Sequence[Region], phrase: ObjectPhrase, mover: BBox, others: Sequence[ObjectPhrase]
+) -> BBox | None:
     """The box of the one region, besides the mover, that fits a phrase."""
-    region = match_one([region for region in regions if iou(region.bbox, mover) < SAME_OBJECT_IOU], phrase)
+    region = match_one([region for region in regions if iou(region.bbox, mover) < SAME_OBJECT_IOU], phrase, others)
     return None if region is None else region.bbox
 
 
@@ -280,7 +282,7 @@ def _with_quantities(scene: Scene, question: Question, grounding: Grounding, rea
 def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:
     """From the mover to the thing that it moves towards."""
     goal = next((other.bbox for other in grounding.others if other.object == phrase.text), None)
-    bbox = goal or _bbox_of(scene.regions, phrase, grounding.bbox)
+    bbox = goal or _bbox_of(scene.regions, phrase, grounding.bbox, ())
     if bbox is None:
         raise CannotReadDirection(
             f"The {grounding.object} moves towards '{phrase.text}', which was not found. "
