@@ -9,6 +9,14 @@ _DENIAL = re.compile(
     r"|n['’]t\b|\bno\b(?!\.?\s*\d)",
     re.IGNORECASE,
 )
+# One sentence that an object is not in the picture, and nothing else.
+_ABSENT = re.compile(
+    r"\W*(?:sorry,? |unfortunately,? )?(?:(?:but )?"
+    r"i (?:can(?:no|['’])t|can not|do(?: not|n['’]t)) (?:see|find|locate|identify)"
+    r"|there (?:is|are|['’]s) (?:no|not any)|no)\b[^.!?:;{}]{1,80}\b(?:in|on|visible in|present in|shown in) "
+    r"(?:the|this|your) (?:given |provided )?(?:image|picture|photo|photograph|scene|frame)\W*",
+    re.IGNORECASE,
+)
 _POINTING = frozenset({"it", "this", "that", "them", "they", "object", "the object", "moving object"})
 _ANSWER_IS = re.compile(r"\b(?:final\s+)?answer\b[\s*_\"'`]*(?:is|:|=)[\s*_\"'`]*(?P<said>[^\n]*)", re.IGNORECASE)
 _TAGGED = re.compile(r"<answer>(?P<said>.*?)(?:</answer>|$)", re.IGNORECASE | re.DOTALL)
@@ -26,6 +34,11 @@ MARKS = "*_`\"'“” \t."
 def names_nothing(name: str) -> bool:
     """Whether a phrase that should name an object refuses, denies, hesitates or points without naming."""
     return _DENIAL.search(name) is not None or name.lower().strip(" .") in _POINTING
+
+
+def says_absent(said: str) -> bool:
+    """Whether a text says, in one sentence, that something is not in the image: "There is no toy car in the image."."""
+    return _ABSENT.fullmatch(said) is not None
 
 
 def is_broken_json(said: str) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, cast, get_args
 
 from cow_service.readers.mllm.changes import CHANGE_FIELDS, Change, read_changes
 from cow_service.readers.mllm.client import PromptCall
-from cow_service.readers.mllm.free_text import is_broken_json, names_nothing
+from cow_service.readers.mllm.free_text import is_broken_json, names_nothing, says_absent
 from cow_service.readers.mllm.images import EncodedImage
 from cow_service.readers.mllm.legs import LEG_FIELDS, NO_LEGS, Legs, read_legs
 from cow_service.readers.mllm.lengths import LENGTH_FIELDS, NOT_SAID, Lengths, read_lengths
@@ -81,6 +81,9 @@ def read_identified(reply: str) -> Identified | None:
     found = [named for value in values for named in _named(value)]
     if not found and not any(isinstance(value, dict | list) or value is None for value in values):
         found = [Identified(name) for name in _in_prose(said)]
+    absent = [named for named in found if says_absent(named.object)]
+    if (found and len(absent) == len(found)) or (not found and says_absent(said)):
+        return None
     if not found:
         if any(_says_none(value) for value in values):
             return None
