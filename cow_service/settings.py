@@ -14,6 +14,7 @@ from pydantic_settings import SettingsError as UnreadableSetting
 KEY_NAME = r"^[A-Za-z0-9._-]{1,64}$"
 KEY_HASH = r"^sha256:[0-9a-f]{64}$"
 SECRET_BYTES = range(24, 65)  # as Standard Webhooks says
+MAX_SECRETS = 2  # that sign at the same time, while one takes over from the other
 ORIGIN = r"^(\*|[a-z][a-z0-9+.-]*://[^/\s?#@A-Z]+)$"  # as browsers write it: lower case, no path
 
 
@@ -154,18 +155,15 @@ class Settings(BaseSettings):
     )
     webhook_secret: SecretStr | None = Field(
         default=None,
-        description="Secret that signs webhooks (Standard Webhooks, whsec_...); without it none are called.",
+        description="Secret that signs webhooks (Standard Webhooks, whsec_...); without it none are called. Two with "
+        "a space between them both sign: the new one and the old one, until every receiver knows the new one.",
     )
 
     @field_validator("webhook_secret")
     @classmethod
     def _signs(cls, secret: SecretStr | None) -> SecretStr | None:
-        begin, _, coded = (secret.get_secret_value() if secret else "whsec_").partition("_")
-        try:
-            length = len(base64.b64decode(coded, validate=True))
-        except ValueError:
-            length = 0
-        if secret is not None and (begin != "whsec" or length not in SECRET_BYTES):
+        each = [] if secret is None else secret.get_secret_value().split(" ")
+        if secret is not None and (len(each) > MAX_SECRETS or not all(map(_is_secret, each))):
             raise ValueError("not whsec_ and base64 of 24 to 64 bytes")
         return secret
 
@@ -186,13 +184,21 @@ class Settings(BaseSettings):
         return ("transformer", "base") if (checkpoint / "vae").is_dir() else ("transformer",)
 
 
+def _is_secret(text: str) -> bool:
+    begin, _, coded = text.partition("_")
+    try:
+        return begin == "whsec" and len(base64.b64decode(coded, validate=True)) in SECRET_BYTES
+    except ValueError:
+        return False
+
+
 def _message(item: Any) -> str:
     """One bad setting. A key or an address may hold a secret, and is not repeated."""
     name = str(item["loc"][0])
     if name == "mllm_base_url":
         return "COW_MLLM_BASE_URL must begin with http:// or https://"
     if name == "webhook_secret":
-        return "COW_WEBHOOK_SECRET must be whsec_ and the base64 of 24 to 64 random bytes"
+        return "COW_WEBHOOK_SECRET must be whsec_ and the base64 of 24 to 64 random bytes, or two of them"
     if name == "api_keys":
         return (
             'COW_API_KEYS must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes '

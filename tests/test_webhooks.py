@@ -6,6 +6,7 @@ import base64
 import hashlib
 import hmac
 import json
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -93,11 +94,11 @@ def receiver() -> Iterator[Receiver]:
 
 @pytest.fixture
 def app(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FastAPI]:
-    """An app with a secret, that may call this machine, and does not wait long."""
+    """An app with a secret and the one before it, that may call this machine, and does not wait long."""
     monkeypatch.syspath_prepend(str(SLOW_GENERATOR))
     monkeypatch.setattr(webhooks, "RETRY_SECONDS", (0, 0))
     monkeypatch.setattr(webhooks, "POLL_SECONDS", 0.05)
-    secret = "whsec_" + base64.b64encode(SECRET).decode()
+    secret = " ".join(f"whsec_{base64.b64encode(each).decode()}" for each in (b"n" * 32, SECRET))
     service = Service(Settings(data_dir=tmp_path / "data", webhook_secret=secret))
     app = app_for(service)
     hooks = running_engine().webhooks
@@ -140,7 +141,9 @@ def verify(message: Message) -> None:
     assert abs(int(headers["webhook-timestamp"]) - time.time()) < PATIENCE
     signed = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + message.body
     wanted = base64.b64encode(hmac.digest(SECRET, signed, hashlib.sha256)).decode()
-    assert f"v1,{wanted}" in headers["webhook-signature"].split(" ")
+    signatures = headers["webhook-signature"].split(" ")
+    assert len(signatures) == 2, "while one secret takes over from another, both sign"
+    assert f"v1,{wanted}" in signatures
 
 
 @pytest.mark.parametrize(("body", "status"), [(BODY, "succeeded"), (LOST, "failed")])
@@ -256,6 +259,19 @@ def test_nobody_there_is_no_end_either(http: TestClient, receiver: Receiver) -> 
     all_done(job)
 
 
+def test_silent_receivers_hold_up_their_own_calls_alone(http: TestClient, receiver: Receiver) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # connections are made, and never answered
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}/"
+        waiting = [submitted(http, {**BODY, "seed": seed, "webhook": url}) for seed in range(9)]
+        connection, _ = silent.accept()
+        submitted(http, {**BODY, "webhook": receiver.url})
+        told_of(receiver)
+        assert all(set(attempts(job)) <= {"ENQUEUED", "PENDING"} for job in waiting), "none has given up yet"
+        connection.close()
+        for job in waiting:
+            assert http.delete(f"/jobs/{job}").status_code == 204
+
+
 def test_a_receiver_that_is_gone_is_left_alone(http: TestClient, receiver: Receiver) -> None:
     receiver.statuses = [410]
     job = submitted(http, {**BODY, "webhook": receiver.url})
@@ -336,6 +352,8 @@ def test_the_secret_is_told_nowhere(http: TestClient, receiver: Receiver, caplog
         "whsec_" + "A" * 28,
         "WHSEC_" + "A" * 32,
         "x" * 5000,
+        " ".join(["whsec_" + "A" * 32] * 3),
+        "whsec_" + "A" * 32 + " ",
     ],
 )
 def test_a_secret_that_is_none_stops_the_start_and_is_not_repeated(

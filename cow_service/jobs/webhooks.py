@@ -14,6 +14,7 @@ import random
 import time
 from functools import cached_property
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from dbos import DBOS, SetEnqueueOptions, SetWorkflowID
 
@@ -26,8 +27,9 @@ from cow_service.settings import Settings
 if TYPE_CHECKING:
     from cow_service.net.egress import Egress
 
-QUEUE = "cow-webhooks"
-MAX_CONCURRENT_DELIVERIES = 8
+QUEUE = "cow-webhook-receivers"  # in which every receiver has a share of its own
+MAX_CONCURRENT_DELIVERIES = 100
+MAX_CONCURRENT_DELIVERIES_TO_ONE = 2  # receiver: one that is silent holds up its own calls alone
 POLL_SECONDS = 1.0
 RETRY_SECONDS = (5, 30, 120, 600, 3600, 6 * 3600)  # before each further attempt, plus or minus JITTER
 JITTER = 0.2  # share
@@ -102,21 +104,30 @@ class Webhooks:
         with database_errors():
             if not self._registered:
                 DBOS.register_queue(
-                    QUEUE, worker_concurrency=MAX_CONCURRENT_DELIVERIES, polling_interval_sec=POLL_SECONDS
+                    QUEUE,
+                    worker_concurrency=MAX_CONCURRENT_DELIVERIES,
+                    partition_worker_concurrency=MAX_CONCURRENT_DELIVERIES_TO_ONE,
+                    polling_interval_sec=POLL_SECONDS,
                 )
                 self._registered = True
-            with SetWorkflowID(attempt_ids(job_id)[attempt - 1]), SetEnqueueOptions(delay_seconds=delay):
+            options = SetEnqueueOptions(delay_seconds=delay, queue_partition_key=_receiver(url))
+            with SetWorkflowID(attempt_ids(job_id)[attempt - 1]), options:
                 DBOS.enqueue_workflow(QUEUE, workflows.webhook, job_id, url, attempt)
 
     def _headers(self, message: str, body: bytes) -> dict[str, str]:
         assert self._secret is not None
-        moment = str(int(time.time()))
+        secrets, moment = self._secret.get_secret_value().split(" "), str(int(time.time()))
         return {
             "Content-Type": "application/json",
             "webhook-id": message,
             "webhook-timestamp": moment,
-            "webhook-signature": sign(self._secret.get_secret_value(), message, moment, body),
+            "webhook-signature": " ".join(sign(each, message, moment, body) for each in secrets),
         }
+
+
+def _receiver(url: str) -> str:
+    """Who is called by a URL: its host and port, as a key of bounded length."""
+    return hashlib.sha256(urlsplit(url).netloc.rpartition("@")[2].lower().encode()).hexdigest()[:32]
 
 
 def attempt_ids(job_id: str) -> list[str]:
