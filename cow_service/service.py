@@ -201,8 +201,9 @@ class Service:
 
         Raises `ArtifactNotFound`, `ImageUrlNotAllowed`, and what `keep_image` raises.
         """
-        if isinstance(ref, ImageUrl) or (isinstance(ref, str) and _OTHER_URL.match(ref[:256])):
-            artifact, image = self.keep_image(self._image_urls.fetch(ref.url if isinstance(ref, ImageUrl) else ref))
+        if isinstance(ref, ImageUrl) or is_url(ref):
+            url = ref.url if isinstance(ref, ImageUrl) else str(ref)
+            artifact, image = self.keep_image(self._image_urls.fetch(url))
             return artifact.sha256, image
         if isinstance(ref, ImageArtifact):
             self.artifacts.touch(ref.artifact)
@@ -248,6 +249,11 @@ class Service:
             pull=None if here else f"cow models pull {name}",
             defaults=manifest.defaults,
         )
+
+
+def is_url(ref: ImageRef) -> bool:
+    """Whether an image must be fetched: it is given by a URL that holds no data."""
+    return isinstance(ref, ImageUrl) or (isinstance(ref, str) and _OTHER_URL.match(ref[:256]) is not None)
 
 
 def _check_modules(name: str, unavailable: type[CowError]) -> None:

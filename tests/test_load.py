@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import os
 import re
@@ -17,12 +18,15 @@ import mllm_server as say
 import numpy as np
 import pytest
 from engines import app_for
+from fastapi import FastAPI
 from mllm_server import MllmServer
 from numpy.typing import NDArray
-from servers import data_url
+from servers import BODY, data_url
 
+from cow_service.api.submission import MAX_CONCURRENT_BODIES
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.media.images import encode_png
+from cow_service.net.images import ImageUrls
 from cow_service.service import Service
 from cow_service.settings import Settings
 
@@ -60,6 +64,35 @@ class Witness:
         if seen != [asked]:
             self.wrong.append((asked, seen))
         handler.send(200, say.completion(f'{{"reasoning": "", "answer": "{seen[0]}"}}'))
+
+
+def test_slow_image_urls_hold_up_nobody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More of them than bodies are decoded at the same time."""
+    arrive, begun = threading.Event(), threading.Semaphore(0)
+
+    def fetched(_: object, url: str) -> bytes:
+        begun.release()
+        assert arrive.wait(30)
+        return base64.b64decode(BODY["image"].partition(",")[2])
+
+    monkeypatch.setattr(ImageUrls, "fetch", fetched)
+
+    async def calls(app: FastAPI) -> None:
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=30) as client:
+            asked = [
+                BODY | {"image": f"https://slow.test/{n}.png", "seed": n} for n in range(MAX_CONCURRENT_BODIES + 2)
+            ]
+            slow = [asyncio.create_task(client.post("/simulate", json=body)) for body in asked]
+            for _ in slow:
+                assert await asyncio.to_thread(begun.acquire, timeout=10)
+            assert (await client.post("/simulate", json=BODY)).status_code == 200
+            assert not any(task.done() for task in slow)
+            arrive.set()
+            assert [(await task).status_code for task in slow] == [200] * len(slow)
+
+    with Service(Settings(data_dir=tmp_path)) as service:
+        asyncio.run(calls(app_for(service)))
 
 
 @pytest.fixture

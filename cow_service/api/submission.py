@@ -26,10 +26,12 @@ from cow_service.media.images import DecodedImage
 from cow_service.observability import context
 from cow_service.records import TERMINAL, JobKind
 from cow_service.requests import ImageArtifact, SimulateRequest
+from cow_service.service import is_url
 from cow_service.stages.run import now
 
 POLL_SECONDS = 3.0  # another process may have run the job
 MAX_CONCURRENT_BODIES = 4  # decoded at the same time
+MAX_CONCURRENT_FETCHES = 64  # of images given by URL
 RETRY_AFTER = {"Retry-After": "1"}
 REPLAYED = "Idempotent-Replayed"  # as Stripe names it
 
@@ -40,9 +42,6 @@ def owner_of(request: Request) -> str | None:
     """Whose key the request came with; None where the server has no keys."""
     owner: str | None = request.scope.get("state", {}).get("owner")
     return owner
-
-
-Checked = tuple[SimulateRequest, DecodedImage | None]  # a request, and its image where that is kept and decoded
 
 
 @dataclass
@@ -74,6 +73,7 @@ class Submitter:
 
     def __post_init__(self) -> None:
         self._limiter = CapacityLimiter(MAX_CONCURRENT_BODIES)
+        self._fetches = CapacityLimiter(MAX_CONCURRENT_FETCHES)
 
     async def run(self, request: Request, kind: JobKind, model: type[Body]) -> Response:
         """The job's result, or the job itself where the caller does not want to wait so long.
@@ -84,7 +84,7 @@ class Submitter:
         checked = await self.in_thread(partial(parse, await receive(request), model, self.engine.service))
         release_body(request)
         try:
-            result = await self.result(request, submission, lambda: checked)
+            result = await self.result(request, submission, *checked)
         except CowError as error:
             error.headers |= submission.headers
             raise
@@ -106,16 +106,27 @@ class Submitter:
         """Decodes a body in a thread, a few at the same time."""
         return await to_thread.run_sync(work, limiter=self._limiter)
 
-    async def submit(self, submission: Submission, read: Callable[[], Checked]) -> str | None:
-        """Makes a job of the request that `read` gives; returns its creation time, or None for one that exists."""
-        created_at = await self.in_thread(lambda: self._submit(submission, *read()))
+    async def submit(self, submission: Submission, body: SimulateRequest, image: DecodedImage | None) -> str | None:
+        """Makes a job of a request; returns its creation time, or None for one that exists.
+
+        `image` is that of the request, where it is kept and decoded. One that is given by a URL is fetched apart from
+        all other work: a server that is slow to send it holds up nobody else.
+        """
+        if image is None and is_url(body.image):
+            await self.in_thread(partial(self._precheck, submission, body, image))
+            fetch = partial(self.engine.service.image_of, body.image)
+            sha256, image = await to_thread.run_sync(fetch, limiter=self._fetches)
+            body = body.model_copy(update={"image": ImageArtifact(artifact=sha256)})
+        created_at = await self.in_thread(partial(self._submit, submission, body, image))
         submission.replayed = created_at is None
         return created_at
 
-    async def result(self, request: Request, submission: Submission, read: Callable[[], Checked]) -> str | None:
+    async def result(
+        self, request: Request, submission: Submission, body: SimulateRequest, image: DecodedImage | None = None
+    ) -> str | None:
         """What the request comes to, as JSON; None where the caller wants the job instead."""
         with self.engine.active.waiting(submission.job_id) as waiter:
-            created_at = await self.submit(submission, read)
+            created_at = await self.submit(submission, body, image)
             if submission.prefer.respond_async and not submission.prefer.wait:
                 return None
             async with disconnected(request) as gone:
@@ -184,16 +195,21 @@ class Submitter:
         if created_at is not None and not submission.may_return:
             await to_thread.run_sync(self.engine.cancel, submission.job_id, submission.owner)
 
-    def _submit(self, submission: Submission, body: SimulateRequest, image: DecodedImage | None) -> str | None:
-        service = self.engine.service
+    def _precheck(self, submission: Submission, body: SimulateRequest, image: DecodedImage | None) -> tuple[str, str]:
+        """Raises what is wrong with a request before its image is looked at; returns its reader and generator."""
         if isinstance(body.image, ImageArtifact):
             self.engine.may_read(body.image.artifact, submission.owner if image is None else None)
         for mask in body.masks:
             if isinstance(mask, ImageArtifact):
                 self.engine.may_read(mask.artifact, submission.owner)
-        reader, generator = service.precheck(body)
+        backends = self.engine.service.precheck(body)
         if body.webhook is not None:
             self.engine.webhooks.check(body.webhook)
+        return backends
+
+    def _submit(self, submission: Submission, body: SimulateRequest, image: DecodedImage | None) -> str | None:
+        service = self.engine.service
+        reader, generator = self._precheck(submission, body, image)
         sha256 = None
         if image is None:
             sha256, image = service.image_of(body.image)

@@ -55,11 +55,11 @@ class Completer:
         """The reply of a job. Errors point into its `AnswerRequest`."""
         submitter = self._submitter
         if chat.stream:
-            created_at = await submitter.submit(submission, lambda: (chat.request, None))
+            created_at = await submitter.submit(submission, chat.request, None)
             events = answer_events(submitter, submission, chat, created_at)
             left = partial(submitter.leave, submission, created_at)
             return Streamed(events, chat.pointers.translate_error, left)
-        result = await submitter.result(request, submission, lambda: (chat.request, None))
+        result = await submitter.result(request, submission, chat.request, None)
         if result is None:
             return await submitter.accepted(submission)
         return Whole(await to_thread.run_sync(lambda: ChatAnswer.parse(chat, result).completion()))

@@ -74,9 +74,9 @@ class Proxy:
         submission = Submission("simulate", owner, prefer, new_job_id(owner, None))
         try:
             if chat.stream:
-                created_at = await self._submitter.submit(submission, lambda: (simulated, None))
+                created_at = await self._submitter.submit(submission, simulated, None)
                 return self._streamed(submission, created_at, chat, asked, reader)
-            result = await self._submitter.result(request, submission, lambda: (simulated, None))
+            result = await self._submitter.result(request, submission, simulated, None)
         except CowError as error:
             return await self._sent(request, _without_frames(chat, _why_not(asked, error)), reader)
         return await self._sent(request, await self._with_frames(chat, asked, result), reader)
