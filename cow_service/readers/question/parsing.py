@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import suppress
 from functools import cache
 from importlib.resources import files
@@ -144,3 +144,8 @@ def may_begin(start: str, word: Word) -> bool:
     """Whether a word may be the first one of a rule."""
     grammar = _grammar()
     return not grammar.starts[start].isdisjoint(grammar.names(word))
+
+
+def terminals(word: str) -> Set[str]:
+    """The terminals of the grammar that a word may be."""
+    return _grammar().terminals.get(word, frozenset())

@@ -17,7 +17,7 @@ from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sente
 from cow_service.readers.question.asking import IT, Asking, read_clause
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
-from cow_service.readers.question.words import PRONOUNS, Word, base_forms
+from cow_service.readers.question.words import Word
 from cow_service.records import Asked
 
 _STARTS = lex.words(
@@ -28,6 +28,7 @@ _OPENERS = lex.words(", and then so but now please")
 _CLAIM = ("true", "or", "false")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
 _SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
+_SUBJECTS_KINDS = frozenset({"PRONOUN", "M", "T", "S"})
 _CONDITIONS = lex.words("if when once after as while upon assuming given provided suppose supposing")
 _MAX_TRIES = 8  # of one sentence: each takes some ms
 MAX_SENTENCES = 12  # of one question; more are not read
@@ -102,7 +103,7 @@ def unread(question: Question) -> Unread:
 def _read(question: Question) -> _Reading | None:
     """The one clause of the question that asks; None where none is understood, or several ask."""
     found, claim = _without_claim(sentences(question))
-    if len(found) > MAX_SENTENCES or any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
+    if len(found) > MAX_SENTENCES or any(len(sentence.words) > MAX_TOKENS for sentence in found):
         return None
     readings = [
         (at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question, claim))
@@ -113,12 +114,11 @@ def _read(question: Question) -> _Reading | None:
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
         return None
-    named = {found[at].items[place] for place in reading.covered}
-    named |= claim | {place for place, item in enumerate(question.items) if item.phrase in listed}
-    if listed:
-        named |= {place for place, item in enumerate(question.items) if item.key == "or"}
-    limits = {at: item.quantity.within for at, item in enumerate(question.items) if item.quantity}
-    limits = {at: limit for at, limit in limits.items() if limit is not None}
+    named = {found[at].words[place].at for place in reading.covered} | claim
+    named |= {at for at, item in enumerate(question.items) if listed and (item.phrase in listed or item.key == "or")}
+    named |= {at for at, item in enumerate(question.items) if item.key == "still" and question.interventions}
+    quantities = {at: item.quantity for at, item in enumerate(question.items) if item.quantity}
+    limits = {at: quantity.within for at, quantity in quantities.items() if quantity.within is not None}
     if not all(_limits(question, named, at) for at in limits):
         return None
     within = min(limits.values(), default=None)
@@ -130,8 +130,8 @@ def _without_claim(found: list[Sentence]) -> tuple[list[Sentence], frozenset[int
     if not found or tuple(found[0].tokens[: len(_CLAIM)]) != _CLAIM:
         return found, frozenset()
     first, number = found[0], len(_CLAIM) + (found[0].tokens[len(_CLAIM) : len(_CLAIM) + 1] == [","])
-    rest = replace(first, tokens=first.tokens[number:], words=first.words[number:], items=first.items[number:])
-    return [each for each in (rest, *found[1:]) if each.tokens], frozenset(first.items[:number])
+    rest = replace(first, words=first.words[number:])
+    return [each for each in (rest, *found[1:]) if each.words], frozenset(word.at for word in first.words[:number])
 
 
 def _limits(question: Question, asking: set[int], at: int) -> bool:
@@ -149,10 +149,11 @@ def _read_sentence(sentence: Sentence, question: Question, claim: Collection[int
     """
     tokens = sentence.tokens
     tries = 0
-    ends = [len(tokens), *(at for at in range(len(tokens)) if _ends(tokens, at, question))]
-    claims = {at for at in range(len(tokens)) if claim and _claims(tokens, at)}
-    for start in (at for at in range(len(tokens)) if at in claims or _starts(sentence, at)):
-        for end in (end for end in ends if end > start):
+    rolling = ["by", question.motion.verb, "-ing"]
+    ends = [at for at in range(len(tokens)) if tokens[at] in _CONDITIONS or tokens[at : at + 3] == rolling]
+    claims = {at for at in range(len(tokens)) if claim and _claims(sentence, at)}
+    for start in (at for at in range(len(tokens)) if at in claims or _starts(sentence, at, question)):
+        for end in (end for end in (len(tokens), *ends) if end > start):
             tries += 1
             if tries > _MAX_TRIES:
                 return None
@@ -162,44 +163,36 @@ def _read_sentence(sentence: Sentence, question: Question, claim: Collection[int
     return None
 
 
-def _ends(tokens: Sequence[str], at: int, question: Question) -> bool:
-    """Whether a condition begins at a token: "if it rolls", "by rolling"."""
-    return tokens[at] in _CONDITIONS or (
-        tokens[at] == "by" and tokens[at + 1 : at + 2] == [f"{question.motion.verb}-ing"]
-    )
-
-
-def _starts(sentence: Sentence, at: int) -> bool:
+def _starts(sentence: Sentence, at: int, question: Question) -> bool:
     """Whether a question may begin at a token: with an auxiliary, or as in "ball rolls left - hits the mug?"."""
-    tokens = sentence.tokens
-    if tokens[at] in _STARTS:
+    tokens, word = sentence.tokens, sentence.words[at]
+    if word.text in _STARTS and not (at and sentence.words[at - 1].at == word.at):
         return _opens(tokens[:at])
-    said = sentence.words[at][0]
+    said = question.items[word.at].key
     finite = said in lex.VERBS and lex.VERBS[said].form == "s"
     return finite and sentence.asks and (at == 0 or tokens[at - 1] == ",")
 
 
-def _claims(tokens: Sequence[str], at: int) -> bool:
+def _claims(sentence: Sentence, at: int) -> bool:
     """Whether a statement may begin at a token: with what does something, at the start or behind a condition."""
-    subject = tokens[at] in PRONOUNS or tokens[at] == "M" or (tokens[at][:1] == "T" and tokens[at][1:].isdecimal())
-    return subject and (at == 0 or tokens[at - 1] in _OPENERS) and _opens(tokens[:at])
+    before = sentence.tokens[:at]
+    return sentence.words[at].kind in _SUBJECTS_KINDS and (not before or before[-1] in _OPENERS) and _opens(before)
 
 
 def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]:
     """The places of a clause without what stands between commas behind its subject: "the car, moving left,"."""
     places = list(range(start, end))
     commas = [at for at in places if tokens[at] == ","]
-    if len(commas) > 1 and commas[0] == start + 2 and tokens[start + 1] in {"M", "it"}:
-        first = tokens[commas[0] + 1]
-        if first in _CONDITIONS or first.endswith("-ing") or first in lex.VERBS:
-            return [at for at in places if not commas[0] <= at <= commas[1]]
+    behind = len(commas) > 1 and commas[0] == start + 2 and tokens[start + 1] in {"M", "it"}
+    if behind and tokens[commas[0] + 1] in _CONDITIONS | lex.VERBS.keys():
+        return [at for at in places if not commas[0] <= at <= commas[1]]
     return places[:-1] if commas and commas[-1] == end - 1 else places
 
 
 def _match(sentence: Sentence, places: Sequence[int], question: Question, claim: bool) -> _Reading | None:
     words = [Word("", word, places[0]) for word in _CLAIM] if claim else []
-    words += [word for at in places for word in _words(sentence.tokens[at], at, question)]
-    tokens = [sentence.tokens[at] for at in places]
+    words += [sentence.words[at] for at in places]
+    tokens = [word.text for word in words]
     senses = {token for token in tokens if token in {"along", "against"}}
     if "arrow" in tokens and senses and senses != {question.motion.arrow}:
         return None  # the motion that was read is another
@@ -214,21 +207,6 @@ def _match(sentence: Sentence, places: Sequence[int], question: Question, claim:
         phrases = phrases | {IT: question.others[0]}
     asking = _into_hollow(asking, tokens, phrases)
     return None if asking is None else _Reading(asking, phrases, frozenset(places))
-
-
-def _words(token: str, at: int, question: Question) -> list[Word]:
-    """A token of a sentence as words of the grammar."""
-    if token in {"M", "OBJ", "OBJS", "X"}:
-        return [Word(token, token, at)]
-    if token[:1] in {"T", "K"} and token[1:].isdecimal():
-        return [Word(token[0], token, at)]
-    if token == "still" and question.interventions:
-        return []  # "will it still hit the cup?": with what is taken away
-    if token in PRONOUNS:
-        return [Word("PRONOUN", token, at)]
-    if token.endswith("-ing"):
-        return [Word("", token.removesuffix("-ing"), at), Word("", "-ing", at)]
-    return [Word("", text, at) for text in base_forms(token)]
 
 
 def _opens(before: Sequence[str]) -> bool:
@@ -248,8 +226,8 @@ def _opens(before: Sequence[str]) -> bool:
 
 def _relates(token: str, after: str) -> bool:
     """Whether a clause follows on "which", "when" or "where": then nothing is asked with them."""
-    subject = after[:1] in {"M", "T", "X"} or after in _SUBJECTS or after.startswith("OBJ")
-    return subject or (token == "when" and after.removesuffix("-ing") in lex.VERBS)
+    subject = after[:1] in {"M", "T", "S", "X"} or after in _SUBJECTS or after.startswith("OBJ")
+    return subject or (token == "when" and after in lex.VERBS)
 
 
 def _into_hollow(asking: Asking, tokens: Sequence[str], phrases: dict[str, ObjectPhrase]) -> Asking | None:
