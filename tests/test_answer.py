@@ -290,7 +290,6 @@ when precisely will it miss the vase?
 will they collide?
 when will it stop?
 how many times will it hit the vase?
-how many cubes will it hit?
 how many objects will it knock over?
 which objects will it hit?
 which object does it touch last?

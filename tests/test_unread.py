@@ -30,7 +30,7 @@ If the ball rolls right, does it hit the mug and the cube? | hit mug and cube
 If the ball rolls right, does it hit the mug before the cube? | hit mug before cube
 If the ball rolls right, will it hit the cone after 2 seconds? | hit cone after 2 seconds
 If the ball rolls left for the first second, does it hit the mug? | for the first second
-If the ball rolls right, does it hit both mugs? | hit both mugs
+If the ball rolls right, does it not hit both mugs? | not hit both mugs
 The ball and the mug are on the table. If it rolls left, does it hit the cone? | it
 The ball moves right, but the mug is glued to the floor. Does the mug move? | mug is glued
 Replace the ball with the cube. If the mug slides left, does it hit the vase? | Replace ball with cube

@@ -7,12 +7,12 @@ ball", `OBJ` and `OBJS` an object or objects of no name. `X` is a phrase that is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import takewhile
+from dataclasses import dataclass, field, replace
+from itertools import dropwhile
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.choices import plain
-from cow_service.readers.question.phrases import Item, ObjectPhrase
+from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import Word, plain_words
 
@@ -25,14 +25,18 @@ _PLURAL = lex.words("objects things items ones obstacles bodies")
 _PLAIN_WORDS = lex.words(
     "take takes taking long soon clear free untouched visible unobstructed unoccluded uncovered unhidden unblocked",
     "first elapse elapses pass passes seconds whole entire total overall altogether",
-    "number least all both short able",
+    "number least all both either none two short able",
 )
 _OF_GENERIC = lex.words("first other different all")
 _TRAILING = lex.words("hard fast slow alone anyway whatsoever second third last twice once again")  # more is asked
 _COUNTING = lex.words(
     "both all every each other several many twice once exactly least most only else same different single",
 ) | (lex.NUMBER_WORDS.keys() - {"one"})
-_SOME = lex.words("any every each either both all many no")  # in front of the things of a kind
+THEM = "them"  # the things that were named
+_TWO = (["the", "two"], ["both"], ["two"])
+_LISTING = frozenset({",", ":", "or"})
+_TWO_OF = lex.words("both either neither")
+_SOME = lex.words("any every each either neither both all many no none one some")  # of the things of a kind
 
 
 @dataclass
@@ -62,6 +66,8 @@ def sentences(question: Question) -> list[Sentence]:
             continue
         if item.phrase is not None:
             found[-1].words += _phrase_words(at, item, item.phrase, question, found[-1])
+        elif item.key in {"them", "these", "those"} and _counts(found[-1].tokens):
+            found[-1].words.append(Word("S", THEM, at))
         elif item.key != "still" or not question.interventions:  # "will it still hit it?": with what is taken away
             found[-1].words += plain_words(["," if item.key in _PAUSES else item.key], at)
     found[-1].asks = True
@@ -70,21 +76,51 @@ def sentences(question: Question) -> list[Sentence]:
 
 def _phrase_words(at: int, item: Item, phrase: ObjectPhrase, question: Question, sentence: Sentence) -> list[Word]:
     words = [word.lower() for word in item.words]
-    determiners = list(takewhile(lex.DETERMINERS.__contains__, words))
-    content = words[len(determiners) :]
-    asked, before = words[0] in {"which", "what"}, sentence.tokens[-2:]
-    kind = before in (["which", "of"], ["what", "of"]) and phrase.head not in _GENERIC and "other" not in content
+    content = list(dropwhile(lex.DETERMINERS.__contains__, words))
+    determiners, before = words[: len(words) - len(content)], sentence.tokens
+    if words in _TWO and before[-1:] == ["of"]:
+        return [Word("S", THEM, at)]
     if words == ["each", "other"] or phrase.head in lex.NO_THINGS or set(content) <= _PLAIN_WORDS:
-        return plain_words(words, at)
-    if question.motion.others and words in (["the", "two"], ["both"]):
-        return plain_words(["they"], at)
-    if kind and phrase.noun is not None:
-        return [_name("K", at, phrase, sentence)]
-    if means_mover(phrase, question) and not asked:
+        return plain_words(["they"] if question.motion.others and words in _TWO else words, at)
+    asked = words[0] in {"which", "what"}
+    if means_mover(phrase, question) and not asked and words[0] not in _SOME:
         return [Word("M", "M", at)]
     named = phrase.inside_box or phrase.colour is not None or phrase.number is not None
     if not named and _GENERIC.intersection(content) and set(content) <= _GENERIC | _OF_GENERIC:
         return _generic(determiners, content, at)
+    listed = not _LISTING.isdisjoint((key_at(question.items, at - 1), key_at(question.items, at + 1)))
+    return _of_kind(at, words, phrase, sentence, listed) or _thing(at, determiners, content, phrase, sentence)
+
+
+def _counts(before: Sequence[str]) -> bool:
+    """Whether what stands in front is "any of", "all the", "neither"."""
+    return before[-1:] in (["all"], ["neither"], ["no"]) or (
+        before[-1:] == ["of"] and not _SOME.isdisjoint(before[-2:-1])
+    )
+
+
+def _of_kind(at: int, words: Sequence[str], phrase: ObjectPhrase, sentence: Sentence, listed: bool) -> list[Word]:
+    """ "Both mugs", "any of the other two mugs", "neither mug" in tokens; none for a phrase that is of no kind."""
+    before = [word for word in sentence.tokens if word != "of"]
+    counts = _counts(sentence.tokens)
+    plain = phrase.colour is None and phrase.number is None and phrase.place is None and not phrase.inside_box
+    of_it = words[0] in _SOME or (words[0] in {"a", "an"} and plain and not listed)
+    if (not counts and not of_it) or phrase.noun is None or phrase.head in _GENERIC or (counts and of_it):
+        return []
+    said = words[0] if of_it else before[-1]
+    content = [word for word in words if word not in {"the", "these", "those"}]
+    if not set(content) & _COUNTING <= _SOME | lex.NUMBER_WORDS.keys() | {"other"} or content[-1] in _TRAILING:
+        return [Word("X", "X", at)]
+    name = " ".join(content if of_it else [*([said] if said in _TWO_OF else []), *content])
+    return [*plain_words([said] if of_it else [], at), _name("S", at, replace(phrase, text=name), sentence)]
+
+
+def _thing(
+    at: int, determiners: Sequence[str], content: Sequence[str], phrase: ObjectPhrase, sentence: Sentence
+) -> list[Word]:
+    asked = not {"which", "what"}.isdisjoint(determiners)
+    if sentence.tokens[-2:] in (["which", "of"], ["what", "of"]) and phrase.noun is not None and "other" not in content:
+        return [_name("K", at, phrase, sentence)]
     if _is_several(determiners, content, phrase, asked):
         return [Word("X", "X", at)]
     return [*([Word("", "which", at)] if asked else []), _name("K" if asked else "T", at, phrase, sentence)]

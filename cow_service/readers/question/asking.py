@@ -39,6 +39,7 @@ _NEGATIONS = frozenset(
 )
 
 
+_SPARING = _NEGATIONS - {"no", "none", "no_contact"}
 _ANY_PART = frozenset({"any_part", "partly", "wholly", "in_full", "at_some_time"})  # hidden in part or once
 
 
@@ -53,6 +54,7 @@ class Asking:
     target: str | None
     among: tuple[str, ...] = ()
     partly: bool = False
+    every: bool = False
 
 
 def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
@@ -68,21 +70,42 @@ def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
     things = list(dict.fromkeys(str(t) for t in _tokens(tree) if t.type == "T" and t not in (*subject, *listed)))
     if negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
-    if form == "which-first" and things:
-        return None  # "which mug is hit by the cone first": of another than the mover
+    of_another = form == "which-first" and things  # "which mug is hit by the cone first": not by the mover
     partly = relation in {"covers", "covered"} and any(node.data in _ANY_PART for node in tree.iter_subtrees())
     target = things[0] if things else None
     asking = Asking(form, relation, negations == 1, None, target, tuple(map(str, listed)), partly)
     inside_it = any(token.type in MOVER for token in subject) and next(tree.find_data("inside_bare"), None) is not None
     if inside_it or (any(token.type == "M" for token in subject) and _speaks_of_it(tree)):
         asking = replace(asking, target=IT)
+    if any(token.type == "S" for token in _tokens(tree)) and not of_another:
+        return _of_kind(asking, tree, subject, done_to)
     alone = next(tree.find_data("meet_bare"), None) is not None
     pronoun = next((str(token) for token in subject if token.type == "PRONOUN"), None)
     if pronoun == "they":
         return _together(asking, beside)
-    if alone or (pronoun is not None and beside is not None):
+    if of_another or alone or (pronoun is not None and beside is not None):
         return None  # which of the two movers is meant is open
     return asking if listed and form == "which-first" else _with_subject(asking, tree, subject, done_to)
+
+
+def _of_kind(asking: Asking, tree: Tree[Token], subject: list[Token], done_to: bool) -> Asking | None:
+    """What is asked of several things: it happens with one of them at least, with each, or with none."""
+    nodes = {str(node.data) for node in tree.iter_subtrees()}
+    sets = [str(token) for token in _tokens(tree) if token.type == "S"]
+    thing = next((str(token) for token in subject if token.type == "T"), None)
+    suffers, every, spared = any(t.type == "S" for t in subject), "all_of" in nodes, bool(_SPARING & nodes)
+    if len(sets) > 1 or (every and "no" in nodes) or (done_to and thing is not None):
+        return None
+    if spared:  # to spare all is to hit none; where any is spared, not each is hit
+        every = not every and suffers
+    relation = asking.relation
+    if suffers != done_to or asking.form == "which-first":  # else the things suffer it, or the subject does it to them
+        acts_on_mover = any(t.type in MOVER for node in tree.find_data("object") for t in _tokens(node))
+        if relation not in {"touches", "covers"} or (suffers and not acts_on_mover):
+            return None
+        relation = "covered" if relation == "covers" else relation
+    doer = asking.target if suffers else thing
+    return replace(asking, among=tuple(sets), every=every, relation=relation, subject=doer, target=None)
 
 
 def _speaks_of_it(tree: Tree[Token]) -> bool:

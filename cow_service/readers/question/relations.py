@@ -13,7 +13,7 @@ from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.accounting import Unread, unread_words
-from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
+from cow_service.readers.question.asked_words import MAX_TOKENS, THEM, Sentence, sentences
 from cow_service.readers.question.asking import IT, Asking, read_clause
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
@@ -65,11 +65,13 @@ def read_asked(question: Question) -> Asked | None:
     subject = None if asking.subject is None else _named(asking.subject, reading, question)
     if asking.relation == "inside" and target is None:
         target = next((_as_named(put.targets[0], question) for put in question.interventions if put.targets), None)
-    kinds = [phrase for token, phrase in reading.phrases.items() if token.startswith("K")]
-    among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question) if phrase not in kinds)
+    among = _meant(reading, question)
+    if among is None:
+        return None
     return Asked(
-        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among,
-        within=reading.within, partly=asking.partly,
+        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated,
+        among=tuple(_as_named(phrase, question) for token, phrase in among if not token.startswith("K")),
+        every=asking.every, within=reading.within, partly=asking.partly,
     )  # fmt: skip
 
 
@@ -84,9 +86,19 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     reading = _read(question)
     if reading is None or reading.asking.form != "which-first":
         return ()
-    named = {token: reading.phrases[token] for token in reading.asking.among}
-    listed = [*(phrase for token, phrase in named.items() if not token.startswith("K")), *reading.listed]
-    return tuple(listed or named.values())
+    return tuple(phrase for _, phrase in _meant(reading, question) or ())
+
+
+def _meant(reading: _Reading, question: Question) -> list[tuple[str, ObjectPhrase]] | None:
+    """The things and kinds that are meant, with their tokens; None for a "them" that is not two or more things."""
+    if reading.listed:
+        return [("", phrase) for phrase in reading.listed]
+    found = [(token, reading.phrases[token]) for token in reading.asking.among if token != THEM]
+    if THEM not in reading.asking.among:
+        return [each for each in found if not each[0].startswith("K")] or found
+    put = [change.object for change in question.interventions if change.kind == "place"]
+    things = [phrase for phrase in (*put, *question.others) if phrase != question.mover]
+    return [("", phrase) for phrase in things] if len(things) > 1 else None
 
 
 @lru_cache(maxsize=64)

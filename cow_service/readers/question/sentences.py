@@ -38,6 +38,7 @@ _INSTRUCTIONS = lex.words(
 )
 _EACH_OF_TWO = lex.words("both each together")
 _PICTURES = lex.words("image images frame frames picture pictures photo photos")
+_HOW_MANY = lex.words("the all both either none two three")
 _SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
@@ -344,7 +345,9 @@ def _others(
     things = [(at, item, item.phrase) for at, item in enumerate(found)]
     things += [(at, item, item.phrase.place.of) for at, item, _ in things if item.phrase and item.phrase.place]
     for at, item, phrase in sorted(things, key=lambda each: each[0]):
-        if phrase is None or is_vague(item) or not _is_object(phrase) or (at in clause and phrase.head in lex.AGENTS):
+        if phrase is None or is_vague(item) or _HOW_MANY.issuperset(item.words):
+            continue
+        if not _is_object(phrase) or (at in clause and phrase.head in lex.AGENTS):
             continue
         if phrase.noun in lex.ADJECTIVES and item.words[0] not in lex.DETERMINERS:
             continue  # "which ball will it hit first?"
