@@ -118,6 +118,12 @@ def _read(found: Sequence[Item], words: Sequence[Word]) -> tuple[list[Interventi
     end = words[length].at if length < len(words) else words[-1].at + 1
     if not named:
         return None
+    if (
+        next(tree.find_data("between"), None) is not None
+        and len(named) == 2
+        and named[1].text.endswith(named[1].head or "")
+    ):
+        return None  # "between the cube": and what else?
     if next(tree.find_data("removal"), None) is not None:
         return [InterventionWords("remove", phrase) for phrase in named], end
     return [_placing(tree, named)], end

@@ -29,8 +29,8 @@ _THEN = lex.words("then afterwards finally")
 _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
-_SINKING = lex.words("lower descend sink")
 _FALLING = lex.words("fall drop plummet plunge descend sink")
+_SINKING = _FALLING | {"lower"}
 _CLIMBING = lex.words("rise ascend")
 _GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
 
@@ -265,7 +265,7 @@ def _is_next_verb(found: Sequence[Item], at: int) -> bool:
     """ "And then drops", "then it rolls": the verb of a further leg."""
     verb = lex.VERBS.get(found[at].key)
     before = at - 1
-    while key_at(found, before) in lex.MOVER_PRONOUNS | lex.BE | {"to"}:
+    while key_at(found, before) in lex.MOVER_PRONOUNS | lex.BE | {"to", "let"}:
         before -= 1
     return verb is not None and verb.kind is not None and key_at(found, before) in _THEN | {"and"}
 

@@ -161,8 +161,8 @@ def _read_sentence(sentence: Sentence, question: Question, claim: Collection[int
     """
     tokens = sentence.tokens
     tries = 0
-    rolling = ["by", question.motion.verb, "-ing"]
-    ends = [at for at in range(len(tokens)) if tokens[at] in _CONDITIONS or tokens[at : at + 3] == rolling]
+    rolling = [[word, question.motion.verb, "-ing"] for word in ("by", "of")]
+    ends = [at for at in range(len(tokens)) if tokens[at] in _CONDITIONS or tokens[at : at + 3] in rolling]
     claims = {at for at in range(len(tokens)) if claim and _claims(sentence, at)}
     for start in (at for at in range(len(tokens)) if at in claims or _starts(sentence, at, question)):
         for end in (end for end in (len(tokens), *ends) if end > start):

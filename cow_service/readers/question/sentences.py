@@ -9,6 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 
 from cow_service.readers.base import Quantity
 from cow_service.readers.question import lexicon as lex
@@ -30,6 +31,7 @@ from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, ke
 from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.reply_forms import without_reply_form
 from cow_service.readers.question.trail_words import TrailWords, split_trail
+from cow_service.readers.question.typing_errors import without_typing_errors
 from cow_service.records import MotionKind
 
 MAX_WORDS = 240  # of a question that are read
@@ -66,6 +68,7 @@ class Question:
     clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
+    errors: tuple[tuple[str, str], ...] = ()  # of typing, each with what it was read as
     beyond: str = ""  # how what is not read any more begins
     pronoun: str = ""  # that stands for the mover where it may stand for two things
     read: frozenset[int] = frozenset()
@@ -75,6 +78,7 @@ class Question:
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
     text, beyond = _cut(without_reply_form(split_options(question).rest))
+    text, errors = without_typing_errors(text)
     changes, found = split_interventions(with_places(with_nouns(items(text))))
     trail, found = split_trail(_at_the_same_time(found))
     found = _without_instructions(found)
@@ -84,7 +88,7 @@ def parse(question: str) -> Question:
     at = best.at if best else len(found)
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
-    arrow = any(token.key.startswith("arrow") for token in tokens(question))
+    arrow = any(token.key.startswith("arrow") for token in tokens(text))
     clause, motion = _motion(found, clauses, best, mover, arrow, changes)
     motion, fitted = replace(motion, trail=_ending(trail, motion)), frozenset[int]()
     if not changes and (best is None or (best.asked and not _says_way(motion))):
@@ -103,8 +107,9 @@ def parse(question: str) -> Question:
         interventions=changes,
         clause=tuple(found[clause.start : clause.stop]),
         mentions_arrow=arrow,
-        names_direction=_DIRECTION_WORDS.search(question) is not None,
+        names_direction=_DIRECTION_WORDS.search(text) is not None,
         beyond=beyond,
+        errors=errors,
         pronoun=_open_pronoun(found, best, mover),
         read=read.union(item.start for item in found[clause.start : clause.stop]) if carried else read,
     )
@@ -146,7 +151,19 @@ def _motion(
         read=motion.read.union(place for place, _ in speeds),
         others=_other_motions(found, clauses, best, shared, end),
     )
-    return range(start if best else at, end), motion
+    return range(start if best else at, end), _with_both(motion, found)
+
+
+def _with_both(motion: MotionWords, found: Sequence[Item]) -> MotionWords:
+    """With "both slowly", which is said of two movers."""
+    for before, item in pairwise(found):
+        if item.quantity is not None and item.quantity.speed is not None and "both" in (before.key, *before.words[-1:]):
+            paced = [replace(other.motion, quantities=(item.quantity,)) for other in motion.others]
+            others = tuple(replace(o, motion=each) for o, each in zip(motion.others, paced, strict=True))
+            if others and item.quantity not in motion.quantities:
+                read = motion.read | {before.start, item.start}
+                return replace(motion, quantities=(*motion.quantities, item.quantity), others=others, read=read)
+    return motion
 
 
 def _ending(trail: TrailWords | None, motion: MotionWords) -> TrailWords | None:
