@@ -22,16 +22,10 @@ _PAUSES = frozenset(":—–")
 _GENERIC = lex.GENERIC | lex.words("obstacle obstacles body bodies")
 _PLURAL = lex.words("objects things items ones obstacles bodies")
 # Words that the chunker takes for nouns, and that are part of the grammar.
-_PLAIN_WORDS = lex.words(
-    "take takes taking long soon clear free untouched visible unobstructed unoccluded uncovered unhidden unblocked",
-    "first elapse elapses pass passes seconds whole entire total overall altogether",
-    "number least all both either none two short able",
-)
+_PLAIN_WORDS = lex.SETS["plain_words"]
 _OF_GENERIC = lex.words("first other different all")
 _TRAILING = lex.words("hard fast slow alone anyway whatsoever second third last twice once again")  # more is asked
-_COUNTING = lex.words(
-    "both all every each other several many twice once exactly least most only else same different single",
-) | (lex.NUMBER_WORDS.keys() - {"one"})
+_COUNTING = lex.SETS["counting"] | (lex.NUMBER_WORDS.keys() - {"one"})
 THEM = "them"  # the things that were named
 _TWO = (["the", "two"], ["both"], ["two"])
 _LISTING = frozenset({",", ":", "or"})

@@ -227,7 +227,7 @@ def _subject(found: Sequence[Item], at: int, verb: str, clause: _Clause) -> Obje
 
 
 def _behind_participle(found: Sequence[Item], at: int) -> ObjectPhrase | None:
-    """ "Sent towards the mug, the ball ...", "after rolling off the table, will the ball ...": the subject behind it."""
+    """ "Sent towards the mug, the ball ...", "after rolling left, will the ball ...": the subject behind it."""
     comma = next((place for place in range(at, len(found)) if found[place].key in SENTENCE_END | {","}), len(found))
     opens = key_at(found, at - 1) in SENTENCE_END | {","} | lex.CONDITIONALS
     if not opens or key_at(found, comma) != "," or phrase_at(found, at + 1) is not None:

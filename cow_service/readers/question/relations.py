@@ -20,10 +20,7 @@ from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import Word
 from cow_service.records import Asked
 
-_STARTS = lex.words(
-    "will would do does did can could shall might may be tell say predict know when where at in after how what which",
-    "with into on onto true has have had",
-)
+_STARTS = lex.SETS["starts"]
 _OPENERS = lex.words(", and then so but now please")
 _CLAIM = ("true", "or", "false")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it

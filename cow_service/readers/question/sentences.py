@@ -35,9 +35,7 @@ from cow_service.readers.question.typing_errors import without_typing_errors
 from cow_service.records import MotionKind
 
 MAX_WORDS = 240  # of a question that are read
-_INSTRUCTIONS = lex.words(
-    "think reason answer choose select pick option options choices explain respond reply provide return output"
-)
+_INSTRUCTIONS = lex.SETS["instructions"]
 _EACH_OF_TWO = lex.words("both each together")
 _PICTURES = lex.words("image images frame frames picture pictures photo photos")
 _HOW_MANY = lex.words("the all both either none two three")

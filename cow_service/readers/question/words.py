@@ -31,10 +31,12 @@ class Word:
 
 def words_of(found: Sequence[Item]) -> list[Word]:
     """The tokens of some items."""
-    return [word for at, item in enumerate(found) for word in _of_item(item, at)]
+    return [word for at in range(len(found)) for word in words_at(found, at)]
 
 
-def _of_item(item: Item, at: int) -> list[Word]:
+def words_at(found: Sequence[Item], at: int) -> list[Word]:
+    """The tokens of one item."""
+    item = found[at]
     if item.phrase is None:
         return plain_words([item.key], at)
     if _is_words(item, item.phrase):
