@@ -121,7 +121,8 @@ def _thing(
 
 
 def _name(kind: str, at: int, phrase: ObjectPhrase, sentence: Sentence) -> Word:
-    name = f"{kind}{len(sentence.phrases)}"
+    same = (name for name, known in sentence.phrases.items() if known == phrase and name.startswith(kind))
+    name = next(same, f"{kind}{len(sentence.phrases)}")
     sentence.phrases[name] = phrase
     return Word(kind, name, at)
 

@@ -4,35 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import get_args
 
 from lark import Token, Tree
 
+from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.parsing import parse_all
 from cow_service.readers.question.words import Word
 from cow_service.records import AskedForm, AskedRelation
 
 IT = "it"  # as a target: the one other thing that is named
 MOVER = frozenset({"M", "PRONOUN"})
-_FORMS: dict[str, AskedForm] = {
-    "whether": "whether", "either": "which-first", "which_first": "which-first", "when": "when",
-    "how_many": "how-many", "where": "where", "what_happens": "what-happens", "changes": "changes",
-}  # fmt: skip
 # By the node of an act: the relation, and whether the subject of the clause is what it is done to.
-_ACTS: dict[str, tuple[AskedRelation, bool]] = {
-    "touches": ("touches", False), "what_touches": ("touches", False), "hit_first": ("touches", False),
-    "touched": ("touches", True),
-    "hits_none": ("touches", False), "misses": ("touches", False), "missed": ("touches", True),
-    "gets_in_way": ("touches", True), "in_way": ("touches", True),
-    "stops_short": ("touches", False),
-    "untouched": ("touches", True), "collides": ("touches", False), "contact_event": ("touches", False),
-    "together": ("touches", False),
-    "hides": ("covers", False), "what_hides": ("covers", False), "hidden": ("covers", True), "stays": ("covers", True),
-    "passes_behind": ("covered", False), "what_passes_behind": ("covered", False),
-    "enters": ("inside", False), "sticks_out": ("inside", False), "leaves": ("leaves", False),
-    "lands": ("lands", False), "disappears": ("covers", True),
-    "stays_up": ("tips", True), "tips_it": ("tips", False), "tips": ("tips", True), "tipped": ("tips", True),
-    "moves_it": ("moves", False), "moves": ("moves", True), "moved": ("moves", True), "still": ("moves", True),
-}  # fmt: skip
+_ACTS = {
+    act: (relation, table == "done_to")
+    for table in ("does", "done_to")
+    for relation in get_args(AskedRelation)
+    for act in lex.TABLES[table].get(relation, "").split()
+}
+_FORMS: dict[str, AskedForm] = {form.replace("-", "_"): form for form in get_args(AskedForm)} | {
+    "either": "which-first"
+}
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
 _NEGATIONS = frozenset(
     {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"}
@@ -62,6 +54,16 @@ def read_clause(words: Sequence[Word], beside: str | None) -> Asking | None:
     tree = parse_all("asked", words)
     if tree is None:
         return None
+    before = {str(token) for node in tree.find_data("once") for token in _tokens(node)}
+    for node in list(tree.iter_subtrees()):
+        node.children = [each for each in node.children if not (isinstance(each, Tree) and each.data == "once")]
+    asking = _read_tree(tree, beside)
+    # What is met before must be what then acts, or is moved: else it says something of the time.
+    met = asking is None or not before or not before.isdisjoint({asking.subject or asking.target, IT})
+    return asking if met else None
+
+
+def _read_tree(tree: Tree[Token], beside: str | None) -> Asking | None:
     form: AskedForm = next(_FORMS[str(node.data)] for node in tree.iter_subtrees_topdown() if node.data in _FORMS)
     negations = sum(node.data in _NEGATIONS for node in tree.iter_subtrees())
     relation, done_to = _act(tree)

@@ -203,10 +203,12 @@ def _subject(found: Sequence[Item], at: int, verb: str, clause: _Clause) -> Obje
     """What moves: the object of an active verb where a person acts, the subject otherwise; None for a pronoun."""
     form, passive = lex.VERBS[found[at].key].form if found[at].key in lex.VERBS else "base", is_passive(found, at)
     near = phrase_at(found, at - 1)
-    if (form == "ing" or (form == "past" and clause.kind == "question")) and near and near.head not in lex.ABSTRACT:
+    rolling = (
+        (form == "ing" or (form == "past" and clause.kind == "question")) and near and near.head not in lex.ABSTRACT
+    )
+    thrown = form == "past" and not passive and clause.verbs and near and near.is_thing and near.head not in lex.AGENTS
+    if rolling or thrown:  # "which cube is hit by the ball thrown along the arrow"
         return near
-    if form == "past" and not passive and clause.verbs and near and near.is_thing and near.head not in lex.AGENTS:
-        return near  # "which cube is hit by the ball thrown along the arrow"
     led = _behind_participle(found, at) if form in {"past", "ing"} and not passive and clause.subject is None else None
     if led is not None:
         return led

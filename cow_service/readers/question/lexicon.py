@@ -26,18 +26,18 @@ class Verb:
     kind: MotionKind | None
 
 
-_TABLES: dict[str, dict[str, str]] = tomllib.loads(
+TABLES: dict[str, dict[str, str]] = tomllib.loads(
     files("cow_service.readers.question").joinpath("lexicon.toml").read_text(encoding="utf-8")
 )
-SETS = {name: words(text) for table in ("sets", "verbs", "of_verbs") for name, text in _TABLES[table].items()}
+SETS = {name: words(text) for table in ("sets", "verbs", "of_verbs") for name, text in TABLES[table].items()}
 
-COLOURS: dict[str, str] = {word: name for name, text in _TABLES["colours"].items() for word in text.split()}
+COLOURS: dict[str, str] = {word: name for name, text in TABLES["colours"].items() for word in text.split()}
 _VECTORS: dict[str, Vector] = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "up": (0.0, -1.0), "down": (0.0, 1.0)}
-DIRECTIONS = {word: _VECTORS[way] for way, text in _TABLES["directions"].items() for word in text.split()}
-NUMBER_WORDS = {word: value for value, word in enumerate(_TABLES["sets"]["numerals"].split(), 1)}
+DIRECTIONS = {word: _VECTORS[way] for way, text in TABLES["directions"].items() for word in text.split()}
+NUMBER_WORDS = {word: value for value, word in enumerate(TABLES["sets"]["numerals"].split(), 1)}
 ADJECTIVES, NOUN_MODIFIERS, MARKED = SETS["adjectives"], SETS["noun_modifiers"], SETS["marked"]
 UNCHANGED_PLURALS = SETS["unchanged_plurals"]
-_UNITS = [[unit, *text.split()] for unit, text in _TABLES["metres"].items()]
+_UNITS = [[unit, *text.split()] for unit, text in TABLES["metres"].items()]
 METRES = {word: float(size) for unit, size, *others in _UNITS for word in (unit, *others)}  # of a unit of length
 PLACES = DIRECTIONS.keys() | SETS["places"]
 DETERMINERS, VAGUE_DETERMINERS = SETS["determiners"], SETS["vague_determiners"]
@@ -63,7 +63,7 @@ def _forms(lemma: str) -> dict[str, Form]:
     stem = lemma + lemma[-1] if lemma in SETS["doubled"] else lemma.removesuffix("e")
     past = lemma[:-1] + "ied" if lemma.endswith("y") and lemma[-2] not in "aeo" else stem + "ed"
     forms: dict[str, Form] = {_third_person(lemma): "s", stem + "ing": "ing"}
-    forms |= dict.fromkeys(_TABLES["irregular_verbs"].get(lemma, past).split(), "past")
+    forms |= dict.fromkeys(TABLES["irregular_verbs"].get(lemma, past).split(), "past")
     forms[lemma] = "base"
     return forms
 
@@ -103,8 +103,8 @@ def is_adverb(word: str) -> bool:
 
 def singular(noun: str) -> str:
     """A plural noun made singular, by its ending."""
-    if noun in _TABLES["irregular_plurals"]:
-        return _TABLES["irregular_plurals"][noun]
+    if noun in TABLES["irregular_plurals"]:
+        return TABLES["irregular_plurals"][noun]
     if noun in UNCHANGED_PLURALS or len(noun) < 4 or not noun.endswith("s") or noun.endswith(("ss", "us", "is")):
         return noun
     if noun.endswith(("sses", "xes", "ches", "shes", "toes")):

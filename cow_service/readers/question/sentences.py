@@ -15,7 +15,6 @@ from cow_service.readers.base import Quantity
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.chunks import items
 from cow_service.readers.question.clauses import (
-    SENTENCE_END,
     Clauses,
     MotionCandidate,
     clause_end,
@@ -27,7 +26,7 @@ from cow_service.readers.question.interventions import InterventionWords, implie
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
 from cow_service.readers.question.ones import with_nouns
-from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, phrase_at, tokens
+from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at, tokens
 from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.reply_forms import without_reply_form
 from cow_service.readers.question.trail_words import TrailWords, split_trail
@@ -35,11 +34,9 @@ from cow_service.readers.question.typing_errors import without_typing_errors
 from cow_service.records import MotionKind
 
 MAX_WORDS = 240  # of a question that are read
-_INSTRUCTIONS = lex.SETS["instructions"]
 _EACH_OF_TWO = lex.words("both each together")
-_PICTURES = lex.words("image images frame frames picture pictures photo photos")
 _HOW_MANY = lex.words("the all both either none two three")
-_SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
+_SAME_TIME = re.compile(r"\bat the same (?:time|moment|instant)\b(?P<joins> as\b)?", re.IGNORECASE)
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
     r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
@@ -76,10 +73,9 @@ class Question:
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
     text, beyond = _cut(without_reply_form(split_options(question).rest))
-    text, errors = without_typing_errors(text)
+    text, errors = without_typing_errors(_SAME_TIME.sub(lambda found: "and" if found["joins"] else "", text))
     changes, found = split_interventions(with_places(with_nouns(items(text))))
-    trail, found = split_trail(_at_the_same_time(found))
-    found = _without_instructions(found)
+    trail, found = split_trail(found)
     clauses = read_clauses(found)
     best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
     best = _before_while(found, clauses, best)
@@ -312,39 +308,6 @@ def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:
     """The first mention of the mover where it is worded more fully: "the white pawn ... if the pawn moves"."""
     fuller = {item.phrase for item in before if item.phrase and item.phrase != mover and _repeats(mover, item.phrase)}
     return fuller.pop() if len(fuller) == 1 else mover
-
-
-def _at_the_same_time(found: list[Item]) -> list[Item]:
-    """Without "at the same time", which says what "and" says; "at the same time as" is "and" too."""
-    kept: list[Item] = []
-    for at, item in enumerate(found):
-        if kept and item.words in _SAME_TIME and kept[-1].key == "at":
-            as_well = kept.pop()
-            if key_at(found, at + 1) == "as":
-                kept.append(replace(as_well, key="and"))
-        elif not (item.key == "as" and at and found[at - 1].words in _SAME_TIME):
-            kept.append(item)
-    return kept
-
-
-def _without_instructions(found: list[Item]) -> list[Item]:
-    kept: list[Item] = []
-    sentence: list[Item] = []
-    for item in [*found, Item(".", 0, 0)]:
-        sentence.append(item)
-        if item.key in SENTENCE_END:
-            if not _is_instruction(flatten(sentence)):
-                kept += sentence
-            sentence = []
-    return [item for item in kept if item.end]  # without the full stop added
-
-
-def _is_instruction(words: Sequence[str]) -> bool:
-    """Whether a sentence says how to answer, or what the images are, not what happens in them."""
-    first = next((word for word in words[:2] if word != "please"), None)
-    if first is None or first in _INSTRUCTIONS:
-        return True
-    return first == "note" and not _PICTURES.isdisjoint(words)
 
 
 def _others(
