@@ -70,7 +70,8 @@ def _read_tree(tree: Tree[Token], beside: str | None) -> Asking | None:
     subject = _tokens(next(tree.find_data("subject"), None))
     listed = [token for node in (*tree.find_data("list"), *tree.find_data("kind")) for token in _tokens(node)]
     things = list(dict.fromkeys(str(t) for t in _tokens(tree) if t.type == "T" and t not in (*subject, *listed)))
-    if negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
+    open_ = any(token.type == "PRONOUN" and token == "them" for token in _tokens(tree))  # which of them
+    if open_ or negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
     of_another = form == "which-first" and things  # "which mug is hit by the cone first": not by the mover
     partly = relation in {"covers", "covered"} and any(node.data in _ANY_PART for node in tree.iter_subtrees())

@@ -147,6 +147,9 @@ def read_from(start: str, found: Sequence[Item], at: int, window: int) -> tuple[
 
     The `line` of a token is the place of its item.
     """
+    first = words_at(found, at)[:1] if at < len(found) else []
+    if not first or not may_begin(start, first[0]):
+        return None
     words = list(islice((word for place in range(at, len(found)) for word in words_at(found, place)), window))
     parsed = parse_from(start, words)
     if parsed is None:

@@ -59,6 +59,8 @@ def _is_one_edit(one: str, other: str) -> bool:
     pairs = [(a, b) for a, b in zip(one, other, strict=False) if a != b]
     if len(one) == len(other) and len(pairs) == 2 and pairs[0] == pairs[1][::-1]:
         return "".join(pair[0] for pair in pairs) in one
+    if len(set(one) ^ set(other)) > 2:
+        return False
     codes = SequenceMatcher(None, one, other, autojunk=False).get_opcodes()
     return [(tag, b - a, d - c) for tag, a, b, c, d in codes if tag != "equal"] in _ONE_EDIT
 
