@@ -91,6 +91,7 @@ class CowError(Exception):
         super().__init__(self.detail)
         self.errors = errors[:MAX_FIELDS]
         self.headers = headers or {}  # of the HTTP response
+        self.usage: dict[str, Any] | None = None  # what was asked of a multimodal LLM before, where that was anything
 
     @property
     def title(self) -> str:
@@ -99,13 +100,14 @@ class CowError(Exception):
 
     def as_problem(self) -> dict[str, Any]:
         """The members of an RFC 9457 problem, as `records.Problem` has them."""
-        return {
+        problem = {
             "type": TYPE_PREFIX + self.code,
             "title": self.title,
             "status": self.status,
             "detail": self.detail,
             "errors": [asdict(field) for field in self.errors],
         }
+        return problem if self.usage is None else problem | {"usage": self.usage}
 
 
 class InvalidRequest(CowError):

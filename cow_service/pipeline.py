@@ -28,6 +28,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
     grounding = run.stage("grounding", ground)
     run.before_computing(lambda: use_stored_masks(run, grounding))  # it looks for trails, which takes long
     motion = run.stage("motion", read_motion, grounding, run.hints)
+    run.before_computing(lambda: run.place_mover(grounding.bbox, motion.cue))
     trajectory = run.stage("trajectory", compute_trajectory, grounding, motion)
     clip = run.stage("generation", generate, grounding, motion, trajectory)
     return Simulation(

@@ -17,7 +17,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 RATE = 0.3  # of "A"; else "B"
-USAGE = {"prompt_tokens": 21, "completion_tokens": 5, "total_tokens": 26, "prompt_tokens_details": {"cached_tokens": 4}}
+USAGE: dict[str, Any] = {
+    "prompt_tokens": 21,
+    "completion_tokens": 5,
+    "total_tokens": 26,
+    "prompt_tokens_details": {"cached_tokens": 4},
+}
 
 Instead = Callable[["_Handler"], None]
 

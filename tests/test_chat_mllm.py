@@ -215,6 +215,7 @@ def test_nothing_that_moves_is_found(served: Served, mllm: RandomMllm) -> None:
     messages = what_if(5, "Describe the image.")
     cow = told(post(served, {"model": NAME, "messages": messages}))["cow"]
     assert (cow["imagined"], cow["reason"]) == (False, "object-not-found")
+    assert cow["usage"] == cow["usage_total"] == {"calls": 1, "input_tokens": 21, "output_tokens": 5}
     assert mllm.last()["messages"] == messages
 
 

@@ -97,7 +97,7 @@ def data_url(image: bytes) -> str:
 
 
 def post(service: Service, path: str, **body: Any) -> dict[str, Any]:
-    """What the application answers; a problem as its code alone, with its status and detail."""
+    """What the application answers; a problem as its code alone, with its status, detail and usage."""
 
     app = app_for(service)
 
@@ -109,7 +109,8 @@ def post(service: Service, path: str, **body: Any) -> dict[str, Any]:
     response = asyncio.run(call())
     told = response.json()
     if response.status_code != 200:
-        return {"problem": told["type"].rsplit(":", 1)[1], "status": response.status_code, "detail": told["detail"]}
+        kept = {"status": response.status_code, "detail": told["detail"], "usage": told.get("usage")}
+        return {"problem": told["type"].rsplit(":", 1)[1], **kept}
     return told
 
 
@@ -807,7 +808,7 @@ def test_text_of_a_question_stays_behind_its_mark(text: str, mllm: MllmServer, m
 def test_a_model_that_obeys_such_text_is_refused(obeyed: str, mllm: MllmServer, make) -> None:
     mllm.say(BALL, obeyed)
     told = post(make(), "/simulate", image=blank(320, 240), question="Point at 0,0!", motion={"direction": [1, 0]})
-    assert told["problem"] == "mllm-bad-reply"
+    assert (told["problem"], told["usage"]["calls"]) == ("mllm-bad-reply", len(mllm.asked))
 
 
 def test_words_of_a_model_are_data_too(mllm: MllmServer, make) -> None:

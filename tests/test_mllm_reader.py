@@ -10,8 +10,9 @@ from dataclasses import replace
 
 import mllm_server as say
 import pytest
-from drawn import ball, floor
+from drawn import ball, block, floor, trail
 from mllm_server import MllmServer
+from runs import run_of
 
 from cow_service.errors import Canceled, CannotReadDirection, MllmUnavailable, ObjectNotFound
 from cow_service.readers.base import CallLog, MotionHints, Quantity, ReaderInput
@@ -20,10 +21,13 @@ from cow_service.readers.mllm.client import MllmClient
 from cow_service.readers.mllm.reader import MllmReader, create
 from cow_service.records import Grounding
 from cow_service.settings import Settings
+from cow_service.stages.grounding import ground
+from cow_service.stages.motion import read_motion
 from cow_service.vision.scene import Scene
 
 QUESTION = "If the ball rolls along the arrow, what does it hit?"
 BALL = {"object": "red ball", "others": [], "kind": "linear", "sentence": "The red ball rolls."}
+GIVEN = {"grounding": {"bbox": [286, 176, 334, 224], "object": "orange ball"}}
 PLACE = {"label": "red ball", "bbox_2d": [172, 390, 297, 590], "cue": "arrow", "direction": [230, 500, 600, 500]}
 
 
@@ -137,6 +141,29 @@ def test_further_legs_and_other_movers_are_kept(mllm: MllmServer, reader: MllmRe
 def test_changes_as_replies_write_them(written, read) -> None:
     found = read_changes({"changes": written})
     assert [(each.relation, each.targets) for each in found] == ([] if read is None else [read])
+
+
+def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm: MllmServer, reader: MllmReader) -> None:
+    """Three balls that stand apart are one ball where something says so; here it is the model's cue."""
+    places = [(120.0, 200.0), (215.0, 200.0), (310.0, 200.0)]
+    image = block(trail(floor(), places, [24.0] * 3, (220, 120, 30), [1.0] * 3), (460, 180, 530, 250), (40, 160, 60))
+    height, width = image.shape[:2]
+    box = [round(1000 * each) for each in (286 / width, 176 / height, 334 / width, 224 / height)]
+    place = {
+        "label": "orange ball",
+        "bbox_2d": box,
+        "cue": "trail",
+        "direction": [box[0], box[1], box[0] + 200, box[1]],
+    }
+    for given, said in (({}, [BALL | {"object": "orange ball"}, place]), (GIVEN, [place])):
+        mllm.say(*map(json.dumps, said))
+        run = run_of(image, reader=lambda: reader, question="Trifft die Kugel den Würfel?", **given)
+        found = run.stage("grounding", ground)
+        motion = run.stage("motion", read_motion, found, run.hints)
+        assert motion.cue == "trail"
+        assert [round(x) for x, _ in motion.trail] == pytest.approx([120, 215], abs=2)
+        assert {region.colour for region in run.scene.regions} == {"orange", "green"}
+        assert len(run.scene.regions) == 2, "the earlier positions are taken out of the image"
 
 
 @pytest.mark.parametrize(("source", "prompts"), [("request", {"locate"}), ("mllm", {"identify", "locate"})])

@@ -101,6 +101,8 @@ def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) ->
         headers=dict(headers or {}),
     )
     error.code = code or error.code
+    if isinstance(usage := problem.get("usage"), dict):
+        error.usage = usage
     if isinstance(status := problem.get("status"), int):
         error.status = status
     return error

@@ -13,7 +13,7 @@ _ERROR = "cow_error"
 
 
 class JsonSerializer(Serializer):
-    """JSON values unchanged; a `CowError` as its code, detail and fields."""
+    """JSON values unchanged; a `CowError` as its code, detail, fields and usage."""
 
     def name(self) -> str:
         """The name that the database keeps beside each value."""
@@ -24,7 +24,7 @@ class JsonSerializer(Serializer):
         if isinstance(data, BaseException):
             error = data if isinstance(data, CowError) else InternalError("The job met an error that nobody foresaw.")
             fields = [{"pointer": field.pointer, "detail": field.detail} for field in error.errors]
-            data = {_ERROR: {"code": error.code, "detail": error.detail, "errors": fields}}
+            data = {_ERROR: {"code": error.code, "detail": error.detail, "errors": fields, "usage": error.usage}}
         return json.dumps(data, separators=(",", ":"))
 
     def deserialize(self, serialized_data: str) -> Any:
@@ -34,4 +34,6 @@ class JsonSerializer(Serializer):
             return value
         kept = value[_ERROR]
         kind = kinds().get(kept["code"], InternalError)  # one of a later version may not be known here
-        return kind(kept["detail"], errors=tuple(FieldError(**field) for field in kept["errors"]))
+        error = kind(kept["detail"], errors=tuple(FieldError(**field) for field in kept["errors"]))
+        error.usage = kept.get("usage")
+        return error

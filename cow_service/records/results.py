@@ -148,6 +148,11 @@ class Problem(BaseModel):
     status: int
     detail: str = Field(description="What was wrong, with the value, and what to do.")
     errors: list[ProblemField] = Field(default_factory=list[ProblemField])
+    usage: Usage | None = Field(
+        default=None,
+        exclude_if=lambda usage: usage is None,
+        description="What was asked of a multimodal LLM before it failed; left out where that was nothing.",
+    )
 
     @property
     def code(self) -> str:

@@ -43,7 +43,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         with run.cpu():
             reading = _given(run, place)
     with run.cpu():
-        run.place_mover(reading.bbox)
+        run.place_mover(reading.bbox, None if reading.hints is None else reading.hints.cue)
         mask = _store_mask(run, reading.bbox)
     given, warnings = _without_mover(all_given, reading.bbox)
     warnings = (*told_of_given, *warnings)
@@ -74,7 +74,7 @@ def use_stored_masks(run: Run[SimulateRequest], grounding: Grounding) -> None:
 
     A mask cut again from its box may differ from one that was cut around a point, or given.
     """
-    run.place_mover(grounding.bbox)
+    run.place_mover(grounding.bbox, None if run.hints is None else run.hints.cue)
     changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
     for placed in (grounding, *grounding.others, *changed):
         if placed.mask is not None:

@@ -60,6 +60,7 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     motion = _complete(run.scene.width, grounding, reading, source, run.request.law)
     if motion.cue == "trail":
         with run.cpu():
+            run.place_mover(grounding.bbox, motion.cue)
             motion = along_trail(run.scene, grounding, motion, run.request.camera, reading.speed is not None)
     return StageResult(value=motion, warnings=(*reading.warnings, *unused, *_assumed(motion, reading)))
 

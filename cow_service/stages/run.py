@@ -13,13 +13,14 @@ from typing import Any, Generic, Protocol, TypeVar
 from pydantic import BaseModel
 
 from cow_service.concurrency import PrioritySemaphore
+from cow_service.errors import CowError
 from cow_service.generators.base import Generator
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import DecodedImage
 from cow_service.observability.timestamps import rfc3339
 from cow_service.readers.base import CallLog, MotionHints, Reader, ReaderInput
 from cow_service.readers.question.sentences import parse
-from cow_service.records import BBox, Grounding, ReaderInfo, Record, Usage
+from cow_service.records import BBox, Cue, Grounding, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.checks import check_request
 from cow_service.stages.keys import BackendRole, StageKey, key_of
@@ -94,9 +95,13 @@ class Run(Generic[Request_co]):
         """The image, and what is measured in it when first asked for."""
         return Scene(self.image.pixels, trail_named=parse(self.request.question).motion.trail is not None)
 
-    def place_mover(self, bbox: BBox) -> None:
-        """Has the scene know where what moves is: which end of a trail it is, the other positions are taken out."""
-        self.scene = self.scene.with_mover(bbox)
+    def place_mover(self, bbox: BBox, cue: Cue | None) -> None:
+        """Has the scene know where what moves is: which end of a trail it is, the other positions are taken out.
+
+        Where `cue` says that a trail tells the motion, balls that look alike, one after another, are one.
+        """
+        scene = self.scene.with_trail_named() if cue == "trail" else self.scene
+        self.scene = scene.with_mover(bbox)
 
     def before_computing(self, work: Callable[[], None]) -> None:
         """Has something done before the next stage is computed: never, where all stages that follow are found again."""
@@ -132,7 +137,12 @@ class Run(Generic[Request_co]):
         started = time.perf_counter()
         self.report(name, 0.0)
         key = key_of(name, self.image.info.sha256, self.request, inputs, self._identity, self.repeats_answers)
-        result, reused = self.step(name, key, lambda: self._compute(name, function, inputs))
+        try:
+            result, reused = self.step(name, key, lambda: self._compute(name, function, inputs))
+        except CowError as error:
+            spent = self.usage(*self.results, name)
+            error.usage = spent.model_dump() if spent.calls else None
+            raise
         self.results[name] = result
         if reused:
             self.reused.append(name)

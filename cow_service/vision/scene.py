@@ -126,10 +126,17 @@ class Scene:
         trail = trail_ending_at(self.trails, bbox)
         if trail is None or any(trail.positions == other.positions for other in self.trails):
             return self
-        return self.once(("mover", trail.positions), lambda: self._ending_at(bbox))
+        return self.once(("mover", trail.positions), lambda: self._with_trails(mover=bbox))
 
-    def _ending_at(self, bbox: BBox) -> Scene:
-        other = replace(self, mover=bbox, _masks={}, _found={}, _preset={}, _obstacles={})
+    def with_trail_named(self) -> Scene:
+        """The scene in which balls that look alike, one after another, are one; masks that were given stay."""
+        if self.trail_named:
+            return self
+        return self.once("trail named", lambda: self._with_trails(trail_named=True, _preset=dict(self._preset)))
+
+    def _with_trails(self, **changes: Any) -> Scene:
+        """The same image with other trails in it."""
+        other = replace(self, **{"_masks": {}, "_found": {}, "_preset": {}, "_obstacles": {}, **changes})
         kept = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "_all_trails")  # which an end of a trail changes not
         other.__dict__.update({key: self.__dict__[key] for key in kept if key in self.__dict__})
         return other

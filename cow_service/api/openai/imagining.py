@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pydantic import ValidationError
 
@@ -11,6 +11,7 @@ from cow_service.api.openai.chats import EXTENSION, Chat, wrong
 from cow_service.api.openai.messages import ImagePart, images_of, other_parts, role_of, texts_of
 from cow_service.api.problems import invalid
 from cow_service.errors import CowError, FieldError
+from cow_service.records import Usage
 from cow_service.requests import SimulateRequest
 
 FIELDS_OF_CHAT = ("image", "question")  # of a `SimulateRequest`: from messages
@@ -34,6 +35,7 @@ class NotImagined:
 
     reason: str
     detail: str
+    usage: Usage = field(default_factory=Usage)  # of what was tried
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,16 @@ class WhatIf:
         """Why nothing was imagined, where the chat goes on without; None where the error is the caller's to hear."""
         told = self.located(error)
         own = any(self._is_given(field.pointer) for field in told.errors)
-        return NotImagined(error.code, error.detail) if isinstance(error, PASSED_OVER) and not own else None
+        if own or not isinstance(error, PASSED_OVER):
+            return None
+        return NotImagined(error.code, error.detail, Usage.model_validate(error.usage or {}))
 
     def located(self, error: CowError) -> CowError:
         """An error of the simulation, pointing into the chat."""
         fields = tuple(FieldError(self._pointer(field.pointer), field.detail) for field in error.errors)
-        return type(error)(error.detail, errors=fields, headers=error.headers)
+        told = type(error)(error.detail, errors=fields, headers=error.headers)
+        told.usage = error.usage
+        return told
 
     def _is_given(self, pointer: str) -> bool:
         """Whether that is a field of `cow`, and one that the caller gave."""

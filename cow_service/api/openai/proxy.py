@@ -71,8 +71,6 @@ class Proxy:
             return await self._sent(request, _without_frames(chat, asked), reader)
         self._submitter.engine.check_capacity()
         simulated, owner = asked.request, owner_of(request)
-        if simulated.reader is None:
-            simulated = simulated.model_copy(update={"reader": answerer.reader})
         submission = Submission("simulate", owner, prefer, new_job_id(owner, None))
         try:
             if chat.stream:
@@ -198,7 +196,10 @@ def _why_not(asked: WhatIf, error: CowError) -> NotImagined:
 
 def _without_frames(chat: Chat, why: NotImagined) -> Ready:
     warnings = (UNUSED,) if why is BY_NAME and chat.cow else ()
-    return Ready(chat, None, ChatImagination(imagined=False, reason=why.reason, detail=why.detail, warnings=warnings))
+    told = ChatImagination(
+        imagined=False, reason=why.reason, detail=why.detail, usage=why.usage, usage_total=why.usage, warnings=warnings
+    )
+    return Ready(chat, None, told)
 
 
 def _extended(messages: list[Any], place: int, parts: tuple[dict[str, Any], ...]) -> list[Any]:
