@@ -22,9 +22,8 @@ _ACTS = {
     for relation in get_args(AskedRelation)
     for act in lex.TABLES[table].get(relation, "").split()
 }
-_FORMS: dict[str, AskedForm] = {form.replace("-", "_"): form for form in get_args(AskedForm)} | {
-    "either": "which-first"
-}
+_FORMS: dict[str, AskedForm] = {"either": "which-first"}
+_FORMS.update({form.replace("-", "_"): form for form in get_args(AskedForm)})
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
 _NEGATIONS = frozenset(
     {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"}
