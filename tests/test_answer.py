@@ -190,7 +190,40 @@ The red ball and the mug both move left. Do they touch each other? | whether tou
 If the red ball and the mug move to the left, do they meet? | whether touches mug
 The vase slides left by 20 pixels while the red ball drops. Does the ball land on the vase? | whether touches red ball
 Will the falling ball hit the vase? | whether touches vase
+True or false: sent straight towards the vase, the red ball hits it. | whether touches vase
+The red ball rolls left and the vase slides right, both slowly. Do they meet? | whether touches vase
+Move the red ball 90 pixels to the left, then let it drop. Does it come down on the vase? | whether touches vase
 """
+
+# What is asked of several things: among which, then "each" and "not" where that is asked.
+OF_SEVERAL = """
+will it hit both mugs? | both mugs | each
+will it avoid both mugs? | both mugs | not
+will either mug be hit? | either mug |
+will it hit neither of the two cubes? | neither two cubes | not
+is it hidden by any of the cones? | cones |
+does it touch all the other balls? | other balls | each
+will both cones stay visible? | both cones | not
+will any of the cones stay visible? | cones | each not
+will it hit a cube? | a cube |
+how many of the other two balls does it touch itself? | other two balls |
+There are a cube and a cone. If the red ball rolls left, will it hit either of them? | cube, cone |
+There are a cube and a cone. If the red ball rolls left, which of the two does it hit first? | cube, cone |
+"""
+
+
+@pytest.mark.parametrize("row", OF_SEVERAL.strip().splitlines())
+def test_what_is_asked_of_several_things(row: str) -> None:
+    question, among, how = (part.strip() for part in row.split("|"))
+    asked = asked_of(question)
+    assert asked is not None
+    assert asked.among == tuple(among.split(", "))
+    assert (asked.every, asked.negated, asked.target) == ("each" in how, "not" in how, None)
+
+
+@pytest.mark.parametrize("what", ["not hit both mugs", "hit any two of the mugs", "hit them", "miss neither mug"])
+def test_what_is_open_of_several_things_is_not_read(what: str) -> None:
+    assert asked_of(f"will it {what}?") is None
 
 
 @pytest.mark.parametrize("row", ASKED.strip().splitlines())
@@ -290,7 +323,6 @@ when precisely will it miss the vase?
 will they collide?
 when will it stop?
 how many times will it hit the vase?
-how many cubes will it hit?
 how many objects will it knock over?
 which objects will it hit?
 which object does it touch last?
@@ -622,6 +654,18 @@ def test_the_folder_of_an_answer(tmp_path: Path) -> None:
         (
             "If the ball rolls left, would the outcome change if the vase were removed?",
             Asked(form="changes", relation="touches"),
+        ),
+        (
+            "If the ball rolls left, once the ball has bumped into the cup, will the cup tip the cube?",
+            Asked(relation="tips", subject="cup", target="cube"),
+        ),
+        (
+            "If the ball is rolled straight at the cup, will that then hit the cube?",
+            Asked(relation="touches", subject="cup", target="cube"),
+        ),
+        (
+            "At 9 px/s, would the ball have hit the cup after 4 seconds of rolling to the left?",
+            Asked(relation="touches", target="cup", within=4.0),
         ),
         (
             "If the ball rolls left, will the cube be hidden by the cup?",

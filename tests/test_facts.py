@@ -94,6 +94,10 @@ THROWN = world(
          "nothing."),
         ("ball", world(ensemble=100, outcome=outcome(Asked(relation="covers"), 0.05, None)),
          "The ball rolls to the right and hides nothing; 95 of 100 worlds agree."),
+        ("ball", world(bodies=(BALL, CUBE), encounters=(touch(),), ensemble=100,
+                       outcome=outcome(Asked(relation="touches", among=("mug", "vase")), 0.02, None)),
+         "The ball rolls to the right, meets the white cube after 1.1 s and does not touch the mug or the vase; "
+         "98 of 100 worlds agree."),
         ("ball", world(bodies=(BALL, CUBE), paths=(path(), path(1)), encounters=(touch(probability=None),)),
          "The ball rolls to the right and meets and pushes the white cube after 1.1 s."),
         ("ball", world(bodies=(BALL, CUBE), paths=(path(), path(1, turned=90.0)), encounters=(touch(),),

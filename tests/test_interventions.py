@@ -29,6 +29,7 @@ If the ball moves left without the vase, will it hit the cube? | remove vase | b
 After removing the vase and the mug, the ball rolls left. Will it hit the cube? | remove vase, remove mug | ball roll
 If I put the apple into the bowl, will it fit? | place apple into bowl | apple put
 If the apple is placed on top of the red box, will it fall off? | place apple onto red box | apple put
+If I put the box between the two cups, does it touch either of them? | place box between two cups | box put
 If I put the box between the vase and the cup, does it touch the cup? | place box between vase & cup | box put
 If the ball is put in front of the mug, will the mug be hidden? | place ball in-front-of mug | ball put
 Were the vase to vanish, would the car, rolling left, hit the mug? | remove vase | car roll

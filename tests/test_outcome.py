@@ -74,6 +74,14 @@ def test_of_anything_any_will_do_but_what_it_stands_on() -> None:
     assert decided(asked(), 1, found).probability == pytest.approx(0.5)
 
 
+def test_of_several_things_one_will_do_or_each_is_meant() -> None:
+    found = events(touches={1: share(0.8), 2: 2.0, 3: 0.1})
+    for every, probability, time in ((False, 1.0, 1.0), (True, 0.8, 2.0)):
+        several = asked(target=None).model_copy(update={"every": every})
+        answer = decide(Query(several, among=(1, 2)), found, DRAWS)
+        assert (answer.probability, answer.time) == (pytest.approx(probability), time)
+
+
 def test_which_is_met_first() -> None:
     soon, late = share(0.8, 0.5), np.full(COUNT, 1.0)
     found = decided(asked("which-first", target=None), None, events(touches={2: soon, 1: late}))

@@ -15,7 +15,7 @@ from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.readers.question.relations import read_asked, unread
 from cow_service.readers.question.sentences import parse
-from cow_service.records import Grounding
+from cow_service.records import Asked, Grounding
 from cow_service.vision.scene import Scene
 
 RED, BLUE, GREEN = (200, 30, 30), (50, 80, 200), (50, 150, 50)
@@ -30,7 +30,7 @@ If the ball rolls right, does it hit the mug and the cube? | hit mug and cube
 If the ball rolls right, does it hit the mug before the cube? | hit mug before cube
 If the ball rolls right, will it hit the cone after 2 seconds? | hit cone after 2 seconds
 If the ball rolls left for the first second, does it hit the mug? | for the first second
-If the ball rolls right, does it hit both mugs? | hit both mugs
+If the ball rolls right, does it not hit both mugs? | not hit both mugs
 The ball and the mug are on the table. If it rolls left, does it hit the cone? | it
 The ball moves right, but the mug is glued to the floor. Does the mug move? | mug is glued
 Replace the ball with the cube. If the mug slides left, does it hit the vase? | Replace ball with cube
@@ -150,3 +150,24 @@ def test_what_is_taken_away_is_not_asked_about() -> None:
 def test_several_movers_at_once_are_refused() -> None:
     with pytest.raises(CannotGround, match="at once"):
         EmbeddedReader().ground(ReaderInput(scene(), "If both balls roll right, is the cube hit?"))
+
+
+def test_the_things_of_a_kind_are_found_or_refused() -> None:
+    found = EmbeddedReader().ground(ReaderInput(scene(), "If the blue cube slides left, does it hit both balls?"))
+    assert {other.object for other in found.others} == {"red ball", "green ball"}
+    assert not [said for said in found.warnings if "not found" in said]
+    with pytest.raises(CannotGround, match="'all three balls'"):
+        EmbeddedReader().ground(ReaderInput(scene(), "If the blue cube slides left, does it hit all three balls?"))
+
+
+def test_typing_errors_are_read_and_said() -> None:
+    question = parse("If the gren ball mvoes to the rigth, will it touhc the trunk?")
+    assert question.errors == (("mvoes", "moves"), ("rigth", "right"), ("touhc", "touch"))
+    assert (question.motion.verb, read_asked(question)) == ("move", Asked(relation="touches", target="trunk"))
+    given = ReaderInput(scene(), "If the red ball rools left, is the cube hit?")
+    assert "Read 'rools' as 'rolls'." in EmbeddedReader().ground(given).warnings
+
+
+@given(st.text("bcdfghjklmnpqrstvwxz", min_size=6, max_size=12))
+def test_no_sense_is_made_of_what_has_none(word: str) -> None:
+    assert parse(f"If the red ball {word} left, does it hit the mug?").errors == ()

@@ -33,7 +33,7 @@ class Query:
     asked: Asked
     target: int | None = None  # None: any
     subject: int = 0  # who does it
-    among: tuple[int, ...] = ()  # of `which-first`: the alternatives; empty: any
+    among: tuple[int, ...] = ()  # the things that are meant; empty: any
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def decide(query: Query, ensemble: WorldEvents, draws: Floats) -> Decided:
     """The answer of an ensemble with draws [K, P]."""
     asked, answers = query.asked, answers_of(query, ensemble)
     answer, probability = _most(answers)
-    times = _per_body(query, ensemble).min(axis=1)
+    times = _happens(query, ensemble)
     times = times[np.isfinite(times)]
     shown = asked.form in ("whether", "when")
     return Decided(
@@ -99,7 +99,13 @@ def answers_of(query: Query, events: WorldEvents) -> list[int]:
         return np.where(np.isfinite(times.min(axis=1)), first, -1).tolist()
     if asked.form == "how-many":
         return np.isfinite(times).sum(axis=1).tolist()
-    return np.isfinite(times).any(axis=1).astype(int).tolist()
+    return np.isfinite(_happens(query, events)).astype(int).tolist()
+
+
+def _happens(query: Query, events: WorldEvents) -> Floats:
+    """[K]: when it has happened with any of the bodies that are meant or, where that is asked, with each of them."""
+    times = _per_body(query, events)
+    return times[:, list(query.among)].max(axis=1) if query.asked.every and query.among else times.min(axis=1)
 
 
 def _most(answers: Sequence[int]) -> tuple[int, float]:

@@ -28,8 +28,10 @@ class Asked(Record):
     target: str | None = Field(default=None, description="The thing asked about in the question's words; null: any.")
     negated: bool = Field(default=False, description="Asked is that it does not happen: to miss, to stay visible.")
     among: tuple[str, ...] = Field(
-        default=(), description="Of `which-first`: the alternatives that the question names; empty: any."
+        default=(),
+        description="The things that are meant where the question names several, or things of a kind; empty: any.",
     )
+    every: bool = Field(default=False, description="It counts only where it happens with each of `among`.")
     partly: bool = Field(default=False, description="Of `covers` and `covered`: it counts where any part is hidden.")
     within: float | None = Field(
         default=None, gt=0, description="How long it may take to happen, s; null: as long as the clip."

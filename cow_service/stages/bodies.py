@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.outcome import Query
 from cow_service.readers.question.choices import plain
+from cow_service.readers.question.kinds import kind_of
+from cow_service.readers.question.options_said import may_name
 from cow_service.readers.question.shapes import is_cube, is_vehicle, shape_of
 from cow_service.records import Asked, Grounding, LocatedObject, Shape
 from cow_service.vision.masks import CroppedMask, iou
@@ -71,11 +73,23 @@ def query_of(asked: Asked, grounding: Grounding, bodies: Sequence[SeenBody]) -> 
     """What a question asks of bodies; None where one that it names was not found under that name."""
     subject = 0 if asked.subject is None else body_named(asked.subject, grounding, bodies)
     target = None if asked.target is None else body_named(asked.target, grounding, bodies)
-    among = [body_named(name, grounding, bodies) for name in asked.among]
-    known = [body for body in among if body is not None]
-    if subject is None or (asked.target is not None and target is None) or len(known) < len(among):
+    among = [bodies_meant(name, grounding, bodies, subject) for name in asked.among]
+    if subject is None or (asked.target is not None and target is None) or not all(among):
         return None
-    return Query(asked, target, subject, tuple(known))
+    known = tuple(dict.fromkeys(body for meant in among for body in meant))
+    named = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})  # not by a kind any more
+    return Query(named, target, subject, known)
+
+
+def bodies_meant(words: str, grounding: Grounding, bodies: Sequence[SeenBody], subject: int | None) -> tuple[int, ...]:
+    """The body of a name, or those of a kind without the mover and the subject; none where they are not as many as
+    is said."""
+    one, kind = body_named(words, grounding, bodies), kind_of(words)
+    if one is not None or kind is None:
+        return () if one is None else (one,)
+    boxes = {other.bbox for other in others_of(grounding) if may_name(kind.phrase, other.object)}
+    found = tuple(i for i, body in enumerate(bodies) if i not in {0, subject} and body.bbox in boxes)
+    return found if kind.count in (None, len(found)) else ()
 
 
 def body_named(words: str, grounding: Grounding, bodies: Sequence[SeenBody]) -> int | None:

@@ -117,9 +117,14 @@ def _placed(
     known = [mover, (change.object, thing.bbox)]
     targets: list[LocatedObject] = []
     for phrase in change.targets:
+        if _is_plural(phrase) and change.relation == "between":
+            targets += _both(without(regions, [Intervention(kind="remove", object=thing)]), phrase, others)
+            continue
         told = f"puts '{change.object.text}' {change.relation} '{phrase.text}'"
         targets.append(_find(scene, regions, phrase, told, known, others, given))
         known.append((phrase, targets[-1].bbox))
+    if change.relation == "between" and len(targets) != 2:
+        raise _not_found(scene, f"puts '{change.object.text}' between", change.targets[0])
     return Intervention(kind="place", object=thing, relation=change.relation, targets=tuple(targets))
 
 

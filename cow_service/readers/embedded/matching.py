@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from cow_service.errors import CannotGround
-from cow_service.readers.embedded.naming import CLEARLY_WORSE, IMPOSSIBLE, is_poor, log_ratios
+from cow_service.readers.embedded.naming import CLEARLY_WORSE, IMPOSSIBLE, is_clear, is_poor, log_ratios
 from cow_service.readers.embedded.singling import at_place, singled_out
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.records import BBox
@@ -59,8 +59,21 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[
 
 def match_both(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[Region]:
     """The two regions that fit a phrase such as "both mugs"; empty where it is not clear which two."""
-    fitting = _foremost(regions, phrase, others, 2)
-    return fitting if len(fitting) == 2 else []
+    return match_some(regions, phrase, others, 2)
+
+
+def match_some(
+    regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase], count: int
+) -> list[Region]:
+    """The so many regions that fit a phrase; empty where it is not clear which."""
+    fitting = _foremost(regions, phrase, others, count)
+    return fitting if len(fitting) == count else []
+
+
+def match_all(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[Region]:
+    """All regions that fit a phrase such as "mugs"; empty where it is not clear of each whether it is one."""
+    fitting = _foremost(regions, phrase, others)
+    return fitting if all(is_clear(region, phrase) for region in fitting) else []
 
 
 def inside_drawn_box(scene: Scene, phrase: ObjectPhrase, remedy: str) -> BBox:

@@ -19,6 +19,7 @@ EXACT, NEAR = 6.0, 3.0  # log ratios of the name of a region's colour, and of ot
 SURE = CLEARLY_WORSE  # log ratio of an outline: more counts no more, so what could be meant too is a rival
 LEAST = -2.0  # log ratio of an outline: less speaks no more against it
 CUT = 0.5  # share of its log ratio that an outline keeps which the border cuts
+CLEAR = 1.0  # log ratio of an outline from which one of several is called so
 POOR = -1.0  # log ratio of an outline: with less it is not called so, unless by its colour
 UNSEEN = -6.0  # log ratio of a name to which no region is assigned
 SHARED = -3.0  # log ratio of a region with two names of the same kind
@@ -74,6 +75,11 @@ def _shared(one: ObjectPhrase, other: ObjectPhrase) -> float:
 def is_poor(region: Region, phrase: ObjectPhrase) -> bool:
     """Whether no colour says for certain that a region is meant, and its outline speaks against that."""
     return region.colour != phrase.colour and _shape_ratio(region, phrase) < POOR
+
+
+def is_clear(region: Region, phrase: ObjectPhrase) -> bool:
+    """Whether a region is what a noun names, whatever else is there."""
+    return _shape_ratio(region, phrase) > CLEAR
 
 
 def _row(regions: Sequence[Region], phrase: ObjectPhrase) -> Row:

@@ -13,6 +13,7 @@ from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, 
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
 from cow_service.readers.embedded.doubts import noun_warnings
+from cow_service.readers.embedded.kinds import is_kind_asked, things_of_kinds
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
 from cow_service.readers.embedded.naming import is_known
@@ -71,8 +72,9 @@ class EmbeddedReader:
             bbox = _mover(scene, regions, question, question.mover)
             placed = find_placed(scene, regions, question, (question.mover, bbox), given.known)
             others = _others(regions, [*question.others, *_sought(given, question)], bbox)
+            others += things_of_kinds(regions, question, bbox, given.known)
             found = {other.object for other in others}
-            unseen = (each for each in question.others if each.text not in found)
+            unseen = (each for each in question.others if each.text not in found and not is_kind_asked(each, question))
             missing = [_not_found(scene, each.text) for each in unseen if given_as(each, given.known) is None]
             boxes = {other.object: other.bbox for other in others} | {question.mover.text: bbox}
             things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
@@ -125,7 +127,8 @@ def create(settings: Settings) -> EmbeddedReader:
 
 def _unread_warnings(question: Question) -> list[str]:
     words = unread(question)
-    said = [f"The words '{each}' were not understood, so no outcome is told." for each in words.turning]
+    said = [f"Read '{error}' as '{meant}'." for error, meant in question.errors]
+    said += [f"The words '{each}' were not understood, so no outcome is told." for each in words.turning]
     return said + [f"The words '{each}' were not understood and changed nothing." for each in words.beside]
 
 

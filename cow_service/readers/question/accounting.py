@@ -13,10 +13,9 @@ from lark import Tree
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.asked_words import means_mover
-from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.parsing import read_from
 from cow_service.readers.question.phrases import PUNCTUATION, Item, key_at
 from cow_service.readers.question.sentences import Question
-from cow_service.readers.question.words import words_of
 
 # Words that hold a sentence together; what they join is read, or is named.
 _STRUCTURE = (
@@ -113,20 +112,15 @@ def _harmless(question: Question, sentence: range, covered: frozenset[int]) -> s
     found = {at for at in sentence if _names_known(question, items[at])}
     if _only_names([items[at] for at in sentence]):
         return set(sentence)
-    words, tries = words_of(items[sentence.start : sentence.stop]), 0
-    for place, word in enumerate(words):
-        at = sentence.start + word.at
-        begins = not place or words[place - 1].at != word.at
-        if not begins or at in found or at in covered or items[at].start in question.read or tries >= _TRIES:
+    tries = 0
+    for at in sentence:
+        if at in found or at in covered or items[at].start in question.read or tries >= _TRIES:
             continue
-        parsed = parse_from("adverbial", words[place : place + 8])
+        parsed = read_from("adverbial", items[: sentence.stop], at, 8)
         tries += 1
-        if parsed is None:
-            continue
-        node = next(iter(parsed[0].children), None)
-        end = words[place + parsed[1]].at if place + parsed[1] < len(words) else words[-1].at + 1
-        if (str(node.data) if isinstance(node, Tree) else "") in _NO_MATTER:
-            found |= set(range(at, sentence.start + end))
+        node = None if parsed is None else next(iter(parsed[0].children), None)
+        if parsed is not None and (str(node.data) if isinstance(node, Tree) else "") in _NO_MATTER:
+            found |= set(range(at, parsed[1]))
     return found
 
 

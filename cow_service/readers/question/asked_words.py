@@ -1,55 +1,50 @@
-"""Renders a question as a line of plain tokens per sentence, for the grammar of what it asks (`asked_grammar`).
+"""Renders the sentences of a question as words of the grammar, for what is asked in them.
 
-`M` is the mover, `T0`, `T1` and so on are other named things, `OBJ` and `OBJS` an object or objects of no name, `K0` is
-the kind in "which ball". Verbs are in their base form, with "-ing" where they end so. `X` is a phrase that is not
-understood.
+`M` is the mover, `T0`, `T1` and so on are other named things, `S0` some things of one kind, `K0` the kind in "which
+ball", `OBJ` and `OBJS` an object or objects of no name. `X` is a phrase that is not understood.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import dropwhile
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.choices import plain
-from cow_service.readers.question.phrases import Item, ObjectPhrase
+from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
 from cow_service.readers.question.sentences import Question
+from cow_service.readers.question.words import Word, plain_words
 
 MAX_TOKENS = 80  # of one sentence; a longer one is not read
 _ENDS = frozenset(".?!;")
 _PAUSES = frozenset(":—–")
-_BE = dict.fromkeys(["be", "is", "are", "was", "were", "been"], "be") | {
-    "being": "be-ing", "gets": "get", "got": "get", "gotten": "get", "getting": "get-ing",
-}  # fmt: skip
-# Verbs of the grammar that the lexicon has for other words.
-_INFLECTED = {
-    "takes": "take", "elapses": "elapse", "makes": "make", "making": "make-ing", "has": "have", "having": "have-ing",
-    "escapes": "escape",
-}  # fmt: skip
 _GENERIC = lex.GENERIC | lex.words("obstacle obstacles body bodies")
 _PLURAL = lex.words("objects things items ones obstacles bodies")
 # Words that the chunker takes for nouns, and that are part of the grammar.
-_PLAIN_WORDS = lex.words(
-    "take takes taking long soon clear free untouched visible unobstructed unoccluded uncovered unhidden unblocked",
-    "first elapse elapses pass passes seconds whole entire total overall altogether",
-    "number least all short able",
-)
+_PLAIN_WORDS = lex.SETS["plain_words"]
 _OF_GENERIC = lex.words("first other different all")
 _TRAILING = lex.words("hard fast slow alone anyway whatsoever second third last twice once again")  # more is asked
-_COUNTING = lex.words(
-    "both all every each other several many twice once exactly least most only else same different single",
-) | (lex.NUMBER_WORDS.keys() - {"one"})
+_COUNTING = lex.SETS["counting"] | (lex.NUMBER_WORDS.keys() - {"one"})
+THEM = "them"  # the things that were named
+_TWO = (["the", "two"], ["both"], ["two"])
+_LISTING = frozenset({",", ":", "or"})
+_TWO_OF = lex.words("both either neither")
+_SOME = lex.words("any every each either neither both all many no none one some")  # of the things of a kind
 
 
 @dataclass
 class Sentence:
-    """One sentence as tokens: for each its words and its place in the items, and the phrases of its `T` and `K`."""
+    """One sentence in words of the grammar, and the phrases of its `T`, `S` and `K`."""
 
-    tokens: list[str] = field(default_factory=list[str])
-    words: list[tuple[str, ...]] = field(default_factory=list[tuple[str, ...]])
-    items: list[int] = field(default_factory=list[int])
+    words: list[Word] = field(default_factory=list[Word])
     phrases: dict[str, ObjectPhrase] = field(default_factory=dict[str, ObjectPhrase])
     asks: bool = False  # it ends with a question mark, or with the text
+
+    @property
+    def tokens(self) -> list[str]:
+        """The texts of its words."""
+        return [word.text for word in self.words]
 
 
 def sentences(question: Question) -> list[Sentence]:
@@ -63,60 +58,73 @@ def sentences(question: Question) -> list[Sentence]:
         limit = item.quantity is not None and item.quantity.within is not None
         if limit or (item.start in question.read and item.quantity is not None and item not in question.clause):
             continue
-        if item.phrase is None:
-            tokens = ["," if item.key in _PAUSES else _word(item.key)]
-        else:
-            of_kind = found[-1].tokens[-2:] in (["which", "of"], ["what", "of"])
-            tokens = _phrase_tokens(item, item.phrase, question, found[-1].phrases, of_kind)
-        found[-1].tokens += tokens
-        said = tuple(word.lower() for word in (item.words or (item.key,)))
-        found[-1].words += [said] * len(tokens)
-        found[-1].items += [at] * len(tokens)
+        if item.phrase is not None:
+            found[-1].words += _phrase_words(at, item, item.phrase, question, found[-1])
+        elif item.key in {"them", "these", "those"} and _counts(found[-1].tokens):
+            found[-1].words.append(Word("S", THEM, at))
+        elif item.key != "still" or not question.interventions:  # "will it still hit it?": with what is taken away
+            found[-1].words += plain_words(["," if item.key in _PAUSES else item.key], at)
     found[-1].asks = True
-    return [sentence for sentence in found if sentence.tokens]
+    return [sentence for sentence in found if sentence.words]
 
 
-def _word(key: str) -> str:
-    if key in _BE:
-        return _BE[key]
-    verb = lex.VERBS.get(key)
-    if verb is None:
-        return _INFLECTED.get(key, key)
-    return f"{verb.lemma}-ing" if verb.form == "ing" else verb.lemma
-
-
-def _phrase_tokens(
-    item: Item, phrase: ObjectPhrase, question: Question, known: dict[str, ObjectPhrase], of_kind: bool
-) -> list[str]:
+def _phrase_words(at: int, item: Item, phrase: ObjectPhrase, question: Question, sentence: Sentence) -> list[Word]:
     words = [word.lower() for word in item.words]
-    determiners = words[: _count_determiners(words)]
-    content = words[len(determiners) :]
+    content = list(dropwhile(lex.DETERMINERS.__contains__, words))
+    determiners, before = words[: len(words) - len(content)], sentence.tokens
+    if words in _TWO and before[-1:] == ["of"]:
+        return [Word("S", THEM, at)]
     if words == ["each", "other"] or phrase.head in lex.NO_THINGS or set(content) <= _PLAIN_WORDS:
-        return [_word(word) for word in words]
-    if question.motion.others and words in (["the", "two"], ["both"]):
-        return ["they"]
-    if of_kind and phrase.noun is not None and phrase.head not in _GENERIC and "other" not in content:
-        known[f"K{len(known)}"] = phrase
-        return [list(known)[-1]]
+        return plain_words(["they"] if question.motion.others and words in _TWO else words, at)
     asked = words[0] in {"which", "what"}
-    return ["M"] if means_mover(phrase, question) and not asked else _named(determiners, content, phrase, asked, known)
-
-
-def _named(
-    determiners: Sequence[str],
-    content: Sequence[str],
-    phrase: ObjectPhrase,
-    asked: bool,
-    known: dict[str, ObjectPhrase],
-) -> list[str]:
+    if means_mover(phrase, question) and not asked and words[0] not in _SOME:
+        return [Word("M", "M", at)]
     named = phrase.inside_box or phrase.colour is not None or phrase.number is not None
     if not named and _GENERIC.intersection(content) and set(content) <= _GENERIC | _OF_GENERIC:
-        return _generic(determiners, content)
+        return _generic(determiners, content, at)
+    listed = not _LISTING.isdisjoint((key_at(question.items, at - 1), key_at(question.items, at + 1)))
+    return _of_kind(at, words, phrase, sentence, listed) or _thing(at, determiners, content, phrase, sentence)
+
+
+def _counts(before: Sequence[str]) -> bool:
+    """Whether what stands in front is "any of", "all the", "neither"."""
+    return before[-1:] in (["all"], ["neither"], ["no"]) or (
+        before[-1:] == ["of"] and not _SOME.isdisjoint(before[-2:-1])
+    )
+
+
+def _of_kind(at: int, words: Sequence[str], phrase: ObjectPhrase, sentence: Sentence, listed: bool) -> list[Word]:
+    """ "Both mugs", "any of the other two mugs", "neither mug" in tokens; none for a phrase that is of no kind."""
+    before = [word for word in sentence.tokens if word != "of"]
+    counts = _counts(sentence.tokens)
+    plain = phrase.colour is None and phrase.number is None and phrase.place is None and not phrase.inside_box
+    of_it = words[0] in _SOME or (words[0] in {"a", "an"} and plain and not listed)
+    if (not counts and not of_it) or phrase.noun is None or phrase.head in _GENERIC or (counts and of_it):
+        return []
+    said = words[0] if of_it else before[-1]
+    content = [word for word in words if word not in {"the", "these", "those"}]
+    if not set(content) & _COUNTING <= _SOME | lex.NUMBER_WORDS.keys() | {"other"} or content[-1] in _TRAILING:
+        return [Word("X", "X", at)]
+    name = " ".join(content if of_it else [*([said] if said in _TWO_OF else []), *content])
+    return [*plain_words([said] if of_it else [], at), _name("S", at, replace(phrase, text=name), sentence)]
+
+
+def _thing(
+    at: int, determiners: Sequence[str], content: Sequence[str], phrase: ObjectPhrase, sentence: Sentence
+) -> list[Word]:
+    asked = not {"which", "what"}.isdisjoint(determiners)
+    if sentence.tokens[-2:] in (["which", "of"], ["what", "of"]) and phrase.noun is not None and "other" not in content:
+        return [_name("K", at, phrase, sentence)]
     if _is_several(determiners, content, phrase, asked):
-        return ["X"]
-    name = f"{'K' if asked else 'T'}{len(known)}"
-    known[name] = phrase
-    return ["which", name] if asked else [name]
+        return [Word("X", "X", at)]
+    return [*([Word("", "which", at)] if asked else []), _name("K" if asked else "T", at, phrase, sentence)]
+
+
+def _name(kind: str, at: int, phrase: ObjectPhrase, sentence: Sentence) -> Word:
+    same = (name for name, known in sentence.phrases.items() if known == phrase and name.startswith(kind))
+    name = next(same, f"{kind}{len(sentence.phrases)}")
+    sentence.phrases[name] = phrase
+    return Word(kind, name, at)
 
 
 def _is_several(determiners: Sequence[str], content: Sequence[str], phrase: ObjectPhrase, asked: bool) -> bool:
@@ -127,15 +135,12 @@ def _is_several(determiners: Sequence[str], content: Sequence[str], phrase: Obje
     return vague or counted or bool(set(content[single:]) & _COUNTING) or content[-1] in _TRAILING
 
 
-def _count_determiners(words: Sequence[str]) -> int:
-    return next((at for at, word in enumerate(words) if word not in lex.DETERMINERS), len(words))
-
-
-def _generic(determiners: Sequence[str], content: Sequence[str]) -> list[str]:
+def _generic(determiners: Sequence[str], content: Sequence[str], at: int) -> list[Word]:
     if len(content) > 1 and content[0] == "one":
-        return ["X"]  # "one object" is a number
+        return [Word("X", "X", at)]  # "one object" is a number
     kept = [word for word in content if word in {"first", "different", "all"}]
-    return [*determiners, *kept, "OBJS" if content[-1] in _PLURAL else "OBJ"]
+    object = "OBJS" if content[-1] in _PLURAL else "OBJ"
+    return [*plain_words([*determiners, *kept], at), Word(object, object, at)]
 
 
 def means_mover(phrase: ObjectPhrase, question: Question) -> bool:

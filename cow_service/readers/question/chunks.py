@@ -15,11 +15,7 @@ from cow_service.readers.question.phrases import PUNCTUATION, Item, is_count, ke
 from cow_service.readers.question.quantities import with_quantities
 
 MAX_WORDS = 12  # of one phrase; what is longer is no phrase
-_LINKS = lex.words(
-    "in inside within with by of that which is are was at on as the labeled labelled marked numbered highlighted",
-    "circled boxed surrounded enclosed bounded outlined encircled indicated shown drawn number saying bearing",
-    "carrying called",
-)
+_LINKS = lex.SETS["links"]
 # Behind a noun they are no part of it: "the ball and the mug both move".
 _BEHIND = lex.words("both twice earlier later last hard all each together neither either nearest closest able farthest")
 _CLOSED = lex.FUNCTION_WORDS | lex.DETERMINERS

@@ -203,10 +203,15 @@ def _subject(found: Sequence[Item], at: int, verb: str, clause: _Clause) -> Obje
     """What moves: the object of an active verb where a person acts, the subject otherwise; None for a pronoun."""
     form, passive = lex.VERBS[found[at].key].form if found[at].key in lex.VERBS else "base", is_passive(found, at)
     near = phrase_at(found, at - 1)
-    if (form == "ing" or (form == "past" and clause.kind == "question")) and near and near.head not in lex.ABSTRACT:
+    rolling = (
+        (form == "ing" or (form == "past" and clause.kind == "question")) and near and near.head not in lex.ABSTRACT
+    )
+    thrown = form == "past" and not passive and clause.verbs and near and near.is_thing and near.head not in lex.AGENTS
+    if rolling or thrown:  # "which cube is hit by the ball thrown along the arrow"
         return near
-    if form == "past" and not passive and clause.verbs and near and near.is_thing and near.head not in lex.AGENTS:
-        return near  # "which cube is hit by the ball thrown along the arrow"
+    led = _behind_participle(found, at) if form in {"past", "ing"} and not passive and clause.subject is None else None
+    if led is not None:
+        return led
     relative = at - 2 if key_at(found, at - 1) in lex.BE else at - 1
     if key_at(found, relative) in {"that", "which", "who"} and phrase_at(found, relative - 1):
         return phrase_at(found, relative - 1)
@@ -221,6 +226,16 @@ def _subject(found: Sequence[Item], at: int, verb: str, clause: _Clause) -> Obje
         if key_at(found, after) in lex.MOVER_PRONOUNS:
             return None
     return clause.subject
+
+
+def _behind_participle(found: Sequence[Item], at: int) -> ObjectPhrase | None:
+    """ "Sent towards the mug, the ball ...", "after rolling left, will the ball ...": the subject behind it."""
+    comma = next((place for place in range(at, len(found)) if found[place].key in SENTENCE_END | {","}), len(found))
+    opens = key_at(found, at - 1) in SENTENCE_END | {","} | lex.CONDITIONALS
+    if not opens or key_at(found, comma) != "," or phrase_at(found, at + 1) is not None:
+        return None
+    subject = phrase_at(found, comma + 1 + (key_at(found, comma + 1) in lex.AUXILIARIES))
+    return subject if subject is not None and subject.is_thing and subject.head not in lex.AGENTS else None
 
 
 def is_vague(item: Item) -> bool:

@@ -120,13 +120,19 @@ def _asked_about(trajectory: Trajectory) -> Encounter | None:
     kind = _KINDS[outcome.asked.relation]
     partly = outcome.asked.partly
     fitting = [each for each in trajectory.encounters if each.kind == kind and (partly or _happened(each))]
-    own = [each for each in fitting if each.subject == body]
+    own = [each for each in fitting if each.subject == body and _is_meant(each.object, trajectory)]
     if outcome.asked.target is not None:
         pair = {trajectory.bodies[body].object, outcome.object} if trajectory.bodies else set[str | None]()
         # Of two that both move, either may be the subject of the encounter.
         other = [each for each in fitting if kind == "touches" and {_name_of(each, trajectory), each.object} == pair]
         own = [each for each in own if each.object == outcome.object] or other
     return min(own, key=lambda each: each.first_frame, default=None)
+
+
+def _is_meant(name: str, trajectory: Trajectory) -> bool:
+    """Whether a thing is one of those asked about, where the question names several."""
+    among = () if trajectory.outcome is None else trajectory.outcome.asked.among
+    return not among or name in among
 
 
 def _name_of(encounter: Encounter, trajectory: Trajectory) -> str:
@@ -148,7 +154,10 @@ def _became(trajectory: Trajectory) -> str:
         (trajectory.bodies[path.body].object, getattr(path, by))
         for path in trajectory.paths[1:]
         if getattr(path, by) is not None and outcome.object in (None, trajectory.bodies[path.body].object)
-    ]
+        and _is_meant(trajectory.bodies[path.body].object, trajectory)
+    ]  # fmt: skip
+    if not found and outcome.asked.among:
+        return ""
     if not found:
         return f"{named(outcome.object, 'the') if outcome.object else 'nothing'} {does_not if outcome.object else does}"
     name, time = min(found, key=lambda each: each[1])
@@ -261,9 +270,10 @@ def _missed(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> str:
     if outcome.asked.partly and ((outcome.probability or 0.0) >= 0.5) != outcome.asked.negated:
         name = named(outcome.object, "the") if outcome.object else "something"  # less than an encounter tells of
         return f"hides a part of {name}" if outcome.asked.relation == "covers" else f"is partly hidden by {name}"
-    if outcome.asked.target is None or outcome.object is None:
+    meant = [outcome.object] if outcome.object else outcome.asked.among
+    if not meant:
         return _NOTHING_MET[outcome.asked.relation]
-    return _NOT_MET[outcome.asked.relation].format(named(outcome.object, "the"))
+    return _NOT_MET[outcome.asked.relation].format(" or ".join(named(each, "the") for each in meant))
 
 
 def _end(trajectory: Trajectory, body: int) -> list[str]:
@@ -290,7 +300,7 @@ def _agreement(trajectory: Trajectory) -> float | None:
         met = _told(trajectory, 0)
         return met[0].probability if met else None
     asked, first = outcome.asked, _asked_about(trajectory)
-    if asked.relation not in _KINDS or asked.within is not None or asked.partly:
+    if asked.relation not in _KINDS or asked.within is not None or asked.partly or asked.every:
         return None
     agreeing: dict[str, float | None] = {
         "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,
@@ -306,4 +316,4 @@ def _count(trajectory: Trajectory) -> int:
     outcome, body = trajectory.outcome, asked_body(trajectory)
     kind = None if outcome is None else _KINDS[outcome.asked.relation]
     own = [each for each in trajectory.encounters if each.subject == body and each.kind == kind]
-    return len({each.object for each in own if _happened(each)})
+    return len({(each.body, each.object) for each in own if _happened(each) and _is_meant(each.object, trajectory)})

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from cow_service.readers.question.lexicon import words
+from cow_service.readers.question.lexicon import SETS, words
 from cow_service.readers.question.sentences import parse_noun_phrase
 from cow_service.readers.question.shapes import shape_of
 
 ContainerForm = Literal["round", "square", "none", "unknown"]
 
-_ROUND = words(
-    "bowl cup mug glass jar pot pan bucket barrel bin basket vase tin can dish goblet teacup pitcher jug tub flowerpot",
-    "saucepan container pail beaker tumbler cauldron urn hat",
-)
+_ROUND = SETS["round"]
 _SQUARE = words("box crate drawer carton case chest tray suitcase bag cart sink crib bathtub package parcel")
 
 

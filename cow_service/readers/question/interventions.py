@@ -8,19 +8,17 @@ from dataclasses import dataclass, replace
 from lark import Token, Tree
 
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.parsing import read_from
 from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
-from cow_service.readers.question.words import Word, words_of
+from cow_service.readers.question.words import words_of
 from cow_service.records import InterventionKind, PlaceRelation
 
 MAX_TRIES = 6  # of one question: each takes some ms; what comes after them is not looked for
 _WINDOW = 16  # words that one may have
 _BEFORE = lex.CONDITIONALS | lex.words(". ! ? ; : , and but then also that with")
 _ANYWHERE = lex.words("without with remove taking in")
-_TELLING = lex.words(
-    "remove delete erase eliminate exclude withdraw discard take rid not gone go absent missing no disappear vanish",
-    "without absence out put place insert set position drop lower throw release",
-)
+_TELLING = lex.SETS["telling"]
+_VERBS = lex.VERBS.keys() | lex.BE
 THINGS = frozenset({"NP", "PRONOUN"})  # terminals of what is named
 _RELATIONS: dict[str, PlaceRelation] = {
     "into": "into", "onto": "onto", "between": "between", "in_front_of": "in-front-of", "behind": "behind",
@@ -46,15 +44,13 @@ def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords,
     """The interventions of a question, and its items without them and without the conditions they leave empty."""
     changes: list[InterventionWords] = []
     gone: set[int] = set()
-    words = words_of(found)
-    begins = {word.at: place for place, word in reversed(list(enumerate(words)))}
     tries = 0
     for at in _starts(found):
-        ahead = words[begins[at] : begins[at] + _WINDOW] if at in begins else []
+        ahead = words_of(found[at : at + 8])
         if at in gone or tries >= MAX_TRIES or _TELLING.isdisjoint(word.text for word in ahead[:8]):
             continue
         tries += 1
-        read = _read(found, ahead)
+        read = _read(found, at)
         if read is not None:
             said, end = read
             if said[0].kind == "remove" and ahead[0].kind and _goes_on(found, at, end):
@@ -79,17 +75,13 @@ def _goes_on(found: Sequence[Item], start: int, end: int) -> bool:
 
 def implied_placing(found: Sequence[Item]) -> tuple[tuple[InterventionWords, ...], frozenset[int]]:
     """ "Will the apple fit into the bowl?": where nothing moves, the apple is put there; and which places say so."""
-    words = words_of(found)
-    for place, word in enumerate(words):
-        if word.text != "fit":
-            continue
-        for start in (place - 2, place - 3, place - 4):
-            parsed = parse_from("fitting", words[start : place + 8]) if start >= 0 else None
-            if parsed is None or parsed[1] <= place - start:
-                continue
-            named = [phrase for token in named_in(parsed[0]) if (phrase := _phrase(found, token.line or 0))]
-            said = frozenset(found[each.at].start for each in words[start : start + parsed[1]])
-            return ((_placing(parsed[0], named),), said) if named else ((), frozenset())
+    fits = (at for at, item in enumerate(found) if lex.lemma(item.key) == "fit")
+    for start in (start for at in fits for start in range(max(at - 3, 0), at)):
+        parsed = read_from("fitting", found, start, _WINDOW)
+        if parsed is not None:
+            tree, end = parsed
+            named = [phrase for token in named_in(tree) if (phrase := _phrase(found, token.line or 0))]
+            return (_placing(tree, named),), frozenset(item.start for item in found[start:end])
     return (), frozenset()
 
 
@@ -105,27 +97,21 @@ def _starts(found: Sequence[Item]) -> Iterator[int]:
             yield at
 
 
-def _read(found: Sequence[Item], words: Sequence[Word]) -> tuple[list[InterventionWords], int] | None:
-    """The interventions at some words, and the place of the first item behind them."""
-    parsed = parse_from("intervention", words)
-    while parsed is not None and _begins_clause(words, parsed[1]):
-        parsed = parse_from("intervention", words[: parsed[1] - 1])
+def _read(found: Sequence[Item], at: int) -> tuple[list[InterventionWords], int] | None:
+    """The interventions from a place on, and the place of the first item behind them."""
+    parsed = read_from("intervention", found, at, _WINDOW)
+    while parsed is not None and found[parsed[1] - 1].phrase and key_at(found, parsed[1]) in _VERBS:
+        parsed = read_from("intervention", found[: parsed[1] - 1], at, _WINDOW)  # "without the vase, the ball rolls"
     if parsed is None:
         return None
-    tree, length = parsed
-    phrases = {place: _phrase(found, word.at) for place, word in enumerate(words) if word.kind}
-    named = [phrase for token in named_in(tree) if (phrase := phrases.get(token.start_pos or 0))]
-    end = words[length].at if length < len(words) else words[-1].at + 1
+    tree, end = parsed
+    named = [phrase for token in named_in(tree) if (phrase := _phrase(found, token.line or 0))]
     if not named:
         return None
     if next(tree.find_data("removal"), None) is not None:
         return [InterventionWords("remove", phrase) for phrase in named], end
-    return [_placing(tree, named)], end
-
-
-def _begins_clause(words: Sequence[Word], end: int) -> bool:
-    """Whether the last thing of some words is the subject of what follows: "without the vase, the ball rolls"."""
-    return bool(words[end - 1].kind) and end < len(words) and (words[end].text in lex.VERBS or words[end].text == "be")
+    alone = len(named) == 2 and named[1].text.endswith(named[1].head or "")  # "between the cube": and what else?
+    return ([_placing(tree, named)], end) if not alone or not list(tree.find_data("between")) else None
 
 
 def named_in(tree: Tree[Token]) -> Iterator[Token]:

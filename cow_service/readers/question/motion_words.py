@@ -13,7 +13,7 @@ from typing import Literal
 from lark import Token, Tree
 
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.parsing import read_from
 from cow_service.readers.question.phrases import Item, ObjectPhrase, QuantityWords, key_at
 from cow_service.readers.question.trail_words import TrailWords
 from cow_service.readers.question.words import ARROWS, words_of
@@ -29,8 +29,8 @@ _THEN = lex.words("then afterwards finally")
 _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
-_SINKING = lex.words("lower descend sink")
 _FALLING = lex.words("fall drop plummet plunge descend sink")
+_SINKING = _FALLING | {"lower"}
 _CLIMBING = lex.words("rise ascend")
 _GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
 
@@ -188,16 +188,12 @@ def with_front(motion: MotionWords, before: Sequence[Item], told: frozenset[int]
 
 def arrow_statement(found: Sequence[Item]) -> frozenset[int]:
     """The places of "The arrow shows the way" where the question says so."""
-    words = words_of(found)
-    for place, word in enumerate(words):
-        opens = key_at(found, word.at - 1) in {".", "?", "!", ";", ":", ",", "that", "and"} and not (
-            place and words[place - 1].at == word.at
-        )
-        if not opens or all(each.text not in ARROWS for each in words[place : place + 4]):
-            continue
-        parsed = parse_from("adverbial", words[place : place + _WINDOW])
-        if parsed is not None and isinstance(parsed[0].children[0], Tree) and parsed[0].children[0].data == "told":
-            return frozenset(found[each.at].start for each in words[place : place + parsed[1]])
+    for at in range(len(found)):
+        opens = key_at(found, at - 1) in {".", "?", "!", ";", ":", ",", "that", "and"}
+        near = any(word.text in ARROWS for word in words_of(found[at : at + 3])) if opens else False
+        parsed = read_from("adverbial", found, at, _WINDOW) if near else None
+        if parsed is not None and next(parsed[0].find_data("told"), None) is not None:
+            return frozenset(item.start for item in found[at : parsed[1]])
     return frozenset()
 
 
@@ -240,24 +236,17 @@ def _kind(leg: _Leg, kind: MotionKind | None) -> MotionKind | None:
 
 def _adverbials(found: Sequence[Item], start: int) -> Iterator[tuple[Tree[Token] | None, Sequence[Item]]]:
     """The adverbials of a clause with their items; None for a quantity, a "then" or a further verb alone."""
-    words = words_of(found)
-    begins = {word.at: place for place, word in reversed(list(enumerate(words)))}
     at, tries = start, 0
     while at < len(found):
-        item = found[at]
+        item, parsed = found[at], None
         if item.quantity is not None or item.key in _THEN or _is_next_verb(found, at):
             yield None, (item,)
-            at += 1
-            continue
-        ahead = words[begins[at] : begins[at] + _WINDOW] if at in begins and tries < _MAX_TRIES else []
-        parsed = parse_from("adverbial", ahead)
-        tries += parsed is not None or bool(ahead)
-        end = at
-        if parsed is not None:
-            last = parsed[1]
-            end = ahead[last].at if last < len(ahead) else ahead[-1].at + 1
-            if end > at:
-                yield parsed[0], found[at:end]
+        elif tries < _MAX_TRIES:
+            tries += 1
+            parsed = read_from("adverbial", found, at, _WINDOW)
+        end = at if parsed is None else parsed[1]
+        if parsed is not None and end > at:
+            yield parsed[0], found[at:end]
         at = max(end, at + 1)
 
 
@@ -265,7 +254,7 @@ def _is_next_verb(found: Sequence[Item], at: int) -> bool:
     """ "And then drops", "then it rolls": the verb of a further leg."""
     verb = lex.VERBS.get(found[at].key)
     before = at - 1
-    while key_at(found, before) in lex.MOVER_PRONOUNS | lex.BE | {"to"}:
+    while key_at(found, before) in lex.MOVER_PRONOUNS | lex.BE | {"to", "let"}:
         before -= 1
     return verb is not None and verb.kind is not None and key_at(found, before) in _THEN | {"and"}
 

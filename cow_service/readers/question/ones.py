@@ -28,6 +28,9 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             meant = things[-1] if item.words == ("the", "latter") else things[-2]
             said.append(replace(item, phrase=meant.phrase, words=meant.words))
             continue
+        if item.key == "that" and things and _acts(found, len(said)):
+            said.append(replace(item, key="", phrase=things[-1].phrase, words=things[-1].words))
+            continue
         if item.words in _OTHER and len(nouns) == 1:
             noun = next(iter(nouns))
             other = ObjectPhrase(f"other {noun}", None, noun)
@@ -43,6 +46,12 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             said.append(item)
             before |= {_kind_of(phrase)} - {""}
     return said
+
+
+def _acts(found: Sequence[Item], at: int) -> bool:
+    """ "Will that then knock into the cube?": what was named last."""
+    verb = lex.lemma(key_at(found, at + 1 + (key_at(found, at + 1) in {"then", "also"})))
+    return key_at(found, at - 1) in lex.AUXILIARIES and verb in lex.TOUCH | lex.OCCLUDE | {"tip", "topple"}
 
 
 def _singles_out(item: Item, phrase: ObjectPhrase) -> bool:

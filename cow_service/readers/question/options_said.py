@@ -15,19 +15,13 @@ _YES = re.compile(r"(?:yes\b(?! (?:and|or) no).*|true)", re.DOTALL | re.IGNORECA
 _NO = re.compile(
     r"no\s*(?:[,.;:!()\u2013\u2014-].*)?|no (?:it|the|this|that|because|they)\b.*|false", re.DOTALL | re.IGNORECASE
 )
-_TOUCHING = lex.words(
-    "hit hits hitting touch touches touching collide collides collision contact impact strike strikes",
-    "bump bumps land lands reach reaches touched struck",
-)
+_TOUCHING = lex.SETS["touching"]
 _COVERING = lex.words("hidden hide hides occluded occlude occludes occlusion covered obscured concealed obstructed")
 _MISSING = lex.words("miss misses missed missing avoid avoids avoided untouched")
 _SEEN = lex.words("visible unobstructed unoccluded uncovered")
 _NEGATIONS = lex.words("not no never n't without nothing neither")
 # They change nothing beside such a word.
-_FILLERS = lex.words(
-    "it they the a an will would does do is are be gets get with into on onto against makes make comes come there in",
-    "by remains stays stay remain still to from view sight of passes pass out",
-)
+_FILLERS = lex.SETS["fillers"]
 _ANY_WORDS = lex.words("anything something any object objects nothing")
 _PASSIVE = lex.words("is are be get gets stays stay remains remain being")
 _BARE = {

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import suppress
 from functools import cache
 from importlib.resources import files
+from itertools import islice
 from threading import Lock
 from typing import Any
 
@@ -15,10 +16,11 @@ from lark.common import LexerConf
 from lark.exceptions import UnexpectedToken
 from lark.grammar import NonTerminal
 from lark.lexer import Lexer
-from lark.parsers.earley import Item
+from lark.parsers.earley import Item as EarleyItem
 from lark.parsers.earley_forest import ForestToParseTree
 
-from cow_service.readers.question.words import Word
+from cow_service.readers.question.phrases import Item
+from cow_service.readers.question.words import Word, words_at
 
 STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial", "place"]
 MAX_WORDS = 48  # of one parse: its work may grow with the cube of their number
@@ -99,7 +101,7 @@ class _Grammar:
         with self.lock, suppress(UnexpectedToken):
             self.words, self.ahead = words, self.names(words[0])
             for rule in self[NonTerminal(start)]:
-                item = Item(rule, 0, 0)
+                item = EarleyItem(rule, 0, 0)
                 (to_scan if item.expect in self.earley.TERMINALS else columns[0]).add(item)
             self.earley._parse(self, columns, to_scan, NonTerminal(start))
         return columns
@@ -140,7 +142,33 @@ def parse_from(start: str, words: Sequence[Word]) -> tuple[Tree[Token], int] | N
     return None
 
 
+def read_from(start: str, found: Sequence[Item], at: int, window: int) -> tuple[Tree[Token], int] | None:
+    """The tree of a rule over the items from a place on, `window` words at most, and the place of the item behind it.
+
+    The `line` of a token is the place of its item.
+    """
+    first = words_at(found, at)[:1] if at < len(found) else []
+    if not first or not may_begin(start, first[0]):
+        return None
+    words = list(islice((word for place in range(at, len(found)) for word in words_at(found, place)), window))
+    parsed = parse_from(start, words)
+    if parsed is None:
+        return None
+    tree, length = parsed
+    return tree, words[length].at if length < len(words) else words[-1].at + 1
+
+
 def may_begin(start: str, word: Word) -> bool:
     """Whether a word may be the first one of a rule."""
     grammar = _grammar()
     return not grammar.starts[start].isdisjoint(grammar.names(word))
+
+
+def listed_words() -> Set[str]:
+    """The words of the grammar."""
+    return _grammar().terminals.keys()
+
+
+def terminals(word: str) -> Set[str]:
+    """The terminals of the grammar that a word may be."""
+    return _grammar().terminals.get(word, frozenset())

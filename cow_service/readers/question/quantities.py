@@ -9,30 +9,16 @@ from lark import Token, Tree
 
 from cow_service.readers.base import Quantity, SpeedWord, Unit
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.parsing import may_begin, parse_from, terminals
 from cow_service.readers.question.phrases import QUANTITY, Item, QuantityWords
-from cow_service.readers.question.words import PRONOUNS, Word, base_forms
+from cow_service.readers.question.words import Word, plain_words
 
 _WINDOW = 12  # words
-_MAX_TRIES = 5  # of one question: each takes some ms
-_STARTS = lex.words(
-    "within in after at with by for during lasting over only exactly very really quite rather slowly slow gently",
-    "softly lightly fast quickly rapidly swiftly hard forcefully halfway midway half but until till a an",
-    "stops stopping",
-)
-_PACES = lex.words("slowly slow gently softly lightly fast quickly rapidly swiftly hard forcefully halfway midway")
-_MEASURES = _PACES | lex.words(
-    "px pixel pixels m meter meters metre metres cm centimeter centimeters centimetre centimetres mm inch inches foot",
-    "feet ft s sec secs second seconds width widths speed velocity pace rate push shove force way until till",
-)
+_MAX_TRIES = 6  # of one question: each takes some ms
+_MEASURES = frozenset({"_SLOWLY", "_QUICKLY", "_SECOND", "_TEMPO", "LENGTH", "WIDTH"})  # terminals
+_BARE = lex.words("halfway midway way until till push shove")  # measures, too
 _ADJECTIVE_BEHIND = lex.DETERMINERS | lex.COLOURS.keys() | lex.ADJECTIVES | lex.words("how as so is are be")
 _NUMERALS = lex.NUMBER_WORDS | {"twenty": 20, "thirty": 30, "forty": 40, "fifty": 50, "sixty": 60, "hundred": 100}
-_METRES = {
-    "m": 1.0, "meter": 1.0, "meters": 1.0, "metre": 1.0, "metres": 1.0, "cm": 0.01, "centimeter": 0.01,
-    "centimeters": 0.01, "centimetre": 0.01, "centimetres": 0.01,
-    "mm": 0.001, "millimeters": 0.001, "millimetres": 0.001, "inch": 0.0254, "inches": 0.0254, "foot": 0.3048,
-    "feet": 0.3048, "ft": 0.3048,
-}  # fmt: skip
 _PARTS = {"half": 0.5, "halfway": 0.5, "quarter": 0.25, "third": 1 / 3, "two_thirds": 2 / 3}
 _WITH_UNIT = re.compile(r"(\d+(?:\.\d+)?)([a-z]+)")
 
@@ -59,12 +45,13 @@ def with_quantities(found: Sequence[Item]) -> list[Item]:
 
 def _may_start(found: Sequence[Item], at: int) -> bool:
     key, before = found[at].key, found[at - 1].key if at else ""
-    if key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND:
+    if (key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND) or before == "number":
         return False
-    ahead = {item.key for item in found[at : at + 8]}
-    if _MEASURES.isdisjoint(ahead) and not any(_WITH_UNIT.fullmatch(each) for each in ahead):
-        return False
-    return key in _STARTS or key[0].isdigit() or (key in _NUMERALS and before != "number")
+    measured = any(
+        each.key in _BARE or _WITH_UNIT.fullmatch(each.key) or not _MEASURES.isdisjoint(terminals(each.key))
+        for each in found[at : at + 8]
+    )
+    return measured and may_begin("quantity", _words(key, at)[0])
 
 
 def _read(found: Sequence[Item], at: int) -> tuple[QuantityWords, int] | None:
@@ -84,7 +71,7 @@ def _words(key: str, at: int) -> list[Word]:
         return [Word("NUMBER", joined[1], at), Word("", joined[2], at)]
     if key in _NUMERALS or re.fullmatch(r"[0-9]+(\.[0-9]+)?", key):
         return [Word("NUMBER", key, at)]
-    return [Word("PRONOUN" if key in PRONOUNS else "", text, at) for text in base_forms(key)]
+    return plain_words([key], at)
 
 
 def _quantity(tree: Tree[Token]) -> QuantityWords:
@@ -108,7 +95,7 @@ def _quantity(tree: Tree[Token]) -> QuantityWords:
 
 def _speed(kind: Tree[Token], number: float, length: tuple[float, Unit] | None) -> SpeedWord | Quantity:
     if length is None:
-        return "slow" if list(kind.find_data("slow")) else "fast"
+        return "slow" if any(node.data in {"slow", "slowly"} for node in kind.iter_subtrees()) else "fast"
     value, unit = length
     per_second: dict[str, Unit] = {"px": "px/s", "m": "m/s", "widths": "widths/s"}
     return Quantity(number * value, per_second[unit])
@@ -132,4 +119,4 @@ def _length(tree: Tree[Token]) -> tuple[float, Unit] | None:
     unit = str(node.children[0])
     if unit.startswith("width"):
         return 1.0, "widths"
-    return (1.0, "px") if unit.startswith("p") else (_METRES[unit], "m")
+    return (1.0, "px") if unit.startswith("p") else (lex.METRES[unit], "m")

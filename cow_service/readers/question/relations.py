@@ -13,21 +13,19 @@ from functools import lru_cache
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.accounting import Unread, unread_words
-from cow_service.readers.question.asked_words import MAX_TOKENS, Sentence, sentences
+from cow_service.readers.question.asked_words import MAX_TOKENS, THEM, Sentence, sentences
 from cow_service.readers.question.asking import IT, Asking, read_clause
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
-from cow_service.readers.question.words import PRONOUNS, Word, base_forms
+from cow_service.readers.question.words import Word
 from cow_service.records import Asked
 
-_STARTS = lex.words(
-    "will would do does did can could shall might may be tell say predict know when where at in after how what which",
-    "with into on onto true has have had",
-)
+_STARTS = lex.SETS["starts"]
 _OPENERS = lex.words(", and then so but now please")
 _CLAIM = ("true", "or", "false")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
 _SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
+_SUBJECTS_KINDS = frozenset({"PRONOUN", "M", "T", "S"})
 _CONDITIONS = lex.words("if when once after as while upon assuming given provided suppose supposing")
 _MAX_TRIES = 8  # of one sentence: each takes some ms
 MAX_SENTENCES = 12  # of one question; more are not read
@@ -64,11 +62,13 @@ def read_asked(question: Question) -> Asked | None:
     subject = None if asking.subject is None else _named(asking.subject, reading, question)
     if asking.relation == "inside" and target is None:
         target = next((_as_named(put.targets[0], question) for put in question.interventions if put.targets), None)
-    kinds = [phrase for token, phrase in reading.phrases.items() if token.startswith("K")]
-    among = tuple(_as_named(phrase, question) for phrase in read_alternatives(question) if phrase not in kinds)
+    among = _meant(reading, question)
+    if among is None:
+        return None
     return Asked(
-        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated, among=among,
-        within=reading.within, partly=asking.partly,
+        form=asking.form, relation=asking.relation, subject=subject, target=target, negated=asking.negated,
+        among=tuple(_as_named(phrase, question) for token, phrase in among if not token.startswith("K")),
+        every=asking.every, within=reading.within, partly=asking.partly,
     )  # fmt: skip
 
 
@@ -83,9 +83,19 @@ def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
     reading = _read(question)
     if reading is None or reading.asking.form != "which-first":
         return ()
-    named = {token: reading.phrases[token] for token in reading.asking.among}
-    listed = [*(phrase for token, phrase in named.items() if not token.startswith("K")), *reading.listed]
-    return tuple(listed or named.values())
+    return tuple(phrase for _, phrase in _meant(reading, question) or ())
+
+
+def _meant(reading: _Reading, question: Question) -> list[tuple[str, ObjectPhrase]] | None:
+    """The things and kinds that are meant, with their tokens; None for a "them" that is not two or more things."""
+    if reading.listed:
+        return [("", phrase) for phrase in reading.listed]
+    found = [(token, reading.phrases[token]) for token in reading.asking.among if token != THEM]
+    if THEM not in reading.asking.among:
+        return [each for each in found if not each[0].startswith("K")] or found
+    put = [change.object for change in question.interventions if change.kind == "place"]
+    things = [phrase for phrase in (*put, *question.others) if phrase != question.mover]
+    return [("", phrase) for phrase in things] if len(things) > 1 else None
 
 
 @lru_cache(maxsize=64)
@@ -102,7 +112,7 @@ def unread(question: Question) -> Unread:
 def _read(question: Question) -> _Reading | None:
     """The one clause of the question that asks; None where none is understood, or several ask."""
     found, claim = _without_claim(sentences(question))
-    if len(found) > MAX_SENTENCES or any(len(sentence.tokens) > MAX_TOKENS for sentence in found):
+    if len(found) > MAX_SENTENCES or any(len(sentence.words) > MAX_TOKENS for sentence in found):
         return None
     readings = [
         (at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question, claim))
@@ -113,12 +123,11 @@ def _read(question: Question) -> _Reading | None:
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
         return None
-    named = {found[at].items[place] for place in reading.covered}
-    named |= claim | {place for place, item in enumerate(question.items) if item.phrase in listed}
-    if listed:
-        named |= {place for place, item in enumerate(question.items) if item.key == "or"}
-    limits = {at: item.quantity.within for at, item in enumerate(question.items) if item.quantity}
-    limits = {at: limit for at, limit in limits.items() if limit is not None}
+    named = {found[at].words[place].at for place in reading.covered} | claim
+    named |= {at for at, item in enumerate(question.items) if listed and (item.phrase in listed or item.key == "or")}
+    named |= {at for at, item in enumerate(question.items) if item.key == "still" and question.interventions}
+    quantities = {at: item.quantity for at, item in enumerate(question.items) if item.quantity}
+    limits = {at: quantity.within for at, quantity in quantities.items() if quantity.within is not None}
     if not all(_limits(question, named, at) for at in limits):
         return None
     within = min(limits.values(), default=None)
@@ -130,8 +139,8 @@ def _without_claim(found: list[Sentence]) -> tuple[list[Sentence], frozenset[int
     if not found or tuple(found[0].tokens[: len(_CLAIM)]) != _CLAIM:
         return found, frozenset()
     first, number = found[0], len(_CLAIM) + (found[0].tokens[len(_CLAIM) : len(_CLAIM) + 1] == [","])
-    rest = replace(first, tokens=first.tokens[number:], words=first.words[number:], items=first.items[number:])
-    return [each for each in (rest, *found[1:]) if each.tokens], frozenset(first.items[:number])
+    rest = replace(first, words=first.words[number:])
+    return [each for each in (rest, *found[1:]) if each.words], frozenset(word.at for word in first.words[:number])
 
 
 def _limits(question: Question, asking: set[int], at: int) -> bool:
@@ -149,10 +158,11 @@ def _read_sentence(sentence: Sentence, question: Question, claim: Collection[int
     """
     tokens = sentence.tokens
     tries = 0
-    ends = [len(tokens), *(at for at in range(len(tokens)) if _ends(tokens, at, question))]
-    claims = {at for at in range(len(tokens)) if claim and _claims(tokens, at)}
-    for start in (at for at in range(len(tokens)) if at in claims or _starts(sentence, at)):
-        for end in (end for end in ends if end > start):
+    rolling = [[word, question.motion.verb, "-ing"] for word in ("by", "of")]
+    ends = [at for at in range(len(tokens)) if tokens[at] in _CONDITIONS or tokens[at : at + 3] in rolling]
+    claims = {at for at in range(len(tokens)) if claim and _claims(sentence, at)}
+    for start in (at for at in range(len(tokens)) if at in claims or _starts(sentence, at, question)):
+        for end in (end for end in (len(tokens), *ends) if end > start):
             tries += 1
             if tries > _MAX_TRIES:
                 return None
@@ -162,44 +172,36 @@ def _read_sentence(sentence: Sentence, question: Question, claim: Collection[int
     return None
 
 
-def _ends(tokens: Sequence[str], at: int, question: Question) -> bool:
-    """Whether a condition begins at a token: "if it rolls", "by rolling"."""
-    return tokens[at] in _CONDITIONS or (
-        tokens[at] == "by" and tokens[at + 1 : at + 2] == [f"{question.motion.verb}-ing"]
-    )
-
-
-def _starts(sentence: Sentence, at: int) -> bool:
+def _starts(sentence: Sentence, at: int, question: Question) -> bool:
     """Whether a question may begin at a token: with an auxiliary, or as in "ball rolls left - hits the mug?"."""
-    tokens = sentence.tokens
-    if tokens[at] in _STARTS:
+    tokens, word = sentence.tokens, sentence.words[at]
+    if word.text in _STARTS and not (at and sentence.words[at - 1].at == word.at):
         return _opens(tokens[:at])
-    said = sentence.words[at][0]
+    said = question.items[word.at].key
     finite = said in lex.VERBS and lex.VERBS[said].form == "s"
     return finite and sentence.asks and (at == 0 or tokens[at - 1] == ",")
 
 
-def _claims(tokens: Sequence[str], at: int) -> bool:
+def _claims(sentence: Sentence, at: int) -> bool:
     """Whether a statement may begin at a token: with what does something, at the start or behind a condition."""
-    subject = tokens[at] in PRONOUNS or tokens[at] == "M" or (tokens[at][:1] == "T" and tokens[at][1:].isdecimal())
-    return subject and (at == 0 or tokens[at - 1] in _OPENERS) and _opens(tokens[:at])
+    before = sentence.tokens[:at]
+    return sentence.words[at].kind in _SUBJECTS_KINDS and (not before or before[-1] in _OPENERS) and _opens(before)
 
 
 def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]:
     """The places of a clause without what stands between commas behind its subject: "the car, moving left,"."""
     places = list(range(start, end))
     commas = [at for at in places if tokens[at] == ","]
-    if len(commas) > 1 and commas[0] == start + 2 and tokens[start + 1] in {"M", "it"}:
-        first = tokens[commas[0] + 1]
-        if first in _CONDITIONS or first.endswith("-ing") or first in lex.VERBS:
-            return [at for at in places if not commas[0] <= at <= commas[1]]
+    behind = len(commas) > 1 and commas[0] == start + 2 and tokens[start + 1] in {"M", "it"}
+    if behind and tokens[commas[0] + 1] in _CONDITIONS | lex.VERBS.keys():
+        return [at for at in places if not commas[0] <= at <= commas[1]]
     return places[:-1] if commas and commas[-1] == end - 1 else places
 
 
 def _match(sentence: Sentence, places: Sequence[int], question: Question, claim: bool) -> _Reading | None:
     words = [Word("", word, places[0]) for word in _CLAIM] if claim else []
-    words += [word for at in places for word in _words(sentence.tokens[at], at, question)]
-    tokens = [sentence.tokens[at] for at in places]
+    words += [sentence.words[at] for at in places]
+    tokens = [word.text for word in words]
     senses = {token for token in tokens if token in {"along", "against"}}
     if "arrow" in tokens and senses and senses != {question.motion.arrow}:
         return None  # the motion that was read is another
@@ -214,21 +216,6 @@ def _match(sentence: Sentence, places: Sequence[int], question: Question, claim:
         phrases = phrases | {IT: question.others[0]}
     asking = _into_hollow(asking, tokens, phrases)
     return None if asking is None else _Reading(asking, phrases, frozenset(places))
-
-
-def _words(token: str, at: int, question: Question) -> list[Word]:
-    """A token of a sentence as words of the grammar."""
-    if token in {"M", "OBJ", "OBJS", "X"}:
-        return [Word(token, token, at)]
-    if token[:1] in {"T", "K"} and token[1:].isdecimal():
-        return [Word(token[0], token, at)]
-    if token == "still" and question.interventions:
-        return []  # "will it still hit the cup?": with what is taken away
-    if token in PRONOUNS:
-        return [Word("PRONOUN", token, at)]
-    if token.endswith("-ing"):
-        return [Word("", token.removesuffix("-ing"), at), Word("", "-ing", at)]
-    return [Word("", text, at) for text in base_forms(token)]
 
 
 def _opens(before: Sequence[str]) -> bool:
@@ -248,8 +235,8 @@ def _opens(before: Sequence[str]) -> bool:
 
 def _relates(token: str, after: str) -> bool:
     """Whether a clause follows on "which", "when" or "where": then nothing is asked with them."""
-    subject = after[:1] in {"M", "T", "X"} or after in _SUBJECTS or after.startswith("OBJ")
-    return subject or (token == "when" and after.removesuffix("-ing") in lex.VERBS)
+    subject = after[:1] in {"M", "T", "S", "X"} or after in _SUBJECTS or after.startswith("OBJ")
+    return subject or (token == "when" and after in lex.VERBS)
 
 
 def _into_hollow(asking: Asking, tokens: Sequence[str], phrases: dict[str, ObjectPhrase]) -> Asking | None:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from cow_service.readers.question.lexicon import SETS, words
 from cow_service.records import OptionsSource
 
 _TEMPLATE = re.compile(r"\{[^{}]*\}", re.DOTALL)
@@ -28,6 +29,8 @@ _TEXT = re.compile(
 )
 # Sentences of the text, and what those are about that say how to reply.
 _BETWEEN_SENTENCES = re.compile(r"((?<=[.?!])\s+|\n+)")
+_BETWEEN_PARTS = re.compile(r"((?<=[.?!;:])\s+)")
+_PICTURES = words("image images frame frames picture pictures photo photos")
 _ABOUT_REPLY = re.compile(
     r"\byour (?:\w+ ){0,2}(?:response|answer|reply|output)s?\b|\bjson\b|answer\s*:\s*\$|\$\s?letter\b", re.IGNORECASE
 )
@@ -64,7 +67,15 @@ def reply_text(prompt: str, reply: Reply) -> str:
 def without_reply_form(prompt: str) -> str:
     """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
     sentences = _BETWEEN_SENTENCES.split(_HEADING.sub("", prompt))
-    return "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
+    kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
+    return "".join(each for each in _BETWEEN_PARTS.split(kept) if not _instructs(each))
+
+
+def _instructs(sentence: str) -> bool:
+    """Whether it says what to do, or what the images are, not what happens in them."""
+    said = re.findall(r"\w+", sentence.lower())
+    first = next((word for word in said[:2] if word != "please"), "")
+    return first in SETS["instructions"] or (first == "note" and not _PICTURES.isdisjoint(said))
 
 
 def json_reply(keys: Sequence[str], reply: Reply) -> str:

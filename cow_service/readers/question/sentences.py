@@ -9,12 +9,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 
 from cow_service.readers.base import Quantity
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.chunks import items
 from cow_service.readers.question.clauses import (
-    SENTENCE_END,
     Clauses,
     MotionCandidate,
     clause_end,
@@ -26,19 +26,17 @@ from cow_service.readers.question.interventions import InterventionWords, implie
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
 from cow_service.readers.question.ones import with_nouns
-from cow_service.readers.question.phrases import Item, ObjectPhrase, flatten, key_at, phrase_at, tokens
+from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at, tokens
 from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.reply_forms import without_reply_form
 from cow_service.readers.question.trail_words import TrailWords, split_trail
+from cow_service.readers.question.typing_errors import without_typing_errors
 from cow_service.records import MotionKind
 
 MAX_WORDS = 240  # of a question that are read
-_INSTRUCTIONS = lex.words(
-    "think reason answer choose select pick option options choices explain respond reply provide return output"
-)
 _EACH_OF_TWO = lex.words("both each together")
-_PICTURES = lex.words("image images frame frames picture pictures photo photos")
-_SAME_TIME = (("the", "same", "time"), ("the", "same", "moment"), ("the", "same", "instant"))
+_HOW_MANY = lex.words("the all both either none two three")
+_SAME_TIME = re.compile(r"\bat the same (?:time|moment|instant)\b(?P<joins> as\b)?", re.IGNORECASE)
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
     r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
@@ -65,6 +63,7 @@ class Question:
     clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
+    errors: tuple[tuple[str, str], ...] = ()  # of typing, each with what it was read as
     beyond: str = ""  # how what is not read any more begins
     pronoun: str = ""  # that stands for the mover where it may stand for two things
     read: frozenset[int] = frozenset()
@@ -74,16 +73,16 @@ class Question:
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
     text, beyond = _cut(without_reply_form(split_options(question).rest))
+    text, errors = without_typing_errors(_SAME_TIME.sub(lambda found: "and" if found["joins"] else "", text))
     changes, found = split_interventions(with_places(with_nouns(items(text))))
-    trail, found = split_trail(_at_the_same_time(found))
-    found = _without_instructions(found)
+    trail, found = split_trail(found)
     clauses = read_clauses(found)
     best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
     best = _before_while(found, clauses, best)
     at = best.at if best else len(found)
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
     mover = _in_full(mover, found[:at]) if mover else None
-    arrow = any(token.key.startswith("arrow") for token in tokens(question))
+    arrow = any(token.key.startswith("arrow") for token in tokens(text))
     clause, motion = _motion(found, clauses, best, mover, arrow, changes)
     motion, fitted = replace(motion, trail=_ending(trail, motion)), frozenset[int]()
     if not changes and (best is None or (best.asked and not _says_way(motion))):
@@ -102,8 +101,9 @@ def parse(question: str) -> Question:
         interventions=changes,
         clause=tuple(found[clause.start : clause.stop]),
         mentions_arrow=arrow,
-        names_direction=_DIRECTION_WORDS.search(question) is not None,
+        names_direction=_DIRECTION_WORDS.search(text) is not None,
         beyond=beyond,
+        errors=errors,
         pronoun=_open_pronoun(found, best, mover),
         read=read.union(item.start for item in found[clause.start : clause.stop]) if carried else read,
     )
@@ -145,7 +145,19 @@ def _motion(
         read=motion.read.union(place for place, _ in speeds),
         others=_other_motions(found, clauses, best, shared, end),
     )
-    return range(start if best else at, end), motion
+    return range(start if best else at, end), _with_both(motion, found)
+
+
+def _with_both(motion: MotionWords, found: Sequence[Item]) -> MotionWords:
+    """With "both slowly", which is said of two movers."""
+    for before, item in pairwise(found):
+        if item.quantity is not None and item.quantity.speed is not None and "both" in (before.key, *before.words[-1:]):
+            paced = [replace(other.motion, quantities=(item.quantity,)) for other in motion.others]
+            others = tuple(replace(o, motion=each) for o, each in zip(motion.others, paced, strict=True))
+            if others and item.quantity not in motion.quantities:
+                read = motion.read | {before.start, item.start}
+                return replace(motion, quantities=(*motion.quantities, item.quantity), others=others, read=read)
+    return motion
 
 
 def _ending(trail: TrailWords | None, motion: MotionWords) -> TrailWords | None:
@@ -298,39 +310,6 @@ def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:
     return fuller.pop() if len(fuller) == 1 else mover
 
 
-def _at_the_same_time(found: list[Item]) -> list[Item]:
-    """Without "at the same time", which says what "and" says; "at the same time as" is "and" too."""
-    kept: list[Item] = []
-    for at, item in enumerate(found):
-        if kept and item.words in _SAME_TIME and kept[-1].key == "at":
-            as_well = kept.pop()
-            if key_at(found, at + 1) == "as":
-                kept.append(replace(as_well, key="and"))
-        elif not (item.key == "as" and at and found[at - 1].words in _SAME_TIME):
-            kept.append(item)
-    return kept
-
-
-def _without_instructions(found: list[Item]) -> list[Item]:
-    kept: list[Item] = []
-    sentence: list[Item] = []
-    for item in [*found, Item(".", 0, 0)]:
-        sentence.append(item)
-        if item.key in SENTENCE_END:
-            if not _is_instruction(flatten(sentence)):
-                kept += sentence
-            sentence = []
-    return [item for item in kept if item.end]  # without the full stop added
-
-
-def _is_instruction(words: Sequence[str]) -> bool:
-    """Whether a sentence says how to answer, or what the images are, not what happens in them."""
-    first = next((word for word in words[:2] if word != "please"), None)
-    if first is None or first in _INSTRUCTIONS:
-        return True
-    return first == "note" and not _PICTURES.isdisjoint(words)
-
-
 def _others(
     found: Sequence[Item],
     mover: ObjectPhrase | None,
@@ -344,7 +323,9 @@ def _others(
     things = [(at, item, item.phrase) for at, item in enumerate(found)]
     things += [(at, item, item.phrase.place.of) for at, item, _ in things if item.phrase and item.phrase.place]
     for at, item, phrase in sorted(things, key=lambda each: each[0]):
-        if phrase is None or is_vague(item) or not _is_object(phrase) or (at in clause and phrase.head in lex.AGENTS):
+        if phrase is None or is_vague(item) or _HOW_MANY.issuperset(item.words):
+            continue
+        if not _is_object(phrase) or (at in clause and phrase.head in lex.AGENTS):
             continue
         if phrase.noun in lex.ADJECTIVES and item.words[0] not in lex.DETERMINERS:
             continue  # "which ball will it hit first?"

@@ -9,13 +9,10 @@ from lark import Token, Tree
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.interventions import named_in
-from cow_service.readers.question.parsing import parse_from
+from cow_service.readers.question.parsing import read_from
 from cow_service.readers.question.phrases import Item, ObjectPhrase
-from cow_service.readers.question.words import words_of
 from cow_service.records import Vector
 
-_STARTS = lex.words("along on follow follows following continues continuing extends extending extend")
-_THE_WAY = ("the", "way")  # "the way it has been going"
 _SIDES = {"leftmost": "left", "rightmost": "right", "topmost": "up", "lowest": "down", "highest": "up",
           "uppermost": "up"}  # fmt: skip
 
@@ -34,15 +31,11 @@ class TrailWords:
 
 def split_trail(found: Sequence[Item]) -> tuple[TrailWords | None, list[Item]]:
     """What is said of a trail, and the items without that."""
-    words = words_of(found)
-    for place, word in enumerate(words):
-        first = not place or words[place - 1].at != word.at
-        if first and (found[word.at].key in _STARTS or found[word.at].words == _THE_WAY):
-            parsed = parse_from("trail", words[place:])
-            if parsed is not None and parsed[1] > 1:
-                tree, length = parsed
-                end = words[place + length].at if place + length < len(words) else len(found)
-                return _trail(found, tree), [*found[: word.at], *found[end:]]
+    for at in range(len(found)):
+        parsed = read_from("trail", found, at, len(found))
+        if parsed is not None and parsed[1] > at + 1:
+            tree, end = parsed
+            return _trail(found, tree), [*found[:at], *found[end:]]
     return None, list(found)
 
 

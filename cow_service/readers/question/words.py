@@ -8,20 +8,14 @@ from dataclasses import dataclass
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.phrases import Item, ObjectPhrase
 
-_BE = frozenset(["be", "is", "are", "was", "were", "been", "am", "'s"])
 _SAME: dict[str, tuple[str, ...]] = {
-    "being": ("be", "-ing"),
-    "n't": ("not",),
-    "cannot": ("can", "not"),
-    "gets": ("get",),
-    "got": ("get",),
-    "getting": ("get", "-ing"),
-    "wo": ("will",),
-    "ca": ("can",),
-    "longer": ("long", "-er"),
-    "leaves": ("leave",),
-    "leaving": ("leave", "-ing"),
-}
+    **dict.fromkeys(["be", "is", "are", "was", "were", "been", "am", "'s"], ("be",)),
+    **dict.fromkeys(["get", "gets", "got", "gotten"], ("get",)),
+    **dict.fromkeys(["has", "had"], ("have",)),
+    "being": ("be", "-ing"), "getting": ("get", "-ing"), "having": ("have", "-ing"), "making": ("make", "-ing"),
+    "makes": ("make",), "elapses": ("elapse",), "longer": ("long", "-er"),
+    "n't": ("not",), "cannot": ("can", "not"), "wo": ("will",), "ca": ("can",),
+}  # fmt: skip
 ARROWS = frozenset(["arrow", "arrowhead"])
 PRONOUNS = frozenset(["it", "itself", "they", "them", "he", "she"])
 
@@ -37,16 +31,22 @@ class Word:
 
 def words_of(found: Sequence[Item]) -> list[Word]:
     """The tokens of some items."""
-    return [word for at, item in enumerate(found) for word in _of_item(item, at)]
+    return [word for at in range(len(found)) for word in words_at(found, at)]
 
 
-def _of_item(item: Item, at: int) -> list[Word]:
+def words_at(found: Sequence[Item], at: int) -> list[Word]:
+    """The tokens of one item."""
+    item = found[at]
     if item.phrase is None:
-        kind = "PRONOUN" if item.key in PRONOUNS else ""
-        return [Word(kind, text, at) for text in base_forms(item.key)]
+        return plain_words([item.key], at)
     if _is_words(item, item.phrase):
-        return [Word("", text, at) for word in item.words for text in base_forms(word)]
+        return plain_words(item.words, at)
     return [Word("AGENT" if item.phrase.head in lex.AGENTS else "NP", item.phrase.text, at)]
+
+
+def plain_words(keys: Sequence[str], at: int) -> list[Word]:
+    """Lower case words at a place as tokens: the base form of a verb, its ending "-ing" apart."""
+    return [Word("PRONOUN" if key in PRONOUNS else "", text, at) for key in keys for text in _base_forms(key)]
 
 
 def _is_words(item: Item, phrase: ObjectPhrase) -> bool:
@@ -59,10 +59,7 @@ def _is_words(item: Item, phrase: ObjectPhrase) -> bool:
     return phrase.head in lex.NO_THINGS or all(word == "one" or lex.is_modifier(word) for word in content)
 
 
-def base_forms(word: str) -> tuple[str, ...]:
-    """A lower case word as tokens: the base form of a verb, its ending "-ing" apart."""
-    if word in _BE:
-        return ("be",)
+def _base_forms(word: str) -> tuple[str, ...]:
     verb = lex.VERBS.get(word)
     if verb is None or word in _SAME:
         return _SAME.get(word, (word,))

@@ -1,0 +1,57 @@
+"""Finds the things of a kind that a question asks about. It refuses where the image does not tell which those are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from cow_service.errors import CannotGround
+from cow_service.readers.embedded.matching import describe, match_all, match_some
+from cow_service.readers.question.kinds import Kind, kind_of
+from cow_service.readers.question.options_said import may_name
+from cow_service.readers.question.phrases import ObjectPhrase
+from cow_service.readers.question.relations import read_asked
+from cow_service.readers.question.sentences import Question
+from cow_service.readers.remedies import GIVE_OBJECT
+from cow_service.records import BBox, LocatedObject
+from cow_service.vision.masks import iou
+from cow_service.vision.regions import SAME_OBJECT_IOU, Region
+
+
+def things_of_kinds(
+    regions: Sequence[Region], question: Question, mover: BBox, given: Sequence[LocatedObject]
+) -> tuple[LocatedObject, ...]:
+    """Those of the regions, but for the mover's, each under its colour; none of a kind that the caller has `given`.
+
+    Raises `CannotGround`.
+    """
+    asked, found = read_asked(question), list[LocatedObject]()
+    left = [region for region in regions if iou(region.bbox, mover) < SAME_OBJECT_IOU]
+    for name in () if asked is None else asked.among:
+        kind = kind_of(name)
+        if kind is None or any(may_name(kind.phrase, each.object) for each in given):
+            continue
+        fitting = _of_kind(left, kind, [other for other in question.others if not is_kind_asked(other, question)])
+        if not fitting:
+            raise CannotGround(
+                f"The question asks about '{name}', and which things those are the image does not tell for certain. "
+                f"Seen: {describe(regions)}. {GIVE_OBJECT}"
+            )
+        names = [f"{region.colour} {kind.phrase.head}" for region in fitting]
+        found += [
+            LocatedObject(object=each, bbox=region.bbox, source="embedded")
+            for each, region in zip(names, fitting, strict=True)
+        ]
+    return tuple(found)
+
+
+def _of_kind(regions: Sequence[Region], kind: Kind, others: Sequence[ObjectPhrase]) -> list[Region]:
+    """The regions of a kind; none where others may be of it, too, or where they are not as many as is said."""
+    if kind.count is not None:
+        return match_some(regions, kind.phrase, others, kind.count)
+    return match_all(regions, kind.phrase, others)
+
+
+def is_kind_asked(phrase: ObjectPhrase, question: Question) -> bool:
+    """Whether a phrase is that of a kind asked about, and of no one thing."""
+    asked = read_asked(question)
+    return asked is not None and any(kind_of(name) and name.endswith(phrase.text.lower()) for name in asked.among)
