@@ -258,7 +258,7 @@ MUGS = block(
         "If the mugs move left, do they hit the ball?",
         "If the wind blows from the left, where does the yellow ball go?",
         "If the table is tilted to the right, where does the ball roll?",
-        "If the yelow bal moves oposite to the arrow, will it hit the mug?",
+        "If the yelow bal moves opsit to the arrow, will it hit the mug?",
         "If the yellow ball moves to the left of the blue mug, will it touch it?",
         "If the yellow ball comes from the left, will it hit the blue mug?",
         "If the yellow ball moves north-east, what happens?",
