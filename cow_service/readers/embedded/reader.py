@@ -23,6 +23,7 @@ from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked, unread
 from cow_service.readers.question.sentences import Question, parse, parse_noun_phrase
 from cow_service.readers.question.wording import same_name
+from cow_service.readers.question.words import ARROWS
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,
@@ -258,6 +259,12 @@ def _as_shown(scene: Scene, question: Question, kind: MotionKind, grounding: Gro
 def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
     """Along the only arrow drawn at the mover, where the question names no direction at all."""
     near = arrows_near(scene, grounding.bbox)
+    clause = (item for item in question.clause if item.phrase is not None and item.phrase.head in ARROWS)
+    if any(item.start not in question.read for item in clause):
+        raise CannotReadDirection(
+            f"How the {grounding.object} moves by the arrow that the question names was not understood. "
+            f"{GIVE_DIRECTION}"
+        )
     if near and question.names_direction:
         raise CannotReadDirection(
             "The question has words of direction that could not be read as the motion's, so the drawn arrow was "
