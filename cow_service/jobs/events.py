@@ -6,10 +6,9 @@ Progress in between has no number: it is not repeated to a client that reconnect
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 from collections.abc import AsyncGenerator
 from dataclasses import dataclass
+from functools import cached_property
 
 from anyio import to_thread
 
@@ -17,6 +16,7 @@ from cow_service.errors import JobNotFound
 from cow_service.jobs.active import share_done
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.state import JobState
+from cow_service.jobs.watches import Watches
 from cow_service.records import TERMINAL, Job
 
 NUMBERED_STAGES = ("gating", "grounding", "generation", "answering")  # motion and trajectory take milliseconds
@@ -32,34 +32,60 @@ class JobEvent:
     number: int | None
     job: Job | None
 
+    @cached_property
+    def data(self) -> str:
+        """The job as JSON, written once for all who follow it."""
+        return "{}" if self.job is None else self.job.model_dump_json()
+
+
+@dataclass(frozen=True)
+class _News:
+    """A job as it is, and its numbered events so far."""
+
+    found: JobState | None  # None: it was deleted
+    events: tuple[JobEvent, ...] = ()
+    progress: JobEvent | None = None
+
+    @property
+    def is_last(self) -> bool:
+        return self.found is None or self.found.job.status in TERMINAL
+
+
+_watches: Watches[_News] = Watches(POLL_SECONDS)
+
 
 async def follow(engine: JobEngine, job_id: str, owner: str | None, after: int) -> AsyncGenerator[JobEvent]:
     """The events of a job after a number, until its end. Raises `JobNotFound` where there is none to begin with."""
-    found = await to_thread.run_sync(engine.find, job_id, owner)
-    sent, reported = after, (None, 0.0)
-    with engine.active.waiting(job_id) as waiter:
+    await to_thread.run_sync(lambda: engine.find(job_id, owner, full=False))
+    sent, reported, number = after, (None, 0.0), 0
+
+    def read() -> _News:
+        try:
+            found = engine.find(job_id, None)
+        except JobNotFound:
+            return _News(None)
+        return _News(found, _durable(engine, found), JobEvent("progress", None, found.job))
+
+    with _watches.following(engine.active, job_id, read, lambda news: news.is_last) as watch:
         while True:
-            waiter.changed.clear()
-            for event in await to_thread.run_sync(_durable, engine, found):
+            news, number = await watch.after(number)
+            if news.found is None:
+                yield JobEvent("deleted", END, None)
+                return
+            for event in news.events:
                 if event.number is not None and event.number > sent:
                     sent = event.number
                     yield event
-            if found.job.status in TERMINAL:
+            job = news.found.job
+            if news.is_last:
                 return
-            now = (found.job.stage, found.job.progress)
-            if now != reported and found.job.status == "running":
+            now = (job.stage, job.progress)
+            if now != reported and job.status == "running" and news.progress is not None:
                 reported = now
-                yield JobEvent("progress", None, found.job)
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(waiter.changed.wait(), POLL_SECONDS)
-            try:
-                found = await to_thread.run_sync(engine.find, job_id, owner)
-            except JobNotFound:
-                yield JobEvent("deleted", END, None)
-                return
+                yield news.progress
 
 
-def _durable(engine: JobEngine, found: JobState) -> list[JobEvent]:
+def _durable(engine: JobEngine, found: JobState) -> tuple[JobEvent, ...]:
     """The numbered events of a job so far."""
     job = found.job
     begun = job.model_copy(
@@ -75,4 +101,4 @@ def _durable(engine: JobEngine, found: JobState) -> list[JobEvent]:
         events.append(JobEvent("stage", FIRST_STAGE + place, done))
     if job.status in TERMINAL:
         events.append(JobEvent(job.status, END, job))
-    return events
+    return tuple(events)

@@ -131,9 +131,8 @@ def job_routes(engine: JobEngine) -> APIRouter:
 
         async def stream() -> AsyncGenerator[ServerSentEvent]:
             async for event in follow(engine, id, owner, after):
-                data = "{}" if event.job is None else event.job.model_dump_json()
                 number = None if event.number is None else str(event.number)
-                yield ServerSentEvent(data, event=event.name, id=number, sep="\n")
+                yield ServerSentEvent(event.data, event=event.name, id=number, sep="\n")
 
         return EventSourceResponse(stream(), ping=PING_SECONDS, sep="\n", headers={"Cache-Control": "no-store"})
 
