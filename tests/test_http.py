@@ -165,7 +165,10 @@ def test_bodies_past_the_limit_are_refused_announced_or_not(http: httpx.Client) 
 def test_addresses_and_methods_that_are_not_there(http: httpx.Client) -> None:
     problem(http.get("/nothing"), 404, "not-found")
     problem(http.get("/simulate"), 405, "method-not-allowed")
-    assert "POST" in http.get("/simulate").headers["allow"]
+    assert http.get("/simulate").headers["allow"] == "POST"
+    for path, methods in (("/jobs/x", "DELETE, GET"), ("/jobs", "GET"), ("/artifacts/x", "GET, HEAD")):
+        assert problem(told := http.patch(path), 405, "method-not-allowed")
+        assert told.headers["allow"] == methods
     problem(http.get("/artifacts/" + "0" * 64), 404, "artifact-not-found")
     problem(http.get("/artifacts/..%2f..%2fetc%2fpasswd"), 404, "not-found")
     problem(http.get("/artifacts/ABC"), 404, "artifact-not-found")

@@ -13,6 +13,7 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match
 
 from cow_service.errors import (
     CowError,
@@ -63,6 +64,8 @@ def install_problem_handlers(app: FastAPI) -> None:
         assert isinstance(error, HTTPException)
         response = respond(_translated(error, request))
         response.headers.update(error.headers or {})
+        if response.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+            response.headers["Allow"] = ", ".join(sorted(_methods(request)))
         return response
 
     async def validation_error(_: Request, error: Exception) -> JSONResponse:
@@ -104,6 +107,14 @@ def _translated(error: HTTPException, request: Request) -> CowError:
     if HTTPStatus.BAD_REQUEST <= error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
         return MalformedBody(f"{error.detail}.")
     return InternalError(f"{error.detail}.")
+
+
+def _methods(request: Request) -> set[str]:
+    """What the address takes: several routes may have it, of which the framework names the first one's methods."""
+    routers = (getattr(each, "original_router", None) for each in request.app.routes)
+    routes = [*request.app.routes, *(route for router in routers if router is not None for route in router.routes)]
+    fitting = (route for route in routes if route.matches(request.scope)[0] is not Match.NONE)
+    return {method for route in fitting for method in getattr(route, "methods", None) or ()}
 
 
 def _path(request: Request) -> str:
