@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import SecretStr
 
-from cow_service.errors import Canceled
+from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.jobs.database import Database
 from cow_service.jobs.stage_cache import KeyLocks, StoredStep
 from cow_service.media.artifacts import ArtifactStore
@@ -77,3 +78,16 @@ def test_nothing_is_stored_for_a_job_that_was_canceled_meanwhile(database: Datab
         step(database, tmp_path, "one", check=canceled)("motion", SHARED, lambda: result(1))
     assert database.find_result(SHARED.digest) is None
     assert database.finished_stages("one") == set()
+
+
+def test_servers_of_one_database_have_one_data_folder(tmp_path: Path) -> None:
+    """Another one would take jobs whose images it does not have."""
+    url = SecretStr(f"sqlite:///{tmp_path / 'shared.sqlite3'}")
+    databases = [Database(Settings(data_dir=tmp_path / name, database_url=url)) for name in "ab"]
+    for database in databases:
+        database.create_tables()
+    for _ in range(2):
+        databases[0].claim("folder-1")
+    with pytest.raises(StorageUnavailable, match="COW_DATA_DIR"):
+        databases[1].claim("folder-2")
+    databases[1].claim("folder-1")

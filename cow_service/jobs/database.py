@@ -48,6 +48,13 @@ _stages = sa.Table(
     sa.Column("job_id", sa.String(64), primary_key=True),
     sa.Column("stage", sa.String(32), primary_key=True),
 )
+# The data folder in which the artifacts of all jobs are: one row, once a server has started.
+_folders = sa.Table(
+    "cow_data_folder",
+    _metadata,
+    sa.Column("id", sa.Integer, primary_key=True),  # always 1
+    sa.Column("folder", sa.String(64), nullable=False),
+)
 # These run several times in every job: as plain text they take a fifth of the time that expressions do.
 _FIND = "SELECT job_id, result FROM cow_stage_results WHERE key = ?"
 # A result that lost its artifacts is computed again, and replaces the one that was there.
@@ -74,6 +81,24 @@ class Database:
             self.file.parent.mkdir(parents=True, exist_ok=True)
         with database_errors():
             _metadata.create_all(self.engine)
+
+    def claim(self, folder: str) -> None:
+        """Notes in which data folder the artifacts of all jobs are. Raises `StorageUnavailable` where in another one.
+
+        A server with a folder of its own would take jobs whose images it does not have, and fail them.
+        """
+        with self._cursor() as cursor:
+            cursor.execute(
+                self._plain("INSERT INTO cow_data_folder (id, folder) VALUES (1, ?) ON CONFLICT DO NOTHING"), (folder,)
+            )
+            cursor.execute("SELECT folder FROM cow_data_folder WHERE id = 1")
+            known = cursor.fetchone()[0]
+        if known != folder:
+            raise StorageUnavailable(
+                "The jobs of this database have their images in another data folder. Give all servers on a database "
+                "the same COW_DATA_DIR, on a disk that they share, or this one another COW_DATABASE_URL. Where that "
+                "folder is lost for good, delete the row of the table cow_data_folder."
+            )
 
     def check(self) -> None:
         """Runs a query that always succeeds where the database can be used."""

@@ -103,6 +103,7 @@ class JobEngine:
         workflows.set_runner(Worker(self.open_jobs, self.webhooks, self.work_ended))
         try:
             self.database.create_tables()
+            self.database.claim(self._lease.folder_id)
             DBOS(config=config)
             DBOS.launch()
         except (SQLAlchemyError, dbos_error.DBOSException) as error:

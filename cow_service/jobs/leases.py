@@ -69,8 +69,13 @@ class ExecutorLease:
 
     def _executor_id(self, number: int) -> str:
         """Unique to the data folder: other machines may use the same database."""
+        return f"{self.folder_id}-{number}"
+
+    @property
+    def folder_id(self) -> str:
+        """Names the data folder, wherever it is mounted."""
         path = self._folder / "name"
         with FileLock(self._folder / "name.lock"):
             if not path.exists():
                 path.write_text(uuid4().hex)
-            return f"{path.read_text()}-{number}"
+            return path.read_text()
