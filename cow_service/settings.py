@@ -153,6 +153,13 @@ class Settings(BaseSettings):
         description="Seconds that running jobs are given when the server stops; what is not done then goes on at the "
         "next start.",
     )
+    outage_budget: float = Field(
+        default=600,
+        ge=0,
+        le=86400,
+        allow_inf_nan=False,
+        description="Seconds that a running job waits for a database or a disk that is away, before it fails.",
+    )
     webhook_secret: SecretStr | None = Field(
         default=None,
         description="Secret that signs webhooks (Standard Webhooks, whsec_...); without it none are called. Two with "

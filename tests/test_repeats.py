@@ -30,6 +30,7 @@ from cow_service.cli.main import app as cli
 from cow_service.client.display import answer_html
 from cow_service.errors import MllmUnavailable
 from cow_service.jobs.database import Database
+from cow_service.jobs.outages import Outages
 from cow_service.jobs.stage_cache import KeyLocks, StoredStep
 from cow_service.mcp.results import answer_result
 from cow_service.mcp.text import answer_text
@@ -292,7 +293,9 @@ def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
     answers(mllm, list("ABA"), looking="B")
     database = Database(Settings(data_dir=tmp_path))
     database.create_tables()
-    step = StoredStep("one", None, False, database, service.artifacts, service.metrics, KeyLocks(), lambda: None)
+    step = StoredStep(
+        "one", None, False, database, service.artifacts, service.metrics, KeyLocks(), Outages(0, lambda: None)
+    )
     request = AnswerRequest.model_validate(BODY | GIVEN | {"imagine": "auto"})
 
     def crash(stage: Stage | None, done: float) -> None:

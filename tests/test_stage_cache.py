@@ -10,6 +10,7 @@ from pydantic import SecretStr
 
 from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.jobs.database import Database
+from cow_service.jobs.outages import Outages
 from cow_service.jobs.stage_cache import KeyLocks, StoredStep
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.observability.metrics import Metrics
@@ -33,9 +34,17 @@ def database(tmp_path: Path) -> Database:
 
 
 def step(
-    database: Database, tmp_path: Path, job_id: str, fresh: bool = False, check=never, owner: str | None = None
+    database: Database,
+    tmp_path: Path,
+    job_id: str,
+    fresh: bool = False,
+    check=never,
+    owner: str | None = None,
+    budget: float = 0,
 ) -> StoredStep:
-    return StoredStep(job_id, owner, fresh, database, ArtifactStore(tmp_path), Metrics(), KeyLocks(), check)
+    return StoredStep(
+        job_id, owner, fresh, database, ArtifactStore(tmp_path), Metrics(), KeyLocks(), Outages(budget, check)
+    )
 
 
 def result(speed: float) -> StageResult[Any]:
@@ -91,3 +100,50 @@ def test_servers_of_one_database_have_one_data_folder(tmp_path: Path) -> None:
     with pytest.raises(StorageUnavailable, match="COW_DATA_DIR"):
         databases[1].claim("folder-2")
     databases[1].claim("folder-1")
+
+
+@pytest.mark.parametrize("away", ["find_result", "store_result", "compute"])
+def test_an_outage_is_waited_for(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, away: str
+) -> None:
+    """The work that is done is not done again."""
+    left, computed, works = [3], [], getattr(database, away, None)
+
+    def fail(*given: Any) -> Any:
+        if left[0]:
+            left[0] -= 1
+            raise StorageUnavailable("The job database cannot be used.")
+        return None if works is None else works(*given)
+
+    def compute() -> StageResult[Any]:
+        if away == "compute":
+            fail()
+        computed.append(1)
+        return result(7)
+
+    if works is not None:
+        monkeypatch.setattr(database, away, fail)
+    found, reused = step(database, tmp_path, "one", budget=30)("motion", SHARED, compute)
+    assert (found.value.speed, reused, len(computed), left) == (7, False, 1, [0])
+    monkeypatch.undo()
+    assert step(database, tmp_path, "two")("motion", SHARED, compute)[1]
+
+
+def test_an_outage_without_end_fails_the_job_or_ends_with_it(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> Any:
+        raise StorageUnavailable("The job database cannot be used.")
+
+    monkeypatch.setattr(database, "find_result", fail)
+    with pytest.raises(StorageUnavailable):
+        step(database, tmp_path, "one", budget=0.3)("motion", SHARED, lambda: result(7))
+    asked = []
+
+    def canceled() -> None:
+        asked.append(1)
+        if len(asked) > 3:
+            raise Canceled("The job was canceled.")
+
+    with pytest.raises(Canceled):
+        step(database, tmp_path, "one", budget=30, check=canceled)("motion", SHARED, lambda: result(7))

@@ -17,7 +17,7 @@ from cow_service.api.body import Body, parse, receive
 from cow_service.api.middleware.body_limit import release_body
 from cow_service.api.minimal import minimal_result
 from cow_service.api.preferences import MINIMAL_APPLIED, Preferences, preferences_of
-from cow_service.errors import Canceled, CowError, JobNotFound
+from cow_service.errors import Canceled, CowError, JobNotFound, StorageUnavailable
 from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.spec import JobSpec
@@ -130,7 +130,11 @@ class Submitter:
             if submission.prefer.respond_async and not submission.prefer.wait:
                 return None
             async with disconnected(request) as gone:
-                return await self.outcome(submission, waiter, created_at, gone, submission.prefer.wait)
+                try:
+                    return await self.outcome(submission, waiter, created_at, gone, submission.prefer.wait)
+                except StorageUnavailable as error:  # the job itself waits until it is over
+                    error.headers |= {"Location": f"/jobs/{submission.job_id}"} | RETRY_AFTER
+                    raise
 
     async def accepted(self, submission: Submission) -> Response:
         """The job, for a caller who does not wait for its end."""

@@ -24,6 +24,7 @@ from cow_service.settings import Settings, SettingsError
 
 BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
 MAX_IDS = 500  # in one statement
+CONNECT_SECONDS = 4  # for a connection to PostgreSQL
 
 _metadata = sa.MetaData()
 _results = sa.Table(
@@ -253,7 +254,7 @@ def _address(settings: Settings) -> tuple[str, Path | None]:
 def _engine(url: str, is_file: bool) -> sa.Engine:
     if not is_file:
         # A commit survives the end of this process at once; `flush` waits for the disk where that matters.
-        options = {"options": "-c synchronous_commit=off"}
+        options = {"options": "-c synchronous_commit=off", "connect_timeout": CONNECT_SECONDS}
         return sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True, connect_args=options)
     engine = sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True)
 

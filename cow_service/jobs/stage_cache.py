@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from cow_service.errors import ArtifactNotFound
 from cow_service.jobs.database import Database
+from cow_service.jobs.outages import Outages
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.observability.metrics import Metrics
 from cow_service.requests import Stage
@@ -59,7 +60,7 @@ class StoredStep:
     artifacts: ArtifactStore
     metrics: Metrics
     locks: KeyLocks
-    check_canceled: Callable[[], None]
+    outages: Outages
 
     def __call__(
         self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
@@ -70,18 +71,19 @@ class StoredStep:
             digest = digest_of({"job": self.job_id, "key": key.digest})
         elif self.owner is not None:
             digest = digest_of({"owner": self.owner, "key": key.digest})
-        with self.locks.held(digest, self.check_canceled):
-            found = self._find(stage, digest)
+        with self.locks.held(digest, self.outages.check_canceled):
+            found = self.outages.wait_through(lambda: self._find(stage, digest))
             if found is not None:
                 result, reused = found
                 self.metrics.stage_cache(stage, hit=reused)
                 if reused:
-                    self.database.reuse_result(self.job_id, stage, result.artifacts)
+                    self.outages.wait_through(lambda: self.database.reuse_result(self.job_id, stage, result.artifacts))
                 return result, reused
             self.metrics.stage_cache(stage, hit=False)
-            result = compute()
-            self.check_canceled()  # the job may have been deleted: nothing may be stored for it
-            self.database.store_result(digest, self.job_id, stage, result.model_dump_json(), result.artifacts)
+            result = self.outages.wait_through(compute)
+            self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
+            kept = digest, self.job_id, stage, result.model_dump_json(), result.artifacts
+            self.outages.wait_through(lambda: self.database.store_result(*kept))
             return result, False
 
     def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:

@@ -13,6 +13,7 @@ from cow_service.errors import Canceled, CowError, InternalError
 from cow_service.jobs import state
 from cow_service.jobs.active import ActiveJob
 from cow_service.jobs.open_jobs import OpenJobs
+from cow_service.jobs.outages import Outages
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.stage_cache import KeyLocks, StoredStep
 from cow_service.jobs.webhooks import Webhooks
@@ -76,28 +77,33 @@ class Worker:
 
     def _outcome(self, job_id: str, spec: JobSpec, running: ActiveJob) -> str:
         metrics = self._open_jobs.service.metrics
+        outages = Outages(self._open_jobs.service.settings.outage_budget, running.check)
+
+        def ended() -> None:
+            outages.wait_through(lambda: self._webhooks.job_ended(job_id, spec.webhook))
+
         try:
-            result = self._result(job_id, spec, running)
+            result = self._result(job_id, spec, running, outages)
         except Canceled as error:
             raise JobAborted from error
         except CowError as error:
             log.info("job %s failed: %s", job_id, error.code)  # its detail may hold what was asked
             metrics.job(spec.kind, "failed")
-            self._webhooks.job_ended(job_id, spec.webhook)
+            ended()
             raise
         except Exception as error:
             log.exception("job %s failed", job_id)
             metrics.job(spec.kind, "failed")
-            self._webhooks.job_ended(job_id, spec.webhook)
+            ended()
             raise InternalError("The server met an error that it did not foresee; its log has the trace.") from error
         for stage, seconds in result.timings.items():
             if stage not in result.reused:
                 metrics.stage(stage, seconds)
         metrics.job(spec.kind, "succeeded")
-        self._webhooks.job_ended(job_id, spec.webhook)
+        ended()
         return result.model_dump_json()
 
-    def _result(self, job_id: str, spec: JobSpec, running: ActiveJob) -> Simulation | Answer:
+    def _result(self, job_id: str, spec: JobSpec, running: ActiveJob, outages: Outages) -> Simulation | Answer:
         open_jobs, service = self._open_jobs, self._open_jobs.service
 
         def progress(stage: Stage | None, done: float) -> None:
@@ -111,11 +117,12 @@ class Worker:
             artifacts=service.artifacts,
             metrics=service.metrics,
             locks=self._locks,
-            check_canceled=running.check,
+            outages=outages,
         )
         request = spec.parsed()
         assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
         image = open_jobs.active.take_image(job_id, request.image.artifact)
+        given = progress, image, step, job_id, spec.created_at
         if isinstance(request, AnswerRequest):
-            return answer(service.prepare(request, progress, image, step, job_id, spec.created_at))
-        return simulate(service.prepare(request, progress, image, step, job_id, spec.created_at))
+            return answer(outages.wait_through(lambda: service.prepare(request, *given)))
+        return simulate(outages.wait_through(lambda: service.prepare(request, *given)))

@@ -243,7 +243,8 @@ class Run(Generic[Request_co]):
 
     def _compute(self, name: Stage, function: Callable[..., StageResult[Any]], inputs: tuple[Any, ...]) -> Any:
         while self._before:
-            self._before.pop(0)()
+            self._before[0]()
+            self._before.pop(0)  # only now: what fails is done again where the stage is
         result = function(self, *inputs)
         if name not in self._calls:
             return result
