@@ -31,7 +31,7 @@ from cow_service.registry import Registry
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, PlaceRequest, SimulateRequest
 from cow_service.settings import Settings, SettingsError
 from cow_service.stages.checks import check_request
-from cow_service.stages.run import Backends, Progress, Run, Step, compute_directly, ignore_progress, now
+from cow_service.stages.run import Backends, Progress, Run, Step, compute_directly, ignore_progress, now, priority_of
 from cow_service.weights.lock import ready
 from cow_service.weights.manifests import find_manifest, load_manifests
 
@@ -94,19 +94,22 @@ class Service:
         step: Step = compute_directly,
         run_id: str | None = None,
         created_at: str | None = None,
+        turn: int = 0,
     ) -> Run[Request]:
         """A run of the request, with its backends and its image, decoded here unless `image` is given.
 
-        Runs compute first in, first out by `created_at` (RFC 3339, by default now). Raises `InvalidRequest` for names
-        of backends that nobody has, the errors of `image_of`, and whatever `progress` raises.
+        Runs compute by `turn`, then first in, first out by `created_at` (RFC 3339, by default now).
+
+        Raises `InvalidRequest` for names of backends that nobody has, the errors of `image_of`, and whatever `progress`
+        raises.
         """
         backends = self._backends(request)
         request = self.keep_masks(request)
         created_at = created_at or now()
         # Also with an image at hand: a run begins in its turn, and its job counts as queued until then.
-        with self.cpu.held(created_at, partial(progress, None, 0.0)):
+        with self.cpu.held(priority_of(turn, created_at), partial(progress, None, 0.0)):
             image = image or self.image_of(request.image)[1]
-        return Run(request, image, backends, progress, step, run_id or str(uuid.uuid4()), created_at)
+        return Run(request, image, backends, progress, step, run_id or str(uuid.uuid4()), created_at, turn)
 
     def keep_masks(self, request: Request) -> Request:
         """The request with its masks as artifacts: those that are data URLs are kept, and not decoded before they are

@@ -142,6 +142,12 @@ class Settings(BaseSettings):
     queue_limit: int = Field(
         default=1000, ge=1, le=1_000_000, description="Jobs that wait or run; more are refused with queue-full."
     )
+    queue_limit_per_key: int | None = Field(
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description="Of them, those of one key; by default half of them where there are several keys.",
+    )
     job_retention_hours: float = Field(
         default=168, gt=0, le=87_600, allow_inf_nan=False, description="Age at which finished jobs are removed, hours."
     )
@@ -173,6 +179,12 @@ class Settings(BaseSettings):
         if secret is not None and (len(each) > MAX_SECRETS or not all(map(_is_secret, each))):
             raise ValueError("not whsec_ and base64 of 24 to 64 bytes")
         return secret
+
+    @property
+    def own_queue_limit(self) -> int:
+        """Jobs of one key that wait or run."""
+        shared = max(1, self.queue_limit // 2) if len(self.api_keys) > 1 else self.queue_limit
+        return min(self.queue_limit, self.queue_limit_per_key or shared)
 
     @property
     def weights_dir(self) -> Path:

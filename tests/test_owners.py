@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
@@ -213,3 +214,32 @@ def test_the_same_keys_are_different_jobs(alice: Caller, bob: Caller) -> None:
     assert alice.http.post("/simulate", json=other, headers=key).json()["generator"]["seed"] == 4
     assert bob.job(others)["status"] == "succeeded"
     problem(bob.http.post("/simulate", json=other, headers=key), 422, "idempotency-key-reused")
+
+
+FLOOD = 24
+
+
+def test_a_flood_of_one_key_holds_up_no_other(tmp_path_factory: pytest.TempPathFactory) -> None:
+    keys = {name: new_key() for name in ("alice", "bob")}
+    own = {
+        "COW_API_KEYS": json.dumps({name: hash_of(key) for name, key in keys.items()}),
+        "COW_CONCURRENCY": "1",
+        "COW_MLLM_CONCURRENCY": "1",
+        "COW_QUEUE_LIMIT": str(2 * FLOOD),
+    }
+    with ExitStack() as stack:
+        one = stack.enter_context(Served(tmp_path_factory.mktemp("flood"), **own))
+        clients = [httpx.Client(base_url=one.http.base_url, timeout=PATIENCE) for _ in keys]
+        for client, key in zip(clients, keys.values(), strict=True):
+            stack.enter_context(client).headers["Authorization"] = f"Bearer {key}"
+        alice, bob = map(Caller, clients)
+        flood = [alice.submit(slow(0.5, seed=seed)) for seed in range(FLOOD)]
+        problem(alice.http.post("/simulate", json=slow(0.5, seed=FLOOD), headers=ASYNC), 503, "queue-full")
+        for seed in range(3):
+            assert bob.http.post("/simulate", json=slow(0.1, seed=seed)).status_code == 200
+        left = alice.http.get("/jobs", params={"status": ["queued", "running"], "limit": 500}).json()["jobs"]
+        assert len(left) >= FLOOD // 2, "in a line of all jobs they would be over"
+        first, last = (alice.job(job)["status"] for job in (flood[0], flood[-1]))
+        assert (first, last) == ("succeeded", "queued"), "within a key, first in, first out"
+        for job in reversed(flood):
+            alice.http.delete(f"/jobs/{job}")

@@ -99,7 +99,7 @@ class Submitter:
         """What the request's headers say. Raises `QueueFull` and `ShuttingDown` where no job can be taken."""
         prefer, owner = preferences_of(request.headers), owner_of(request)
         if prefer.key is None:
-            self.engine.check_capacity()  # before the body is read: a refusal comes at once
+            self.engine.check_capacity(owner)  # before the body is read: a refusal comes at once
         return Submission(kind, owner, prefer, new_job_id(owner, prefer.key))
 
     async def in_thread(self, work: Callable[[], Made]) -> Made:

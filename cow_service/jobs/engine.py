@@ -16,7 +16,15 @@ from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
 
-from dbos import DBOS, DBOSConfig, DBOSContextSetAuth, SetWorkflowAttributes, SetWorkflowID, WorkflowHandle
+from dbos import (
+    DBOS,
+    DBOSConfig,
+    DBOSContextSetAuth,
+    SetEnqueueOptions,
+    SetWorkflowAttributes,
+    SetWorkflowID,
+    WorkflowHandle,
+)
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -36,7 +44,14 @@ from cow_service.jobs.maintenance import Maintenance
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.serializer import JsonSerializer
 from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.state import ATTRIBUTE_CREATED_AT, ATTRIBUTE_GENERATOR, JobFilters, JobState
+from cow_service.jobs.state import (
+    ATTRIBUTE_CREATED_AT,
+    ATTRIBUTE_GENERATOR,
+    ATTRIBUTE_TURN,
+    JobFilters,
+    JobState,
+    OpenJob,
+)
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.jobs.worker import JobAborted, Worker
 from cow_service.media.images import DecodedImage
@@ -156,14 +171,19 @@ class JobEngine:
             raise ShuttingDown("The server is stopping. Ask another one, or this one again in a while.")
         self.database.check()
 
-    def check_capacity(self) -> None:
+    def check_capacity(self, owner: str | None) -> None:
         """Raises `QueueFull` where another job would be too many, `ShuttingDown` where none is accepted."""
-        limit = self.service.settings.queue_limit
+        limit, own_limit = self.service.settings.queue_limit, self.service.settings.own_queue_limit
         if self._stopping:
             raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
         if len(self.open_jobs) >= limit:
             raise QueueFull(
                 f"{len(self.open_jobs)} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later."
+            )
+        if owner is not None and own_limit < limit and (own := self.open_jobs.count_of(owner)) >= own_limit:
+            raise QueueFull(
+                f"{own} jobs of your key wait or run, and COW_QUEUE_LIMIT_PER_KEY is {own_limit}. Send the request "
+                "again when some of them have ended."
             )
 
     def submit(self, job_id: str, spec: JobSpec, owner: str | None, key: str | None, image: DecodedImage) -> bool:
@@ -189,9 +209,10 @@ class JobEngine:
 
     def _submit(self, job_id: str, spec: JobSpec, owner: str | None, image: DecodedImage) -> None:
         with self.open_jobs.lock:  # the count must not change between the check and the record
-            self.check_capacity()
+            self.check_capacity(owner)
             starts_now = self.open_jobs.count(spec.generator) < self.max_running_jobs_per_generator
-            self.open_jobs.record(job_id, spec.generator)
+            spec = spec.model_copy(update={"turn": self.open_jobs.next_turn(owner)})
+            self.open_jobs.record(job_id, OpenJob(spec.generator, owner, spec.turn))
         try:
             # Before the job exists: its image and masks must not be removed before work on it starts.
             self.database.add_references(job_id, [image.info.sha256, *spec.masks])
@@ -327,7 +348,7 @@ class JobEngine:
                     on_conflict="always_update",
                 )
                 self._queues.add(name)
-            with _attributes(job_id, spec, owner):
+            with _attributes(job_id, spec, owner), SetEnqueueOptions(priority=spec.turn + 1):
                 DBOS.enqueue_workflow(name, _workflow(spec), spec.model_dump())
 
     def _interrupt(self) -> None:
@@ -348,7 +369,8 @@ class JobEngine:
 @contextmanager
 def _attributes(job_id: str, spec: JobSpec, owner: str | None) -> Generator[None]:
     """What DBOS keeps beside a workflow. Times in SQLite are whole seconds: that of the spec is exact."""
-    attributes = SetWorkflowAttributes({ATTRIBUTE_GENERATOR: spec.generator, ATTRIBUTE_CREATED_AT: spec.created_at})
+    kept = {ATTRIBUTE_GENERATOR: spec.generator, ATTRIBUTE_CREATED_AT: spec.created_at, ATTRIBUTE_TURN: str(spec.turn)}
+    attributes = SetWorkflowAttributes(kept)
     with SetWorkflowID(job_id), DBOSContextSetAuth(owner, None), attributes:
         yield
 

@@ -11,6 +11,7 @@ from cow_service.errors import CowError
 from cow_service.jobs import state
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.database import Database, database_errors
+from cow_service.jobs.state import OpenJob
 from cow_service.jobs.webhooks import attempt_ids
 from cow_service.service import Service
 
@@ -23,8 +24,8 @@ class OpenJobs:
         self.database = Database(service.settings)
         self.active = ActiveJobs()
         self.lock = threading.RLock()
-        self._open: dict[str, str] = {}  # open jobs, and the generator of each
-        self._changes: list[tuple[str, str | None]] | None = None  # to the open jobs, while `recount` reads them
+        self._open: dict[str, OpenJob] = {}
+        self._changes: list[tuple[str, OpenJob | None]] | None = None  # to the open jobs, while `recount` reads them
 
     def __len__(self) -> int:
         return len(self._open)
@@ -32,17 +33,33 @@ class OpenJobs:
     def count(self, generator: str) -> int:
         """How many jobs of a generator are open."""
         with self.lock:
-            return sum(each == generator for each in self._open.values())
+            return sum(each.generator == generator for each in self._open.values())
 
-    def record(self, job_id: str, generator: str | None) -> None:
-        """A job is open with a generator, or, with None, no longer open."""
+    def count_of(self, owner: str | None) -> int:
+        """How many jobs of an owner are open."""
+        with self.lock:
+            return sum(each.owner == owner for each in self._open.values())
+
+    def next_turn(self, owner: str | None) -> int:
+        """The turn of an owner's next job: behind their others, and no later than the first that is open of anybody.
+
+        Owners so take turns, however many jobs each of them has (start-time fair queuing, with the lowest turn that is
+        open for the time of the server).
+        """
+        with self.lock:
+            turns = [each.turn for each in self._open.values()]
+            own = [each.turn for each in self._open.values() if each.owner == owner]
+            return max(min(turns, default=0), max(own, default=-1) + 1)
+
+    def record(self, job_id: str, job: OpenJob | None) -> None:
+        """A job is open, or, with None, no longer open."""
         with self.lock:
             if self._changes is not None:
-                self._changes.append((job_id, generator))
-            if generator is None:
+                self._changes.append((job_id, job))
+            if job is None:
                 self._open.pop(job_id, None)
             else:
-                self._open[job_id] = generator
+                self._open[job_id] = job
 
     def recount(self) -> None:
         """Reads the open jobs from the database, those of other processes included."""
@@ -52,17 +69,17 @@ class OpenJobs:
         with self.lock:
             changes, self._changes = self._changes, None
             self._open = found
-            for job_id, generator in changes or ():  # what happened while the database was asked
-                self.record(job_id, generator)
+            for job_id, job in changes or ():  # what happened while the database was asked
+                self.record(job_id, job)
 
     def depth(self) -> Counter[tuple[str, str]]:
         """How many jobs of each generator are queued, and how many running."""
         with self.lock:
             jobs = dict(self._open)
         depth: Counter[tuple[str, str]] = Counter()
-        for job_id, generator in jobs.items():
+        for job_id, job in jobs.items():
             active = self.active.get(job_id)
-            depth[generator, "queued" if active is None or active.stage is None else "running"] += 1
+            depth[job.generator, "queued" if active is None or active.stage is None else "running"] += 1
         return depth
 
     def ended(self, job_id: str, outcome: str | CowError | None, created_at: str | None = None) -> None:

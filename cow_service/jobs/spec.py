@@ -21,6 +21,7 @@ class JobSpec(Record):
     created_at: str = Field(description="RFC 3339, UTC.")
     fresh: bool = Field(default=False, description="Take no results of other jobs.")
     webhook: str | None = Field(default=None, description="URL to call when the job has ended.")
+    turn: int = Field(default=0, ge=0, description="Its place among the jobs of all keys: the lower comes first.")
     request_id: str | None = None
     traceparent: str | None = None
 

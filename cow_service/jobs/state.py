@@ -18,7 +18,8 @@ from cow_service.observability.timestamps import rfc3339
 from cow_service.records import Answer, Job, JobKind, JobPage, JobStatus, Problem, Simulation
 
 KINDS: tuple[JobKind, ...] = get_args(JobKind)
-ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT = "generator", "created_at"  # what DBOS keeps beside a workflow
+# What DBOS keeps beside a workflow.
+ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT, ATTRIBUTE_TURN = "generator", "created_at", "turn"
 STATUS: dict[str, JobStatus] = {
     "ENQUEUED": "queued",
     "DELAYED": "queued",
@@ -123,9 +124,23 @@ def workflows_of_jobs(**filters: Any) -> list[WorkflowStatus]:
         return DBOS.list_workflows(**(defaults | filters))
 
 
-def open_jobs() -> dict[str, str]:
-    """The jobs that wait or run anywhere, and the generator of each."""
-    return {one.workflow_id: _attribute(one, ATTRIBUTE_GENERATOR) for one in workflows_of_jobs(status=OPEN)}
+@dataclass(frozen=True)
+class OpenJob:
+    """A job that waits or runs."""
+
+    generator: str
+    owner: str | None = None
+    turn: int = 0
+
+
+def open_jobs() -> dict[str, OpenJob]:
+    """The jobs that wait or run anywhere, by their ids."""
+    return {
+        one.workflow_id: OpenJob(
+            _attribute(one, ATTRIBUTE_GENERATOR), one.authenticated_user, int(_attribute(one, ATTRIBUTE_TURN) or 0)
+        )
+        for one in workflows_of_jobs(status=OPEN)
+    }
 
 
 def ended_before(moment: datetime, limit: int) -> list[str]:

@@ -122,7 +122,7 @@ class Worker:
         request = spec.parsed()
         assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
         image = open_jobs.active.take_image(job_id, request.image.artifact)
-        given = progress, image, step, job_id, spec.created_at
+        given = progress, image, step, job_id, spec.created_at, spec.turn
         if isinstance(request, AnswerRequest):
             return answer(outages.wait_through(lambda: service.prepare(request, *given)))
         return simulate(outages.wait_through(lambda: service.prepare(request, *given)))

@@ -60,6 +60,11 @@ def now() -> str:
     return rfc3339(time.time())
 
 
+def priority_of(turn: int, created_at: str) -> str:
+    """A string that sorts by turn, then by time (RFC 3339)."""
+    return f"{turn:010d} {created_at}"
+
+
 @dataclass(frozen=True)
 class Backends:
     """Who does the work of one request. Reader and generator are loaded when a stage first needs them."""
@@ -83,6 +88,7 @@ class Run(Generic[Request_co]):
     step: Step = compute_directly
     id: str = field(default_factory=lambda: str(uuid.uuid4()))
     created_at: str = field(default_factory=now)
+    turn: int = 0  # of the job, among those of all callers: the lower comes first
     results: dict[Stage, StageResult[Any]] = field(default_factory=dict[Stage, StageResult[Any]])
     timings: dict[str, float] = field(default_factory=dict[str, float])  # seconds per stage
     reused: list[Stage] = field(default_factory=list[Stage])  # results that another request had computed
@@ -163,13 +169,18 @@ class Run(Generic[Request_co]):
         """Raises `Canceled` where nobody wants the result any more."""
         self.progress(*self._current)
 
+    @property
+    def priority(self) -> str:
+        """Of this run where several wait to compute; the lowest comes first."""
+        return priority_of(self.turn, self.created_at)
+
     def cpu(self) -> AbstractContextManager[None]:
-        """To be held around work on the CPU. First in, first out by the time of the request; not reentrant."""
-        return self.backends.cpu.held(self.created_at, self.check_canceled)
+        """To be held around work on the CPU. By turn, then by the time of the request; not reentrant."""
+        return self.backends.cpu.held(self.priority, self.check_canceled)
 
     def device(self) -> AbstractContextManager[None]:
         """To be held around the work of the generator."""
-        return self.backends.device().held(self.created_at, self.check_canceled)
+        return self.backends.device().held(self.priority, self.check_canceled)
 
     def reader_input(self, stage: Stage) -> ReaderInput:
         """What the reader is given on behalf of a stage."""

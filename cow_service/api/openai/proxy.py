@@ -69,8 +69,8 @@ class Proxy:
         asked = BY_NAME if answerer.imagine == "never" else what_if(chat)
         if isinstance(asked, NotImagined):
             return await self._sent(request, _without_frames(chat, asked), reader)
-        self._submitter.engine.check_capacity()
         simulated, owner = asked.request, owner_of(request)
+        self._submitter.engine.check_capacity(owner)
         submission = Submission("simulate", owner, prefer, new_job_id(owner, None))
         try:
             if chat.stream:
