@@ -26,7 +26,7 @@ _FORMS: dict[str, AskedForm] = {"either": "which-first"}
 _FORMS.update({form.replace("-", "_"): form for form in get_args(AskedForm)})
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
 _NEGATIONS = frozenset(
-    {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"}
+    {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short", "spared", "stays_in"}
 )
 
 

@@ -17,7 +17,7 @@ from cow_service.readers.question.quantities import with_quantities
 MAX_WORDS = 12  # of one phrase; what is longer is no phrase
 _LINKS = lex.SETS["links"]
 # Behind a noun they are no part of it: "the ball and the mug both move".
-_BEHIND = lex.words("both twice earlier later last hard all each together neither either nearest closest able farthest")
+_BEHIND = lex.words("both twice earlier later last hard safe all each together neither either nearest closest able farthest")
 _CLOSED = lex.FUNCTION_WORDS | lex.DETERMINERS
 _NUMBERED = lex.words("with labeled labelled marked numbered bearing carrying saying called")
 _FINITE_BE = lex.words("be is are was were 's")
@@ -92,6 +92,9 @@ def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: b
         return inside and not has_noun and key_at(found, at - 1) in lex.COLOURS and key_at(found, at + 1) in lex.COLOURS
     if key == "a" and (inside or key_at(found, at - 1) in _NUMBERED):
         return not _is_determiner(found, at)
+    if key == "can" and determined and not has_noun:  # "the green can"; but "the red can hit the blue"
+        after = lex.VERBS.get(key_at(found, at + 1))
+        return asked or not (after is not None and after.form == "base")
     if key in lex.PLACES or key in {"one", "far"}:
         return determined and not has_noun
     behind = (has_noun and key in _BEHIND) or _is_measure(found, at, has_noun)
