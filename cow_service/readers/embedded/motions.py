@@ -40,8 +40,9 @@ def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | N
         )
     distances += [Quantity(share * (way or 0.0), "px") for share in shares]
     if bbox is not None:
-        sizes = ((each.own_widths, bbox[2] - bbox[0]) for each in words), ((each.own_heights, bbox[3] - bbox[1]) for each in words)
-        distances += [Quantity(number * size, "px") for said in sizes for number, size in said if number is not None]
+        x0, y0, x1, y1 = bbox
+        distances += [Quantity(each.own_widths * (x1 - x0), "px") for each in words if each.own_widths is not None]
+        distances += [Quantity(each.own_heights * (y1 - y0), "px") for each in words if each.own_heights is not None]
     speeds: list[SpeedWord | Quantity] = [each.speed for each in words if each.speed is not None]
     ends: list[Until] = [each.until for each in words if each.until is not None]
     return Said(

@@ -21,8 +21,8 @@ from cow_service.readers.question.sentences import Question
 # Words that hold a sentence together; what they join is read, or is named.
 _STRUCTURE = (
     PUNCTUATION | lex.AUXILIARIES | lex.BE | lex.MOVER_PRONOUNS | lex.CAUSATIVES | (lex.CONDITIONALS - {"unless"})
-    | lex.words("to that which who and but then so i you we us me there also have has had please now here go come get goes comes")
-    | lex.words("someone somebody ok either")
+    | lex.words("to that which who and but then so i you we us me there also have has had please now here")
+    | lex.words("someone somebody ok either go come get goes comes")
     | lex.words("what happens happen tell know will keep keeps kept continue continues continued start starts started")
     | lex.words("begin begins began s yes")
 )  # fmt: skip
@@ -91,7 +91,7 @@ def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Itera
 
 
 def _orders(question: Question, sentence: range, at: int) -> bool:
-    """ "First", "is first rolled left, then ...", "as the ball rolls": it says when, as the rest of the sentence does."""
+    """ "First", "is first rolled left, then ...", "as the ball rolls": when, as the rest of the sentence says."""
     if question.items[at].key == "first" and at > sentence.start and at + 1 < sentence.stop:
         return bool(question.motion.steps) and question.items[at + 1].start in question.read
     return at == sentence.start and (question.items[at].key == "first" or is_during(question.items, at))

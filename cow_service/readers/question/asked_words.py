@@ -103,12 +103,19 @@ def _of_kind(at: int, words: Sequence[str], phrase: ObjectPhrase, sentence: Sent
     of_it = words[0] in _SOME or (words[0] in {"a", "an"} and plain and not listed)
     if (not counts and not of_it) or phrase.noun is None or phrase.head in _GENERIC or (counts and of_it):
         return []
+    if counts and _is_one(words):
+        return []  # "any of the cube" is a part of it
     said = words[0] if of_it else "" if fronted else before[-1]
     content = [word for word in words if word not in {"the", "these", "those"}]
     if not set(content) & _COUNTING <= _SOME | lex.NUMBER_WORDS.keys() | {"other"} or content[-1] in _TRAILING:
         return [Word("X", "X", at)]
     name = " ".join(content if of_it else [*([said] if said in _TWO_OF else []), *content])
     return [*plain_words([said] if of_it else [], at), _name("S", at, replace(phrase, text=name), sentence)]
+
+
+def _is_one(words: Sequence[str]) -> bool:
+    """Whether the words "the blue cube" are of one thing."""
+    return words[0] in {"the", "this", "that"} and lex.singular(words[-1]) == words[-1]
 
 
 def _thing(

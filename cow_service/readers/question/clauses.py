@@ -15,7 +15,9 @@ from cow_service.records import MotionKind
 
 SENTENCE_END = frozenset(".?!;:")
 _ClauseKind = Literal["cond", "plain", "question"]
-_GOES_ON = lex.words("~ though to toward towards along in at as opposite against away and then forward backward") | lex.PLACES
+_GOES_ON = lex.PLACES | lex.words(
+    "~ to toward towards along in at as opposite against away and then forward backward though"
+)
 # A conditional clause is where the motion stands; a question without one may still hold it.
 _RANKS: dict[_ClauseKind, int] = {"cond": 30, "plain": 20, "question": 10}
 _UNKNOWN_VERB = 15

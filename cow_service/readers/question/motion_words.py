@@ -292,6 +292,10 @@ def _apply(
             leg.ahead.add(name == "forward")
         case "beside_it":
             return False
+        case "airborne":
+            leg.marks.add(name)
+            flies = leg.verb in lex.VERBS and lex.VERBS[leg.verb].kind in {"projectile", "fall"}
+            return flies or leg.verb in _KICKED  # "rolls through the air": the worlds have nothing that does
         case "stops":
             return bool(leg.quantities)
         case "towards":

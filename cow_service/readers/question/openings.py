@@ -11,7 +11,8 @@ from cow_service.readers.question.phrases import key_at, tokens
 _ENDS = frozenset(".?!;")
 _WINDOW = 24  # words of the openings of one sentence
 _MAX_TRIES = 12  # of one question
-_SAID_AS = re.compile(rf"\b(?:{'|'.join(sorted(map(re.escape, lex.TABLES['said_as']), key=len, reverse=True))})\b", re.I)
+_LONGEST_FIRST = sorted(map(re.escape, lex.TABLES["said_as"]), key=len, reverse=True)
+_SAID_AS = re.compile(rf"\b(?:{'|'.join(_LONGEST_FIRST)})\b", re.I)
 _TAG = re.compile(rf",\s*(?:{'|'.join(lex.SETS['tags'])})\s*\?(?=\s+\S)", re.I)  # and something else is asked
 
 

@@ -45,7 +45,9 @@ def with_quantities(found: Sequence[Item]) -> list[Item]:
 
 def _may_start(found: Sequence[Item], at: int) -> bool:
     key, before = found[at].key, found[at - 1].key if at else ""
-    if (key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND) or before == "number" or key_at(found, at + 1) == "between":
+    if (key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND) or before == "number":
+        return False
+    if key in _PARTS and key_at(found, at + 1) == "between":
         return False
     measured = any(
         each.key in _BARE or _WITH_UNIT.fullmatch(each.key) or not _MEASURES.isdisjoint(terminals(each.key))

@@ -236,7 +236,8 @@ def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidat
         for each in clauses.candidates
         if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
         and each.at > best.at and each.kind not in {None, "static"}
-        and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
+        and each.start > best.at and each.subject is not None and (each.subject.noun or each.subject.colour)
+        and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 
 
@@ -309,7 +310,7 @@ def _joint_motion(found: Sequence[Item], best: MotionCandidate | None, end: int)
 def _in_full(mover: ObjectPhrase, before: Sequence[Item], changes: Sequence[InterventionWords]) -> ObjectPhrase:
     """The first mention of the mover where it is worded more fully: "the white pawn ... if the pawn moves"."""
     named = [item.phrase for item in before if item.phrase]
-    named += [phrase for change in changes for phrase in (change.object, *change.targets)]
+    named += [phrase for change in changes for phrase in (change.object, *change.targets) if change.kind == "place"]
     fuller = {phrase for phrase in named if phrase != mover and _repeats(mover, phrase)}
     return fuller.pop() if len(fuller) == 1 else mover
 
