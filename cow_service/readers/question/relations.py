@@ -127,7 +127,7 @@ def _read(question: Question) -> _Reading | None:
     named = {found[at].words[place].at for place in reading.covered} | claim
     named |= {at for at, item in enumerate(question.items) if listed and (item.phrase in listed or item.key == "or")}
     named |= {at for at, item in enumerate(question.items) if item.key == "still" and question.interventions}
-    named |= _premise(found[:at], reading, question)
+    named |= _premise(found[: at + 1], reading, question)
     quantities = {at: item.quantity for at, item in enumerate(question.items) if item.quantity}
     limits = {at: quantity.within for at, quantity in quantities.items() if quantity.within is not None}
     if not all(_limits(question, named, at) for at in limits):
@@ -136,14 +136,17 @@ def _read(question: Question) -> _Reading | None:
     return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within, claim=bool(claim))
 
 
-def _premise(before: Sequence[Sentence], reading: _Reading, question: Question) -> set[int]:
-    """The places of "and strikes the bowl" in a statement, where what the bowl then does is asked."""
+def _premise(told: Sequence[Sentence], reading: _Reading, question: Question) -> set[int]:
+    """The places of "and strikes the bowl" in front of the question, where what the bowl then does is asked."""
     subject = reading.asking.subject
     if subject is None or subject not in reading.phrases:
         return set()
-    for sentence in (each for each in before if not each.asks):
-        for start in (at for at, token in enumerate(sentence.tokens) if token in {"and", ","}):
-            words = sentence.words[start:]
+    ends = [len(each.words) for each in told[:-1]] + [max(min(reading.covered) - 1, 0)]
+    for sentence, end in zip(told, ends, strict=True):
+        if sentence.asks and sentence is not told[-1]:
+            continue
+        for start in (at for at, token in enumerate(sentence.tokens[:end]) if token in {"and", ","}):
+            words = sentence.words[start:end]
             tree = parse_all("premise", words)
             struck = [] if tree is None else [word.text for word in words if word.kind == "T"]
             if struck and _as_named(sentence.phrases[struck[0]], question) == _named(subject, reading, question):
