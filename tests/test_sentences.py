@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cow_service.readers.base import Quantity
+from cow_service.readers.embedded.motions import quantities
 from cow_service.readers.question import lexicon
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.sentences import Question, parse, parse_noun_phrase
@@ -434,3 +436,32 @@ def test_time_is_bounded(piece: str) -> None:
     started = time.process_time()
     parse(text)
     assert time.process_time() - started < 2  # s: generous; quadratic work takes far longer
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "object", "relation"),
+    [
+        ("If the mug had never been there, does the ball hit the cube?", "remove", "mug", None),
+        ("Clear away the mug. Does the ball hit the cube?", "remove", "mug", None),
+        ("Pop the ball in the mug. Does it fit?", "place", "ball", "into"),
+        (
+            "Put the green can halfway between the cube and the mug. Does the ball hit it?",
+            "place",
+            "green can",
+            "between",
+        ),
+    ],
+)
+def test_further_words_of_changes(text: str, kind: str, object: str, relation: str | None) -> None:
+    (change,) = parse(text).interventions
+    assert (change.kind, change.object.text, change.relation) == (kind, object, relation)
+
+
+@pytest.mark.parametrize(
+    ("said", "widths"), [("twice its own width", 2.0), ("by half its width", 0.5), ("by its own diameter", 1.0)]
+)
+def test_lengths_of_its_own(said: str, widths: float) -> None:
+    motion = parse(f"If the ball rolls left {said}, does it hit the mug?").motion
+    assert [each.own_widths for each in motion.quantities] == [widths]
+    box = (10.0, 20.0, 50.0, 100.0)
+    assert quantities(motion.quantities, None, box)["distance"] == Quantity(40 * widths, "px")

@@ -46,6 +46,12 @@ If the ball rolls off the shelf to the left, does it hit the mug? | off shelf
 If the ball rolls along the arrow, will it hit the mug on its way against the arrow? | hit mug on way against arrow
 Is the mug hit first by the ball if it rolls left? | hit first by ball
 Which mug is hit by the cone first if the ball rolls left? | mug is hit by cone first
+The ball rolls left and strikes the cube. Does the ball hit the mug? | strikes cube
+The ball rolls left and misses the cube. Does the cube hit the mug? | misses cube
+First shift the ball left by 90 px, in the air, and only then release it. Will it hit the mug? | in air
+Nobody throws the cube. If the ball rolls left, does it hit the mug? | cube
+If the ball rolls left by twice the width of the mug, does it hit the cube? | by twice width of mug
+If the ball rolls right, does it still hit the mug at the end? | still hit mug at end
 True or false? The mug is on the table. If the ball rolls left, it hits the mug. | mug
 """
 BESIDE = """
@@ -58,6 +64,13 @@ There is a red ball and a blue mug. If the ball rolls right, does it hit the mug
 Please tell me: would the ball, rolling freely along the arrow on the floor, hit the mug?
 Remove the vase and then roll the ball gently to the right by 20 px. Does it still hit the mug?
 Is the ball able to reach the mug by rolling left?
+Excuse me, could you please tell me whether the ball is going to hit the mug if we give it a little push left?
+OK so what I'd like to know is whether the ball, rolling left, gets past the mug without touching it.
+The ball rolls left and strikes the bowl, right? Would the bowl be shoved into the cone by this?
+As the ball goes rolling off to the left, is there any risk of it hitting the mug?
+Given the direction of the arrow, would the ball manage to avoid the mug?
+What if nobody throws the ball and it just falls straight down, is the mug safe from being hit?
+Let's say the ball sets off to the left, though only by twice its own width. Has it gone out of the picture by then?
 First the ball rolls left, then down. Does it hit the mug?
 Within 2 seconds, will the ball rolling right reach the mug that is nearer to the camera?
 """

@@ -17,7 +17,16 @@ from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 
 SEEN = ROOT / "tests" / "data" / "wordings" / "seen.json"
-_SAME = {"teal": "cyan", "gray": "grey", "beside": "next-to", "over": "onto"}
+_SAME = {
+    "cup": "mug",
+    "can": "cylinder",
+    "box": "cube",
+    "sphere": "ball",
+    "teal": "cyan",
+    "gray": "grey",
+    "beside": "next-to",
+    "over": "onto",
+}
 _WORDLESS = {"the", "a", "one", "it", "thing", "of", "toy", "object"}
 
 

@@ -12,7 +12,7 @@ from cow_service.readers.base import OtherMotionReading, Quantity, SpeedWord, St
 from cow_service.readers.question.motion_words import OtherWords, StepWords
 from cow_service.readers.question.phrases import QuantityWords
 from cow_service.readers.remedies import GIVE_DIRECTION
-from cow_service.records import DIRECTED_KINDS, Grounding, Until, Vector
+from cow_service.records import DIRECTED_KINDS, BBox, Grounding, Until, Vector
 
 _T = TypeVar("_T")
 
@@ -26,8 +26,11 @@ class Said(TypedDict):
     until: Until | None
 
 
-def quantities(words: Sequence[QuantityWords], way: float | None) -> Said:
-    """The quantities of one leg; `way`, px, is how far it is to what it moves towards. Raises `CannotReadDirection`."""
+def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | None = None) -> Said:
+    """The quantities of one leg; `way`, px, is how far it is to what it moves towards, `bbox` is that of what moves.
+
+    Raises `CannotReadDirection`.
+    """
     distances = [each.distance for each in words if each.distance is not None]
     shares = [each.share for each in words if each.share is not None]
     if shares and way is None:
@@ -36,6 +39,10 @@ def quantities(words: Sequence[QuantityWords], way: float | None) -> Said:
             "`motion.distance`."
         )
     distances += [Quantity(share * (way or 0.0), "px") for share in shares]
+    if bbox is not None:
+        x0, y0, x1, y1 = bbox
+        distances += [Quantity(each.own_widths * (x1 - x0), "px") for each in words if each.own_widths is not None]
+        distances += [Quantity(each.own_heights * (y1 - y0), "px") for each in words if each.own_heights is not None]
     speeds: list[SpeedWord | Quantity] = [each.speed for each in words if each.speed is not None]
     ends: list[Until] = [each.until for each in words if each.until is not None]
     return Said(
@@ -52,12 +59,12 @@ def _one(name: str, values: list[_T]) -> _T | None:
     return values[0] if values else None
 
 
-def step_readings(steps: Sequence[StepWords]) -> tuple[StepReading, ...]:
-    """The legs behind the first."""
+def step_readings(steps: Sequence[StepWords], bbox: BBox) -> tuple[StepReading, ...]:
+    """The legs behind the first of what has this box."""
     readings: list[StepReading] = []
     for step in steps:
         direction, depth = _way(step.direction, step.depth)
-        said = quantities(step.quantities, None)
+        said = quantities(step.quantities, None, bbox)
         readings.append(StepReading(direction, depth, said["distance"], said["duration"]))
     return tuple(readings)
 

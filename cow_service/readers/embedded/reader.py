@@ -285,8 +285,8 @@ def _with_quantities(scene: Scene, question: Question, grounding: Grounding, rea
     words = question.motion
     parted = any(each.share is not None for each in words.quantities)
     way = length(_towards(scene, words.towards, grounding)) if parted and words.towards is not None else None
-    steps, others = step_readings(words.steps), other_readings(words.others, grounding)
-    return replace(reading, **quantities(words.quantities, way), steps=steps, others=others)
+    steps, others = step_readings(words.steps, grounding.bbox), other_readings(words.others, grounding)
+    return replace(reading, **quantities(words.quantities, way, grounding.bbox), steps=steps, others=others)
 
 
 def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:

@@ -13,6 +13,7 @@ from lark import Tree
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.asked_words import means_mover
+from cow_service.readers.question.clauses import is_during
 from cow_service.readers.question.parsing import read_from
 from cow_service.readers.question.phrases import PUNCTUATION, Item, key_at
 from cow_service.readers.question.sentences import Question
@@ -20,8 +21,8 @@ from cow_service.readers.question.sentences import Question
 # Words that hold a sentence together; what they join is read, or is named.
 _STRUCTURE = (
     PUNCTUATION | lex.AUXILIARIES | lex.BE | lex.MOVER_PRONOUNS | lex.CAUSATIVES | (lex.CONDITIONALS - {"unless"})
-    | lex.words("to that which who and but then so i you we us me there also have has had please now here go come get")
-    | lex.words("someone somebody ok either")
+    | lex.words("to that which who and but then so i you we us me there also have has had please now here")
+    | lex.words("someone somebody ok either go come get goes comes")
     | lex.words("what happens happen tell know will keep keeps kept continue continues continued start starts started")
     | lex.words("begin begins began s yes")
 )  # fmt: skip
@@ -80,13 +81,20 @@ def _runs(question: Question, sentence: range, covered: frozenset[int]) -> Itera
     for at in sentence:
         item = question.items[at]
         read = at in covered or item.start in question.read or at in harmless or _leads_on(question, at)
-        structure = item.phrase is None and (item.key in _STRUCTURE or (item.key == "first" and at == sentence.start))
+        structure = item.phrase is None and (item.key in _STRUCTURE or _orders(question, sentence, at))
         if not read and (run or not structure) and item.key not in PUNCTUATION:
             run.append(at)
         elif run:
             yield from _trimmed(question, run)
             run = []
     yield from _trimmed(question, run)
+
+
+def _orders(question: Question, sentence: range, at: int) -> bool:
+    """ "First", "is first rolled left, then ...", "as the ball rolls": when, as the rest of the sentence says."""
+    if question.items[at].key == "first" and at > sentence.start and at + 1 < sentence.stop:
+        return bool(question.motion.steps) and question.items[at + 1].start in question.read
+    return at == sentence.start and (question.items[at].key == "first" or is_during(question.items, at))
 
 
 def _leads_on(question: Question, at: int) -> bool:
@@ -114,6 +122,8 @@ def _harmless(question: Question, sentence: range, covered: frozenset[int]) -> s
         return set(sentence)
     tries = 0
     for at in sentence:
+        if items[at].key == "nobody" and key_at(items, at + 1) in lex.VERBS:
+            found |= {at, at + 1}  # "nobody throws the ball and it falls"; another thing than the mover is named
         if at in found or at in covered or items[at].start in question.read or tries >= _TRIES:
             continue
         parsed = read_from("adverbial", items[: sentence.stop], at, 8)

@@ -23,11 +23,12 @@ _GENERIC = lex.GENERIC | lex.words("obstacle obstacles body bodies")
 _PLURAL = lex.words("objects things items ones obstacles bodies")
 # Words that the chunker takes for nouns, and that are part of the grammar.
 _PLAIN_WORDS = lex.SETS["plain_words"]
-_OF_GENERIC = lex.words("first other different all")
+_OF_GENERIC = lex.words("first other different all single")
 _TRAILING = lex.words("hard fast slow alone anyway whatsoever second third last twice once again")  # more is asked
 _COUNTING = lex.SETS["counting"] | (lex.NUMBER_WORDS.keys() - {"one"})
 THEM = "them"  # the things that were named
-_TWO = (["the", "two"], ["both"], ["two"])
+_TWO = (["the", "two"], ["those", "two"], ["these", "two"], ["both"], ["two"])
+_CHANCES = ([], ["chance"], ["danger"], ["risk"], ["possibility"], ["likelihood"])
 _LISTING = frozenset({",", ":", "or"})
 _TWO_OF = lex.words("both either neither")
 _SOME = lex.words("any every each either neither both all many no none one some")  # of the things of a kind
@@ -72,7 +73,7 @@ def _phrase_words(at: int, item: Item, phrase: ObjectPhrase, question: Question,
     words = [word.lower() for word in item.words]
     content = list(dropwhile(lex.DETERMINERS.__contains__, words))
     determiners, before = words[: len(words) - len(content)], sentence.tokens
-    if words in _TWO and before[-1:] == ["of"]:
+    if words in _TWO and before[-1:] == ["of"] and before[-2:-1] not in _CHANCES:
         return [Word("S", THEM, at)]
     if words == ["each", "other"] or phrase.head in lex.NO_THINGS or set(content) <= _PLAIN_WORDS:
         return plain_words(["they"] if question.motion.others and words in _TWO else words, at)
@@ -96,17 +97,25 @@ def _counts(before: Sequence[str]) -> bool:
 def _of_kind(at: int, words: Sequence[str], phrase: ObjectPhrase, sentence: Sentence, listed: bool) -> list[Word]:
     """ "Both mugs", "any of the other two mugs", "neither mug" in tokens; none for a phrase that is of no kind."""
     before = [word for word in sentence.tokens if word != "of"]
-    counts = _counts(sentence.tokens)
+    fronted = sentence.tokens in (["of"], ["out", "of"])  # "of the three balls, which ..."
+    counts = fronted or _counts(sentence.tokens)
     plain = phrase.colour is None and phrase.number is None and phrase.place is None and not phrase.inside_box
     of_it = words[0] in _SOME or (words[0] in {"a", "an"} and plain and not listed)
     if (not counts and not of_it) or phrase.noun is None or phrase.head in _GENERIC or (counts and of_it):
         return []
-    said = words[0] if of_it else before[-1]
+    if counts and _is_one(words):
+        return []  # "any of the cube" is a part of it
+    said = words[0] if of_it else "" if fronted else before[-1]
     content = [word for word in words if word not in {"the", "these", "those"}]
     if not set(content) & _COUNTING <= _SOME | lex.NUMBER_WORDS.keys() | {"other"} or content[-1] in _TRAILING:
         return [Word("X", "X", at)]
     name = " ".join(content if of_it else [*([said] if said in _TWO_OF else []), *content])
     return [*plain_words([said] if of_it else [], at), _name("S", at, replace(phrase, text=name), sentence)]
+
+
+def _is_one(words: Sequence[str]) -> bool:
+    """Whether the words "the blue cube" are of one thing."""
+    return words[0] in {"the", "this", "that"} and lex.singular(words[-1]) == words[-1]
 
 
 def _thing(
@@ -138,7 +147,7 @@ def _is_several(determiners: Sequence[str], content: Sequence[str], phrase: Obje
 def _generic(determiners: Sequence[str], content: Sequence[str], at: int) -> list[Word]:
     if len(content) > 1 and content[0] == "one":
         return [Word("X", "X", at)]  # "one object" is a number
-    kept = [word for word in content if word in {"first", "different", "all"}]
+    kept = [word for word in content if word in {"first", "different", "all", "single"}]
     object = "OBJS" if content[-1] in _PLURAL else "OBJ"
     return [*plain_words([*determiners, *kept], at), Word(object, object, at)]
 

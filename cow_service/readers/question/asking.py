@@ -27,6 +27,7 @@ _FORMS.update({form.replace("-", "_"): form for form in get_args(AskedForm)})
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
 _NEGATIONS = frozenset(
     {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"}
+    | {"spared", "stays_in"}
 )
 
 
@@ -72,6 +73,8 @@ def _read_tree(tree: Tree[Token], beside: str | None) -> Asking | None:
     open_ = any(token.type == "PRONOUN" and token == "them" for token in _tokens(tree))  # which of them
     if open_ or negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
+    if form == "which-first" and not things and not listed and next(tree.find_data("lands_on"), None) is not None:
+        form = "where"  # "what does it land on?": on the floor, too
     of_another = form == "which-first" and things  # "which mug is hit by the cone first": not by the mover
     partly = relation in {"covers", "covered"} and any(node.data in _ANY_PART for node in tree.iter_subtrees())
     target = things[0] if things else None

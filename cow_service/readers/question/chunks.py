@@ -17,7 +17,9 @@ from cow_service.readers.question.quantities import with_quantities
 MAX_WORDS = 12  # of one phrase; what is longer is no phrase
 _LINKS = lex.SETS["links"]
 # Behind a noun they are no part of it: "the ball and the mug both move".
-_BEHIND = lex.words("both twice earlier later last hard all each together neither either nearest closest able farthest")
+_BEHIND = lex.words(
+    "safe both twice earlier later last hard all each together neither either nearest closest able farthest"
+)
 _CLOSED = lex.FUNCTION_WORDS | lex.DETERMINERS
 _NUMBERED = lex.words("with labeled labelled marked numbered bearing carrying saying called")
 _FINITE_BE = lex.words("be is are was were 's")
@@ -92,8 +94,8 @@ def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: b
         return inside and not has_noun and key_at(found, at - 1) in lex.COLOURS and key_at(found, at + 1) in lex.COLOURS
     if key == "a" and (inside or key_at(found, at - 1) in _NUMBERED):
         return not _is_determiner(found, at)
-    if key in lex.PLACES or key in {"one", "far"}:
-        return determined and not has_noun
+    if key in lex.PLACES or key in {"one", "far", "can"}:
+        return determined and not has_noun and (key != "can" or _is_tin(found, at, asked))
     behind = (has_noun and key in _BEHIND) or _is_measure(found, at, has_noun)
     if key in PUNCTUATION or key in _CLOSED or behind or _is_shared_verb(found, at, start, has_noun):
         return False
@@ -125,8 +127,8 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
         return False  # "the balls to the left move up"
     if not has_noun:
         before = key_at(found, at - 1)
-        if verb.form == "base" and asked and before in {"one", "two", "both"}:
-            return False  # "will the two collide?"
+        if before in {"one", "two", "both"} and ((verb.form == "base" and asked) or (verb.form == "ing" and closed)):
+            return False  # "will the two collide?", "any chance of those two running into each other?"
         if verb.form == "s" and before == "one":
             return False  # "the orange one slides"
         begun = begun or (verb.form == "base" and _is_label(found, at + 1))
@@ -137,6 +139,12 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
     if verb.form == "base":
         return not asked or (not goes_on and (after in lex.VERBS or after in _FINITE_BE))
     return verb.form == "s" and after in {"are", "were"}
+
+
+def _is_tin(found: Sequence[Item], at: int, asked: bool) -> bool:
+    """ "The green can"; but "the red can hit the blue"."""
+    after = lex.VERBS.get(key_at(found, at + 1))
+    return asked or after is None or after.form != "base"
 
 
 def _in_clause(key: str) -> bool:

@@ -15,7 +15,9 @@ from cow_service.records import MotionKind
 
 SENTENCE_END = frozenset(".?!;:")
 _ClauseKind = Literal["cond", "plain", "question"]
-_GOES_ON = lex.words("~ to toward towards along in at as opposite against away and then forward backward") | lex.PLACES
+_GOES_ON = lex.PLACES | lex.words(
+    "~ to toward towards along in at as opposite against away and then forward backward though"
+)
 # A conditional clause is where the motion stands; a question without one may still hold it.
 _RANKS: dict[_ClauseKind, int] = {"cond": 30, "plain": 20, "question": 10}
 _UNKNOWN_VERB = 15
@@ -109,7 +111,7 @@ def _opens(found: Sequence[Item], at: int, clause: _Clause) -> _ClauseKind | Non
         return "plain"
     if key in {",", "(", ")", "—", "–"}:
         return None if clause.kind == "cond" and not clause.verbs else "plain"
-    if key in lex.CONDITIONALS:
+    if key in lex.CONDITIONALS or is_during(found, at):
         return "cond"
     if key in lex.CAUSATIVES:
         return None if key_at(found, at + 1) in {"go", "loose"} else clause.kind
@@ -117,6 +119,13 @@ def _opens(found: Sequence[Item], at: int, clause: _Clause) -> _ClauseKind | Non
         return "question"
     follows = at + 1 < len(found) and found[at + 1].phrase is not None
     return clause.kind if key in {"and", "but", "then"} and clause.verbs and follows else None
+
+
+def is_during(found: Sequence[Item], at: int) -> bool:
+    """ "As the cube slides left, does it ...": an "as" that opens a sentence, in front of a thing."""
+    after = phrase_at(found, at + 1)
+    opens = found[at].key == "as" and key_at(found, at - 1) in SENTENCE_END
+    return opens and after is not None and after.is_thing
 
 
 def _is_inversion(found: Sequence[Item], at: int) -> bool:
@@ -142,7 +151,7 @@ def _candidate(found: Sequence[Item], at: int, clause: _Clause) -> MotionCandida
     if key in _STILL and key_at(found, at - 1) in lex.BE and clause.kind != "question":
         return MotionCandidate(at, clause.start, "stay", "static", clause.subject, _RANKS[clause.kind])
     verb = lex.VERBS.get(key)
-    if verb is None or _is_idle(found, at, verb):
+    if verb is None or _is_idle(found, at, verb) or key_at(found, at - 1) == "nobody":
         return None
     rank, kind = _rank(found, at, verb, clause), verb.kind
     if rank == 0 or _is_about_picture(found, at, clause) or (kind is None and not _is_struck(found, at, verb)):

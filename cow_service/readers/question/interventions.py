@@ -55,7 +55,7 @@ def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords,
             said, end = read
             if said[0].kind == "remove" and ahead[0].kind and _goes_on(found, at, end):
                 said = [replace(change, then_moves=True) for change in said]
-            changes += said
+            changes += [change for change in said if change not in changes]
             gone |= _emptied(found, at, end, gone)
     return tuple(changes), [item for at, item in enumerate(found) if at not in gone]
 

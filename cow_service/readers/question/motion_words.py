@@ -29,7 +29,8 @@ _THEN = lex.words("then afterwards finally")
 _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
-_FALLING = lex.words("fall drop plummet plunge descend sink")
+_SETS_GOING = lex.words("send start keep get")
+_FALLING = lex.words("fall drop release plummet plunge descend sink")
 _SINKING = _FALLING | {"lower"}
 _CLIMBING = lex.words("rise ascend")
 _GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
@@ -148,10 +149,13 @@ def read_motion(
                     legs.append(_Leg(""))
             elif items[0].key in lex.VERBS and len(legs) > 1 and not leg.verb:
                 leg.verb = lex.lemma(items[0].key)
+                if lex.VERBS[items[0].key].kind in {"fall", "projectile"} and leg.verb not in _FALLING:
+                    continue
         elif isinstance(node, Tree):
             later = len(legs) > 1 and str(node.data) in _FIRST_LEG_ONLY
             aside = str(node.data) == "off" and _stands_before_thing(found, items[-1])
-            if later or aside or not _apply(legs[-1], node, found, mover, asked or kind == "fall", arrow):
+            ended = str(node.data) == "stops" and len(legs) > 1 and not _says_more(legs[-1])
+            if later or aside or not _apply(legs[-1 - ended], node, found, mover, asked or kind == "fall", arrow):
                 continue
         read |= {item.start for item in items}
     first, *rest = [leg for at, leg in enumerate(legs) if not at or leg.way(None) is not None or leg.depths]
@@ -161,7 +165,7 @@ def read_motion(
 def _stands_before_thing(found: Sequence[Item], item: Item) -> bool:
     """ "Rolls on the mug", "off the shelf": not "rolls on", "rolls off"."""
     after = next((each for each in found if each.start >= item.end), None)
-    return after is not None and after.phrase is not None
+    return after is not None and after.phrase is not None and after.phrase.is_thing
 
 
 def with_front(motion: MotionWords, before: Sequence[Item], told: frozenset[int]) -> MotionWords:
@@ -190,7 +194,7 @@ def arrow_statement(found: Sequence[Item]) -> frozenset[int]:
     """The places of "The arrow shows the way" where the question says so."""
     for at in range(len(found)):
         opens = key_at(found, at - 1) in {".", "?", "!", ";", ":", ",", "that", "and"}
-        near = any(word.text in ARROWS for word in words_of(found[at : at + 3])) if opens else False
+        near = any(word.text in ARROWS for word in words_of(found[at : at + 4])) if opens else False
         parsed = read_from("adverbial", found, at, _WINDOW) if near else None
         if parsed is not None and next(parsed[0].find_data("told"), None) is not None:
             return frozenset(item.start for item in found[at : parsed[1]])
@@ -239,7 +243,7 @@ def _adverbials(found: Sequence[Item], start: int) -> Iterator[tuple[Tree[Token]
     at, tries = start, 0
     while at < len(found):
         item, parsed = found[at], None
-        if item.quantity is not None or item.key in _THEN or _is_next_verb(found, at):
+        if item.quantity is not None or item.key in _THEN or _is_next_verb(found, at) or _is_set_going(found, at):
             yield None, (item,)
         elif tries < _MAX_TRIES:
             tries += 1
@@ -256,7 +260,14 @@ def _is_next_verb(found: Sequence[Item], at: int) -> bool:
     before = at - 1
     while key_at(found, before) in lex.MOVER_PRONOUNS | lex.BE | {"to", "let"}:
         before -= 1
-    return verb is not None and verb.kind is not None and key_at(found, before) in _THEN | {"and"}
+    return verb is not None and verb.kind is not None and key_at(found, before) in _THEN | {"and", "so"}
+
+
+def _is_set_going(found: Sequence[Item], at: int) -> bool:
+    """ "Sends the ball rolling", "sets it sliding"."""
+    verb = lex.VERBS.get(found[at].key)
+    sent = at == 2 and lex.lemma(found[0].key) in _SETS_GOING and key_at(found, 1) in lex.MOVER_PRONOUNS | {""}
+    return sent and verb is not None and verb.kind == "linear" and verb.form == "ing"
 
 
 def _apply(
@@ -281,6 +292,10 @@ def _apply(
             leg.ahead.add(name == "forward")
         case "beside_it":
             return False
+        case "airborne":
+            leg.marks.add(name)
+            flies = leg.verb in lex.VERBS and lex.VERBS[leg.verb].kind in {"projectile", "fall"}
+            return flies or leg.verb in _KICKED  # "rolls through the air": the worlds have nothing that does
         case "stops":
             return bool(leg.quantities)
         case "towards":

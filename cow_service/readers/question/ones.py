@@ -31,6 +31,9 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
         if item.key == "that" and things and _acts(found, len(said)):
             said.append(replace(item, key="", phrase=things[-1].phrase, words=things[-1].words))
             continue
+        if item.words[:1] == ("that",) and phrase is not None and (again := _last_like(phrase, things)):
+            said.append(replace(item, phrase=again, words=("that", *again.text.split())))
+            continue
         if item.words in _OTHER and len(nouns) == 1:
             noun = next(iter(nouns))
             other = ObjectPhrase(f"other {noun}", None, noun)
@@ -46,6 +49,13 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             said.append(item)
             before |= {_kind_of(phrase)} - {""}
     return said
+
+
+def _last_like(phrase: ObjectPhrase, things: Sequence[Item]) -> ObjectPhrase | None:
+    """ "That mug": the mug that was named last."""
+    if phrase.noun is None or phrase.text.lower() != phrase.noun:
+        return None
+    return next((each.phrase for each in reversed(things) if each.phrase and each.phrase.noun == phrase.noun), None)
 
 
 def _acts(found: Sequence[Item], at: int) -> bool:

@@ -22,7 +22,7 @@ from lark.parsers.earley_forest import ForestToParseTree
 from cow_service.readers.question.phrases import Item
 from cow_service.readers.question.words import Word, words_at
 
-STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial", "place"]
+STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial", "place", "opening", "premise"]
 MAX_WORDS = 48  # of one parse: its work may grow with the cube of their number
 
 
@@ -136,6 +136,8 @@ def parse_from(start: str, words: Sequence[Word]) -> tuple[Tree[Token], int] | N
         return None
     columns = _grammar().columns(start, ahead)
     for end in range(len(columns) - 1, 0, -1):
+        if end < len(ahead) and ahead[end].text == "-ing":
+            continue  # "the ball is going" is not "the ball is gone"
         tree = _grammar().tree(start, columns[end])
         if tree is not None:
             return tree, end

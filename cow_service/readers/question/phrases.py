@@ -55,6 +55,8 @@ class QuantityWords:
     speed: SpeedWord | Quantity | None = None
     distance: Quantity | None = None
     share: float | None = None  # of the way to what it moves towards
+    own_widths: float | None = None  # a distance, in widths of what moves
+    own_heights: float | None = None
     duration: float | None = None  # s
     until: Until | None = None
     within: float | None = None  # s: a limit of what is asked about, not of the motion

@@ -12,7 +12,7 @@ from cow_service.readers.question.parsing import read_from
 from cow_service.readers.question.phrases import Item, PlaceWords, key_at
 
 _WINDOW = 9  # words
-_PUTS = lex.words("put place insert set position lower")
+_PUTS = lex.words("put place insert set position lower stand stick pop plonk plop")
 
 
 def with_places(found: Sequence[Item]) -> list[Item]:

@@ -10,16 +10,16 @@ from lark import Token, Tree
 from cow_service.readers.base import Quantity, SpeedWord, Unit
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.parsing import may_begin, parse_from, terminals
-from cow_service.readers.question.phrases import QUANTITY, Item, QuantityWords
+from cow_service.readers.question.phrases import QUANTITY, Item, QuantityWords, key_at
 from cow_service.readers.question.words import Word, plain_words
 
 _WINDOW = 12  # words
 _MAX_TRIES = 6  # of one question: each takes some ms
 _MEASURES = frozenset({"_SLOWLY", "_QUICKLY", "_SECOND", "_TEMPO", "LENGTH", "WIDTH"})  # terminals
-_BARE = lex.words("halfway midway way until till push shove")  # measures, too
+_BARE = lex.words("width diameter height halfway midway way until till push shove")  # measures, too
 _ADJECTIVE_BEHIND = lex.DETERMINERS | lex.COLOURS.keys() | lex.ADJECTIVES | lex.words("how as so is are be")
 _NUMERALS = lex.NUMBER_WORDS | {"twenty": 20, "thirty": 30, "forty": 40, "fifty": 50, "sixty": 60, "hundred": 100}
-_PARTS = {"half": 0.5, "halfway": 0.5, "quarter": 0.25, "third": 1 / 3, "two_thirds": 2 / 3}
+_PARTS = {"half": 0.5, "halfway": 0.5, "quarter": 0.25, "third": 1 / 3, "two_thirds": 2 / 3, "twice": 2.0}
 _WITH_UNIT = re.compile(r"(\d+(?:\.\d+)?)([a-z]+)")
 
 
@@ -46,6 +46,8 @@ def with_quantities(found: Sequence[Item]) -> list[Item]:
 def _may_start(found: Sequence[Item], at: int) -> bool:
     key, before = found[at].key, found[at - 1].key if at else ""
     if (key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND) or before == "number":
+        return False
+    if key in _PARTS and key_at(found, at + 1) == "between":
         return False
     measured = any(
         each.key in _BARE or _WITH_UNIT.fullmatch(each.key) or not _MEASURES.isdisjoint(terminals(each.key))
@@ -78,6 +80,7 @@ def _quantity(tree: Tree[Token]) -> QuantityWords:
     kind = tree.children[0]
     assert isinstance(kind, Tree)
     number, length = _number(kind), _length(kind)
+    own = next(kind.find_pred(lambda node: node.data in {"own_width", "own_height"}), None)
     until = "contact" if list(kind.find_data("contact")) else "out-of-view"
     match kind.data:
         case "speed":
@@ -86,6 +89,9 @@ def _quantity(tree: Tree[Token]) -> QuantityWords:
             return QuantityWords(within=number)
         case "duration":
             return QuantityWords(duration=number)
+        case "distance" if own is not None:
+            wide = own.data == "own_width"
+            return QuantityWords(own_widths=number) if wide else QuantityWords(own_heights=number)
         case "distance":
             value, unit = length or (1.0, "widths")
             return QuantityWords(distance=Quantity(number * value, unit))

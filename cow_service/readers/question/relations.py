@@ -15,6 +15,7 @@ from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.accounting import Unread, unread_words
 from cow_service.readers.question.asked_words import MAX_TOKENS, THEM, Sentence, sentences
 from cow_service.readers.question.asking import IT, Asking, read_clause
+from cow_service.readers.question.parsing import parse_all
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import Word
@@ -126,12 +127,31 @@ def _read(question: Question) -> _Reading | None:
     named = {found[at].words[place].at for place in reading.covered} | claim
     named |= {at for at, item in enumerate(question.items) if listed and (item.phrase in listed or item.key == "or")}
     named |= {at for at, item in enumerate(question.items) if item.key == "still" and question.interventions}
+    named |= _premise(found[: at + 1], reading, question)
     quantities = {at: item.quantity for at, item in enumerate(question.items) if item.quantity}
     limits = {at: quantity.within for at, quantity in quantities.items() if quantity.within is not None}
     if not all(_limits(question, named, at) for at in limits):
         return None
     within = min(limits.values(), default=None)
     return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within, claim=bool(claim))
+
+
+def _premise(told: Sequence[Sentence], reading: _Reading, question: Question) -> set[int]:
+    """The places of "and strikes the bowl" in front of the question, where what the bowl then does is asked."""
+    subject = reading.asking.subject
+    if subject is None or subject not in reading.phrases:
+        return set()
+    ends = [len(each.words) for each in told[:-1]] + [max(min(reading.covered) - 1, 0)]
+    for sentence, end in zip(told, ends, strict=True):
+        if sentence.asks and sentence is not told[-1]:
+            continue
+        for start in (at for at, token in enumerate(sentence.tokens[:end]) if token in {"and", ","}):
+            words = sentence.words[start:end]
+            tree = parse_all("premise", words)
+            struck = [] if tree is None else [word.text for word in words if word.kind == "T"]
+            if struck and _as_named(sentence.phrases[struck[0]], question) == _named(subject, reading, question):
+                return {word.at for word in words}
+    return set()
 
 
 def _without_claim(found: list[Sentence]) -> tuple[list[Sentence], frozenset[int]]:
@@ -178,6 +198,8 @@ def _starts(sentence: Sentence, at: int, question: Question) -> bool:
     if word.text in _STARTS and not (at and sentence.words[at - 1].at == word.at):
         return _opens(tokens[:at])
     said = question.items[word.at].key
+    if word.kind == "PRONOUN" and at and at + 1 < len(tokens):  # "let go of the ball, it lands on the mug?"
+        said = question.items[sentence.words[at + 1].at].key
     finite = said in lex.VERBS and lex.VERBS[said].form == "s"
     return finite and sentence.asks and (at == 0 or tokens[at - 1] == ",")
 
@@ -192,7 +214,7 @@ def _without_insertion(tokens: Sequence[str], start: int, end: int) -> list[int]
     """The places of a clause without what stands between commas behind its subject: "the car, moving left,"."""
     places = list(range(start, end))
     commas = [at for at in places if tokens[at] == ","]
-    behind = len(commas) > 1 and commas[0] == start + 2 and tokens[start + 1] in {"M", "it"}
+    behind = len(commas) > 1 and commas[0] <= start + 4 and tokens[commas[0] - 1] in {"M", "it"}
     if behind and tokens[commas[0] + 1] in _CONDITIONS | lex.VERBS.keys():
         return [at for at in places if not commas[0] <= at <= commas[1]]
     return places[:-1] if commas and commas[-1] == end - 1 else places

@@ -26,6 +26,7 @@ from cow_service.readers.question.interventions import InterventionWords, implie
 from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
 from cow_service.readers.question.ones import with_nouns
+from cow_service.readers.question.openings import without_openings
 from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at, tokens
 from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.reply_forms import without_reply_form
@@ -74,6 +75,7 @@ def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
     text, beyond = _cut(without_reply_form(split_options(question).rest))
     text, errors = without_typing_errors(_SAME_TIME.sub(lambda found: "and" if found["joins"] else "", text))
+    text = without_openings(text)
     changes, found = split_interventions(with_places(with_nouns(items(text))))
     trail, found = split_trail(found)
     clauses = read_clauses(found)
@@ -81,7 +83,7 @@ def parse(question: str) -> Question:
     best = _before_while(found, clauses, best)
     at = best.at if best else len(found)
     mover = (best.subject if best else None) or _antecedent(found, clauses, at)
-    mover = _in_full(mover, found[:at]) if mover else None
+    mover = _in_full(mover, found[:at], changes) if mover else None
     arrow = any(token.key.startswith("arrow") for token in tokens(text))
     clause, motion = _motion(found, clauses, best, mover, arrow, changes)
     motion, fitted = replace(motion, trail=_ending(trail, motion)), frozenset[int]()
@@ -234,7 +236,8 @@ def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidat
         for each in clauses.candidates
         if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
         and each.at > best.at and each.kind not in {None, "static"}
-        and each.start > best.at and each.subject is not None and not _repeats(each.subject, best.subject)
+        and each.start > best.at and each.subject is not None and (each.subject.noun or each.subject.colour)
+        and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 
 
@@ -304,9 +307,11 @@ def _joint_motion(found: Sequence[Item], best: MotionCandidate | None, end: int)
     return [OtherWords(thing, replace(motion, read=motion.read | both))]
 
 
-def _in_full(mover: ObjectPhrase, before: Sequence[Item]) -> ObjectPhrase:
+def _in_full(mover: ObjectPhrase, before: Sequence[Item], changes: Sequence[InterventionWords]) -> ObjectPhrase:
     """The first mention of the mover where it is worded more fully: "the white pawn ... if the pawn moves"."""
-    fuller = {item.phrase for item in before if item.phrase and item.phrase != mover and _repeats(mover, item.phrase)}
+    named = [item.phrase for item in before if item.phrase]
+    named += [phrase for change in changes for phrase in (change.object, *change.targets) if change.kind == "place"]
+    fuller = {phrase for phrase in named if phrase != mover and _repeats(mover, phrase)}
     return fuller.pop() if len(fuller) == 1 else mover
 
 
