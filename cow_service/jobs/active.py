@@ -20,8 +20,7 @@ STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation
 class ActiveJob:
     """One job that this process works on."""
 
-    stage: Stage | None = None
-    done: float = 0.0  # share of the stage
+    at: tuple[Stage | None, float] = (None, 0.0)  # the stage, and the share of it that is done: one value, read at once
     cancel_requested: threading.Event = field(default_factory=threading.Event)
     finished: bool = False  # the work is over, though the database may not have its outcome yet
 
@@ -105,8 +104,8 @@ class ActiveJobs:
         active.check()
         if stage is None:
             return
-        if stage != active.stage or done > active.done:
-            active.stage, active.done = stage, done
+        if stage != active.at[0] or done > active.at[1]:
+            active.at = stage, done
             for waiter in self._waiters_of(job):
                 waiter.loop.call_soon_threadsafe(waiter.changed.set)
 

@@ -79,7 +79,7 @@ class OpenJobs:
         depth: Counter[tuple[str, str]] = Counter()
         for job_id, job in jobs.items():
             active = self.active.get(job_id)
-            depth[job.generator, "queued" if active is None or active.stage is None else "running"] += 1
+            depth[job.generator, "queued" if active is None or active.at[0] is None else "running"] += 1
         return depth
 
     def ended(self, job_id: str, outcome: str | CowError | None, created_at: str | None = None) -> None:

@@ -164,8 +164,9 @@ def _state(status: WorkflowStatus, active: ActiveJobs) -> JobState:
     running = active.get(status.workflow_id) if shown == "running" else None
     stage, progress = None, 1.0 if shown == "succeeded" else 0.0
     if running is not None:
-        stage, progress = running.stage, share_done(kind, running.stage, running.done)
-    if shown == "running" and status.executor_id == DBOS.executor_id and (running is None or running.stage is None):
+        stage, done = running.at
+        progress = share_done(kind, stage, done)
+    if shown == "running" and status.executor_id == DBOS.executor_id and stage is None:
         shown = "queued"  # it was taken from the queue, but no thread works on it yet
     error = _error(status) if shown == "failed" else None
     created = _attribute(status, ATTRIBUTE_CREATED_AT) or _time(status.created_at)
