@@ -21,7 +21,9 @@ test: $(VENV)/.test ## all tests, slow ones included
 test-fast: $(VENV)/.test ## the tests that take seconds
 	$(PYTEST) -m "not slow"
 
-soak: $(VENV)/.test ## the crash, fuzz and state-machine tests, ten times as long as in `make test`
+soak: $(VENV)/.test ## the crash, fuzz and state-machine tests, ten times as long as in `make test`, and public harnesses
+	$(BIN)/python -m pip install --quiet --no-compile --editable ".[test,harnesses]" --constraint tests/constraints.txt
+	$(PYTEST) tests/test_inspect.py tests/test_docs.py
 	COW_TEST_SCALE=10 $(PYTEST) -m soak
 
 lint: $(VENV)/.test ## style, layers and types

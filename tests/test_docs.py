@@ -18,6 +18,7 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 import httpx
@@ -33,6 +34,7 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SERVE = re.compile(r"(^|\s)(cow serve|make serve|cow mcp --transport)\b")
 READY = 60.0  # seconds
 NEEDS_A_GPU = "COW_GENERATOR=ati"
+HARNESS = "inspect_ai"  # its commands are run where it is installed: by `make soak`
 DOCKER = """#!/bin/sh
 echo "$@" >> "$DOCKER_ASKED"
 """
@@ -239,7 +241,7 @@ def test_commands_and_programs_run_as_they_stand_there(checkout: Checkout, page:
             checkout.serve()
             succeeded(checkout.run(f"python -W error::DeprecationWarning {program.name}"), block.text)
             ran += 1
-        elif block.language == "sh":
+        elif block.language == "sh" and (HARNESS not in block.text or find_spec(HARNESS)):
             run_commands(checkout, block.text)
             ran += 1
     assert ran
