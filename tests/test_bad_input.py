@@ -764,4 +764,5 @@ def test_bodies_that_do_not_arrive(hasty: Server, headers: tuple[str, ...], piec
 
 
 def test_a_body_that_is_in_may_be_worked_on_for_longer(hasty: Server) -> None:
-    assert httpx.post(hasty.address + "/simulate", json={**BODY, "num_frames": 481, "video": True}).status_code == 200
+    body = {**BODY, "num_frames": 481, "video": True}
+    assert httpx.post(hasty.address + "/simulate", json=body, timeout=60).status_code == 200
