@@ -15,16 +15,16 @@ demo: $(VENV)/.base ## run the main job on an example
 serve: $(VENV)/.base ## start the server on 127.0.0.1:8000
 	$(BIN)/cow serve
 
-test: $(VENV)/.test ## all tests, slow ones included
+test: $(VENV)/.test ## all tests, slow ones included; of long tables of cases a third
 	$(PYTEST)
 
 test-fast: $(VENV)/.test ## the tests that take seconds
 	$(PYTEST) -m "not slow"
 
-soak: $(VENV)/.test ## the crash, fuzz and state-machine tests, ten times as long as in `make test`, and public harnesses
+soak: $(VENV)/.test ## all tests and all cases, those of crashes, fuzz and states ten times as long, and public harnesses
 	$(BIN)/python -m pip install --quiet --no-compile --editable ".[test,harnesses]" --constraint tests/constraints.txt
 	$(PYTEST) tests/test_inspect.py tests/test_docs.py
-	COW_TEST_SCALE=10 $(PYTEST) -m soak
+	COW_TEST_SCALE=10 $(PYTEST)
 
 lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/ruff check .

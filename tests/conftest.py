@@ -82,12 +82,28 @@ def all_scenes() -> list[Path]:
     return folders + shared[:: max(1, 3 // SCALE)]
 
 
+LONG_TABLE = 8  # cases of one test; of longer ones a third is run, all of them in `make soak`
+
+
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    chosen = config.args != config.getini("testpaths") or config.option.keyword or config.option.markexpr
+    if SCALE == 1 and not chosen:  # what is chosen by name is run whole
+        thin_out(config, items)
     for item in items:
         if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
             item.add_marker(pytest.mark.soak)
     items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
+
+
+def thin_out(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leaves every third case of long tables."""
+    of_test: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        of_test.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    left = {id(item) for cases in of_test.values() for item in (cases[::3] if len(cases) > LONG_TABLE else cases)}
+    config.hook.pytest_deselected(items=[item for item in items if id(item) not in left])
+    items[:] = [item for item in items if id(item) in left]
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
