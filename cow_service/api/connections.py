@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import resource
+import sys
 from typing import ClassVar
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -72,6 +72,10 @@ class Connection(H11Protocol):
 
 def allow_connections() -> None:
     """Raises the number of files that this process may open as far as the system lets it, and fits `most` to it."""
+    if sys.platform == "win32":
+        return  # it has no such limit on connections
+    import resource  # noqa: PLC0415 # of Unix
+
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MAX_CONNECTIONS + RESERVED_FILES
     if soft != resource.RLIM_INFINITY and soft < wanted:

@@ -16,7 +16,7 @@ _RELEASE = "release_body"  # in the state of a request
 class BodyLimit:
     """ASGI middleware: counts the body's bytes, and the seconds from the request's headers to the body's end.
 
-    How long the headers take is the HTTP server's matter, uvicorn's: the app hears of a request once they are in.
+    How long the headers take is the matter of `api/connections.py`: the app hears of a request once they are in.
     """
 
     def __init__(self, app: ASGIApp, megabytes: float, seconds: float, megabytes_at_once: float) -> None:
