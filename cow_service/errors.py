@@ -37,6 +37,8 @@
     ├── ShuttingDown               shutting-down            503
     ├── Canceled                   canceled                 409
     ├── StorageUnavailable         storage-unavailable      503
+    ├── WorkerEnded                worker-ended             500
+    ├── JobTimeout                 job-timeout              504
     └── InternalError              internal-error           500
 
 An error's docstring is its title on the wire. Its message says what was wrong, with the value, and what to do about it;
@@ -326,10 +328,27 @@ class StorageUnavailable(CowError):
     code, status = "storage-unavailable", 503
 
 
+class WorkerEnded(CowError):
+    """The process that computed the job ended before the job was done."""
+
+    code, status = "worker-ended", 500
+
+
+class JobTimeout(CowError):
+    """The job took longer than this server allows."""
+
+    code, status = "job-timeout", 504
+
+
 class InternalError(CowError):
     """The server met an error of its own."""
 
     code, status = "internal-error", 500
+
+
+def unforeseen() -> InternalError:
+    """The error for an exception that is none of these, and whose text may tell what it should not."""
+    return InternalError("The server met an error that it did not foresee; its log has the trace.")
 
 
 def kinds(base: type[CowError] = CowError) -> dict[str, type[CowError]]:

@@ -11,6 +11,7 @@ from cow_service.api.connections import Connection, allow_connections
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
+from cow_service.workers.pool import WorkerPool
 
 LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
 CLOSE_SECONDS = 5.0  # for open connections, after the grace period of running jobs
@@ -31,8 +32,13 @@ class Server(uvicorn.Server):
 
 def run_server(service: Service) -> None:
     """Serves until a signal ends it. Raises the `CowError` for which the default request cannot be served."""
-    engine, readiness = JobEngine(service), Readiness(service)
     settings = service.settings
+    pool = WorkerPool(settings) if settings.workers else None
+    if pool is None:
+        engine, readiness = JobEngine(service), Readiness(service)
+    else:
+        pool.start()  # it loads what the jobs need while the server starts
+        engine, readiness = JobEngine(service, pool), Readiness(service, pool.check)
     config = uvicorn.Config(
         create_app(engine, readiness),
         host=settings.host,

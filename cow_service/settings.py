@@ -93,6 +93,28 @@ class Settings(BaseSettings):
         description="Where models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU.",
     )
     concurrency: int = Field(default=2, ge=1, le=256, description="Requests computed at the same time; others wait.")
+    workers: bool = Field(
+        default=True,
+        description="Compute in processes of their own, one per request at a time; 0: in that of the server, where a "
+        "crash ends every job and Python computes one at a time.",
+    )
+    worker_memory_mb: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="Memory that one worker process may take, MB; its job fails with worker-ended beyond that. By "
+        "default 80% of the machine's.",
+    )
+    worker_jobs: int = Field(
+        default=1000, ge=1, description="Jobs after which a worker process is replaced by a new one."
+    )
+    job_timeout: float = Field(
+        default=3600,
+        gt=0,
+        le=604_800,
+        allow_inf_nan=False,
+        description="Seconds that one job may compute in a worker process; beyond that it fails with job-timeout.",
+    )
     generator_concurrency: dict[str, Annotated[int, Field(ge=1, le=256)]] = Field(
         default_factory=dict,
         description="Clips that a generator makes at the same time, by its name, as JSON; by default 1 of a video "

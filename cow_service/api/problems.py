@@ -48,11 +48,6 @@ def respond(error: CowError) -> JSONResponse:
     return JSONResponse(error.as_problem(), error.status, headers=headers | error.headers, media_type=MEDIA_TYPE)
 
 
-def unforeseen_error() -> InternalError:
-    """The error for an exception that no code expects."""
-    return InternalError("The server met an error that it did not foresee; its log has the trace.")
-
-
 def install_problem_handlers(app: FastAPI) -> None:
     """Makes every error of the app a problem, those of the framework and unforeseen ones included."""
 
@@ -72,9 +67,9 @@ def install_problem_handlers(app: FastAPI) -> None:
         assert isinstance(error, RequestValidationError)
         return respond(invalid(error))
 
-    async def unforeseen(request: Request, error: Exception) -> JSONResponse:
+    async def any_other(request: Request, error: Exception) -> JSONResponse:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return respond(unforeseen_error())
+        return respond(unforeseen())
 
     async def gone(request: Request, _: Exception) -> Response:
         log.info("%s %s: the caller left before its body was in", request.method, request.url.path)
@@ -84,7 +79,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(CowError, cow_error)
     app.add_exception_handler(HTTPException, framework_error)
     app.add_exception_handler(RequestValidationError, validation_error)
-    app.add_exception_handler(Exception, unforeseen)
+    app.add_exception_handler(Exception, any_other)
 
 
 def documented(*errors: type[CowError]) -> dict[int | str, dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from queue import SimpleQueue
@@ -11,6 +12,8 @@ from typing import Any
 from cow_service.client.batches import Batch, Outcome
 from cow_service.client.questions import Question
 from cow_service.client.steps import Steps, Stopped
+
+END_SECONDS = 0.5  # that threads are given to end before their connections are closed
 
 
 def outcomes(run: Callable[[Steps[Any], threading.Event], Any], batch: Batch) -> Iterator[Outcome[Any]]:
@@ -57,3 +60,6 @@ def outcomes(run: Callable[[Steps[Any], threading.Event], Any], batch: Batch) ->
         stop.set()
         for _ in threads:
             todo.put(None)
+        until = time.monotonic() + END_SECONDS
+        for thread in threads:
+            thread.join(max(0.0, until - time.monotonic()))

@@ -38,6 +38,7 @@ from cow_service.errors import (
     StorageUnavailable,
 )
 from cow_service.jobs import state, workflows
+from cow_service.jobs.computing import Computer, InProcess
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.leases import ExecutorLease
 from cow_service.jobs.maintenance import Maintenance
@@ -67,8 +68,10 @@ log = logging.getLogger("cow_service")
 class JobEngine:
     """Runs the jobs of one service, from `start` to `close`. Its methods block: not for an event loop."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Service, computer: Computer | None = None) -> None:
+        """`computer`: who computes the jobs; by default this process."""
         self.open_jobs = OpenJobs(service)
+        self._computer = computer or InProcess(self.open_jobs)
         self.active, self.database = self.open_jobs.active, self.open_jobs.database
         self.webhooks = Webhooks(service.settings)
         self._lease = ExecutorLease(service.settings.data_dir / "executors")
@@ -91,12 +94,6 @@ class JobEngine:
         self.webhooks.use(service.settings)
 
     @property
-    def max_running_jobs_per_generator(self) -> int:
-        """How many jobs of one generator this process runs: those that compute, and those that wait for an MLLM."""
-        settings = self.service.settings
-        return settings.concurrency + settings.mllm_concurrency
-
-    @property
     def is_running(self) -> bool:
         """Whether it was started and not closed."""
         return self._threads is not None
@@ -115,7 +112,7 @@ class JobEngine:
             use_listen_notify=False,
             log_level="WARNING",
         )
-        workflows.set_runner(Worker(self.open_jobs, self.webhooks, self.work_ended))
+        workflows.set_runner(Worker(self.open_jobs, self.webhooks, self._computer, self.work_ended))
         try:
             self.database.create_tables()
             self.database.claim(self._lease.folder_id)
@@ -131,6 +128,7 @@ class JobEngine:
             self._lease.release()
             raise
         self._stopping = False
+        self._computer.start()
         self._threads = ThreadPoolExecutor(thread_name_prefix="cow-job", max_workers=1024)
         self.open_jobs.recount()
         self.service.metrics.queue_depth = self.open_jobs.depth
@@ -161,6 +159,7 @@ class JobEngine:
         if self._threads is not None:
             self._threads.shutdown(wait=True, cancel_futures=True)
             self._threads = None
+        self._computer.close()
         workflows.set_runner(None)
         self.database.close()
         self._lease.release()
@@ -210,7 +209,7 @@ class JobEngine:
     def _submit(self, job_id: str, spec: JobSpec, owner: str | None, image: DecodedImage) -> None:
         with self.open_jobs.lock:  # the count must not change between the check and the record
             self.check_capacity(owner)
-            starts_now = self.open_jobs.count(spec.generator) < self.max_running_jobs_per_generator
+            starts_now = self.open_jobs.count(spec.generator) < self._computer.capacity(spec.generator)
             spec = spec.model_copy(update={"turn": self.open_jobs.next_turn(owner)})
             self.open_jobs.record(job_id, OpenJob(spec.generator, owner, spec.turn))
         try:
@@ -343,7 +342,7 @@ class JobEngine:
             if name not in self._queues:
                 DBOS.register_queue(
                     name,
-                    worker_concurrency=self.max_running_jobs_per_generator,
+                    worker_concurrency=self._computer.capacity(spec.generator),
                     polling_interval_sec=QUEUE_POLL_SECONDS,
                     on_conflict="always_update",
                 )

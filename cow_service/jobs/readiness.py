@@ -13,10 +13,12 @@ MIN_FREE_BYTES = 200_000_000  # on the disk of the data folder
 
 
 class Readiness:
-    """Loads the default backends once, in a thread of its own."""
+    """Waits once until the default backends are loaded, in a thread of its own."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Service, load: Callable[[], None] | None = None) -> None:
+        """`load` returns once they are loaded, and raises the `CowError` for which they cannot be."""
         self._service = service
+        self._load_backends = load or service.check
         self._done = threading.Event()
         self._started = False
         self.error: CowError | None = None
@@ -36,7 +38,8 @@ class Readiness:
         """Raises `NotReady` while loading, `StorageUnavailable`, `ReaderUnavailable`, `GeneratorUnavailable`."""
         if self._started and not self._done.is_set():
             raise NotReady("The default reader and generator are being loaded. Ask again in a while.")
-        self._service.check()
+        self._service.artifacts.check()
+        self._load_backends()
         free = shutil.disk_usage(self._service.settings.data_dir).free
         if free < MIN_FREE_BYTES:
             needed = MIN_FREE_BYTES / 1e6
@@ -46,7 +49,7 @@ class Readiness:
 
     def _load(self, failed: Callable[[], None]) -> None:
         try:
-            self._service.check()
+            self._load_backends()
         except CowError as error:
             self.error = error
             failed()

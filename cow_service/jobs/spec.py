@@ -31,6 +31,12 @@ class JobSpec(Record):
         return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
 
     @property
+    def image(self) -> str:
+        """The digest of the image."""
+        digest: str = self.request["image"]["artifact"]
+        return digest
+
+    @property
     def masks(self) -> list[str]:
         """The digests of the masks that the request gives."""
         places = [self.request.get("grounding") or {}, *self.request.get("objects", ())]

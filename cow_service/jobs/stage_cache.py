@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,17 +14,19 @@ from cow_service.errors import ArtifactNotFound
 from cow_service.jobs.database import Database
 from cow_service.jobs.outages import Outages
 from cow_service.media.artifacts import ArtifactStore
-from cow_service.observability.metrics import Metrics
 from cow_service.requests import Stage
 from cow_service.stages.keys import StageKey
 from cow_service.stages.results import RESULT_TYPES, StageResult, digest_of
 
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for another one's result checks whether it was canceled
 
+HoldKey = Callable[[str, Callable[[], None]], AbstractContextManager[None]]
+"""Holds the lock of a key; what the second argument raises ends the wait for it."""
+
 
 @dataclass
 class KeyLocks:
-    """A lock for each key in use: what one job of this process computes, another one waits for."""
+    """A lock for each key in use: what one job computes, another one waits for."""
 
     _guard: threading.Lock = field(default_factory=threading.Lock)
     _locks: dict[str, tuple[threading.Lock, int]] = field(default_factory=dict[str, tuple[threading.Lock, int]])
@@ -51,15 +53,15 @@ class KeyLocks:
 
 @dataclass
 class StoredStep:
-    """The `Step` of one job: a result is stored as soon as it is there, and this process does not compute it again."""
+    """The `Step` of one job: a result is stored as soon as it is there, and not computed again."""
 
     job_id: str
     owner: str | None  # whose results of other jobs may be taken: nobody learns what another key asked
     fresh: bool  # results of other jobs are not taken
     database: Database
     artifacts: ArtifactStore
-    metrics: Metrics
-    locks: KeyLocks
+    looked_for: Callable[[Stage, bool], None]  # hears whether a stage was found
+    hold_key: HoldKey
     outages: Outages
 
     def __call__(
@@ -71,15 +73,15 @@ class StoredStep:
             digest = digest_of({"job": self.job_id, "key": key.digest})
         elif self.owner is not None:
             digest = digest_of({"owner": self.owner, "key": key.digest})
-        with self.locks.held(digest, self.outages.check_canceled):
+        with self.hold_key(digest, self.outages.check_canceled):
             found = self.outages.wait_through(lambda: self._find(stage, digest))
             if found is not None:
                 result, reused = found
-                self.metrics.stage_cache(stage, hit=reused)
+                self.looked_for(stage, reused)
                 if reused:
                     self.outages.wait_through(lambda: self.database.reuse_result(self.job_id, stage, result.artifacts))
                 return result, reused
-            self.metrics.stage_cache(stage, hit=False)
+            self.looked_for(stage, False)
             result = self.outages.wait_through(compute)
             self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
             kept = digest, self.job_id, stage, result.model_dump_json(), result.artifacts

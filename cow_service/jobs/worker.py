@@ -1,4 +1,4 @@
-"""The work on one job, inside its workflow: the service's stages, with progress, checkpoints and an end."""
+"""The work on one job, inside its workflow: given to who computes it, with progress and an end."""
 
 from __future__ import annotations
 
@@ -9,19 +9,15 @@ from typing import Any
 
 from dbos import DBOS
 
-from cow_service.errors import Canceled, CowError, InternalError
+from cow_service.errors import Canceled, CowError, unforeseen
 from cow_service.jobs import state
 from cow_service.jobs.active import ActiveJob
+from cow_service.jobs.computing import Computer, Work
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.outages import Outages
 from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.stage_cache import KeyLocks, StoredStep
 from cow_service.jobs.webhooks import Webhooks
-from cow_service.observability import tracing
-from cow_service.observability.context import bound
-from cow_service.pipeline import answer, simulate
-from cow_service.records import Answer, Simulation
-from cow_service.requests import AnswerRequest, ImageArtifact, Stage
+from cow_service.observability import context, tracing
 
 POLL_SECONDS, MAX_POLLS = 0.1, 100  # until the database has the end of a webhook's job
 
@@ -35,11 +31,13 @@ class JobAborted(BaseException):
 class Worker:
     """Does the work of an engine's jobs. Thread-safe."""
 
-    def __init__(self, open_jobs: OpenJobs, webhooks: Webhooks, on_work_ended: Callable[[str], None]) -> None:
+    def __init__(
+        self, open_jobs: OpenJobs, webhooks: Webhooks, computer: Computer, on_work_ended: Callable[[str], None]
+    ) -> None:
         self._open_jobs = open_jobs
         self._webhooks = webhooks
+        self._computer = computer
         self._on_work_ended = on_work_ended
-        self._locks = KeyLocks()
 
     def run(self, job_id: str, spec: dict[str, Any]) -> str:
         """Does the work of a job; returns the result as JSON.
@@ -49,7 +47,7 @@ class Worker:
         job = JobSpec.model_validate(spec)
         try:
             with (
-                bound(request=job.request_id, job=job_id),
+                context.bound(request=job.request_id, job=job_id),
                 tracing.span(f"job {job.kind}", parent=job.traceparent, job_id=job_id),
                 self._open_jobs.active.running(job_id) as running,
             ):
@@ -83,7 +81,7 @@ class Worker:
             outages.wait_through(lambda: self._webhooks.job_ended(job_id, spec.webhook))
 
         try:
-            result = self._result(job_id, spec, running, outages)
+            outcome = self._computer.compute(self._work(job_id, spec, running))
         except Canceled as error:
             raise JobAborted from error
         except CowError as error:
@@ -95,34 +93,21 @@ class Worker:
             log.exception("job %s failed", job_id)
             metrics.job(spec.kind, "failed")
             ended()
-            raise InternalError("The server met an error that it did not foresee; its log has the trace.") from error
-        for stage, seconds in result.timings.items():
-            if stage not in result.reused:
-                metrics.stage(stage, seconds)
+            raise unforeseen() from error
+        for stage, seconds in outcome.timings.items():
+            metrics.stage(stage, seconds)
         metrics.job(spec.kind, "succeeded")
         ended()
-        return result.model_dump_json()
+        return outcome.result
 
-    def _result(self, job_id: str, spec: JobSpec, running: ActiveJob, outages: Outages) -> Simulation | Answer:
-        open_jobs, service = self._open_jobs, self._open_jobs.service
-
-        def progress(stage: Stage | None, done: float) -> None:
-            open_jobs.active.progress(job_id, running, stage, done)
-
-        step = StoredStep(
+    def _work(self, job_id: str, spec: JobSpec, running: ActiveJob) -> Work:
+        active = self._open_jobs.active
+        return Work(
             job_id=job_id,
+            spec=spec.model_copy(update={"traceparent": context.traceparent()}),
             owner=DBOS.authenticated_user,
-            fresh=spec.fresh,
-            database=open_jobs.database,
-            artifacts=service.artifacts,
-            metrics=service.metrics,
-            locks=self._locks,
-            outages=outages,
+            image=lambda: active.take_image(job_id, spec.image),
+            progress=lambda stage, done: active.progress(job_id, running, stage, done),
+            check=running.check,
+            looked_for=self._open_jobs.service.metrics.stage_cache,
         )
-        request = spec.parsed()
-        assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
-        image = open_jobs.active.take_image(job_id, request.image.artifact)
-        given = progress, image, step, job_id, spec.created_at, spec.turn
-        if isinstance(request, AnswerRequest):
-            return answer(outages.wait_through(lambda: service.prepare(request, *given)))
-        return simulate(outages.wait_through(lambda: service.prepare(request, *given)))

@@ -32,6 +32,12 @@ class Manifest(Record):
     licence: str
     weights: str | None = Field(default=None, description="Repository of the weights; null where there are none.")
     extra: str | None = Field(default=None, description="The optional dependency group that it needs.")
+    concurrency: int | None = Field(
+        default=None,
+        ge=1,
+        description="Jobs that a generator or reader works on at the same time on a device of its own; null where it "
+        "has none.",
+    )
     modules: tuple[str, ...] = Field(default=(), description="Python modules that must be importable.")
     settings: tuple[str, ...] = Field(default=(), description="Settings (COW_...) that it cannot do without.")
     sources: dict[str, Source] = Field(default_factory=dict, description="What `cow models pull` downloads, by part.")

@@ -14,7 +14,8 @@ from urllib.parse import quote
 from starlette.routing import compile_path
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from cow_service.api.problems import respond, unforeseen_error
+from cow_service.api.problems import respond
+from cow_service.errors import unforeseen
 from cow_service.observability import tracing
 from cow_service.observability.metrics import Metrics
 
@@ -60,7 +61,7 @@ class AccessLog:
         except Exception as error:
             if not status:
                 log.error("%s %s failed", scope["method"], _shown(scope), exc_info=error)
-                await respond(unforeseen_error())(scope, receive, observed)
+                await respond(unforeseen())(scope, receive, observed)
             elif not complete:
                 raise  # the server must break the connection off: the caller would take the part for the whole
             # Else the framework has answered and logged it, and raised it again only to tell the server.

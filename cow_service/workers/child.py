@@ -1,0 +1,195 @@
+"""The main program of a worker process: `python -m cow_service.workers.child FD`, on one end of a pipe.
+
+It ends as soon as the pipe does, whatever it is doing: the process that started it is gone then, and another one takes
+its jobs.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import psutil
+
+from cow_service.errors import Canceled, CowError, unforeseen
+from cow_service.jobs.computing import Work, compute
+from cow_service.jobs.database import Database
+from cow_service.jobs.serializer import JsonSerializer
+from cow_service.jobs.stage_cache import HoldKey as HoldKeyOf
+from cow_service.observability import context, tracing
+from cow_service.observability import logging as logs
+from cow_service.readers.question.sentences import parse
+from cow_service.requests import Stage
+from cow_service.service import Service
+from cow_service.settings import Settings
+from cow_service.workers.messages import (
+    Cancel,
+    Configure,
+    Failed,
+    FromWorker,
+    Heartbeat,
+    HoldKey,
+    KeyHeld,
+    Loaded,
+    LookedFor,
+    Progressed,
+    ReleaseKey,
+    Start,
+    Stop,
+    Succeeded,
+    ToWorker,
+)
+
+HEARTBEAT_SECONDS = 1.0
+CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for a key checks whether it was canceled
+MIN_PROGRESS = 0.005  # of a stage, between two messages
+OOM_SCORE = "500"  # the system ends this process before the one that holds the jobs
+
+log = logging.getLogger("cow_service")
+
+
+@dataclass
+class _Job:
+    """One job at work here."""
+
+    canceled: threading.Event = field(default_factory=threading.Event)
+    key_held: threading.Event = field(default_factory=threading.Event)
+    told: tuple[Stage | None, float] = (None, 0.0)
+
+    def check(self) -> None:
+        if self.canceled.is_set():
+            raise Canceled("The job was canceled.")
+
+
+class WorkerProcess:
+    """Computes the jobs that come over a pipe, each in a thread."""
+
+    def __init__(self, pipe: Connection[FromWorker, ToWorker], settings: Settings) -> None:
+        self._pipe = pipe
+        self._sending = threading.Lock()
+        self._service = Service(settings)
+        self._database = Database(settings)
+        self._jobs: dict[str, _Job] = {}
+
+    def run(self) -> None:
+        """Works until the pipe ends."""
+        threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
+        threading.Thread(target=self._load, name="load", daemon=True).start()
+        while True:
+            match self._pipe.recv():
+                case Start() as start:
+                    self._jobs[start.job_id] = _Job()
+                    threading.Thread(target=self._work, args=(start,), name="job", daemon=True).start()
+                case Cancel(job_id) if job_id in self._jobs:
+                    self._jobs[job_id].canceled.set()
+                case KeyHeld(job_id) if job_id in self._jobs:
+                    self._jobs[job_id].key_held.set()
+                case Stop():
+                    return
+                case _:
+                    pass  # about a job that has just ended
+
+    def _send(self, message: FromWorker) -> None:
+        with self._sending:
+            self._pipe.send(message)
+
+    def _beat(self) -> None:
+        process, ended = psutil.Process(), threading.Event()
+        while not ended.wait(HEARTBEAT_SECONDS):
+            self._send(Heartbeat(process.memory_info().rss))
+
+    def _load(self) -> None:
+        try:
+            self._service.check()
+        except CowError as error:
+            self._send(Loaded(JsonSerializer().serialize(error)))
+        except Exception:
+            log.exception("the default backends could not be loaded")
+            self._send(Loaded(JsonSerializer().serialize(unforeseen())))
+        else:
+            self._send(Loaded(None))
+            parse("")  # it builds the grammar, for which the first job would have to wait
+
+    def _work(self, start: Start) -> None:
+        spec = start.spec
+        try:
+            with (
+                context.bound(request=spec.request_id, job=start.job_id),
+                tracing.span("compute", parent=spec.traceparent, job_id=start.job_id),
+            ):
+                work, hold_key = self._work_of(start), self._hold_key_of(start.job_id)
+                message = Succeeded(start.job_id, compute(work, self._service, self._database, hold_key))
+        except CowError as error:
+            message = Failed(start.job_id, JsonSerializer().serialize(error))
+        except Exception:
+            log.exception("job %s failed", start.job_id)
+            message = Failed(start.job_id, JsonSerializer().serialize(unforeseen()))
+        del self._jobs[start.job_id]
+        self._send(message)
+
+    def _work_of(self, start: Start) -> Work:
+        job_id, job, images = start.job_id, self._jobs[start.job_id], [start.image]
+
+        def progress(stage: Stage | None, done: float) -> None:
+            job.check()
+            if stage != job.told[0] or done >= min(1.0, job.told[1] + MIN_PROGRESS):
+                job.told = stage, done
+                self._send(Progressed(job_id, stage, done))
+
+        return Work(
+            job_id=job_id,
+            spec=start.spec,
+            owner=start.owner,
+            image=lambda: images.pop() if images else None,
+            progress=progress,
+            check=job.check,
+            looked_for=lambda stage, found: self._send(LookedFor(job_id, stage, found)),
+        )
+
+    def _hold_key_of(self, job_id: str) -> HoldKeyOf:
+        job = self._jobs[job_id]
+
+        @contextmanager
+        def held(key: str, check_canceled: Callable[[], None]) -> Generator[None]:
+            job.key_held.clear()
+            self._send(HoldKey(job_id, key))
+            try:
+                while not job.key_held.wait(CANCEL_POLL_SECONDS):
+                    check_canceled()
+                yield
+            finally:
+                self._send(ReleaseKey(job_id, key))
+
+        return held
+
+
+def main(descriptor: int) -> None:
+    """Works on the pipe of a file descriptor until it ends."""
+    # A terminal's Ctrl-C and a service manager's stop reach every process: the one that holds the jobs decides.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    with suppress(OSError):  # elsewhere than on Linux
+        Path("/proc/self/oom_score_adj").write_text(OOM_SCORE)
+    pipe: Connection[FromWorker, ToWorker] = Connection(descriptor)
+    try:
+        first = pipe.recv()
+        assert isinstance(first, Configure)
+        logs.set_up(first.settings)
+        tracing.start()
+        WorkerProcess(pipe, first.settings).run()
+    except (EOFError, OSError):
+        pass
+    tracing.stop()
+    os._exit(0)  # threads may be at work; nobody wants what they do
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

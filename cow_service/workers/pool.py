@@ -1,0 +1,221 @@
+"""The worker processes of one server or worker: how many there are, which job each gets, and when one is replaced.
+
+Jobs of light generators share some processes, `COW_CONCURRENCY` of them. A generator with a device of its own has a
+process of its own: no photograph's frames wait for its clips, and its weights are loaded once.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from functools import partial
+
+import psutil
+
+from cow_service.concurrency import PrioritySemaphore
+from cow_service.errors import ShuttingDown, WorkerEnded
+from cow_service.jobs.computing import Outcome, Work
+from cow_service.jobs.stage_cache import KeyLocks
+from cow_service.settings import Settings
+from cow_service.stages.run import priority_of
+from cow_service.weights.manifests import find_manifest
+from cow_service.workers.process import Worker, WorkerGone
+
+LIGHT = "light"
+MAX_CRASHES = 3  # of workers that had nothing but the job
+HEARTBEAT_TIMEOUT_SECONDS = 15.0  # after which a worker that says nothing is ended
+WATCH_SECONDS = 0.5  # between two looks at each worker
+SHARE_OF_MEMORY = 0.8  # of the machine's, that one worker may take where no setting says how much
+RENEW_SHARE = 0.75  # of that, from which on a worker without a job is replaced
+
+log = logging.getLogger("cow_service")
+
+
+class Group:
+    """The workers for one kind of jobs. They are started when they are first needed."""
+
+    def __init__(self, name: str, settings: Settings, size: int, jobs_each: int) -> None:
+        self.name, self.size, self.jobs_each = name, size, jobs_each
+        self.places = PrioritySemaphore(size * jobs_each)
+        self.workers: list[Worker] = []
+        self.alone = threading.Lock()  # held by a job that is computed for itself, as its last worker crashed
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._taken: dict[Worker, int] = {}
+        self._closed = False
+
+    def start(self) -> None:
+        """Starts the first worker."""
+        with self._lock:
+            self._start()
+
+    def take(self, *, fresh: bool = False) -> Worker:
+        """The worker with the fewest jobs, or a new one where all have some and there may be more."""
+        with self._lock:
+            free = [one for one in self.workers if one.is_alive and self._taken[one] < self.jobs_each]
+            best = min(free, key=lambda one: self._taken[one], default=None)
+            if fresh or best is None or (self._taken[best] and len(self.workers) < self.size):
+                best = self._start()
+            self._taken[best] += 1
+            return best
+
+    def give_back(self, worker: Worker, *, renew: bool) -> None:
+        """The job of a worker is over. One that is to be renewed gets no more jobs, and ends without any."""
+        with self._lock:
+            self._taken[worker] -= 1
+            if (renew or not worker.is_alive) and worker in self.workers:
+                self.workers.remove(worker)
+            ends = worker not in self.workers and not self._taken[worker]
+            if ends:
+                del self._taken[worker]
+        if ends:
+            threading.Thread(target=worker.close, name="cow-worker-end", daemon=True).start()
+
+    def close(self) -> None:
+        """Ends all workers."""
+        with self._lock:
+            self._closed = True
+            workers, self.workers = self.workers, []
+        for worker in workers:
+            worker.close()
+
+    def _start(self) -> Worker:
+        if self._closed:
+            raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
+        worker = Worker(f"{self.name}-{len(self.workers) + 1}", self._settings)
+        self.workers.append(worker)
+        self._taken[worker] = 0
+        return worker
+
+
+class WorkerPool:
+    """All workers of this process. A `Computer` of a job engine."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._locks = KeyLocks()
+        self._guard = threading.Lock()
+        self._groups: dict[str, Group] = {}
+        self._closed = threading.Event()
+        limit = settings.worker_memory_mb
+        self._memory_limit = limit * 1e6 if limit else SHARE_OF_MEMORY * psutil.virtual_memory().total
+        self._watching: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Starts a worker for the default generator, which loads it, and one for all light ones."""
+        if self._watching is not None:
+            return
+        self._watching = threading.Thread(target=self._watch, name="cow-workers", daemon=True)
+        self._watching.start()
+        for name in {LIGHT, _group_of(self._settings.reader, self._settings.generator, self._settings)}:
+            self._group(name).start()
+
+    def close(self) -> None:
+        """Ends all workers."""
+        self._closed.set()
+        for group in self.groups:
+            group.close()
+        if self._watching is not None:
+            self._watching.join()
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """The groups that have, or had, workers."""
+        with self._guard:
+            return tuple(self._groups.values())
+
+    def capacity(self, generator: str) -> int:
+        """As many as its workers have places for."""
+        group = self._group(_group_of(self._settings.reader, generator, self._settings))
+        return group.size * group.jobs_each
+
+    def check(self) -> None:
+        """Waits until the default backends are loaded. Raises the `CowError` for which they cannot be."""
+        for group in self.groups:
+            for worker in tuple(group.workers)[:1]:
+                worker.wait_loaded()
+
+    def compute(self, work: Work) -> Outcome:
+        """Gives a job to a worker, in its turn. Raises the `CowError` that it fails with, `Canceled`, `WorkerEnded`."""
+        group = self._group(_group_of(work.spec.reader, work.spec.generator, self._settings))
+        priority = priority_of(work.spec.turn, work.spec.created_at)
+        crashes, alone = 0, group.jobs_each == 1
+        with group.places.held(priority, partial(work.progress, None, 0.0)):
+            while True:
+                try:
+                    if alone and group.jobs_each > 1:
+                        with group.alone:
+                            return self._computed(work, group, fresh=True)
+                    return self._computed(work, group, fresh=False)
+                except WorkerGone as gone:
+                    crashes += alone
+                    log.warning("the worker of job %s %s", work.job_id, gone)
+                    if crashes == MAX_CRASHES or gone.is_final:
+                        raise WorkerEnded(f"The process that computed the job {gone}. It is not tried again.") from gone
+                    alone = True  # the next crash is this job's own
+
+    def _computed(self, work: Work, group: Group, *, fresh: bool) -> Outcome:
+        worker, renew = group.take(fresh=fresh), fresh
+        try:
+            return worker.run(work, self._locks)
+        finally:
+            renew |= worker.jobs_done >= self._settings.worker_jobs
+            renew |= worker.memory_bytes > RENEW_SHARE * self._memory_limit
+            group.give_back(worker, renew=renew)
+
+    def _group(self, name: str) -> Group:
+        with self._guard:
+            if name not in self._groups:
+                self._groups[name] = _new_group(name, self._settings)
+            return self._groups[name]
+
+    def _watch(self) -> None:
+        """Ends workers that are frozen or too large."""
+        looked = time.monotonic()
+        while not self._closed.wait(WATCH_SECONDS):
+            slept = time.monotonic() - looked > HEARTBEAT_TIMEOUT_SECONDS / 2  # this process was frozen itself
+            looked = time.monotonic()
+            for worker in [one for group in self.groups for one in tuple(group.workers)]:
+                if slept:
+                    worker.heard = looked
+                elif looked - worker.heard > HEARTBEAT_TIMEOUT_SECONDS:
+                    worker.kill(f"was ended, as it said nothing for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
+                elif worker.memory_bytes > self._memory_limit:
+                    worker.kill(f"was ended, as it took {worker.memory_bytes / 1e6:.0f} MB", is_final=True)
+
+
+def _group_of(reader: str, generator: str, settings: Settings) -> str:
+    """Who has a device has a process: a reader that has one uses the same for the clips."""
+    if _own(reader) is not None:
+        return reader
+    return LIGHT if _clips(generator, settings) is None else generator
+
+
+def _new_group(name: str, settings: Settings) -> Group:
+    waiting = settings.mllm_concurrency if settings.mllm else 0  # jobs that compute nothing, as they wait for an MLLM
+    if name == LIGHT:
+        size, cpu, generator = settings.concurrency, 1, settings.generator
+        if _clips(generator, settings) is not None:
+            generator = "cutout"
+        waiting = math.ceil(waiting / size)
+        jobs_each = cpu + waiting
+    elif _own(settings.reader) is None or name != settings.reader:
+        size, cpu, generator = 1, 1, name
+        jobs_each = (_clips(name, settings) or 1) + waiting
+    else:  # a reader that computes on a device
+        size, cpu, generator, waiting = 1, settings.concurrency, settings.generator, settings.mllm_concurrency
+        jobs_each = cpu + waiting
+    own = {"concurrency": cpu, "mllm_concurrency": max(1, waiting), "generator": generator}
+    return Group(name, settings.model_copy(update=own), size, jobs_each)
+
+
+def _clips(generator: str, settings: Settings) -> int | None:
+    """Clips at the same time of a generator that has a device or a limit of its own; None where it has none."""
+    return settings.generator_concurrency.get(generator, _own(generator))
+
+
+def _own(name: str) -> int | None:
+    manifest = find_manifest(name)
+    return None if manifest is None else manifest.concurrency

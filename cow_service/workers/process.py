@@ -1,0 +1,224 @@
+"""A worker process as seen by the process that started it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from queue import Empty, SimpleQueue
+
+from cow_service.errors import Canceled, CowError, JobTimeout
+from cow_service.jobs.computing import Outcome, Work
+from cow_service.jobs.serializer import JsonSerializer
+from cow_service.jobs.stage_cache import KeyLocks
+from cow_service.settings import Settings
+from cow_service.workers.messages import (
+    Cancel,
+    Configure,
+    Failed,
+    FromWorker,
+    Heartbeat,
+    HoldKey,
+    KeyHeld,
+    Loaded,
+    LookedFor,
+    OfJob,
+    Progressed,
+    ReleaseKey,
+    Start,
+    Stop,
+    Succeeded,
+    ToWorker,
+)
+
+POLL_SECONDS = 0.1  # how often a job at work is checked: whether it was canceled, whether its time is over
+CANCEL_SECONDS = 5.0  # that a canceled job is given to end; then its process is ended
+END_SECONDS = 5.0  # that a process is given to end by itself
+
+log = logging.getLogger("cow_service")
+
+
+class WorkerGone(Exception):
+    """The process ended, or was ended, while it had the job. The text says why.
+
+    `is_final`: it would be the same in another process.
+    """
+
+    def __init__(self, reason: str, *, is_final: bool) -> None:
+        super().__init__(reason)
+        self.is_final = is_final
+
+
+class Worker:
+    """One worker process, from its start to its end. Safe to use from every thread."""
+
+    def __init__(self, name: str, settings: Settings) -> None:
+        ours, theirs = Pipe()
+        self.name = name
+        self.jobs_done = 0
+        self.memory_bytes = 0
+        self.heard = time.monotonic()  # when it last sent a heartbeat
+        self._job_timeout = settings.job_timeout
+        self._pipe: Connection[ToWorker, FromWorker] = ours
+        self._sending = threading.Lock()
+        self._inboxes: dict[str, SimpleQueue[OfJob | None]] = {}
+        self._loaded = threading.Event()
+        self._load_error: CowError | None = None
+        self._ended = threading.Event()
+        self._reason, self._is_final = "crashed", False
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "cow_service.workers.child", str(theirs.fileno())], pass_fds=[theirs.fileno()]
+            )
+        threading.Thread(target=self._listen, name=f"cow-{name}", daemon=True).start()
+        self._send(Configure(settings))
+
+    @property
+    def pid(self) -> int:
+        """The process."""
+        return self._process.pid
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it can be given jobs."""
+        return not self._ended.is_set()
+
+    @property
+    def jobs(self) -> tuple[str, ...]:
+        """The jobs that it has."""
+        return tuple(self._inboxes)
+
+    def wait_loaded(self, seconds: float | None = None) -> bool:
+        """Waits until the default backends are loaded; returns whether they are. Raises the error of loading them."""
+        loaded = self._loaded.wait(seconds)
+        if self._load_error is not None:
+            raise self._load_error
+        return loaded
+
+    def run(self, work: Work, locks: KeyLocks) -> Outcome:
+        """Computes a job. Raises the `CowError` that it fails with, `Canceled`, `JobTimeout`, `WorkerGone`."""
+        inbox = self._inboxes[work.job_id] = SimpleQueue()
+        try:
+            with ExitStack() as stack:
+                self._send(Start(work.job_id, work.spec, work.owner, work.image()))
+                return self._follow(work, inbox, _Keys(self, work, locks, stack))
+        finally:
+            del self._inboxes[work.job_id]
+            self.jobs_done += 1
+
+    def kill(self, reason: str, *, is_final: bool = False) -> None:
+        """Ends the process at once, also one that is stopped. Its jobs raise `WorkerGone`."""
+        self._reason, self._is_final = reason, is_final
+        self._process.kill()
+
+    def close(self) -> None:
+        """Ends the process. It has no jobs."""
+        self._send(Stop())
+        try:
+            self._process.wait(END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self.kill("did not end")
+            self._process.wait()
+        self._ended.wait()
+        self._pipe.close()
+
+    def check_alive(self) -> None:
+        """Raises `WorkerGone`."""
+        if self._ended.is_set():
+            raise WorkerGone(f"{self._reason} ({_how(self._process.wait())})", is_final=self._is_final)
+
+    def _follow(self, work: Work, inbox: SimpleQueue[OfJob | None], keys: _Keys) -> Outcome:
+        until, canceled = time.monotonic() + self._job_timeout, False
+        while True:
+            message = None
+            try:
+                if not canceled:
+                    work.check()
+                with contextlib.suppress(Empty):
+                    message = inbox.get(timeout=POLL_SECONDS)
+                if isinstance(message, HoldKey):
+                    keys.hold(message.key)
+                elif isinstance(message, Progressed) and not canceled:
+                    work.progress(message.stage, message.done)
+            except Canceled:
+                canceled, until = True, time.monotonic() + CANCEL_SECONDS
+                self._send(Cancel(work.job_id))
+            match message:
+                case Succeeded(outcome=outcome):
+                    return outcome
+                case Failed(error=error):
+                    raise JsonSerializer().deserialize(error)
+                case LookedFor(stage=stage, found=found):
+                    work.looked_for(stage, found)
+                case ReleaseKey(key=key):
+                    keys.release(key)
+                case None:
+                    self.check_alive()
+                case _:
+                    pass
+            if time.monotonic() > until:
+                raise self._too_late(canceled=canceled)
+
+    def _too_late(self, *, canceled: bool) -> CowError:
+        """Ends the process, as a job in it goes on after its time."""
+        self.kill("was ended, as another job of it had to end")
+        if canceled:
+            return Canceled("The job was canceled.")
+        return JobTimeout(f"The job computed for more than {self._job_timeout:g} s, which COW_JOB_TIMEOUT allows.")
+
+    def _send(self, message: ToWorker) -> None:
+        with self._sending, contextlib.suppress(OSError):  # its end is noticed where its messages are read
+            self._pipe.send(message)
+
+    def _listen(self) -> None:
+        """Hands each message to the job that it is about, until the process has ended."""
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                match self._pipe.recv():
+                    case Heartbeat(memory_bytes=memory_bytes):
+                        self.heard, self.memory_bytes = time.monotonic(), memory_bytes
+                    case Loaded(error=error):
+                        self._load_error = None if error is None else JsonSerializer().deserialize(error)
+                        self._loaded.set()
+                    case message:
+                        if (inbox := self._inboxes.get(message.job_id)) is not None:
+                            inbox.put(message)
+        self._ended.set()
+        self._loaded.set()
+        for inbox in list(self._inboxes.values()):
+            inbox.put(None)
+
+
+class _Keys:
+    """The keys that a job holds; all are given back with `stack`."""
+
+    def __init__(self, worker: Worker, work: Work, locks: KeyLocks, stack: ExitStack) -> None:
+        self._worker, self._work, self._locks, self._stack = worker, work, locks, stack
+        self._held: dict[str, ExitStack] = {}
+
+    def hold(self, key: str) -> None:
+        """Waits for a key and tells the worker. Raises `Canceled` and `WorkerGone`."""
+
+        def check() -> None:
+            self._worker.check_alive()
+            self._work.check()
+
+        held = self._held[key] = self._stack.enter_context(ExitStack())
+        held.enter_context(self._locks.held(key, check))
+        self._worker._send(KeyHeld(self._work.job_id))  # pyright: ignore[reportPrivateUsage]
+
+    def release(self, key: str) -> None:
+        """Gives a key back, if the job holds it."""
+        if key in self._held:
+            self._held.pop(key).close()
+
+
+def _how(code: int) -> str:
+    """How a process ended, for the log."""
+    return f"signal {-code}" if code < 0 else f"exit code {code}"
