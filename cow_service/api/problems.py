@@ -23,6 +23,7 @@ from cow_service.errors import (
     MethodNotAllowed,
     NotFound,
     shortened,
+    unforeseen,
 )
 from cow_service.requests.faults import SHOWN_CHARACTERS, field_errors
 
