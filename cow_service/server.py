@@ -1,13 +1,17 @@
-"""Runs the HTTP server of one process: engine, readiness and a graceful shutdown."""
+"""Runs one process: an HTTP server with its engine, readiness and a graceful shutdown, or a worker without HTTP."""
 
 from __future__ import annotations
 
+import logging
+import signal
 import socket
+import threading
 
 import uvicorn
 
 from cow_service.api.app import create_app
 from cow_service.api.connections import Connection, allow_connections
+from cow_service.jobs.computing import Elsewhere
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
@@ -15,6 +19,8 @@ from cow_service.workers.pool import WorkerPool
 
 LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
 CLOSE_SECONDS = 5.0  # for open connections, after the grace period of running jobs
+
+log = logging.getLogger("cow_service")
 
 
 class Server(uvicorn.Server):
@@ -30,15 +36,44 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
+def _parts(service: Service) -> tuple[JobEngine, Readiness]:
+    """The engine of a server of its role, and what tells whether it is ready."""
+    if service.settings.role == "api":
+        return JobEngine(service, Elsewhere()), Readiness(service, lambda: None)
+    if not service.settings.workers:
+        return JobEngine(service), Readiness(service)
+    pool = WorkerPool(service.settings)
+    pool.start()  # it loads what the jobs need while the server starts
+    return JobEngine(service, pool), Readiness(service, pool.check)
+
+
+def run_worker(service: Service) -> None:
+    """Computes jobs of the queues until a signal ends it. Raises the `CowError` for which its backends do not load."""
+    pool, ended = WorkerPool(service.settings), threading.Event()
+
+    def end(number: int, frame: object) -> None:
+        ended.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    pool.start()
+    engine = JobEngine(service, pool)
+    try:
+        pool.check()
+        engine.start()
+        log.info("this worker takes jobs: %s", ", ".join(service.settings.queues) or "of all queues")
+        ended.wait()
+    finally:
+        if engine.is_running:
+            engine.close()
+        pool.close()
+        service.close()
+
+
 def run_server(service: Service) -> None:
     """Serves until a signal ends it. Raises the `CowError` for which the default request cannot be served."""
     settings = service.settings
-    pool = WorkerPool(settings) if settings.workers else None
-    if pool is None:
-        engine, readiness = JobEngine(service), Readiness(service)
-    else:
-        pool.start()  # it loads what the jobs need while the server starts
-        engine, readiness = JobEngine(service, pool), Readiness(service, pool.check)
+    engine, readiness = _parts(service)
     config = uvicorn.Config(
         create_app(engine, readiness),
         host=settings.host,

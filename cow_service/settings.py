@@ -98,6 +98,16 @@ class Settings(BaseSettings):
         description="Compute in processes of their own, one per request at a time; 0: in that of the server, where a "
         "crash ends every job and Python computes one at a time.",
     )
+    role: Literal["all", "api"] = Field(
+        default="all",
+        description="What a server does: api takes requests and computes nothing, for which `cow worker` runs beside "
+        "it on the same job database; all does both.",
+    )
+    queues: tuple[str, ...] = Field(
+        default=(),
+        description="Queues from which jobs are taken, as JSON: light, and the name of each backend with a device of "
+        "its own, such as ati; by default all.",
+    )
     worker_memory_mb: float | None = Field(
         default=None,
         gt=0,

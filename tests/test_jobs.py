@@ -923,7 +923,7 @@ def hear_until_cut(served: Served, job_id: str, heard: list[str]) -> None:
 def test_after_a_crash_jobs_go_on_where_they_were(tmp_path_factory: pytest.TempPathFactory) -> None:
     with Served(tmp_path_factory.mktemp("crash")) as one:
         key = {"Idempotency-Key": "crash"}
-        job = one.submit(slow(2, seed=96), **key)
+        job = one.submit(slow(5, seed=96), **key)
         done = one.ended(one.submit({**BODY, "image": data_url(picture(7))})["id"])
         one.rendering(job["id"])
         heard = events_until(one, job["id"], "grounding")
@@ -943,7 +943,7 @@ def test_after_a_crash_jobs_go_on_where_they_were(tmp_path_factory: pytest.TempP
         assert one.clips().count(96) == 2
         results = stage_results(one, job["id"])
         assert {stage: results[stage] for stage in before} == before  # not made again
-        assert one.http.post("/simulate", json=slow(2, seed=96), headers=key).json() == after["result"]
+        assert one.http.post("/simulate", json=slow(5, seed=96), headers=key).json() == after["result"]
 
 
 def events_until(served: Served, job_id: str, stage: str) -> list[dict[str, Any]]:

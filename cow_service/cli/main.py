@@ -132,19 +132,44 @@ def serve(
     port: Annotated[
         int | None, typer.Option(help="Port to listen on; 0 takes a free one.", show_default="COW_PORT, 8000")
     ] = None,
+    role: Annotated[
+        Literal["all", "api"] | None,
+        typer.Option(help="api: take requests only, and leave the jobs to `cow worker`.", show_default="COW_ROLE, all"),
+    ] = None,
 ) -> None:
     """Start the server."""
-    service = _service(host=host, port=port)
-    from cow_service.observability import logging as logs  # noqa: PLC0415
-    from cow_service.observability import tracing  # noqa: PLC0415
-
-    logs.set_up(service.settings)
-    tracing.start()
+    service = _served(host=host, port=port, role=role)
     from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
     from cow_service.server import run_server  # noqa: PLC0415
 
     warn_if_open(service.settings)
     run_server(service)
+
+
+@app.command()
+def worker(
+    queues: Annotated[
+        str | None,
+        typer.Option(help="Queues to take jobs from: light, and ati or another name.", show_default="COW_QUEUES, all"),
+    ] = None,
+) -> None:
+    """Compute the jobs of servers on the same job database."""
+    named = None if queues is None else tuple(name.strip() for name in queues.split(",") if name.strip())
+    service = _served(queues=named)
+    from cow_service.server import run_worker  # noqa: PLC0415
+
+    run_worker(service)
+
+
+def _served(**overrides: Any) -> Service:
+    """The service of a process that goes on, with its logs and traces."""
+    service = _service(**overrides)
+    from cow_service.observability import logging as logs  # noqa: PLC0415
+    from cow_service.observability import tracing  # noqa: PLC0415
+
+    logs.set_up(service.settings)
+    tracing.start()
+    return service
 
 
 @app.command()
@@ -174,13 +199,13 @@ def openapi() -> None:
     typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
 
 
-def _service(host: str | None = None, port: int | None = None) -> Service:
+def _service(**overrides: Any) -> Service:
     from cow_service.service import Service  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 
     for name, level in QUIET.items():
         os.environ.setdefault(name, level)
-    return Service(load_settings(host=host, port=port))
+    return Service(load_settings(**overrides))
 
 
 app.command("batch")(batch_cli.batch)

@@ -65,6 +65,7 @@ class ActiveJobs:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._running: dict[str, ActiveJob] = {}
+        self._elsewhere: dict[str, tuple[Stage | None, float]] = {}  # how far jobs are that other processes run
         self._waiters: dict[str, list[Waiter]] = {}
         self._images: dict[str, DecodedImage] = {}
 
@@ -114,6 +115,23 @@ class ActiveJobs:
         with self._lock:
             return self._running.get(job)
 
+    def at(self, job: str) -> tuple[Stage | None, float] | None:
+        """The stage and the share of it that is done, of a job that any process runs; None where that is not known."""
+        active = self.get(job)
+        return self._elsewhere.get(job) if active is None else active.at
+
+    def heard(self, job: str, stage: Stage | None, done: float) -> None:
+        """Another process told how far a job is; wakes its waiters."""
+        if self.get(job) is None:
+            self._elsewhere[job] = stage, done
+            for waiter in self._waiters_of(job):
+                waiter.loop.call_soon_threadsafe(waiter.changed.set)
+
+    def awaited_elsewhere(self) -> list[str]:
+        """The jobs that somebody waits for in this process, and that it does not run."""
+        with self._lock:
+            return [job for job in self._waiters if job not in self._running]
+
     def ids(self) -> list[str]:
         """The jobs that this process works on."""
         with self._lock:
@@ -154,6 +172,7 @@ class ActiveJobs:
     def notify_ended(self, job: str, outcome: str | CowError | None, created_at: str | None = None) -> None:
         """Tells waiters that a job has ended. `outcome` where it is at hand, and of which job of that id it is."""
         self.forget(job)
+        self._elsewhere.pop(job, None)
         for waiter in self._waiters_of(job):
             waiter.loop.call_soon_threadsafe(waiter.notify, outcome, created_at)
 

@@ -53,8 +53,8 @@ class Computer(Protocol):
         """Lets go of what it holds. No job is at work any more."""
         ...
 
-    def capacity(self, generator: str) -> int:
-        """How many jobs of a generator are taken at the same time."""
+    def capacity(self, queue: str) -> int:
+        """How many jobs of a queue are taken at the same time; 0 where none is."""
         ...
 
     def compute(self, work: Work) -> Outcome:
@@ -75,7 +75,7 @@ class InProcess:
     def close(self) -> None:
         """Does nothing."""
 
-    def capacity(self, generator: str) -> int:
+    def capacity(self, queue: str) -> int:
         """Those that compute, and those that wait for an MLLM."""
         settings = self._open_jobs.service.settings
         return settings.concurrency + settings.mllm_concurrency
@@ -83,6 +83,24 @@ class InProcess:
     def compute(self, work: Work) -> Outcome:
         """As the protocol says."""
         return compute(work, self._open_jobs.service, self._open_jobs.database, self._locks.held)
+
+
+class Elsewhere:
+    """Computes no jobs: worker processes that share the job database take them from its queues."""
+
+    def start(self) -> None:
+        """Does nothing."""
+
+    def close(self) -> None:
+        """Does nothing."""
+
+    def capacity(self, queue: str) -> int:
+        """None."""
+        return 0
+
+    def compute(self, work: Work) -> Outcome:
+        """Is never called, as no job is taken."""
+        raise NotImplementedError
 
 
 def compute(work: Work, service: Service, database: Database, hold_key: HoldKey) -> Outcome:

@@ -115,6 +115,13 @@ class Database:
         """Closes its connections."""
         self.engine.dispose()
 
+    def notify(self, channel: str, payload: str) -> None:
+        """Tells all who listen to a channel of PostgreSQL."""
+        with database_errors(), self._reading.connect() as connection:
+            connection.execute(
+                sa.text("SELECT pg_notify(:channel, :payload)"), {"channel": channel, "payload": payload}
+            )
+
     def flush(self) -> None:
         """Returns once everything that was committed is on the disk, and so outlives a loss of power."""
         if self.file is None:

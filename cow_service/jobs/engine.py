@@ -10,19 +10,14 @@ from __future__ import annotations
 import logging
 import threading
 import uuid
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from http import HTTPStatus
-from typing import Any
+from typing import Any, cast
 
 from dbos import (
     DBOS,
     DBOSConfig,
-    DBOSContextSetAuth,
-    SetEnqueueOptions,
-    SetWorkflowAttributes,
-    SetWorkflowID,
     WorkflowHandle,
 )
 from dbos import error as dbos_error
@@ -40,15 +35,15 @@ from cow_service.errors import (
 from cow_service.jobs import state, workflows
 from cow_service.jobs.computing import Computer, InProcess
 from cow_service.jobs.database import database_errors
-from cow_service.jobs.leases import ExecutorLease
+from cow_service.jobs.dispatch import Dispatch
+from cow_service.jobs.leases import folder_name, lease_of
 from cow_service.jobs.maintenance import Maintenance
+from cow_service.jobs.news import JobNews, news_of
 from cow_service.jobs.open_jobs import OpenJobs
+from cow_service.jobs.queues import WEBHOOKS, QueuePolls, queue_of
 from cow_service.jobs.serializer import JsonSerializer
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.state import (
-    ATTRIBUTE_CREATED_AT,
-    ATTRIBUTE_GENERATOR,
-    ATTRIBUTE_TURN,
     JobFilters,
     JobState,
     OpenJob,
@@ -57,9 +52,9 @@ from cow_service.jobs.webhooks import Webhooks
 from cow_service.jobs.worker import JobAborted, Worker
 from cow_service.media.images import DecodedImage
 from cow_service.records import TERMINAL, JobPage
+from cow_service.requests import Stage
 from cow_service.service import Service
 
-QUEUE_POLL_SECONDS = 0.25  # a process takes jobs from a queue before it has computed those that it has
 HANDOVER_SECONDS = 3.0  # for interrupted jobs to end, after the grace period
 
 log = logging.getLogger("cow_service")
@@ -74,11 +69,13 @@ class JobEngine:
         self._computer = computer or InProcess(self.open_jobs)
         self.active, self.database = self.open_jobs.active, self.open_jobs.database
         self.webhooks = Webhooks(service.settings)
-        self._lease = ExecutorLease(service.settings.data_dir / "executors")
-        self._maintenance = Maintenance(self.open_jobs, self._lease)
+        self._lease = lease_of(self.database, service.settings.data_dir / "executors")
+        self._polls = QueuePolls(self._computer.capacity)
+        self._news = news_of(self.database, self.active.awaited_elsewhere, self._has_ended)
+        self._maintenance = Maintenance(self.open_jobs, self._lease, self._news)
         self._stopping = False
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
-        self._queues: set[str] = set()
+        self._dispatch = Dispatch()
         self._followed: set[str] = set()  # jobs whose end a thread waits for
         self._submit_lock, self._cancel_lock = threading.Lock(), threading.Lock()
         self._threads: ThreadPoolExecutor | None = None
@@ -101,30 +98,10 @@ class JobEngine:
     def start(self) -> None:
         """Opens the database and recovers the jobs that were interrupted. Raises `StorageUnavailable`."""
         self.service.artifacts.check()
-        executor = self._lease.acquire()
-        config = DBOSConfig(
-            name="cow",
-            system_database_url=self.database.url,
-            system_database_engine=self.database.engine,
-            application_version=workflows.VERSION,
-            executor_id=executor,
-            serializer=JsonSerializer(),
-            use_listen_notify=False,
-            log_level="WARNING",
-        )
-        workflows.set_runner(Worker(self.open_jobs, self.webhooks, self._computer, self.work_ended))
+        workflows.set_runner(Worker(self.open_jobs, self.webhooks, self._computer, self._news, self.work_ended))
         try:
-            self.database.create_tables()
-            self.database.claim(self._lease.folder_id)
-            DBOS(config=config)
-            DBOS.launch()
-        except (SQLAlchemyError, dbos_error.DBOSException) as error:
-            DBOS.destroy()
-            self._lease.release()
-            raise StorageUnavailable(
-                f"The job database cannot be used ({type(error).__name__}): see COW_DATABASE_URL."
-            ) from error
-        except CowError:
+            self._launch()
+        except BaseException:
             self._lease.release()
             raise
         self._stopping = False
@@ -132,7 +109,35 @@ class JobEngine:
         self._threads = ThreadPoolExecutor(thread_name_prefix="cow-job", max_workers=1024)
         self.open_jobs.recount()
         self.service.metrics.queue_depth = self.open_jobs.depth
+        self._polls.start()
+        self._news.start(self._hear)
         self._maintenance.start()
+
+    def _launch(self) -> None:
+        """Has DBOS run on the database. Of its queues it looks after that of the webhooks; `QueuePolls` has ours."""
+        self.database.create_tables()
+        folder = self.service.settings.data_dir / "executors"
+        folder.mkdir(parents=True, exist_ok=True)
+        self.database.claim(folder_name(folder))
+        config = DBOSConfig(
+            name="cow",
+            system_database_url=self.database.url,
+            system_database_engine=self.database.engine,
+            application_version=workflows.VERSION,
+            executor_id=self._lease.acquire(),
+            serializer=JsonSerializer(),
+            use_listen_notify=False,
+            log_level="WARNING",
+        )
+        try:
+            DBOS(config=config)
+            DBOS.listen_queues([WEBHOOKS])
+            DBOS.launch()
+        except (SQLAlchemyError, dbos_error.DBOSException) as error:
+            DBOS.destroy()
+            raise StorageUnavailable(
+                f"The job database cannot be used ({type(error).__name__}): see COW_DATABASE_URL."
+            ) from error
 
     def drain(self) -> None:
         """Accepts no more jobs, and answers callers who wait for a job that does not run.
@@ -151,6 +156,8 @@ class JobEngine:
         self.drain()
         self._maintenance.stop()
         grace = self.service.settings.shutdown_grace
+        self._polls.stop()
+        self._news.stop()
         # DBOS takes nothing from the queues from here on, and polls once a second whether the work is done.
         DBOS.destroy(workflow_completion_timeout_sec=int(grace + HANDOVER_SECONDS) if self.active.ids() else 0)
         if self._grace is not None:
@@ -209,17 +216,18 @@ class JobEngine:
     def _submit(self, job_id: str, spec: JobSpec, owner: str | None, image: DecodedImage) -> None:
         with self.open_jobs.lock:  # the count must not change between the check and the record
             self.check_capacity(owner)
-            starts_now = self.open_jobs.count(spec.generator) < self._computer.capacity(spec.generator)
+            queue = queue_of(spec.reader, spec.generator, self.service.settings)
+            starts_now = self.open_jobs.count(queue) < self._computer.capacity(queue)
             spec = spec.model_copy(update={"turn": self.open_jobs.next_turn(owner)})
-            self.open_jobs.record(job_id, OpenJob(spec.generator, owner, spec.turn))
+            self.open_jobs.record(job_id, OpenJob(spec.generator, owner, spec.turn, queue))
         try:
             # Before the job exists: its image and masks must not be removed before work on it starts.
             self.database.add_references(job_id, [image.info.sha256, *spec.masks])
             if starts_now:
                 self.active.put_image(job_id, image)
-                self._start(job_id, spec, owner)
+                self._start(job_id, spec, owner, queue)
             else:
-                self._enqueue(job_id, spec, owner)
+                self._enqueue(job_id, spec, owner, queue)
         except BaseException:
             self.active.drop_image(job_id)
             self.open_jobs.record(job_id, None)
@@ -251,6 +259,7 @@ class JobEngine:
             with database_errors():
                 DBOS.cancel_workflow(job_id)
         self.active.request_cancel(job_id)
+        self._news.tell(JobNews("canceled", job_id))
         self.open_jobs.ended(job_id, None)
         found = self.find(job_id, owner)
         if found.job.status == "canceled":
@@ -274,6 +283,7 @@ class JobEngine:
 
     def work_ended(self, job_id: str) -> None:
         """The work on a job is over in this process. Where no thread waits for its end, maintenance announces it."""
+        self._polls.wake()
         if job_id not in self._followed and not self._stopping:
             self._maintenance.announce(job_id)
 
@@ -296,13 +306,12 @@ class JobEngine:
         found = state.find(job_id, self.active)
         return found is not None and found.error is not None and found.error.status == HTTPStatus.SERVICE_UNAVAILABLE
 
-    def _start(self, job_id: str, spec: JobSpec, owner: str | None) -> None:
+    def _start(self, job_id: str, spec: JobSpec, owner: str | None, queue: str) -> None:
         """Starts a job in this process; it is in the database when this returns."""
         assert self._threads is not None
         self._followed.add(job_id)
         try:
-            with _attributes(job_id, spec, owner), _accept_errors():
-                handle = DBOS.start_workflow(_workflow(spec), spec.model_dump())
+            handle = self._dispatch.start(job_id, spec, owner, queue)
             self._threads.submit(self._follow, job_id, spec.created_at, handle)
         except BaseException:
             self._followed.discard(job_id)
@@ -325,6 +334,7 @@ class JobEngine:
         # A job of the same id, of a key that was used again after a deletion, may not have ended.
         if outcome is not None or self._has_ended(job_id):
             self.open_jobs.ended(job_id, outcome, created_at)
+            self._news.tell(JobNews("ended", job_id))
         else:
             self.active.forget(job_id)
 
@@ -335,20 +345,25 @@ class JobEngine:
             return False  # `recount` corrects the count, and waiters poll
         return found is None or found.ended is not None
 
-    def _enqueue(self, job_id: str, spec: JobSpec, owner: str | None) -> None:
-        """Puts a job into the queue of its generator."""
-        name = f"cow-{spec.generator}"
-        with _accept_errors():
-            if name not in self._queues:
-                DBOS.register_queue(
-                    name,
-                    worker_concurrency=self._computer.capacity(spec.generator),
-                    polling_interval_sec=QUEUE_POLL_SECONDS,
-                    on_conflict="always_update",
-                )
-                self._queues.add(name)
-            with _attributes(job_id, spec, owner), SetEnqueueOptions(priority=spec.turn + 1):
-                DBOS.enqueue_workflow(name, _workflow(spec), spec.model_dump())
+    def _enqueue(self, job_id: str, spec: JobSpec, owner: str | None, queue: str) -> None:
+        """Puts a job into a queue."""
+        self._dispatch.enqueue(job_id, spec, owner, queue)
+        self._polls.wake()
+        self._news.tell(JobNews("queued", job_id))
+
+    def _hear(self, news: JobNews) -> None:
+        """What a process on the database told of a job."""
+        match news.what:
+            case "queued":
+                self._polls.wake()
+            case "progress":
+                self.active.heard(news.job_id, cast(Stage | None, news.stage), news.done)
+            case "canceled":
+                self.active.request_cancel(news.job_id)
+            case "ended" if self.active.get(news.job_id) is None:
+                self.open_jobs.ended(news.job_id, None)
+            case _:
+                pass  # one that this process ran: it is said here with its outcome
 
     def _interrupt(self) -> None:
         """Has running jobs end without an outcome: they continue after the next start."""
@@ -363,29 +378,6 @@ class JobEngine:
                 headers={"Location": f"/jobs/{job_id}"},
             )
             self.active.notify_ended(job_id, error)
-
-
-@contextmanager
-def _attributes(job_id: str, spec: JobSpec, owner: str | None) -> Generator[None]:
-    """What DBOS keeps beside a workflow. Times in SQLite are whole seconds: that of the spec is exact."""
-    kept = {ATTRIBUTE_GENERATOR: spec.generator, ATTRIBUTE_CREATED_AT: spec.created_at, ATTRIBUTE_TURN: str(spec.turn)}
-    attributes = SetWorkflowAttributes(kept)
-    with SetWorkflowID(job_id), DBOSContextSetAuth(owner, None), attributes:
-        yield
-
-
-@contextmanager
-def _accept_errors() -> Generator[None]:
-    """Translates what DBOS raises when it is given a job to `StorageUnavailable`."""
-    try:
-        with database_errors():
-            yield
-    except dbos_error.DBOSException as error:
-        raise StorageUnavailable(f"The job database did not take the job ({type(error).__name__}).") from error
-
-
-def _workflow(spec: JobSpec) -> Callable[[dict[str, Any]], str]:
-    return workflows.answer if spec.kind == "answer" else workflows.simulate
 
 
 def new_job_id(owner: str | None, key: str | None) -> str:

@@ -1,81 +1,191 @@
-"""The executor id of this process in the job database: the same after a restart, and never that of a live process.
+"""Who is alive: each process has an executor id in the job database and a lease on it, which ends with the process.
 
-Each process holds one numbered lock file of its data folder, which the operating system releases however the process
-ends. A restart finds its old number free, and with it the jobs that were interrupted there.
+On SQLite the lease is a lock file of the data folder, which the operating system releases however the process ends. On
+PostgreSQL it is an advisory lock of a session that the server ends when nothing was heard for a while: also a process
+that is frozen, or whose machine is gone, loses it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import contextmanager
+import hashlib
+import logging
+import threading
+import time
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, Protocol
 from uuid import uuid4
 
+import psycopg
+import sqlalchemy as sa
 from filelock import FileLock, Timeout
 
 from cow_service.errors import StorageUnavailable
+from cow_service.jobs.database import Database, database_errors
 
-MAX_EXECUTORS = 256  # processes on one data folder
+BEAT_SECONDS = 1.5  # between two signs of life
+SILENCE_SECONDS = 8.0  # after which PostgreSQL ends the session of a lease
+CONFIRM_SECONDS = 2.5  # that a lease must be free: after a restart of the server everybody's is for a moment
+
+log = logging.getLogger("cow_service")
 
 
-class ExecutorLease:
-    """The lease of this process on an executor id, and a view of those that have expired."""
+class Lease(Protocol):
+    """The lease of this process, and a view of those of others."""
+
+    def acquire(self) -> str:
+        """Takes a lease on a new executor id, and returns the id. Raises `StorageUnavailable`."""
+        ...
+
+    @contextmanager
+    def ended(self, executors: Iterable[str]) -> Generator[list[str]]:
+        """Those of some executors whose processes have ended. Nobody else finds them inside the block."""
+        ...
+
+    def release(self) -> None:
+        """Gives the lease back."""
+        ...
+
+
+class FolderLease:
+    """On SQLite: a lock file."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._lock: FileLock | None = None
+        self._executor = ""
 
     def acquire(self) -> str:
-        """Takes the first free id and returns it. Raises `StorageUnavailable`."""
+        """As the protocol says."""
+        self._executor = uuid4().hex
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            for number in range(MAX_EXECUTORS):
-                self._lock = self._try_lock(number)
-                if self._lock is not None:
-                    return self._executor_id(number)
+            self._lock = FileLock(self._folder / f"{self._executor}.lock")
+            self._lock.acquire(timeout=0)
         except OSError as error:
             raise StorageUnavailable("The data folder cannot be written: no place for this process.") from error
-        raise StorageUnavailable(
-            f"{MAX_EXECUTORS} processes use this data folder; give this one another by COW_DATA_DIR."
-        )
+        return self._executor
 
     @contextmanager
-    def expired(self) -> Generator[list[str]]:
-        """The ids of processes that have ended. No other process can acquire them inside the block."""
-        locks: dict[int, FileLock] = {}
+    def ended(self, executors: Iterable[str]) -> Generator[list[str]]:
+        """As the protocol says."""
+        locks: dict[str, FileLock] = {}
         try:
-            for path in self._folder.glob("*.lock"):
-                # The lock of this process cannot be taken twice, so its own id is never among them.
-                if path.stem.isdigit() and (lock := self._try_lock(int(path.stem))) is not None:
-                    locks[int(path.stem)] = lock
-            yield [self._executor_id(number) for number in locks]
+            for executor in set(executors) - {self._executor}:
+                lock = FileLock(self._folder / f"{executor}.lock")
+                with suppress(Timeout):
+                    lock.acquire(timeout=0)
+                    locks[executor] = lock
+            yield list(locks)
         finally:
             for lock in locks.values():
                 lock.release()
+                Path(lock.lock_file).unlink(missing_ok=True)
 
     def release(self) -> None:
-        """Gives the id back."""
+        """As the protocol says."""
         if self._lock is not None:
             self._lock.release()
+            Path(self._lock.lock_file).unlink(missing_ok=True)
             self._lock = None
 
-    def _try_lock(self, number: int) -> FileLock | None:
-        lock = FileLock(self._folder / f"{number}.lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            return None
-        return lock
 
-    def _executor_id(self, number: int) -> str:
-        """Unique to the data folder: other machines may use the same database."""
-        return f"{self.folder_id}-{number}"
+class SessionLease:
+    """On PostgreSQL: an advisory lock of a session of its own."""
 
-    @property
-    def folder_id(self) -> str:
-        """Names the data folder, wherever it is mounted."""
-        path = self._folder / "name"
-        with FileLock(self._folder / "name.lock"):
-            if not path.exists():
-                path.write_text(uuid4().hex)
-            return path.read_text()
+    def __init__(self, database: Database) -> None:
+        self._address = sa.make_url(database.url).set(drivername="postgresql").render_as_string(hide_password=False)
+        self._executor = ""
+        self._session: psycopg.Connection[Any] | None = None
+        self._guard = threading.Lock()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._free_since: dict[str, float] = {}
+
+    def acquire(self) -> str:
+        """As the protocol says."""
+        self._executor = uuid4().hex
+        self._stop.clear()
+        with database_errors():
+            self._open()
+        self._thread = threading.Thread(target=self._beat, name="cow-lease", daemon=True)
+        self._thread.start()
+        return self._executor
+
+    @contextmanager
+    def ended(self, executors: Iterable[str]) -> Generator[list[str]]:
+        """As the protocol says. One counts as ended when its lease was free before, too."""
+        with self._guard:
+            session = self._session
+            if session is None:  # an outage: nobody can be told from those that have ended
+                yield []
+                return
+            free = set[str]()
+            try:
+                with database_errors():
+                    free |= {one for one in set(executors) - {self._executor} if _try_lock(session, one)}
+                now = time.monotonic()
+                self._free_since = {one: self._free_since.get(one, now) for one in free}
+                yield [one for one, since in self._free_since.items() if now - since >= CONFIRM_SECONDS]
+            finally:
+                with suppress(psycopg.Error):  # with the session its locks end, too
+                    for one in free:
+                        session.execute("SELECT pg_advisory_unlock(%s)", (_key(one),))
+
+    def release(self) -> None:
+        """As the protocol says."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._session is not None:
+            with suppress(psycopg.Error):
+                self._session.close()
+            self._session = None
+
+    def _beat(self) -> None:
+        """Keeps the session alive, and takes the lease again after an outage."""
+        while not self._stop.wait(BEAT_SECONDS):
+            with self._guard:
+                try:
+                    if self._session is None:
+                        self._open()
+                    else:
+                        self._session.execute("SELECT 1")
+                except psycopg.Error:
+                    log.warning("the lease of this process was lost: it is taken again when the database is back")
+                    if self._session is not None:
+                        with suppress(psycopg.Error):
+                            self._session.close()
+                    self._session = None
+                    self._free_since = {}
+
+    def _open(self) -> None:
+        session = psycopg.connect(self._address, autocommit=True, connect_timeout=4)
+        session.execute("SELECT set_config('idle_session_timeout', %s, false)", (f"{SILENCE_SECONDS:g}s",))
+        session.execute("SELECT pg_advisory_lock(%s)", (_key(self._executor),))  # held by who looks at it, for a moment
+        self._session = session
+
+
+def _try_lock(session: psycopg.Connection[Any], executor: str) -> bool:
+    row = session.execute("SELECT pg_try_advisory_lock(%s)", (_key(executor),)).fetchone()
+    return row is not None and bool(row[0])
+
+
+def _key(executor: str) -> int:
+    return int.from_bytes(hashlib.sha256(executor.encode()).digest()[:8], signed=True)
+
+
+def lease_of(database: Database, folder: Path) -> Lease:
+    """The lease of a process on a database; `folder` is that of the lock files."""
+    return SessionLease(database) if database.file is None else FolderLease(folder)
+
+
+def folder_name(folder: Path) -> str:
+    """Names a folder, wherever it is mounted."""
+    path = folder / "name"
+    with FileLock(folder / "name.lock"):
+        if not path.exists():
+            path.write_text(uuid4().hex)
+        return path.read_text()

@@ -14,13 +14,16 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import CowError
 from cow_service.jobs import state
-from cow_service.jobs.leases import ExecutorLease
+from cow_service.jobs.leases import Lease
+from cow_service.jobs.news import JobNews, News
 from cow_service.jobs.open_jobs import OpenJobs
+from cow_service.jobs.queues import PREFIX
+from cow_service.jobs.recovery import recover
 
 OUTCOME_POLL_SECONDS = 0.005  # while the database has not got the outcome of finished work
 OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own polling
-CANCEL_POLL_SECONDS = 1.0  # for jobs that run here and were canceled by another process
-RECOVERY_SECONDS = 10.0  # between checks for dead processes and stalled jobs
+CANCEL_POLL_SECONDS = 1.0  # for jobs that run here and were canceled by another process, and for processes that ended
+STALLED_SECONDS = 10.0  # between checks for stalled jobs
 GARBAGE_SECONDS = 600.0  # between garbage collections
 ARTIFACT_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
 SUBMIT_SECONDS = 5.0  # within which a job is in the database after the reference to its image
@@ -33,8 +36,9 @@ log = logging.getLogger("cow_service")
 class Maintenance:
     """Two threads beside an engine's own."""
 
-    def __init__(self, open_jobs: OpenJobs, lease: ExecutorLease) -> None:
+    def __init__(self, open_jobs: OpenJobs, lease: Lease, news: News) -> None:
         self._open_jobs = open_jobs
+        self._news = news
         self._lease = lease
         self._finished: dict[str, float] = {}  # jobs whose outcome is awaited, and until when
         self._has_finished = threading.Event()
@@ -102,45 +106,54 @@ class Maintenance:
             found = state.find(job_id, self._open_jobs.active, full=False)
             if found is None or found.ended is not None:
                 self._open_jobs.ended(job_id, None)
+                self._news.tell(JobNews("ended", job_id))
                 del self._finished[job_id]
 
     def _maintain(self) -> None:
-        recovered = collected = time.monotonic()  # recovered jobs refer to their artifacts before anything is removed
-        self._logged(self._recover)
-        while not self._stop.wait(CANCEL_POLL_SECONDS):
-            now = time.monotonic()
+        looked = collected = time.monotonic()  # recovered jobs refer to their artifacts before anything is removed
+        while not self._stop.is_set():
+            self._logged(self._recover)
             self._logged(self._poll_cancellations)
-            if now - recovered > RECOVERY_SECONDS:
-                recovered = now
-                self._logged(self._recover)
+            now = time.monotonic()
+            if now - looked > STALLED_SECONDS:
+                looked = now
                 self._logged(self._resume_stalled)
                 self._logged(self._open_jobs.recount)
             if now - collected > GARBAGE_SECONDS:
                 collected = now
                 self._logged(self.collect_garbage)
+            self._stop.wait(CANCEL_POLL_SECONDS)
 
     def _poll_cancellations(self) -> None:
-        """Another process may have canceled or deleted a job that runs here."""
-        for job_id in self._open_jobs.active.ids():
-            found = state.find(job_id, self._open_jobs.active, full=False)
-            if found is None or found.job.status == "canceled":
-                self._open_jobs.active.request_cancel(job_id)
+        """Another process may have canceled or deleted a job that runs here, or taken it while this one was frozen."""
+        running = self._open_jobs.active.ids()
+        if not running:
+            return
+        ours = {
+            one.workflow_id
+            for one in state.workflows_of_jobs(workflow_ids=running)
+            if one.status != "CANCELLED" and one.executor_id == DBOS.executor_id
+        }
+        for job_id in set(running) - ours:
+            self._open_jobs.active.request_cancel(job_id)
 
     def _recover(self) -> None:
-        """Returns the jobs of processes that have ended to the queue, from which any live process takes them."""
-        with self._lease.expired() as executors:
-            # What DBOS itself does at its start. The public `resume_workflow` would also revive a job that was
-            # canceled meanwhile, and would reset the count of starts that ends a job which kills its process.
-            for handle in DBOS._recover_pending_workflows(executors) if executors else ():  # pyright: ignore[reportPrivateUsage]
-                log.info("recovering %s", handle.get_workflow_id())
+        """Returns the jobs of processes that have ended to their queues, from which any live process takes them."""
+        executors = state.executors_at_work() - {DBOS.executor_id}
+        if not executors:
+            return
+        with self._lease.ended(executors) as ended:
+            for job_id in recover(ended):
+                log.info("recovering %s", job_id)
 
     def _resume_stalled(self) -> None:
         """Resumes jobs of this process that no thread works on: their outcome could not be written, for example."""
         pending = state.workflows_of_jobs(status="PENDING", executor_id=DBOS.executor_id)
         idle = {one.workflow_id for one in pending} - set(self._open_jobs.active.ids())
-        for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
-            log.warning("job %s was stalled, and is resumed", job_id)
-            DBOS.resume_workflow(job_id)
+        for one in pending:
+            if one.workflow_id in idle & self._idle:  # idle at the last check, too: it is not just being started
+                log.warning("job %s was stalled, and is resumed", one.workflow_id)
+                DBOS.resume_workflow(one.workflow_id, queue_name=PREFIX + state.queue_of(one))
         self._idle = idle
 
     def _logged(self, work: Callable[[], None]) -> bool:

@@ -30,10 +30,10 @@ class OpenJobs:
     def __len__(self) -> int:
         return len(self._open)
 
-    def count(self, generator: str) -> int:
-        """How many jobs of a generator are open."""
+    def count(self, queue: str) -> int:
+        """How many jobs of a queue are open, in it or at work."""
         with self.lock:
-            return sum(each.generator == generator for each in self._open.values())
+            return sum(each.queue == queue for each in self._open.values())
 
     def count_of(self, owner: str | None) -> int:
         """How many jobs of an owner are open."""

@@ -14,12 +14,13 @@ from dbos import DBOS, WorkflowStatus
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest
 from cow_service.jobs.active import ActiveJobs, share_done
 from cow_service.jobs.database import database_errors
+from cow_service.jobs.queues import LIGHT
 from cow_service.observability.timestamps import rfc3339
 from cow_service.records import Answer, Job, JobKind, JobPage, JobStatus, Problem, Simulation
 
 KINDS: tuple[JobKind, ...] = get_args(JobKind)
 # What DBOS keeps beside a workflow.
-ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT, ATTRIBUTE_TURN = "generator", "created_at", "turn"
+ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT, ATTRIBUTE_TURN, ATTRIBUTE_QUEUE = "generator", "created_at", "turn", "queue"
 STATUS: dict[str, JobStatus] = {
     "ENQUEUED": "queued",
     "DELAYED": "queued",
@@ -131,16 +132,36 @@ class OpenJob:
     generator: str
     owner: str | None = None
     turn: int = 0
+    queue: str = LIGHT
 
 
 def open_jobs() -> dict[str, OpenJob]:
     """The jobs that wait or run anywhere, by their ids."""
     return {
         one.workflow_id: OpenJob(
-            _attribute(one, ATTRIBUTE_GENERATOR), one.authenticated_user, int(_attribute(one, ATTRIBUTE_TURN) or 0)
+            _attribute(one, ATTRIBUTE_GENERATOR),
+            one.authenticated_user,
+            int(_attribute(one, ATTRIBUTE_TURN) or 0),
+            queue_of(one),
         )
         for one in workflows_of_jobs(status=OPEN)
     }
+
+
+def queue_of(status: WorkflowStatus) -> str:
+    """The queue that a job belongs to, also where it was started without waiting in it."""
+    return _attribute(status, ATTRIBUTE_QUEUE) or LIGHT
+
+
+def pending_of(executors: list[str] | None = None) -> list[WorkflowStatus]:
+    """The workflows that some processes, or all, have in hand, those of webhooks included."""
+    with database_errors():
+        return DBOS.list_workflows(status="PENDING", executor_id=executors, load_input=False, load_output=False)
+
+
+def executors_at_work() -> set[str]:
+    """The executor ids of the processes that have workflows in hand."""
+    return {one.executor_id for one in pending_of() if one.executor_id is not None}
 
 
 def ended_before(moment: datetime, limit: int) -> list[str]:
@@ -161,10 +182,10 @@ def _attribute(status: WorkflowStatus, name: str) -> str:
 def _state(status: WorkflowStatus, active: ActiveJobs) -> JobState:
     kind = cast(JobKind, status.name)
     shown = STATUS[status.status]
-    running = active.get(status.workflow_id) if shown == "running" else None
+    at = active.at(status.workflow_id) if shown == "running" else None
     stage, progress = None, 1.0 if shown == "succeeded" else 0.0
-    if running is not None:
-        stage, done = running.at
+    if at is not None:
+        stage, done = at
         progress = share_done(kind, stage, done)
     if shown == "running" and status.executor_id == DBOS.executor_id and stage is None:
         shown = "queued"  # it was taken from the queue, but no thread works on it yet

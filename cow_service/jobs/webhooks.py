@@ -21,13 +21,13 @@ from dbos import DBOS, SetEnqueueOptions, SetWorkflowID
 from cow_service.errors import WebhookNotAllowed
 from cow_service.jobs import workflows
 from cow_service.jobs.database import database_errors
+from cow_service.jobs.queues import WEBHOOKS
 from cow_service.records import Job
 from cow_service.settings import Settings
 
 if TYPE_CHECKING:
     from cow_service.net.egress import Egress
 
-QUEUE = "cow-webhook-receivers"  # in which every receiver has a share of its own
 MAX_CONCURRENT_DELIVERIES = 100
 MAX_CONCURRENT_DELIVERIES_TO_ONE = 2  # receiver: one that is silent holds up its own calls alone
 POLL_SECONDS = 1.0
@@ -104,7 +104,7 @@ class Webhooks:
         with database_errors():
             if not self._registered:
                 DBOS.register_queue(
-                    QUEUE,
+                    WEBHOOKS,
                     worker_concurrency=MAX_CONCURRENT_DELIVERIES,
                     partition_worker_concurrency=MAX_CONCURRENT_DELIVERIES_TO_ONE,
                     polling_interval_sec=POLL_SECONDS,
@@ -112,7 +112,7 @@ class Webhooks:
                 self._registered = True
             options = SetEnqueueOptions(delay_seconds=delay, queue_partition_key=_receiver(url))
             with SetWorkflowID(attempt_ids(job_id)[attempt - 1]), options:
-                DBOS.enqueue_workflow(QUEUE, workflows.webhook, job_id, url, attempt)
+                DBOS.enqueue_workflow(WEBHOOKS, workflows.webhook, job_id, url, attempt)
 
     def _headers(self, message: str, body: bytes) -> dict[str, str]:
         assert self._secret is not None

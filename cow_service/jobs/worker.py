@@ -13,11 +13,13 @@ from cow_service.errors import Canceled, CowError, unforeseen
 from cow_service.jobs import state
 from cow_service.jobs.active import ActiveJob
 from cow_service.jobs.computing import Computer, Work
+from cow_service.jobs.news import JobNews, News
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.outages import Outages
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.observability import context, tracing
+from cow_service.requests import Stage
 
 POLL_SECONDS, MAX_POLLS = 0.1, 100  # until the database has the end of a webhook's job
 
@@ -32,11 +34,17 @@ class Worker:
     """Does the work of an engine's jobs. Thread-safe."""
 
     def __init__(
-        self, open_jobs: OpenJobs, webhooks: Webhooks, computer: Computer, on_work_ended: Callable[[str], None]
+        self,
+        open_jobs: OpenJobs,
+        webhooks: Webhooks,
+        computer: Computer,
+        news: News,
+        on_work_ended: Callable[[str], None],
     ) -> None:
         self._open_jobs = open_jobs
         self._webhooks = webhooks
         self._computer = computer
+        self._news = news
         self._on_work_ended = on_work_ended
 
     def run(self, job_id: str, spec: dict[str, Any]) -> str:
@@ -102,12 +110,18 @@ class Worker:
 
     def _work(self, job_id: str, spec: JobSpec, running: ActiveJob) -> Work:
         active = self._open_jobs.active
+
+        def progress(stage: Stage | None, done: float) -> None:
+            active.progress(job_id, running, stage, done)
+            if stage is not None:
+                self._news.tell(JobNews("progress", job_id, stage, done))
+
         return Work(
             job_id=job_id,
             spec=spec.model_copy(update={"traceparent": context.traceparent()}),
             owner=DBOS.authenticated_user,
             image=lambda: active.take_image(job_id, spec.image),
-            progress=lambda stage, done: active.progress(job_id, running, stage, done),
+            progress=progress,
             check=running.check,
             looked_for=self._open_jobs.service.metrics.stage_cache,
         )

@@ -17,13 +17,13 @@ import psutil
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import ShuttingDown, WorkerEnded
 from cow_service.jobs.computing import Outcome, Work
+from cow_service.jobs.queues import LIGHT, clips, places, queue_of
 from cow_service.jobs.stage_cache import KeyLocks
 from cow_service.settings import Settings
 from cow_service.stages.run import priority_of
 from cow_service.weights.manifests import find_manifest
 from cow_service.workers.process import Worker, WorkerGone
 
-LIGHT = "light"
 MAX_CRASHES = 3  # of workers that had nothing but the job
 HEARTBEAT_TIMEOUT_SECONDS = 15.0  # after which a worker that says nothing is ended
 WATCH_SECONDS = 0.5  # between two looks at each worker
@@ -109,7 +109,8 @@ class WorkerPool:
             return
         self._watching = threading.Thread(target=self._watch, name="cow-workers", daemon=True)
         self._watching.start()
-        for name in {LIGHT, _group_of(self._settings.reader, self._settings.generator, self._settings)}:
+        default = queue_of(self._settings.reader, self._settings.generator, self._settings)
+        for name in self._settings.queues or {LIGHT, default}:
             self._group(name).start()
 
     def close(self) -> None:
@@ -126,9 +127,16 @@ class WorkerPool:
         with self._guard:
             return tuple(self._groups.values())
 
-    def capacity(self, generator: str) -> int:
-        """As many as its workers have places for."""
-        group = self._group(_group_of(self._settings.reader, generator, self._settings))
+    def capacity(self, queue: str) -> int:
+        """As many as its workers have places for; none of a queue whose backend cannot run here."""
+        # Older versions had a queue for each generator.
+        name = queue if places(queue) is not None else queue_of("", queue, self._settings)
+        if self._settings.queues and name not in self._settings.queues:
+            return 0
+        manifest = find_manifest(name)
+        if manifest is not None and manifest.missing_modules():
+            return 0
+        group = self._group(name)
         return group.size * group.jobs_each
 
     def check(self) -> None:
@@ -139,7 +147,7 @@ class WorkerPool:
 
     def compute(self, work: Work) -> Outcome:
         """Gives a job to a worker, in its turn. Raises the `CowError` that it fails with, `Canceled`, `WorkerEnded`."""
-        group = self._group(_group_of(work.spec.reader, work.spec.generator, self._settings))
+        group = self._group(queue_of(work.spec.reader, work.spec.generator, self._settings))
         priority = priority_of(work.spec.turn, work.spec.created_at)
         crashes, alone = 0, group.jobs_each == 1
         with group.places.held(priority, partial(work.progress, None, 0.0)):
@@ -186,36 +194,19 @@ class WorkerPool:
                     worker.kill(f"was ended, as it took {worker.memory_bytes / 1e6:.0f} MB", is_final=True)
 
 
-def _group_of(reader: str, generator: str, settings: Settings) -> str:
-    """Who has a device has a process: a reader that has one uses the same for the clips."""
-    if _own(reader) is not None:
-        return reader
-    return LIGHT if _clips(generator, settings) is None else generator
-
-
 def _new_group(name: str, settings: Settings) -> Group:
     waiting = settings.mllm_concurrency if settings.mllm else 0  # jobs that compute nothing, as they wait for an MLLM
     if name == LIGHT:
         size, cpu, generator = settings.concurrency, 1, settings.generator
-        if _clips(generator, settings) is not None:
+        if clips(generator, settings) is not None:
             generator = "cutout"
         waiting = math.ceil(waiting / size)
         jobs_each = cpu + waiting
-    elif _own(settings.reader) is None or name != settings.reader:
+    elif places(settings.reader) is None or name != settings.reader:
         size, cpu, generator = 1, 1, name
-        jobs_each = (_clips(name, settings) or 1) + waiting
+        jobs_each = (clips(name, settings) or 1) + waiting
     else:  # a reader that computes on a device
         size, cpu, generator, waiting = 1, settings.concurrency, settings.generator, settings.mllm_concurrency
         jobs_each = cpu + waiting
     own = {"concurrency": cpu, "mllm_concurrency": max(1, waiting), "generator": generator}
     return Group(name, settings.model_copy(update=own), size, jobs_each)
-
-
-def _clips(generator: str, settings: Settings) -> int | None:
-    """Clips at the same time of a generator that has a device or a limit of its own; None where it has none."""
-    return settings.generator_concurrency.get(generator, _own(generator))
-
-
-def _own(name: str) -> int | None:
-    manifest = find_manifest(name)
-    return None if manifest is None else manifest.concurrency
