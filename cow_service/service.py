@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import uuid
 from functools import partial
+from importlib.metadata import entry_points
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -17,7 +18,7 @@ from cow_service.errors import (
     ReaderUnavailable,
     field_of,
 )
-from cow_service.generators.base import Generator
+from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, media_type_of
 from cow_service.media.data_urls import decode_data_url
 from cow_service.media.images import DecodedImage, decode
@@ -56,6 +57,7 @@ class Service:
         self._image_urls = ImageUrls(settings)
         self.artifacts = ArtifactStore(settings.data_dir / "artifacts")
         self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable, settings)
+        self._generator_limits = {point.name: point for point in entry_points(group="cow_service.generator_limits")}
         self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable, settings)
         for setting, name, names in (
             ("COW_READER", settings.reader, self.readers.names()),
@@ -127,15 +129,25 @@ class Service:
         """Says at once what is wrong with a request as far as that costs nothing; returns its reader and generator.
 
         Raises `InvalidRequest` for backends that nobody has and for options that the generator does not take, and
-        `ReaderUnavailable` or `GeneratorUnavailable` where their modules are not installed.
+        `ReaderUnavailable` or `GeneratorUnavailable` where their modules are needed here and not installed.
         """
         reader = self._known("reader", request.reader or self.settings.reader, self.readers)
         name = self._known("generator", request.generator or self.settings.generator, self.generators)
-        _check_modules(reader, ReaderUnavailable)
-        _check_modules(name, GeneratorUnavailable)
-        if self.generators.is_made(name) or name == self.settings.generator:
-            check_request(self._generator(name), request)
+        if self.settings.role != "api":  # else workers have what it lacks
+            _check_modules(reader, ReaderUnavailable)
+            _check_modules(name, GeneratorUnavailable)
+        limits = self._limits(name)
+        if limits is not None:
+            check_request(limits, request)
         return reader, name
+
+    def _limits(self, name: str) -> Limits | None:
+        """What a generator takes of a request; None where only the generator itself knows, which is not loaded."""
+        if name in self._generator_limits:
+            return self._generator_limits[name].load()()
+        if self.generators.is_made(name) or name == self.settings.generator:
+            return self._generator(name)
+        return None
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""

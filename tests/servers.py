@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx
+import psutil
 from drawn import ball, block, floor, png_bytes
 
 SLOW_GENERATOR = Path(__file__).resolve().parents[1] / "benchmarks" / "slow_generator"
@@ -158,6 +159,51 @@ class Served:
     def clips(self) -> list[int]:
         """Seeds of the slow clips that were begun, one for each time."""
         return [int(line) for line in self.journal.read_text().split()]
+
+
+class Worker:
+    """A worker on the data folder and database of a server. Ends with the `with` block."""
+
+    def __init__(self, folder: Path, log: str, **settings: str) -> None:
+        own = {"COW_DATA_DIR": str(folder / "data"), "PYTHONPATH": str(SLOW_GENERATOR)}
+        own["SLOW_JOURNAL"] = str(folder / "journal")
+        self._environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
+        self._environment |= own | settings
+        self._log_file = folder / log
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Worker:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for one in self.processes():
+            one.kill()
+        if self._process is not None:
+            self._process.wait()
+
+    def start(self) -> None:
+        """Starts it, and waits until it takes jobs."""
+        said = self._log_file.stat().st_size if self._log_file.exists() else 0
+        if self._process is not None:
+            self._process.wait()
+        command = [sys.executable, "-m", "cow_service.cli.main", "worker"]
+        with self._log_file.open("ab") as log:
+            self._process = subprocess.Popen(command, env=self._environment, stdout=log, stderr=log)
+        eventually(lambda: "takes jobs" in self._log_file.read_text()[said:])
+
+    def processes(self) -> list[psutil.Process]:
+        """It and its children, itself last; none where it is gone."""
+        assert self._process is not None
+        try:
+            own = psutil.Process(self._process.pid)
+            return [*own.children(recursive=True), own]
+        except psutil.NoSuchProcess:
+            return []
+
+    def cpu_seconds(self) -> float:
+        """That it and its children have computed."""
+        return sum(sum(one.cpu_times()[:2]) for one in self.processes())
 
 
 def eventually(look: Callable[[], Value | None], patience: float = PATIENCE) -> Value:

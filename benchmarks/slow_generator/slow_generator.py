@@ -6,9 +6,10 @@ The folder of this file on PYTHONPATH registers it as `slow`, exactly as an inst
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,19 @@ class SlowOptions(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     seconds: float = Field(default=0.2, ge=0, le=3600)
+    end: Literal["well", "kill", "memory", "hang"] = "well"
+
+
+def _end(how: str) -> None:
+    """Does to this process what a fault in a native library, an image that is too large, or a lost lock would."""
+    if how == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    held: list[bytearray] = []
+    while how == "memory":
+        held.append(bytearray(os.urandom(1_000_000)) * 50)
+        time.sleep(0.05)
+    if how == "hang":
+        time.sleep(3600)
 
 
 class SlowGenerator:
@@ -52,6 +66,7 @@ class SlowGenerator:
         if journal := os.environ.get("SLOW_JOURNAL"):
             with open(journal, "ab", buffering=0) as file:  # one write: it is whole, or not there
                 file.write(f"{given.seed}\n".encode())
+        _end(getattr(given.options, "end", "well"))
         seconds: float = getattr(given.options, "seconds", 0.0)
         for done, index in enumerate(indices):
             progress(done / len(indices))

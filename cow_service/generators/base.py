@@ -31,20 +31,28 @@ class GeneratorInput:
     trajectory has one frame more, the first, in which they are still there."""
 
 
-class Generator(Protocol):
-    """Makes the frames of a clip."""
+class Limits(Protocol):
+    """What a generator takes of a request: known without its libraries, where it says so in a place of its own.
+
+    Entry points of the group `cow_service.generator_limits` are classes of this kind, by the generator's name.
+    """
 
     options_model: type[BaseModel]  # what `generator_options` of a request may hold
+
+    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
+        """`(num_frames,)` where it can make a clip of that many frames, else the lengths next to it that it can."""
+        ...
+
+
+class Generator(Limits, Protocol):
+    """Makes the frames of a clip."""
+
     concurrency: int | None  # clips at the same time on a device of its own; None where it computes on the CPU
     fingerprint: str
     """All that decides a clip, besides what it is given: model, revision, weights, profile."""
 
     def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """Who would make this clip, and what would have to be the same to make it again."""
-        ...
-
-    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
-        """`(num_frames,)` where it can make a clip of that many frames, else the lengths next to it that it can."""
         ...
 
     def size(self, width: int, height: int) -> tuple[int, int]:

@@ -7,11 +7,11 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from cow_service.errors import FieldError, InvalidRequest, pointer_part
-from cow_service.generators.base import Generator
+from cow_service.generators.base import Limits
 from cow_service.requests import SimulateRequest
 
 
-def check_request(generator: Generator, request: SimulateRequest) -> BaseModel:
+def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
     """The generator's own options, checked, as is the length of the clip.
 
     Raises `InvalidRequest` with a JSON Pointer for each option that the generator does not take, for a clip that it
@@ -34,7 +34,7 @@ def check_request(generator: Generator, request: SimulateRequest) -> BaseModel:
     return options
 
 
-def _read_options(generator: Generator, given: dict[str, Any]) -> BaseModel:
+def _read_options(generator: Limits, given: dict[str, Any]) -> BaseModel:
     try:
         return generator.options_model.model_validate(given)
     except ValidationError as error:

@@ -9,17 +9,17 @@ from hashlib import sha256
 from typing import cast
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.wan.conditioning import TrackConditioning
 from cow_service.generators.wan.embedding_cache import EmbeddingCache
 from cow_service.generators.wan.execution import exclusive_use, within_memory
+from cow_service.generators.wan.options import WanLimits, WanOptions
 from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, latent_shape
 from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.sampling import Sampling
-from cow_service.generators.wan.tracks import nearest_lengths, tracks_of
+from cow_service.generators.wan.tracks import tracks_of
 from cow_service.records import GeneratorInfo
 from cow_service.vision.types import Image
 from cow_service.weights.device import cpu_threads
@@ -27,19 +27,6 @@ from cow_service.weights.device import cpu_threads
 SIDE_MULTIPLE = 16  # px: the sides of a clip are multiples of it
 MAX_SIDE = 1024 * SIDE_MULTIPLE  # px: the model has 1024 positions each way
 DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
-
-
-class WanOptions(BaseModel):
-    """What `generator_options` may hold for a video model. What is not given is as the profile says."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-    steps: int | None = Field(default=None, ge=1, le=200, description="Denoising steps.")
-    shift: float | None = Field(default=None, gt=0, le=50, description="Shift of the noise schedule.")
-    guidance_scale: float | None = Field(default=None, ge=0, le=30, description="1 does without guidance.")
-    prompt: str | None = Field(default=None, max_length=4000, description="By default the sentence of the motion.")
-    negative_prompt: str | None = Field(default=None, max_length=4000, description="By default that of the model.")
-    clean_cues: bool = Field(default=True, description="Take drawn arrows and boxes out of the first frame.")
 
 
 @dataclass(frozen=True)
@@ -70,20 +57,15 @@ class LoadedModel:
         return sha256(repr(parts).encode()).hexdigest()
 
 
-class WanGenerator:
+class WanGenerator(WanLimits):
     """Wan2.1 image-to-video, conditioned on tracks. One clip at a time on its device; others wait."""
 
-    options_model = WanOptions
     concurrency = 1
 
     def __init__(self, model: LoadedModel) -> None:
         self.fingerprint = model.fingerprint
         self._model = model
         self._embeddings = EmbeddingCache(model.pipeline)
-
-    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
-        """4n + 1 frames, 5 to 81."""
-        return nearest_lengths(num_frames)
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """The model's area at the image's aspect ratio, sides rounded down to multiples of 16 px.

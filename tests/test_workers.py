@@ -1,0 +1,158 @@
+"""API servers and workers on one job database: a crash, a frozen worker, a flood of memory, and who computes what."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import psutil
+import pytest
+from conftest import SCALE
+from postgres import postgres_server
+from servers import ASYNC, BODY, Served, Worker, eventually, problem, slow
+
+from cow_service.weights.manifests import load_manifests
+
+pytestmark = pytest.mark.slow
+
+
+def poison(how: str, seed: int = 0) -> dict[str, Any]:
+    """A request whose clip does something to the process that makes it, after a moment."""
+    body = slow(0.2, seed=seed)
+    return body | {"generator_options": {"seconds": 0.2, "end": how}}
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with Served(tmp_path_factory.mktemp("workers"), COW_WORKER_MEMORY_MB="1000", COW_JOB_TIMEOUT="6") as one:
+        yield one
+
+
+def workers_of(served: Served) -> list[psutil.Process]:
+    assert served.process is not None
+    return [
+        one for one in psutil.Process(served.process.pid).children() if "cow_service.workers.child" in one.cmdline()
+    ]
+
+
+def test_a_crash_harms_the_job_that_caused_it_and_no_other(served: Served) -> None:
+    innocents = [served.submit(slow(0.3, seed=seed))["id"] for seed in range(1, 7)]
+    guilty = served.submit(poison("kill", seed=100))["id"]
+    innocents += [served.submit(slow(0.3, seed=seed))["id"] for seed in range(7, 13)]
+    ended = served.ended(guilty)
+    assert ended["status"] == "failed"
+    assert ended["problem"]["type"] == "urn:cow:problem:worker-ended"
+    assert "signal 9" in ended["problem"]["detail"]
+    assert {served.ended(one)["status"] for one in innocents} == {"succeeded"}
+    assert served.clips().count(100) == 3, "it is tried again: the crash may have been no fault of the job"
+    assert all(served.clips().count(seed) == 1 for seed in range(1, 13)), "nobody else was begun twice"
+
+
+def test_too_much_memory_ends_the_job_alone(served: Served) -> None:
+    told = problem(served.http.post("/simulate", json=poison("memory", seed=101)), 500, "worker-ended")
+    assert "MB" in told["detail"]
+    assert served.clips().count(101) == 1, "it would take as much again"
+    assert served.http.post("/simulate", json=slow(0.1, seed=102)).status_code == 200
+
+
+def test_a_job_that_never_ends_is_ended(served: Served) -> None:
+    problem(served.http.post("/simulate", json=poison("hang", seed=103)), 504, "job-timeout")
+    assert served.http.post("/simulate", json=slow(0.1, seed=104)).status_code == 200
+
+
+def test_a_job_that_cannot_be_stopped_is_canceled_all_the_same(served: Served) -> None:
+    job = served.submit(poison("hang", seed=105))
+    served.rendering(job["id"])
+    assert served.http.post(f"/jobs/{job['id']}/cancel").json()["status"] == "canceled"
+    eventually(
+        lambda: len(served.clips()) and served.http.post("/simulate", json=slow(0.1, seed=106)).status_code == 200
+    )
+
+
+@pytest.mark.skipif(SCALE == 1, reason="frozen processes are waited for in `make soak`")
+def test_a_frozen_worker_is_replaced(served: Served) -> None:
+    job = served.submit(slow(4, seed=107))
+    served.rendering(job["id"])
+    frozen = workers_of(served)
+    for one in frozen:
+        one.suspend()
+    assert served.ended(job["id"])["status"] == "succeeded"
+    assert not {one.pid for one in frozen} & {one.pid for one in workers_of(served)}
+
+
+def test_what_a_generator_needs_is_told_by_its_manifest() -> None:
+    """The class says the same, where its libraries are installed."""
+    from cow_service.generators.wan.generator import WanGenerator
+
+    assert {load_manifests()[name].concurrency for name in ("ati", "wan-move", "tiny-ati")} == {
+        WanGenerator.concurrency
+    }
+    assert load_manifests()["cutout"].concurrency is None
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[str]:
+    with postgres_server() as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def fleet(postgres: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Served, Worker, Worker]]:
+    """A server that computes nothing, and two workers, on one PostgreSQL."""
+    folder, own = tmp_path_factory.mktemp("fleet"), {"COW_DATABASE_URL": postgres}
+    with (
+        Served(folder, COW_ROLE="api", **own) as api,
+        Worker(folder, log="first", **own) as first,
+        Worker(folder, log="second", **own) as second,
+    ):
+        yield api, first, second
+
+
+def test_an_api_server_computes_nothing_and_two_workers_share_the_jobs(fleet: tuple[Served, Worker, Worker]) -> None:
+    api, *workers = fleet
+    assert api.process is not None
+    assert workers_of(api) == []
+    before = [one.cpu_seconds() for one in workers]
+    with ThreadPoolExecutor(8) as threads:
+        bodies = [slow(2, seed=seed) for seed in range(200, 208)]
+        answers = list(threads.map(lambda body: api.http.post("/simulate", json=body), bodies))
+    assert [answer.status_code for answer in answers] == [200] * 8
+    assert all(one.cpu_seconds() > spent + 0.2 for one, spent in zip(workers, before, strict=True)), "one did nothing"
+
+
+def test_progress_and_cancellation_reach_the_other_process(fleet: tuple[Served, Worker, Worker]) -> None:
+    api, *_ = fleet
+    job = api.submit(slow(30, seed=210))
+    api.rendering(job["id"])
+    eventually(lambda: api.job(job["id"])["progress"] > 0.25)
+    assert api.http.post(f"/jobs/{job['id']}/cancel").json()["status"] == "canceled"
+    assert api.http.post("/simulate", json=slow(0.1, seed=211)).status_code == 200
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL] if SCALE == 1 else [signal.SIGKILL, signal.SIGSTOP])
+def test_a_worker_that_is_gone_or_frozen_loses_its_jobs(fleet: tuple[Served, Worker, Worker], number: int) -> None:
+    api, first, second = fleet
+    jobs = [api.submit(slow(3, seed=220 + 10 * number + place))["id"] for place in range(3)]
+    for job in jobs:
+        eventually(lambda job=job: api.job(job)["status"] != "queued")
+    victim = first if number == signal.SIGKILL else second
+    for one in victim.processes():
+        os.kill(one.pid, number)
+    assert {api.ended(job)["status"] for job in jobs} == {"succeeded"}
+    if number == signal.SIGKILL:
+        first.start()
+    else:
+        for one in victim.processes():
+            os.kill(one.pid, signal.SIGCONT)
+
+
+def test_an_api_server_takes_jobs_for_models_that_it_does_not_have(fleet: tuple[Served, Worker, Worker]) -> None:
+    api, *_ = fleet
+    wrong = {**BODY, "generator": "ati", "num_frames": 81, "generator_options": {"steps": "many"}}
+    problem(api.http.post("/simulate", json=wrong, headers=ASYNC), 422, "invalid-request")
+    job = api.submit(wrong | {"generator_options": {"steps": 4}})
+    assert api.job(job["id"])["status"] in ("queued", "running", "failed")
+    api.http.delete(f"/jobs/{job['id']}")
