@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -78,6 +79,7 @@ class WorkerProcess:
         self._service = Service(settings)
         self._database = Database(settings)
         self._jobs: dict[str, _Job] = {}
+        self._threads = ThreadPoolExecutor(max_workers=1024, thread_name_prefix="job")
 
     def run(self) -> None:
         """Works until the pipe ends."""
@@ -87,7 +89,7 @@ class WorkerProcess:
             match self._pipe.recv():
                 case Start() as start:
                     self._jobs[start.job_id] = _Job()
-                    threading.Thread(target=self._work, args=(start,), name="job", daemon=True).start()
+                    self._threads.submit(self._work, start)
                 case Cancel(job_id) if job_id in self._jobs:
                     self._jobs[job_id].canceled.set()
                 case KeyHeld(job_id) if job_id in self._jobs:
