@@ -173,7 +173,7 @@ class Operations:
 
     def artifact(self, sha256: str) -> Steps[bytes]:
         """The bytes of an artifact, checked against their digest."""
-        response = yield from self._exchange(Send("GET", f"/artifacts/{quote(sha256, safe='')}"))
+        response = yield from self._exchange(Send("GET", f"/artifacts/{quote(sha256, safe='')}", follow=True))
         if hashlib.sha256(response.content).hexdigest() != sha256:
             raise BadResponse(f"The artifact {sha256} came damaged ({len(response.content)} bytes): get it again.")
         return response.content
@@ -251,6 +251,7 @@ class Operations:
             "params": send.params,
             "content": send.content,
             "timeout": self.endpoint.limited(send.limit),
+            **({"follow_redirects": True} if send.follow else {}),
         }
 
     def _stream_arguments(self, job_id: str, cursor: EventCursor) -> dict[str, Any]:

@@ -118,7 +118,7 @@ class JobEngine:
         workflows.set_runner(Worker(self.open_jobs, self.webhooks, self.work_ended))
         try:
             self.database.create_tables()
-            self.database.claim(self._lease.folder_id)
+            self.database.claim(self.service.artifacts.address)
             DBOS(config=config)
             DBOS.launch()
         except (SQLAlchemyError, dbos_error.DBOSException) as error:

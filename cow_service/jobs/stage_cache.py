@@ -94,6 +94,8 @@ class StoredStep:
         job_id, text = row
         try:
             result = RESULT_TYPES[stage].model_validate_json(text)
+            if result.artifacts and job_id != self.job_id:  # before they are looked for: nobody removes them meanwhile
+                self.database.add_references(self.job_id, result.artifacts)
             for sha256 in result.artifacts:
                 self.artifacts.touch(sha256)
         except (ArtifactNotFound, ValidationError):  # lost, or of another version
