@@ -9,7 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import httpx
+import obstore
 from moto.server import ThreadedMotoServer
+from obstore.store import S3Store
 
 
 @dataclass
@@ -35,15 +37,14 @@ class ObjectStore:
 
     def damage(self, sha256: str, media_type: str = "image/png") -> None:
         """Puts other bytes where those of a digest are."""
-        self._object("PUT", sha256, content=b"damaged", headers={"Content-Type": media_type})
+        obstore.put(self._objects, sha256, b"damaged", attributes={"Content-Type": media_type})
 
     def remove(self, sha256: str) -> None:
-        self._object("DELETE", sha256)
+        obstore.delete(self._objects, sha256)
 
     def names(self) -> set[str]:
         """The names of the objects below the prefix."""
-        listing = httpx.get(f"{self.endpoint}/{self.bucket}?list-type=2&prefix=cow/").text
-        return {part.partition("</Key>")[0] for part in listing.split("<Key>cow/")[1:]}
+        return {one["path"] for chunk in obstore.list(self._objects) for one in chunk}
 
     def refuse_everybody(self) -> None:
         """From now on keys are looked at, and there is none."""
@@ -52,9 +53,18 @@ class ObjectStore:
     def accept_everybody(self) -> None:
         httpx.post(f"{self.endpoint}/moto-api/reset-auth", content=b"inf")
 
-    def _object(self, method: str, name: str, **options: object) -> None:
-        response = httpx.request(method, f"{self.endpoint}/{self.bucket}/cow/{name}", **options)  # type: ignore[arg-type]
-        response.raise_for_status()
+    @property
+    def _objects(self) -> S3Store:
+        environment = self.environment
+        return S3Store(
+            self.bucket,
+            prefix="cow",
+            access_key_id=environment["AWS_ACCESS_KEY_ID"],
+            secret_access_key=environment["AWS_SECRET_ACCESS_KEY"],
+            region=environment["AWS_REGION"],
+            endpoint=self.endpoint,
+            client_options={"allow_http": True},
+        )
 
 
 class _Counting(logging.Handler):

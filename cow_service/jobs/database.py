@@ -100,8 +100,8 @@ class Database:
         if known != address:
             raise StorageUnavailable(
                 f"The jobs of this database have their images in {known}, and this server in {address}. Give all "
-                "servers on a database the same COW_ARTIFACTS: an object store, or a folder on a disk that they share, by "
-                "default that of COW_DATA_DIR. Or give this one another COW_DATABASE_URL. Where that place is lost for "
+                "servers on a database the same COW_ARTIFACTS: an object store, or a folder on a disk that they share, "
+                "by default that of COW_DATA_DIR. Or give this one another COW_DATABASE_URL. Where that place is lost for "
                 "good, delete the row of the table cow_artifact_store."
             )
 
@@ -123,17 +123,20 @@ class Database:
         if self.file is None:
             return
         with database_errors(), self._reading.connect() as connection:
+            cursor = connection.connection.cursor()
 
             def pragma(text: str) -> int:
-                return connection.exec_driver_sql(f"PRAGMA {text}").scalar() or 0
+                cursor.execute(f"PRAGMA {text}")
+                rows = cursor.fetchall()  # all of them: SQLite gives a page back for each
+                return rows[0][0] if rows and rows[0] else 0
 
             if pragma("auto_vacuum") != INCREMENTAL:  # the file of an earlier version: it is written anew once
                 if pragma("freelist_count") > pragma("page_count") / 2:
                     pragma("auto_vacuum=INCREMENTAL")
-                    connection.exec_driver_sql("VACUUM")
+                    cursor.execute("VACUUM")
             else:
                 while (free := pragma("freelist_count") - KEPT_FREE_PAGES) > 0 and not stop():
-                    connection.exec_driver_sql(f"PRAGMA incremental_vacuum({min(free, VACUUM_PAGES)})").all()
+                    pragma(f"incremental_vacuum({min(free, VACUUM_PAGES)})")
             pragma("wal_checkpoint(PASSIVE)")  # the file is cut by it
 
     def close(self) -> None:
