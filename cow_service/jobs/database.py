@@ -25,6 +25,7 @@ from cow_service.settings import Settings, SettingsError
 BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
 MAX_IDS = 500  # in one statement
 CONNECT_SECONDS = 4  # for a connection to PostgreSQL
+MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log, beyond which it is cut when it begins anew
 INCREMENTAL = 2  # SQLite's number of that mode
 VACUUM_PAGES, KEPT_FREE_PAGES = 500, 500  # of 4 kB: given back at a time, and kept for what is written next
 
@@ -300,6 +301,7 @@ def _engine(url: str, is_file: bool) -> sa.Engine:
         for pragma in (
             "auto_vacuum=INCREMENTAL",
             "journal_mode=WAL",
+            f"journal_size_limit={MAX_LOG_BYTES}",
             "synchronous=NORMAL",
             f"busy_timeout={BUSY_TIMEOUT_MS}",
             "foreign_keys=ON",
