@@ -78,6 +78,15 @@ def test_a_file_is_moved_in_and_nothing_stays_behind(store, settings):
     assert not list(settings.data_dir.rglob("*.part"))
 
 
+def test_what_a_killed_process_left_goes_after_a_while(store, settings):
+    with store.scratch() as path:
+        path.write_bytes(DATA)
+        store.remove_leftovers(time.time() - LONG)
+        assert path.exists()
+        store.remove_leftovers(time.time() + LONG)
+        assert not list(settings.data_dir.rglob("*.part"))
+
+
 def test_what_is_not_there_is_named(store):
     for call in (store.get, store.read, store.touch, lambda name: store.local_file(name).__enter__()):
         for name in (SHA256, "../" * 21 + "x", SHA256.upper()):

@@ -15,6 +15,7 @@ from servers import BODY, IMAGE, PATIENCE, Served, problem
 
 from cow_service.api.middleware.keys import hash_of, new_key
 from cow_service.client import Client
+from cow_service.client.errors import ServerUnreachable
 
 pytestmark = pytest.mark.slow
 
@@ -90,6 +91,19 @@ def test_the_sdk_follows_and_keeps_its_key_to_itself(served, objects, keys):
     assert str(followed.url).startswith(objects.endpoint)
     assert keys["alice"] not in str(followed.url) + str(followed.headers)
     assert "authorization" not in followed.headers
+
+
+def test_the_sdk_says_that_the_store_cannot_be_reached():
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.url.host == "store":
+            raise httpx.ConnectError("refused", request=request)
+        return httpx.Response(307, headers={"Location": "http://store/bucket/x?signature=secret"})
+
+    with httpx.Client(transport=httpx.MockTransport(answer)) as http:
+        client = Client("http://server:80", http_client=http, retries=0)
+        with pytest.raises(ServerUnreachable, match="COW_ARTIFACTS_REDIRECT=false") as caught:
+            client.artifact("0" * 64)
+    assert "secret" not in caught.value.detail
 
 
 def test_what_is_damaged_is_made_again(served, objects):

@@ -199,7 +199,7 @@ class Operations:
                 break
             yield Sleep(pause)
         if isinstance(outcome, httpx.HTTPError):
-            raise unreachable(outcome) from outcome
+            raise unreachable(outcome, self.endpoint.base_url) from outcome
         # What an earlier attempt deleted, whose response was lost, is gone.
         if send.method == "DELETE" and attempts > 1 and outcome.status_code == NOT_FOUND:
             return outcome
@@ -269,7 +269,7 @@ class Operations:
         elif isinstance(outcome, httpx.ConnectError):
             self._refused += 1
             if not self._ever_answered and self._refused >= MAX_FIRST_ATTEMPTS:
-                raise unreachable(outcome) from outcome
+                raise unreachable(outcome, self.endpoint.base_url) from outcome
         return outcome
 
 

@@ -102,8 +102,8 @@ class Database:
             raise StorageUnavailable(
                 f"The jobs of this database have their images in {known}, and this server in {address}. Give all "
                 "servers on a database the same COW_ARTIFACTS: an object store, or a folder on a disk that they share, "
-                "by default that of COW_DATA_DIR. Or give this one another COW_DATABASE_URL. Where that place is lost for "
-                "good, delete the row of the table cow_artifact_store."
+                "by default that of COW_DATA_DIR. Or give this one another COW_DATABASE_URL. Where that place is lost "
+                "for good, delete the row of the table cow_artifact_store."
             )
 
     def check(self) -> None:

@@ -14,6 +14,7 @@ from cow_service.service import Service
 # Both are longer than an object store's times of use may be wrong.
 UNREFERENCED_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
 BUDGET_GRACE_SECONDS = 900.0  # that it is kept after its last use, whatever the budget: a stage may be about to refer
+LEFTOVER_SECONDS = 24 * 3600.0  # that a temporary file is kept after it was last written to
 
 log = logging.getLogger("cow_service")
 
@@ -22,6 +23,7 @@ def collect_artifacts(service: Service, database: Database, stop: Callable[[], b
     """Removes what is not needed any more, as of `now` (Unix time, s; by default the clock's), until `stop` says so."""
     now = time.time() if now is None else now
     store, max_gb = service.artifacts, service.settings.artifacts_max_gb
+    store.remove_leftovers(now - LEFTOVER_SECONDS)
     left = _remove_unreferenced(store, database, list(store.listed()), now - UNREFERENCED_GRACE_SECONDS, stop)
     if max_gb is not None:
         _keep_within(max_gb * 1e9, store, database, left, now - BUDGET_GRACE_SECONDS, stop)

@@ -96,8 +96,7 @@ class StoredStep:
             result = RESULT_TYPES[stage].model_validate_json(text)
             if result.artifacts and job_id != self.job_id:  # before they are looked for: nobody removes them meanwhile
                 self.database.add_references(self.job_id, result.artifacts)
-            for sha256 in result.artifacts:
-                self.artifacts.touch(sha256)
+            self.artifacts.touch(*result.artifacts)
         except (ArtifactNotFound, ValidationError):  # lost, or of another version
             return None
         return result, job_id != self.job_id

@@ -79,8 +79,8 @@ class ArtifactStore(Protocol):
         """The bytes of an artifact, which are those of its digest; marks it as used now. Raises as `get` does."""
         ...
 
-    def touch(self, sha256: str) -> None:
-        """Marks an artifact whose bytes are those of its digest as used now. Raises as `get` does."""
+    def touch(self, *sha256: str) -> None:
+        """Marks artifacts whose bytes are those of their digests as used now. Raises as `get` does."""
         ...
 
     def local_file(self, sha256: str) -> AbstractContextManager[Path]:
@@ -101,6 +101,10 @@ class ArtifactStore(Protocol):
 
     def scratch(self) -> AbstractContextManager[Path]:
         """A path on this machine for a temporary file; deleted afterwards unless `put_file` moved it."""
+        ...
+
+    def remove_leftovers(self, untouched_since: float) -> None:
+        """Removes temporary files of processes that were killed: those not written to after that time."""
         ...
 
     def check(self) -> None:

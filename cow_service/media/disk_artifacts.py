@@ -31,6 +31,7 @@ from cow_service.media.artifacts import (
     is_digest,
     not_found,
 )
+from cow_service.media.temporary_files import remove_temporary_files, temporary_beside
 from cow_service.records import Artifact
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -73,7 +74,7 @@ class DiskArtifacts:
                 self._use(known)
                 return known.artifact
             target = self._target(sha256, extension)
-            with _temporary_beside(target) as temporary:
+            with temporary_beside(target) as temporary:
                 with temporary.open("xb") as file:
                     file.write(data)
                     _sync(file)
@@ -87,7 +88,7 @@ class DiskArtifacts:
                 sha256 = hashlib.file_digest(file, "sha256").hexdigest()
                 _sync(file)
             target = self._target(sha256, extension)
-            with _temporary_beside(target) as temporary:
+            with temporary_beside(target) as temporary:
                 path.replace(temporary)
                 return self._commit(temporary, target, sha256)
 
@@ -102,11 +103,12 @@ class DiskArtifacts:
             self._use(stored)
             return stored.path.read_bytes()
 
-    def touch(self, sha256: str) -> None:
-        """Sets the time of the file."""
-        stored = self._get(sha256)
-        with _storage_errors(), _deleted_meanwhile(sha256):
-            self._use(stored)
+    def touch(self, *sha256: str) -> None:
+        """Sets the times of the files."""
+        for one in sha256:
+            stored = self._get(one)
+            with _storage_errors(), _deleted_meanwhile(one):
+                self._use(stored)
 
     @contextmanager
     def local_file(self, sha256: str) -> Generator[Path]:
@@ -140,12 +142,17 @@ class DiskArtifacts:
         """A path on the disk of the folder, so that the file needs no copying."""
         with ExitStack() as stack:
             with _storage_errors():
-                path = stack.enter_context(_temporary_beside(self._folder / "scratch"))
+                path = stack.enter_context(temporary_beside(self._folder / "scratch"))
             yield path
+
+    def remove_leftovers(self, untouched_since: float) -> None:
+        """Looks for them beside the artifacts."""
+        with _storage_errors():
+            remove_temporary_files(self._folder, untouched_since)
 
     def check(self) -> None:
         """Writes, syncs and removes a small file."""
-        with _storage_errors(), _temporary_beside(self._folder / "check") as temporary, temporary.open("xb") as file:
+        with _storage_errors(), temporary_beside(self._folder / "check") as temporary, temporary.open("xb") as file:
             file.write(b"\0")
             _sync(file)
 
@@ -214,17 +221,6 @@ def _state(path: Path) -> tuple[int, ...]:
     """What changes with the bytes of a file, unless the disk itself damages them."""
     status = path.stat()
     return status.st_ino, status.st_size, status.st_mtime_ns
-
-
-@contextmanager
-def _temporary_beside(target: Path) -> Generator[Path]:
-    """A name for a file that does not exist yet, on the target's own disk so that it can be renamed to it."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.parent / f".{uuid4().hex}.part"
-    try:
-        yield temporary
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -13,12 +13,12 @@ import logging
 import threading
 import time
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import obstore
 from obstore import exceptions
@@ -35,12 +35,14 @@ from cow_service.media.artifacts import (
     is_digest,
     not_found,
 )
+from cow_service.media.temporary_files import remove_temporary_files, temporary_beside
 from cow_service.records import Artifact
 from cow_service.settings import SettingsError
 
 RENEWED_AFTER_SECONDS = 300.0
 REQUEST_SECONDS, CONNECT_SECONDS = 30.0, 3.0  # that a request and a connection may take
 RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request; an outage that lasts longer is waited for by the job
+MAX_PARALLEL = 8  # requests for one job
 CHECKED = "check"  # the object that shows that the store can be written and read
 _REFUSED = (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)
 
@@ -119,8 +121,17 @@ class ObjectArtifacts:
             self._send(sha256, data, found.artifact.media_type)
         return data
 
-    def touch(self, sha256: str) -> None:
-        """Gets the bytes only where they were not compared, or where they must be sent again."""
+    def touch(self, *sha256: str) -> None:
+        """Gets bytes only where they were not compared, or where they must be sent again."""
+        if len(sha256) <= 1:
+            for one in sha256:
+                self._touch(one)
+            return
+        with ThreadPoolExecutor(min(len(sha256), MAX_PARALLEL)) as pool:
+            for _ in pool.map(self._touch, sha256):
+                pass  # what one of them raises is raised here
+
+    def _touch(self, sha256: str) -> None:
         found = self._found(sha256)
         if not (found.is_fresh and self._is_verified(found)):
             self.read(sha256)
@@ -166,13 +177,15 @@ class ObjectArtifacts:
     @contextmanager
     def scratch(self) -> Generator[Path]:
         """A path in the folder for temporary files."""
-        with _scratch_errors():
-            self._scratch_folder.mkdir(parents=True, exist_ok=True)
-        path = self._scratch_folder / f"{uuid4().hex}.part"
-        try:
+        with ExitStack() as stack:
+            with _scratch_errors():
+                path = stack.enter_context(temporary_beside(self._scratch_folder / "scratch"))
             yield path
-        finally:
-            path.unlink(missing_ok=True)
+
+    def remove_leftovers(self, untouched_since: float) -> None:
+        """Looks for them in the folder for temporary files."""
+        with _scratch_errors():
+            remove_temporary_files(self._scratch_folder, untouched_since)
 
     def check(self) -> None:
         """Sends a small object and gets it. Deleting needs a permission, too, but only once artifacts are old."""
