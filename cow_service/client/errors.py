@@ -67,8 +67,8 @@ def unreachable(error: httpx.HTTPError, base_url: str | None = None) -> ServerUn
     server = url if base_url is None else httpx.URL(base_url)
     if (url.scheme, url.host, url.port) != (server.scheme, server.host, server.port):
         return ServerUnreachable(
-            f"{request} The server keeps its artifacts there. Where callers cannot reach that place, the server must pass "
-            "them on (COW_ARTIFACTS_REDIRECT=false)."
+            f"{request} The server keeps its artifacts there. Where callers cannot reach that place, the server must "
+            "pass them on (COW_ARTIFACTS_REDIRECT=false)."
         )
     return ServerUnreachable(f"{request} Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?")
 
