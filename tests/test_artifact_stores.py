@@ -87,6 +87,18 @@ def test_what_a_killed_process_left_goes_after_a_while(store, settings):
         assert not list(settings.data_dir.rglob("*.part"))
 
 
+def test_a_batch_is_there_when_its_block_ends(store):
+    with store.batch() as batch:
+        artifacts = [batch.put(name.encode() * 500, "image/png") for name in ("ab", "cd", "ef")]
+        with batch.scratch() as path:
+            path.write_bytes(DATA)
+            artifacts.append(batch.put_file(path, "video/mp4"))
+            assert not path.exists()
+        with pytest.raises(ValueError, match="'image/gif' is not kept"):
+            batch.put(DATA, "image/gif")
+    assert [store.get(each.sha256) for each in artifacts] == artifacts
+
+
 def test_what_is_not_there_is_named(store):
     for call in (store.get, store.read, store.touch, lambda name: store.local_file(name).__enter__()):
         for name in (SHA256, "../" * 21 + "x", SHA256.upper()):
@@ -166,7 +178,12 @@ def test_a_store_that_is_away_or_refuses_is_a_typed_error(objects, store_of_obje
         absent.check()
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     away = open_artifact_store(Settings(data_dir=tmp_path, artifacts=objects.url))
-    for call in (away.check, lambda: away.touch(SHA256), lambda: list(away.listed())):
+
+    def put_in_a_batch() -> None:
+        with away.batch() as batch:
+            batch.put(DATA, "image/png")
+
+    for call in (away.check, lambda: away.touch(SHA256), lambda: list(away.listed()), put_in_a_batch):
         with pytest.raises(StorageUnavailable, match="object store of COW_ARTIFACTS cannot be used"):
             call()
 

@@ -49,16 +49,8 @@ class ListedArtifact:
     used_at: float
 
 
-class ArtifactStore(Protocol):
-    """Keeps bytes under their digests. Safe to share between threads.
-
-    Every method raises `StorageUnavailable` where the store cannot be read or written.
-    """
-
-    @property
-    def address(self) -> str:
-        """Names the store, the same for every process that shares it. It holds no credentials."""
-        ...
+class ArtifactWriter(Protocol):
+    """Stores bytes under their digests. Every method raises `StorageUnavailable` where the store cannot be written."""
 
     def put(self, data: bytes, media_type: str) -> Artifact:
         """Stores bytes, also where those that are stored under their digest are damaged; marks them as used now.
@@ -69,6 +61,22 @@ class ArtifactStore(Protocol):
 
     def put_file(self, path: Path, media_type: str) -> Artifact:
         """Moves in a finished file of `scratch`; afterwards `path` no longer exists. Raises as `put` does."""
+        ...
+
+    def scratch(self) -> AbstractContextManager[Path]:
+        """A path on this machine for a temporary file; deleted afterwards unless `put_file` moved it."""
+        ...
+
+
+class ArtifactStore(ArtifactWriter, Protocol):
+    """Keeps bytes under their digests. Safe to share between threads.
+
+    Every method raises `StorageUnavailable` where the store cannot be read or written.
+    """
+
+    @property
+    def address(self) -> str:
+        """Names the store, the same for every process that shares it. It holds no credentials."""
         ...
 
     def get(self, sha256: str) -> Artifact:
@@ -99,8 +107,11 @@ class ArtifactStore(Protocol):
         """All artifacts, in no particular order."""
         ...
 
-    def scratch(self) -> AbstractContextManager[Path]:
-        """A path on this machine for a temporary file; deleted afterwards unless `put_file` moved it."""
+    def batch(self) -> AbstractContextManager[ArtifactWriter]:
+        """A writer several of whose puts may run at the same time; all are done when its block ends.
+
+        The end of the block raises what any of them raises.
+        """
         ...
 
     def remove_leftovers(self, untouched_since: float) -> None:

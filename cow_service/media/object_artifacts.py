@@ -28,6 +28,7 @@ from cow_service.errors import StorageUnavailable
 from cow_service.media.artifacts import (
     MAX_VERIFIED,
     MEDIA_TYPES,
+    ArtifactWriter,
     ListedArtifact,
     artifact_of,
     check_digest,
@@ -35,6 +36,7 @@ from cow_service.media.artifacts import (
     is_digest,
     not_found,
 )
+from cow_service.media.object_batch import ObjectBatch, scratch_errors, take_file
 from cow_service.media.temporary_files import remove_temporary_files, temporary_beside
 from cow_service.records import Artifact
 from cow_service.settings import SettingsError
@@ -91,23 +93,12 @@ class ObjectArtifacts:
     def put(self, data: bytes, media_type: str) -> Artifact:
         """Sends bytes, unless this process knows that the same bytes are there."""
         extension_of(media_type)
-        sha256 = hashlib.sha256(data).hexdigest()
-        if sha256 in self._verified:
-            found = self._head(sha256)
-            if found is not None and found.is_fresh and self._is_verified(found):
-                return found.artifact
-        self._send(sha256, data, media_type)
-        return artifact_of(sha256, media_type, len(data))
+        return self._put(hashlib.sha256(data).hexdigest(), data, media_type)
 
     def put_file(self, path: Path, media_type: str) -> Artifact:
         """Sends the bytes of a file, and deletes it."""
         extension_of(media_type)
-        with _scratch_errors():
-            data = path.read_bytes()
-        artifact = self.put(data, media_type)
-        with _scratch_errors():
-            path.unlink()
-        return artifact
+        return self.put(take_file(path), media_type)
 
     def get(self, sha256: str) -> Artifact:
         """Finds an object. Its bytes are not compared: whoever gets them from a signed URL can."""
@@ -142,7 +133,7 @@ class ObjectArtifacts:
         check_digest(sha256)
         _, data = self._fetch(sha256)
         with self.scratch() as path:
-            with _scratch_errors():
+            with scratch_errors():
                 path.write_bytes(data)
             yield path
 
@@ -178,13 +169,21 @@ class ObjectArtifacts:
     def scratch(self) -> Generator[Path]:
         """A path in the folder for temporary files."""
         with ExitStack() as stack:
-            with _scratch_errors():
+            with scratch_errors():
                 path = stack.enter_context(temporary_beside(self._scratch_folder / "scratch"))
             yield path
 
+    @contextmanager
+    def batch(self) -> Generator[ArtifactWriter]:
+        """Sends in threads."""
+        with ThreadPoolExecutor(MAX_PARALLEL, thread_name_prefix="cow-artifacts") as pool:
+            batch = ObjectBatch(pool, self._put, self.scratch)
+            yield batch
+            batch.wait()
+
     def remove_leftovers(self, untouched_since: float) -> None:
         """Looks for them in the folder for temporary files."""
-        with _scratch_errors():
+        with scratch_errors():
             remove_temporary_files(self._scratch_folder, untouched_since)
 
     def check(self) -> None:
@@ -192,6 +191,14 @@ class ObjectArtifacts:
         with _store_errors():
             obstore.put(self._store, CHECKED, b"\0", use_multipart=False)
             obstore.get(self._store, CHECKED).bytes()
+
+    def _put(self, sha256: str, data: bytes, media_type: str) -> Artifact:
+        if sha256 in self._verified:
+            found = self._head(sha256)
+            if found is not None and found.is_fresh and self._is_verified(found):
+                return found.artifact
+        self._send(sha256, data, media_type)
+        return artifact_of(sha256, media_type, len(data))
 
     def _found(self, sha256: str) -> _Object:
         check_digest(sha256)
@@ -271,13 +278,3 @@ def _store_errors() -> Generator[None]:
 def _unavailable(reason: str, error: Exception) -> StorageUnavailable:
     log.warning("object store: %s", str(error).partition("\n")[0])
     return StorageUnavailable(f"The object store of COW_ARTIFACTS cannot be used: {reason}.")
-
-
-@contextmanager
-def _scratch_errors() -> Generator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise StorageUnavailable(
-            f"The data folder cannot be used for temporary files ({error.strerror or type(error).__name__})."
-        ) from error
