@@ -18,6 +18,7 @@ from obstore.store import S3Store
 class ObjectStore:
     """`url` is for COW_ARTIFACTS, `environment` for obstore."""
 
+    server: ThreadedMotoServer
     endpoint: str
     bucket: str
     requests: Counter[str] = field(default_factory=Counter[str])
@@ -45,6 +46,16 @@ class ObjectStore:
     def names(self) -> set[str]:
         """The names of the objects below the prefix."""
         return {one["path"] for chunk in obstore.list(self._objects) for one in chunk}
+
+    def stop(self) -> None:
+        """Is away until `start`."""
+        self.server.stop()
+
+    def start(self) -> None:
+        """Is back at the same address, with all objects."""
+        host, _, port = self.endpoint.removeprefix("http://").partition(":")
+        self.server = ThreadedMotoServer(ip_address=host, port=int(port), verbose=True)
+        self.server.start()
 
     def refuse_everybody(self) -> None:
         """From now on keys are looked at, and there is none."""
@@ -88,7 +99,7 @@ def serving(bucket: str = "bucket") -> Iterator[ObjectStore]:
     level = logger.level
     server.start()
     host, port = server.get_host_and_port()
-    store = ObjectStore(f"http://{host}:{port}", bucket)
+    store = ObjectStore(server, f"http://{host}:{port}", bucket)
     counting = _Counting(store.requests)
     try:
         logger.addHandler(counting)
@@ -100,4 +111,4 @@ def serving(bucket: str = "bucket") -> Iterator[ObjectStore]:
     finally:
         logger.removeHandler(counting)
         logger.setLevel(level)
-        server.stop()
+        store.server.stop()

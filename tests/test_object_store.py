@@ -6,12 +6,13 @@ import hashlib
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 
 import httpx
 import object_store
 import pytest
-from servers import BODY, IMAGE, PATIENCE, Served, problem
+from servers import BODY, IMAGE, PATIENCE, Served, eventually, problem, slow
 
 from cow_service.api.middleware.keys import hash_of, new_key
 from cow_service.client import Client
@@ -118,6 +119,21 @@ def test_what_is_damaged_is_made_again(served, objects):
     for sha256 in (image, frame["sha256"]):
         found = served.http.get(f"/artifacts/{sha256}", follow_redirects=True)
         assert hashlib.sha256(found.content).hexdigest() == sha256
+
+
+def test_a_store_that_is_away_for_a_while_costs_no_clip(served, objects):
+    job = served.submit(slow(1.0, seed=77))
+    served.rendering(job["id"])
+    objects.stop()
+    try:
+        eventually(lambda: served.http.get("/readyz").status_code == 503)
+        problem(served.http.post("/simulate", json=BODY), 503, "storage-unavailable")
+        time.sleep(2)  # the clip is done meanwhile, and cannot be sent
+        assert served.job(job["id"])["status"] == "running"
+    finally:
+        objects.start()
+    assert served.ended(job["id"])["status"] == "succeeded"
+    assert served.clips().count(77) == 1
 
 
 def test_another_server_passes_the_bytes_on(served, objects, tmp_path):

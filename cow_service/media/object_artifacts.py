@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +43,11 @@ from cow_service.records import Artifact
 from cow_service.settings import SettingsError
 
 RENEWED_AFTER_SECONDS = 300.0
-REQUEST_SECONDS, CONNECT_SECONDS = 30.0, 3.0  # that a request and a connection may take
-RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request; an outage that lasts longer is waited for by the job
+REQUEST_SECONDS, CONNECT_SECONDS = 8.0, 3.0  # that a request with its bytes, and a connection, may take
+RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request that somebody may wait for
+# Of the bytes of a clip, which took long to make; an outage that lasts longer is waited for by the job.
+PATIENT_RETRY_SECONDS, MAX_PATIENT_RETRIES = 60.0, 1000
+FIRST_BACKOFF_SECONDS, MAX_BACKOFF_SECONDS = 0.1, 2.0
 MAX_PARALLEL = 8  # requests for one job
 CHECKED = "check"  # the object that shows that the store can be written and read
 _REFUSED = (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)
@@ -70,20 +74,8 @@ class ObjectArtifacts:
         self._scratch_folder = scratch_folder
         self._verified: dict[str, str] = {}  # ETags of the objects whose bytes were compared with their digests
         self._guard = threading.Lock()
-        try:
-            # A plain http:// endpoint is used only where the environment names one.
-            self._store: Any = from_url(
-                url,
-                client_options={
-                    "allow_http": True,
-                    "timeout": timedelta(seconds=REQUEST_SECONDS),
-                    "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
-                },
-                retry_config={"max_retries": MAX_RETRIES, "retry_timeout": timedelta(seconds=RETRY_SECONDS)},
-            )
-        except (exceptions.BaseError, ValueError) as error:
-            reason = str(error).partition("\n")[0]
-            raise SettingsError(f"Bad settings: the object store of COW_ARTIFACTS cannot be used: {reason}.") from error
+        self._store = _open(url, MAX_RETRIES, RETRY_SECONDS)
+        self._patient_store = _open(url, MAX_PATIENT_RETRIES, PATIENT_RETRY_SECONDS)
 
     @property
     def address(self) -> str:
@@ -109,7 +101,7 @@ class ObjectArtifacts:
         check_digest(sha256)
         found, data = self._fetch(sha256)
         if not found.is_fresh:
-            self._send(sha256, data, found.artifact.media_type)
+            self._send(sha256, data, found.artifact.media_type, self._store)
         return data
 
     def touch(self, *sha256: str) -> None:
@@ -177,7 +169,7 @@ class ObjectArtifacts:
     def batch(self) -> Generator[ArtifactWriter]:
         """Sends in threads."""
         with ThreadPoolExecutor(MAX_PARALLEL, thread_name_prefix="cow-artifacts") as pool:
-            batch = ObjectBatch(pool, self._put, self.scratch)
+            batch = ObjectBatch(pool, partial(self._put, patiently=True), self.scratch)
             yield batch
             batch.wait()
 
@@ -192,12 +184,12 @@ class ObjectArtifacts:
             obstore.put(self._store, CHECKED, b"\0", use_multipart=False)
             obstore.get(self._store, CHECKED).bytes()
 
-    def _put(self, sha256: str, data: bytes, media_type: str) -> Artifact:
+    def _put(self, sha256: str, data: bytes, media_type: str, *, patiently: bool = False) -> Artifact:
         if sha256 in self._verified:
             found = self._head(sha256)
             if found is not None and found.is_fresh and self._is_verified(found):
                 return found.artifact
-        self._send(sha256, data, media_type)
+        self._send(sha256, data, media_type, self._patient_store if patiently else self._store)
         return artifact_of(sha256, media_type, len(data))
 
     def _found(self, sha256: str) -> _Object:
@@ -231,11 +223,11 @@ class ObjectArtifacts:
         self._note_verified(sha256, found.e_tag)
         return found, data
 
-    def _send(self, sha256: str, data: bytes, media_type: str) -> None:
+    def _send(self, sha256: str, data: bytes, media_type: str, store: Any) -> None:
         with _store_errors():
             # In one piece: an upload in parts takes three requests and more.
             attributes = {"Content-Type": media_type}
-            result = obstore.put(self._store, sha256, data, attributes=attributes, use_multipart=False)
+            result = obstore.put(store, sha256, data, attributes=attributes, use_multipart=False)
         self._note_verified(sha256, result["e_tag"])
 
     def _remove(self, sha256: str) -> None:
@@ -255,6 +247,30 @@ class ObjectArtifacts:
                 self._verified[sha256] = e_tag
 
 
+def _open(url: str, max_retries: int, retry_seconds: float) -> Any:
+    try:
+        return from_url(
+            url,
+            client_options={
+                "allow_http": True,  # for an endpoint of the environment that is one of http://
+                "timeout": timedelta(seconds=REQUEST_SECONDS),
+                "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
+            },
+            retry_config={
+                "max_retries": max_retries,
+                "retry_timeout": timedelta(seconds=retry_seconds),
+                "backoff": {
+                    "init_backoff": timedelta(seconds=FIRST_BACKOFF_SECONDS),
+                    "max_backoff": timedelta(seconds=MAX_BACKOFF_SECONDS),
+                    "base": 2,
+                },
+            },
+        )
+    except (exceptions.BaseError, ValueError) as error:
+        reason = str(error).partition("\n")[0]
+        raise SettingsError(f"Bad settings: the object store of COW_ARTIFACTS cannot be used: {reason}.") from error
+
+
 def _object(sha256: str, result: obstore.GetResult) -> _Object | None:
     meta, media_type = result.meta, result.attributes.get("Content-Type", "")
     if media_type not in MEDIA_TYPES:  # an object that somebody else has put there
@@ -272,7 +288,9 @@ def _store_errors() -> Generator[None]:
     except FileNotFoundError as error:
         raise _unavailable("there is no such bucket", error) from error
     except exceptions.BaseError as error:
-        raise _unavailable(f"{type(error).__name__}; the log says more", error) from error
+        raise _unavailable(
+            f"no answer, or no credentials ({type(error).__name__}): the log says more", error
+        ) from error
 
 
 def _unavailable(reason: str, error: Exception) -> StorageUnavailable:
