@@ -40,7 +40,7 @@ def media_type_of(data: bytes) -> str | None:
     return "video/mp4" if data[4:8] == b"ftyp" else None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ListedArtifact:
     """An artifact as a listing has it. No job needed it after `used_at`, seconds since 1970."""
 
