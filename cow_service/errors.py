@@ -323,7 +323,7 @@ class Canceled(CowError):
 
 
 class StorageUnavailable(CowError):
-    """The data folder cannot be written or read."""
+    """The data folder, the object store or the job database cannot be used."""
 
     code, status = "storage-unavailable", 503
 

@@ -19,7 +19,8 @@ from cow_service.errors import (
     field_of,
 )
 from cow_service.generators.base import Generator, Limits
-from cow_service.media.artifacts import ArtifactStore, media_type_of
+from cow_service.media.artifact_stores import open_artifact_store
+from cow_service.media.artifacts import media_type_of
 from cow_service.media.data_urls import decode_data_url
 from cow_service.media.images import DecodedImage, decode
 from cow_service.net.images import ImageUrls
@@ -55,7 +56,7 @@ class Service:
         self._guard = Lock()
         self.metrics = Metrics()
         self._image_urls = ImageUrls(settings)
-        self.artifacts = ArtifactStore(settings.data_dir / "artifacts")
+        self.artifacts = open_artifact_store(settings)
         self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable, settings)
         self._generator_limits = {point.name: point for point in entry_points(group="cow_service.generator_limits")}
         self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable, settings)
@@ -221,7 +222,6 @@ class Service:
             artifact, image = self.keep_image(self._image_urls.fetch(url))
             return artifact.sha256, image
         if isinstance(ref, ImageArtifact):
-            self.artifacts.touch(ref.artifact)
             data = self.artifacts.read(ref.artifact)
             return ref.artifact, decode(data, max_megapixels=self.settings.max_image_megapixels)
         artifact, image = self.keep_image(decode_data_url(ref))

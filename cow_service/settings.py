@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,6 +16,8 @@ KEY_NAME = r"^[A-Za-z0-9._-]{1,64}$"
 KEY_HASH = r"^sha256:[0-9a-f]{64}$"
 SECRET_BYTES = range(24, 65)  # as Standard Webhooks says
 MAX_SECRETS = 2  # that sign at the same time, while one takes over from the other
+# Without a name or a password before the bucket: they would be kept in the job database.
+OBJECT_STORE = re.compile(r"(s3|gs|az)://[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9._-]+)*/?")
 ORIGIN = r"^(\*|[a-z][a-z0-9+.-]*://[^/\s?#@A-Z]+)$"  # as browsers write it: lower case, no path
 
 
@@ -29,7 +32,25 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(
         default_factory=lambda: user_data_path("cow", appauthor=False),
-        description="Folder for artifacts; made if missing.",
+        description="Folder for artifacts, the job database and temporary files; made if missing.",
+    )
+    artifacts: str | None = Field(
+        default=None,
+        min_length=1,
+        description="Where artifacts are kept: a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or "
+        "az://CONTAINER/PREFIX; by default the folder `artifacts` of the data folder.",
+    )
+    artifacts_redirect: bool = Field(
+        default=True,
+        description="Whether callers are sent to the object store for artifacts, by signed URLs; if not, the server "
+        "passes the bytes on.",
+    )
+    artifacts_max_gb: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="Artifacts that are kept, in GB (10^9 bytes): beyond, those that no job used for longest are "
+        "removed; by default age alone decides.",
     )
     host: str = Field(default="127.0.0.1", description="Address the server listens on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port the server listens on; 0 takes a free one.")
@@ -152,6 +173,13 @@ class Settings(BaseSettings):
         default="info", description="The least important messages that the server logs."
     )
 
+    @field_validator("artifacts")
+    @classmethod
+    def _is_place(cls, place: str | None) -> str | None:
+        if place is not None and "://" in place and OBJECT_STORE.fullmatch(place) is None:
+            raise ValueError("neither a folder nor an object store")
+        return place
+
     @field_validator("api_keys")
     @classmethod
     def _different(cls, hashes: dict[str, str]) -> dict[str, str]:
@@ -248,6 +276,11 @@ def _message(item: Any) -> str:
     name = str(item["loc"][0])
     if name == "mllm_base_url":
         return "COW_MLLM_BASE_URL must begin with http:// or https://"
+    if name == "artifacts":
+        return (
+            "COW_ARTIFACTS must be a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX, "
+            "without credentials: those come from variables of their own, such as AWS_*"
+        )
     if name == "webhook_secret":
         return "COW_WEBHOOK_SECRET must be whsec_ and the base64 of 24 to 64 random bytes, or two of them"
     if name == "api_keys":

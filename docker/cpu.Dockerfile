@@ -22,7 +22,7 @@ COPY models models
 COPY prompts prompts
 COPY cow_service cow_service
 RUN --mount=type=cache,target=/root/.cache/pip \
-    pip install "/src[providers,otel,mcp]"
+    pip install "/src[providers,otel,mcp,objects]"
 
 FROM ${PYTHON_IMAGE}
 ARG PYTHON_IMAGE

@@ -34,7 +34,7 @@ COPY models models
 COPY prompts prompts
 COPY cow_service cow_service
 RUN --mount=type=cache,target=/root/.cache/pip \
-    pip install "torch==${TORCH_VERSION}" "/src[wan,fp8,local,providers,otel,mcp]"
+    pip install "torch==${TORCH_VERSION}" "/src[wan,fp8,local,providers,otel,mcp,objects]"
 
 FROM ${PYTHON_IMAGE}
 ARG PYTHON_IMAGE

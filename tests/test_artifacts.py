@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from cow_service.errors import ArtifactNotFound, StorageUnavailable
-from cow_service.media.artifacts import MEDIA_TYPES, ArtifactStore
+from cow_service.media.artifacts import MEDIA_TYPES
+from cow_service.media.disk_artifacts import DiskArtifacts
 
 DATA = b"frame" * 1000
 SHA256 = hashlib.sha256(DATA).hexdigest()
@@ -24,12 +25,17 @@ def folder(tmp_path) -> Path:
 
 
 @pytest.fixture
-def store(folder) -> ArtifactStore:
-    return ArtifactStore(folder)
+def store(folder) -> DiskArtifacts:
+    return DiskArtifacts(folder)
 
 
 def files(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def path_of(store: DiskArtifacts, sha256: str) -> Path:
+    with store.local_file(sha256) as path:
+        return path
 
 
 def failing(number: int):
@@ -48,9 +54,9 @@ def test_put_get_read(store, folder, media_type, extension):
         "media_type": media_type,
         "size": len(DATA),
     }
-    stored = store.get(SHA256)
-    assert stored.artifact == artifact
-    assert stored.path == folder / SHA256[:2] / f"{SHA256}.{extension}"
+    assert store.get(SHA256) == artifact
+    with store.local_file(SHA256) as path:
+        assert path == folder / SHA256[:2] / f"{SHA256}.{extension}"
     assert store.read(SHA256) == DATA
     assert files(folder) == [f"{SHA256[:2]}/{SHA256}.{extension}"]
 
@@ -58,10 +64,10 @@ def test_put_get_read(store, folder, media_type, extension):
 @pytest.mark.parametrize("damage", [DATA[:-1], DATA[:-1] + b"x", b""], ids=["shorter", "changed", "empty"])
 @pytest.mark.parametrize("started_anew", [False, True])
 def test_what_is_damaged_is_not_handed_out_and_heals(store, folder, damage, started_anew):
-    path = store.get(store.put(DATA, "image/png").sha256).path
+    path = path_of(store, store.put(DATA, "image/png").sha256)
     path.write_bytes(damage)
     if started_anew:
-        store = ArtifactStore(folder)
+        store = DiskArtifacts(folder)
     with pytest.raises(ArtifactNotFound):
         store.get(SHA256)
     assert files(folder) == []
@@ -72,7 +78,7 @@ def test_what_is_damaged_is_not_handed_out_and_heals(store, folder, damage, star
 
 def test_bytes_are_compared_once(store, folder, monkeypatch):
     store.put(DATA, "image/png")
-    anew, compared = ArtifactStore(folder), []
+    anew, compared = DiskArtifacts(folder), []
     whole = hashlib.file_digest
     monkeypatch.setattr(hashlib, "file_digest", lambda *given: compared.append(1) or whole(*given))
     for _ in range(3):
@@ -87,9 +93,9 @@ def test_no_bytes_are_an_artifact_too(store):
 
 def test_a_second_put_changes_nothing_but_says_that_it_is_needed(store, folder):
     first = store.put(DATA, "image/png")
-    before = store.get(SHA256).path.stat()
+    before = path_of(store, SHA256).stat()
     assert store.put(DATA, "image/png") == first
-    after = store.get(SHA256).path.stat()
+    after = path_of(store, SHA256).stat()
     assert (before.st_ino, before.st_size) == (after.st_ino, after.st_size)
     assert before.st_mtime_ns <= after.st_mtime_ns
     assert len(files(folder)) == 1
@@ -101,7 +107,7 @@ def test_the_first_media_type_stays(store, folder, tmp_path):
     again = tmp_path / "again"
     again.write_bytes(DATA)
     assert store.put_file(again, "image/webp").media_type == "video/mp4"
-    assert store.get(SHA256).artifact.media_type == "video/mp4"
+    assert store.get(SHA256).media_type == "video/mp4"
     assert len(files(folder)) == 1
     assert not again.exists()
 
@@ -117,7 +123,7 @@ def test_put_file_moves_the_file_in(store, folder, tmp_path):
 
 def test_another_store_on_the_same_folder_finds_it(store, folder):
     artifact = store.put(DATA, "image/jpeg")
-    assert ArtifactStore(folder).get(SHA256).artifact == artifact
+    assert DiskArtifacts(folder).get(SHA256) == artifact
 
 
 @pytest.mark.parametrize("put", ["put", "put_file"])
@@ -178,7 +184,7 @@ def test_a_full_disk_is_named(store, folder, monkeypatch, number):
 def test_a_file_where_the_folder_should_be(tmp_path):
     blocked = tmp_path / "data"
     blocked.write_bytes(b"")
-    store = ArtifactStore(blocked)
+    store = DiskArtifacts(blocked)
     source = tmp_path / "clip"
     source.write_bytes(DATA)
     for call in (
@@ -228,10 +234,11 @@ def test_the_same_bytes_from_many_threads(store, folder):
 def test_what_nobody_needs_any_more_goes(store, folder):
     kept, loose = store.put(DATA, "image/png"), store.put(b"other", "image/png")
     for artifact in (kept, loose):
-        os.utime(store.get(artifact.sha256).path, (1000, 1000))
-    assert set(store.untouched_since(1000)) == {kept.sha256, loose.sha256}
+        os.utime(path_of(store, artifact.sha256), (1000, 1000))
+    listed = {one.sha256: one for one in store.listed()}
+    assert {(each.size, each.used_at) for each in listed.values()} == {(len(DATA), 1000), (len(b"other"), 1000)}
     store.touch(kept.sha256)
-    assert list(store.untouched_since(1000)) == [loose.sha256]
+    assert [one.sha256 for one in store.listed() if one.used_at <= 1000] == [loose.sha256]
     assert not store.delete(kept.sha256, untouched_since=1000)
     assert store.delete(loose.sha256, untouched_since=1000)
     assert not store.delete(loose.sha256, untouched_since=1000)

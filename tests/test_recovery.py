@@ -12,13 +12,14 @@ from dbos import DBOS
 from engines import running_engine
 
 from cow_service.jobs import workflows
+from cow_service.jobs.recovery import recover
 
 REMEDY = """
-Maintenance._recover relies on DBOS._recover_pending_workflows(executor_ids), which is private. If it is gone or acts
-otherwise: look for a public function that returns PENDING workflows of named executors to the queue, without reviving
-canceled ones and without resetting recovery_attempts; else do so with one UPDATE of workflow_status, as
-SystemDatabase.reenqueue_for_recovery of DBOS 3.4 does (status ENQUEUED, owner_xid and started_at_epoch_ms NULL,
-queue_name the one that it had or DBOS' internal one, where status is PENDING and executor_id is one of them).
+jobs/recovery.py relies on SystemDatabase.reenqueue_for_recovery, which is private. If it is gone or acts otherwise: look
+for a public function that returns PENDING workflows of named executors to a queue, without reviving canceled ones and
+without resetting recovery_attempts; else do so with one UPDATE of workflow_status (status ENQUEUED, owner_xid and
+started_at_epoch_ms NULL, queue_name the one that it had or else the light one, where status is PENDING and executor_id
+is one of them).
 """
 
 
@@ -53,14 +54,13 @@ def rows() -> Iterator[SimpleNamespace]:
 
 
 def test_the_private_function_of_dbos_does_what_recovery_needs(rows: SimpleNamespace) -> None:
-    recover = getattr(DBOS, "_recover_pending_workflows", None)
-    assert recover is not None, REMEDY
-    handles = recover([rows.executor])
-    assert len(handles) == 1, REMEDY
+    recovered = recover([rows.executor])
     pending, canceled = rows.row("PENDING"), rows.row("CANCELLED")
-    assert handles[0].get_workflow_id() == pending.workflow_uuid, REMEDY
+    assert recovered == [pending.workflow_uuid], REMEDY
     assert (pending.status, pending.recovery_attempts) == ("ENQUEUED", 3), REMEDY
+    assert pending.queue_name == f"nobody-reads-{rows.executor}", REMEDY
     assert canceled.status == "CANCELLED", REMEDY
+    assert recover([rows.executor]) == recover([]) == [], "they are no longer that executor's"
 
 
 def test_its_public_neighbour_would_revive_what_was_canceled(rows: SimpleNamespace) -> None:

@@ -294,7 +294,14 @@ def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
     database = Database(Settings(data_dir=tmp_path))
     database.create_tables()
     step = StoredStep(
-        "one", None, False, database, service.artifacts, service.metrics, KeyLocks(), Outages(0, lambda: None)
+        "one",
+        None,
+        False,
+        database,
+        service.artifacts,
+        service.metrics.stage_cache,
+        KeyLocks().held,
+        Outages(0, lambda: None),
     )
     request = AnswerRequest.model_validate(BODY | GIVEN | {"imagine": "auto"})
 

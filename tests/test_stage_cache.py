@@ -12,7 +12,7 @@ from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.jobs.database import Database
 from cow_service.jobs.outages import Outages
 from cow_service.jobs.stage_cache import KeyLocks, StoredStep
-from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.disk_artifacts import DiskArtifacts
 from cow_service.observability.metrics import Metrics
 from cow_service.records import MetresPerPixel, Motion
 from cow_service.settings import Settings
@@ -43,7 +43,14 @@ def step(
     budget: float = 0,
 ) -> StoredStep:
     return StoredStep(
-        job_id, owner, fresh, database, ArtifactStore(tmp_path), Metrics(), KeyLocks(), Outages(budget, check)
+        job_id,
+        owner,
+        fresh,
+        database,
+        DiskArtifacts(tmp_path),
+        Metrics().stage_cache,
+        KeyLocks().held,
+        Outages(budget, check),
     )
 
 
@@ -89,7 +96,7 @@ def test_nothing_is_stored_for_a_job_that_was_canceled_meanwhile(database: Datab
     assert database.finished_stages("one") == set()
 
 
-def test_servers_of_one_database_have_one_data_folder(tmp_path: Path) -> None:
+def test_servers_of_one_database_have_one_place_for_artifacts(tmp_path: Path) -> None:
     """Another one would take jobs whose images it does not have."""
     url = SecretStr(f"sqlite:///{tmp_path / 'shared.sqlite3'}")
     databases = [Database(Settings(data_dir=tmp_path / name, database_url=url)) for name in "ab"]

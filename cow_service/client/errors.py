@@ -53,14 +53,23 @@ class BadResponse(CowError):
 _OWN: dict[str, type[CowError]] = {kind.code: kind for kind in (ServerUnreachable, WaitTimeout, BadResponse)}
 
 
-def unreachable(error: httpx.HTTPError) -> ServerUnreachable | BadResponse:
-    """The error of a request without a response, or with one that cannot be decoded."""
+def unreachable(error: httpx.HTTPError, base_url: str | None = None) -> ServerUnreachable | BadResponse:
+    """The error of a request without a response, or with one that cannot be decoded.
+
+    With the server's address it says where a redirect pointed elsewhere.
+    """
     url = error.request.url
     request = (
         f"{error.request.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}."
     )
     if isinstance(error, httpx.DecodingError):
         return BadResponse(f"{request} Does a proxy stand between?")
+    server = url if base_url is None else httpx.URL(base_url)
+    if (url.scheme, url.host, url.port) != (server.scheme, server.host, server.port):
+        return ServerUnreachable(
+            f"{request} The server keeps its artifacts there. Where callers cannot reach that place, the server must "
+            "pass them on (COW_ARTIFACTS_REDIRECT=false)."
+        )
     return ServerUnreachable(f"{request} Is the server running (`cow serve`), and is this its address (COW_BASE_URL)?")
 
 

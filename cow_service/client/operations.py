@@ -173,7 +173,7 @@ class Operations:
 
     def artifact(self, sha256: str) -> Steps[bytes]:
         """The bytes of an artifact, checked against their digest."""
-        response = yield from self._exchange(Send("GET", f"/artifacts/{quote(sha256, safe='')}"))
+        response = yield from self._exchange(Send("GET", f"/artifacts/{quote(sha256, safe='')}", follow=True))
         if hashlib.sha256(response.content).hexdigest() != sha256:
             raise BadResponse(f"The artifact {sha256} came damaged ({len(response.content)} bytes): get it again.")
         return response.content
@@ -199,7 +199,7 @@ class Operations:
                 break
             yield Sleep(pause)
         if isinstance(outcome, httpx.HTTPError):
-            raise unreachable(outcome) from outcome
+            raise unreachable(outcome, self.endpoint.base_url) from outcome
         # What an earlier attempt deleted, whose response was lost, is gone.
         if send.method == "DELETE" and attempts > 1 and outcome.status_code == NOT_FOUND:
             return outcome
@@ -251,6 +251,7 @@ class Operations:
             "params": send.params,
             "content": send.content,
             "timeout": self.endpoint.limited(send.limit),
+            **({"follow_redirects": True} if send.follow else {}),
         }
 
     def _stream_arguments(self, job_id: str, cursor: EventCursor) -> dict[str, Any]:
@@ -268,7 +269,7 @@ class Operations:
         elif isinstance(outcome, httpx.ConnectError):
             self._refused += 1
             if not self._ever_answered and self._refused >= MAX_FIRST_ATTEMPTS:
-                raise unreachable(outcome) from outcome
+                raise unreachable(outcome, self.endpoint.base_url) from outcome
         return outcome
 
 

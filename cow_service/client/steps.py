@@ -18,7 +18,8 @@ T = TypeVar("T")
 class Send:
     """Send a request; the result is an `httpx.Response` or an `httpx.HTTPError`.
 
-    `limit` caps the client's timeout, in seconds of silence.
+    `limit` caps the client's timeout, in seconds of silence. `follow` goes where a redirect points, which is another
+    host where the server keeps artifacts in an object store: httpx sends it no API key.
     """
 
     method: str
@@ -28,6 +29,7 @@ class Send:
     content: bytes | None = None
     media_type: str | None = None
     limit: float | None = None
+    follow: bool = False
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import time
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,9 @@ from cow_service.settings import Settings, SettingsError
 BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
 MAX_IDS = 500  # in one statement
 CONNECT_SECONDS = 4  # for a connection to PostgreSQL
+MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log, beyond which it is cut when it begins anew
+INCREMENTAL = 2  # SQLite's number of that mode
+VACUUM_PAGES, KEPT_FREE_PAGES = 500, 500  # of 4 kB: given back at a time, and kept for what is written next
 
 _metadata = sa.MetaData()
 _results = sa.Table(
@@ -49,12 +52,12 @@ _stages = sa.Table(
     sa.Column("job_id", sa.String(64), primary_key=True),
     sa.Column("stage", sa.String(32), primary_key=True),
 )
-# The data folder in which the artifacts of all jobs are: one row, once a server has started.
-_folders = sa.Table(
-    "cow_data_folder",
+# Where the artifacts of all jobs are: one row, once a server has started.
+_stores = sa.Table(
+    "cow_artifact_store",
     _metadata,
     sa.Column("id", sa.Integer, primary_key=True),  # always 1
-    sa.Column("folder", sa.String(64), nullable=False),
+    sa.Column("address", sa.Text, nullable=False),
 )
 # These run several times in every job: as plain text they take a fifth of the time that expressions do.
 _FIND = "SELECT job_id, result FROM cow_stage_results WHERE key = ?"
@@ -83,22 +86,24 @@ class Database:
         with database_errors():
             _metadata.create_all(self.engine)
 
-    def claim(self, folder: str) -> None:
-        """Notes in which data folder the artifacts of all jobs are. Raises `StorageUnavailable` where in another one.
+    def claim(self, address: str) -> None:
+        """Notes where the artifacts of all jobs are. Raises `StorageUnavailable` where they are elsewhere.
 
-        A server with a folder of its own would take jobs whose images it does not have, and fail them.
+        A server with a store of its own would take jobs whose images it does not have, and fail them.
         """
         with self._cursor() as cursor:
             cursor.execute(
-                self._plain("INSERT INTO cow_data_folder (id, folder) VALUES (1, ?) ON CONFLICT DO NOTHING"), (folder,)
+                self._plain("INSERT INTO cow_artifact_store (id, address) VALUES (1, ?) ON CONFLICT DO NOTHING"),
+                (address,),
             )
-            cursor.execute("SELECT folder FROM cow_data_folder WHERE id = 1")
+            cursor.execute("SELECT address FROM cow_artifact_store WHERE id = 1")
             known = cursor.fetchone()[0]
-        if known != folder:
+        if known != address:
             raise StorageUnavailable(
-                "The jobs of this database have their images in another data folder. Give all servers on a database "
-                "the same COW_DATA_DIR, on a disk that they share, or this one another COW_DATABASE_URL. Where that "
-                "folder is lost for good, delete the row of the table cow_data_folder."
+                f"The jobs of this database have their images in {known}, and this server in {address}. Give all "
+                "servers on a database the same COW_ARTIFACTS: an object store, or a folder on a disk that they share, "
+                "by default that of COW_DATA_DIR. Or give this one another COW_DATABASE_URL. Where that place is lost "
+                "for good, delete the row of the table cow_artifact_store."
             )
 
     def check(self) -> None:
@@ -110,6 +115,30 @@ class Database:
         """As `check`, but only of a database server: DBOS would wait for one that is down, and so would the caller."""
         if self.file is None:
             self.check()
+
+    def give_room_back(self, stop: Callable[[], bool]) -> None:
+        """Returns the room of removed rows to the disk, in steps between which others write.
+
+        PostgreSQL does it by itself.
+        """
+        if self.file is None:
+            return
+        with database_errors(), self._reading.connect() as connection:
+            cursor = connection.connection.cursor()
+
+            def pragma(text: str) -> int:
+                cursor.execute(f"PRAGMA {text}")
+                rows = cursor.fetchall()  # all of them: SQLite gives a page back for each
+                return rows[0][0] if rows and rows[0] else 0
+
+            if pragma("auto_vacuum") != INCREMENTAL:  # the file of an earlier version: it is written anew once
+                if pragma("freelist_count") > pragma("page_count") / 2:
+                    pragma("auto_vacuum=INCREMENTAL")
+                    cursor.execute("VACUUM")
+            else:
+                while (free := pragma("freelist_count") - KEPT_FREE_PAGES) > 0 and not stop():
+                    pragma(f"incremental_vacuum({min(free, VACUUM_PAGES)})")
+            pragma("wal_checkpoint(PASSIVE)")  # the file is cut by it
 
     def close(self) -> None:
         """Closes its connections."""
@@ -185,6 +214,13 @@ class Database:
         found: set[str] = set()
         for chunk in _chunks(list(artifacts)):
             found |= self._column(sa.select(_references.c.sha256).where(_references.c.sha256.in_(chunk)))
+        return found
+
+    def artifacts_of(self, jobs: Iterable[str]) -> set[str]:
+        """The artifacts that some jobs need."""
+        found: set[str] = set()
+        for chunk in _chunks(list(jobs)):
+            found |= self._column(sa.select(_references.c.sha256).where(_references.c.job_id.in_(chunk)))
         return found
 
     def jobs_with(self, sha256: str) -> list[str]:
@@ -268,7 +304,15 @@ def _engine(url: str, is_file: bool) -> sa.Engine:
     @event.listens_for(engine, "connect")
     def prepare(connection: object, _: object) -> None:  # pyright: ignore[reportUnusedFunction]
         connection.isolation_level = "IMMEDIATE"  # type: ignore[attr-defined] # writers wait instead of failing
-        for pragma in ("journal_mode=WAL", "synchronous=NORMAL", f"busy_timeout={BUSY_TIMEOUT_MS}", "foreign_keys=ON"):
+        # The first one works only in a file without tables, and before the mode of its journal is set.
+        for pragma in (
+            "auto_vacuum=INCREMENTAL",
+            "journal_mode=WAL",
+            f"journal_size_limit={MAX_LOG_BYTES}",
+            "synchronous=NORMAL",
+            f"busy_timeout={BUSY_TIMEOUT_MS}",
+            "foreign_keys=ON",
+        ):
             connection.execute(f"PRAGMA {pragma}")  # type: ignore[attr-defined]
 
     return engine

@@ -36,7 +36,7 @@ from cow_service.jobs import state, workflows
 from cow_service.jobs.computing import Computer, InProcess
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.dispatch import Dispatch
-from cow_service.jobs.leases import folder_name, lease_of
+from cow_service.jobs.leases import lease_of
 from cow_service.jobs.maintenance import Maintenance
 from cow_service.jobs.news import JobNews, news_of
 from cow_service.jobs.open_jobs import OpenJobs
@@ -116,9 +116,7 @@ class JobEngine:
     def _launch(self) -> None:
         """Has DBOS run on the database. Of its queues it looks after that of the webhooks; `QueuePolls` has ours."""
         self.database.create_tables()
-        folder = self.service.settings.data_dir / "executors"
-        folder.mkdir(parents=True, exist_ok=True)
-        self.database.claim(folder_name(folder))
+        self.database.claim(self.service.artifacts.address)
         config = DBOSConfig(
             name="cow",
             system_database_url=self.database.url,

@@ -180,12 +180,3 @@ def _key(executor: str) -> int:
 def lease_of(database: Database, folder: Path) -> Lease:
     """The lease of a process on a database; `folder` is that of the lock files."""
     return SessionLease(database) if database.file is None else FolderLease(folder)
-
-
-def folder_name(folder: Path) -> str:
-    """Names a folder, wherever it is mounted."""
-    path = folder / "name"
-    with FileLock(folder / "name.lock"):
-        if not path.exists():
-            path.write_text(uuid4().hex)
-        return path.read_text()

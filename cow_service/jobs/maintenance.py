@@ -14,6 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import CowError
 from cow_service.jobs import state
+from cow_service.jobs.garbage import collect_artifacts
 from cow_service.jobs.leases import Lease
 from cow_service.jobs.news import JobNews, News
 from cow_service.jobs.open_jobs import OpenJobs
@@ -25,7 +26,6 @@ OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own poll
 CANCEL_POLL_SECONDS = 1.0  # for jobs that run here and were canceled by another process, and for processes that ended
 STALLED_SECONDS = 10.0  # between checks for stalled jobs
 GARBAGE_SECONDS = 600.0  # between garbage collections
-ARTIFACT_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
 SUBMIT_SECONDS = 5.0  # within which a job is in the database after the reference to its image
 MAX_REMOVED_JOBS = 200  # at a time
 JOIN_TIMEOUT_SECONDS = 5.0
@@ -82,12 +82,8 @@ class Maintenance:
             # A job that is being submitted refers to its image a moment before it is in the database.
             if missing and not self._stop.wait(SUBMIT_SECONDS):
                 open_jobs.database.remove_jobs(sorted(missing - state.existing(sorted(missing))))
-        moment = time.time() - ARTIFACT_GRACE_SECONDS
-        untouched = list(open_jobs.service.artifacts.untouched_since(moment))
-        needed = open_jobs.database.referenced(untouched)
-        removed = sum(open_jobs.service.artifacts.delete(one, moment) for one in untouched if one not in needed)
-        if removed:
-            log.info("removed %d artifacts that no job refers to", removed)
+        collect_artifacts(open_jobs.service, open_jobs.database, self._stop.is_set)
+        open_jobs.database.give_room_back(self._stop.is_set)
 
     def _announce_ends(self) -> None:
         while self._has_finished.wait() and not self._stop.is_set():

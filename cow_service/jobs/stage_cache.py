@@ -96,8 +96,9 @@ class StoredStep:
         job_id, text = row
         try:
             result = RESULT_TYPES[stage].model_validate_json(text)
-            for sha256 in result.artifacts:
-                self.artifacts.touch(sha256)
+            if result.artifacts and job_id != self.job_id:  # before they are looked for: nobody removes them meanwhile
+                self.database.add_references(self.job_id, result.artifacts)
+            self.artifacts.touch(*result.artifacts)
         except (ArtifactNotFound, ValidationError):  # lost, or of another version
             return None
         return result, job_id != self.job_id

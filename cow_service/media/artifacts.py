@@ -1,26 +1,19 @@
-"""Frames, masks and clips as files, named by the SHA-256 of their bytes.
+"""What keeps images, frames, masks and clips: bytes that are named by their SHA-256.
 
-The layout is `<folder>/<first two digits>/<digest>.<extension>`; the extension keeps the media type. A file whose bytes
-are no longer those of its name is removed when that is seen: it is then as if it had never been kept, and comes back
-when the same bytes are sent or computed again.
+Bytes that are no longer those of their name are removed when that is seen: it is then as if they had never been kept,
+and they come back when the same bytes are sent or computed again.
 """
 
 from __future__ import annotations
 
-import errno
-import hashlib
-import logging
-import os
 import re
-import threading
-from collections.abc import Generator, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
-from uuid import uuid4
+from typing import Protocol
 
-from cow_service.errors import ArtifactNotFound, StorageUnavailable
+from cow_service.errors import ArtifactNotFound
 from cow_service.records import Artifact
 
 MEDIA_TYPES = {
@@ -30,14 +23,11 @@ MEDIA_TYPES = {
     "video/mp4": "mp4",
     "application/json": "json",
 }
+MAX_VERIFIED = 10_000  # digests that a process remembers to have compared with their bytes
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 _MAX_SHOWN_CHARACTERS = 80
-MAX_VERIFIED = 10_000  # files
-
-log = logging.getLogger("cow_service")
 
 
 def media_type_of(data: bytes) -> str | None:
@@ -50,207 +40,116 @@ def media_type_of(data: bytes) -> str | None:
     return "video/mp4" if data[4:8] == b"ftyp" else None
 
 
-@dataclass(frozen=True)
-class StoredArtifact:
-    """An artifact and where its bytes are on this machine. The path never leaves the server."""
+@dataclass(frozen=True, slots=True)
+class ListedArtifact:
+    """An artifact as a listing has it. No job needed it after `used_at`, seconds since 1970."""
 
-    artifact: Artifact
-    path: Path
+    sha256: str
+    size: int  # bytes
+    used_at: float
 
 
-class ArtifactStore:
-    """Content-addressed files under one folder, made when first needed. Safe to share between threads.
-
-    Every method raises `StorageUnavailable` where the folder cannot be read or written.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._commit_lock = threading.Lock()
-        self._verified: dict[str, tuple[int, ...]] = {}  # files whose bytes were compared with their names
+class ArtifactWriter(Protocol):
+    """Stores bytes under their digests. Every method raises `StorageUnavailable` where the store cannot be written."""
 
     def put(self, data: bytes, media_type: str) -> Artifact:
-        """Stores bytes. Bytes that are stored already keep their first media type.
+        """Stores bytes, also where those that are stored under their digest are damaged; marks them as used now.
 
         Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
         """
-        extension = _extension(media_type)
-        sha256 = hashlib.sha256(data).hexdigest()
-        with _storage_errors():
-            known = self._intact(sha256)
-            if known is not None:
-                self._use(known)
-                return known.artifact
-            target = self._target(sha256, extension)
-            with _temporary_beside(target) as temporary:
-                with temporary.open("xb") as file:
-                    file.write(data)
-                    _sync(file)
-                return self._commit(temporary, target, sha256)
+        ...
 
     def put_file(self, path: Path, media_type: str) -> Artifact:
-        """Moves in a finished file of `scratch`, hashing it in chunks; afterwards `path` no longer exists.
+        """Moves in a finished file of `scratch`; afterwards `path` no longer exists. Raises as `put` does."""
+        ...
 
-        Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
-        """
-        extension = _extension(media_type)
-        with _storage_errors():
-            with path.open("rb+") as file:
-                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-                _sync(file)
-            target = self._target(sha256, extension)
-            with _temporary_beside(target) as temporary:
-                path.replace(temporary)
-                return self._commit(temporary, target, sha256)
+    def scratch(self) -> AbstractContextManager[Path]:
+        """A path on this machine for a temporary file; deleted afterwards unless `put_file` moved it."""
+        ...
 
-    def get(self, sha256: str) -> StoredArtifact:
-        """Find an artifact. Raises `ArtifactNotFound` if there is none, or if it is not a digest at all."""
-        if _DIGEST.fullmatch(sha256) is None:
-            # Before any path is built: only a digest may become part of one.
-            raise ArtifactNotFound(
-                f"No artifact is named {sha256[:_MAX_SHOWN_CHARACTERS]!r}: give its SHA-256, 64 lower-case hex digits."
-            )
-        with _storage_errors():
-            stored = self._intact(sha256)
-        if stored is None:
-            raise ArtifactNotFound(
-                f"No artifact has the SHA-256 {sha256}: send the image again, or run the simulation that made it."
-            )
-        return stored
 
-    def touch(self, sha256: str) -> None:
-        """Marks an artifact as used now. Raises as `get` does."""
-        stored = self.get(sha256)
-        with _storage_errors():
-            self._use(stored)
+class ArtifactStore(ArtifactWriter, Protocol):
+    """Keeps bytes under their digests. Safe to share between threads.
+
+    Every method raises `StorageUnavailable` where the store cannot be read or written.
+    """
+
+    @property
+    def address(self) -> str:
+        """Names the store, the same for every process that shares it. It holds no credentials."""
+        ...
+
+    def get(self, sha256: str) -> Artifact:
+        """Finds an artifact. Raises `ArtifactNotFound` if there is none, or if it is not a digest at all."""
+        ...
+
+    def read(self, sha256: str) -> bytes:
+        """The bytes of an artifact, which are those of its digest; marks it as used now. Raises as `get` does."""
+        ...
+
+    def touch(self, *sha256: str) -> None:
+        """Marks artifacts whose bytes are those of their digests as used now. Raises as `get` does."""
+        ...
+
+    def local_file(self, sha256: str) -> AbstractContextManager[Path]:
+        """A file with the bytes of an artifact, which is there inside the block. Raises as `get` does."""
+        ...
+
+    def signed_url(self, sha256: str, seconds: float) -> str | None:
+        """A URL under which anybody can get an artifact for so long; None where the store has none."""
+        ...
 
     def delete(self, sha256: str, untouched_since: float) -> bool:
         """Deletes an artifact unless it was used after that time (seconds since 1970). Returns whether it did."""
-        with _storage_errors():
-            stored = self._find(sha256)
-            if stored is None or stored.path.stat().st_mtime > untouched_since:
-                return False
-            stored.path.unlink(missing_ok=True)
-        return True
+        ...
 
-    def untouched_since(self, moment: float) -> Iterator[str]:
-        """Digests of the artifacts not used after that time (seconds since 1970)."""
-        with _storage_errors():
-            for path in self._folder.glob("[0-9a-f][0-9a-f]/*.*"):
-                if _DIGEST.fullmatch(path.stem) and path.stat().st_mtime <= moment:
-                    yield path.stem
+    def listed(self) -> Iterator[ListedArtifact]:
+        """All artifacts, in no particular order."""
+        ...
 
-    def read(self, sha256: str) -> bytes:
-        """The bytes of an artifact. Raises as `get` does."""
-        path = self.get(sha256).path
-        with _storage_errors():
-            return path.read_bytes()
+    def batch(self) -> AbstractContextManager[ArtifactWriter]:
+        """A writer several of whose puts may run at the same time; all are done when its block ends.
 
-    @contextmanager
-    def scratch(self) -> Generator[Path]:
-        """A path on the data folder's disk for a temporary file; deleted afterwards unless `put_file` moved it."""
-        with ExitStack() as stack:
-            with _storage_errors():
-                path = stack.enter_context(_temporary_beside(self._folder / "scratch"))
-            yield path
+        The end of the block raises what any of them raises.
+        """
+        ...
+
+    def remove_leftovers(self, untouched_since: float) -> None:
+        """Removes temporary files of processes that were killed: those not written to after that time."""
+        ...
 
     def check(self) -> None:
-        """Write, sync and remove a small file. Raises `StorageUnavailable` if that fails."""
-        with _storage_errors(), _temporary_beside(self._folder / "check") as temporary, temporary.open("xb") as file:
-            file.write(b"\0")
-            _sync(file)
-
-    def _use(self, stored: StoredArtifact) -> None:
-        os.utime(stored.path)  # it is in use: maintenance deletes by this time
-        self._note_verified(stored)
-
-    def _intact(self, sha256: str) -> StoredArtifact | None:
-        """A stored file that holds what its name says, compared once for as long as it is not changed."""
-        stored = self._find(sha256)
-        try:
-            if stored is None or self._verified.get(sha256) == _state(stored.path):
-                return stored
-            with stored.path.open("rb") as file:
-                found = hashlib.file_digest(file, "sha256").hexdigest()
-            if found == sha256:
-                self._note_verified(stored)
-                return stored
-        except FileNotFoundError:  # it was deleted just now
-            return None
-        log.error("artifact %s is damaged and was removed", sha256)
-        stored.path.unlink(missing_ok=True)
-        return None
-
-    def _note_verified(self, stored: StoredArtifact) -> None:
-        if len(self._verified) >= MAX_VERIFIED:
-            self._verified.clear()
-        self._verified[stored.artifact.sha256] = _state(stored.path)
-
-    def _target(self, sha256: str, extension: str) -> Path:
-        return self._folder / sha256[:2] / f"{sha256}.{extension}"
-
-    def _find(self, sha256: str) -> StoredArtifact | None:
-        for media_type, extension in MEDIA_TYPES.items():
-            path = self._target(sha256, extension)
-            try:
-                size = path.stat().st_size
-            except FileNotFoundError:
-                continue
-            url = f"/artifacts/{sha256}"
-            return StoredArtifact(Artifact(sha256=sha256, url=url, media_type=media_type, size=size), path)
-        return None
-
-    def _commit(self, temporary: Path, target: Path, sha256: str) -> Artifact:
-        # Two threads may store the same bytes under two media types: the first one decides.
-        with self._commit_lock:
-            stored = self._intact(sha256)
-            if stored is None:
-                temporary.replace(target)
-                stored = self._find(sha256)
-                if stored is not None:
-                    self._note_verified(stored)
-        if stored is None:
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-        return stored.artifact
+        """Writes a small thing and removes or replaces it. Raises `StorageUnavailable` if that fails."""
+        ...
 
 
-def _state(path: Path) -> tuple[int, ...]:
-    """What changes with the bytes of a file, unless the disk itself damages them."""
-    status = path.stat()
-    return status.st_ino, status.st_size, status.st_mtime_ns
+def artifact_of(sha256: str, media_type: str, size: int) -> Artifact:
+    """The record of an artifact of so many bytes."""
+    return Artifact(sha256=sha256, url=f"/artifacts/{sha256}", media_type=media_type, size=size)
 
 
-def _extension(media_type: str) -> str:
+def is_digest(name: str) -> bool:
+    """Whether a name is a SHA-256 in hexadecimal digits."""
+    return _DIGEST.fullmatch(name) is not None
+
+
+def check_digest(name: str) -> None:
+    """Raises `ArtifactNotFound` for what is no digest: nothing else may become part of a path."""
+    if not is_digest(name):
+        raise ArtifactNotFound(
+            f"No artifact is named {name[:_MAX_SHOWN_CHARACTERS]!r}: give its SHA-256, 64 lower-case hex digits."
+        )
+
+
+def not_found(sha256: str) -> ArtifactNotFound:
+    """The error for a digest that nothing is kept under."""
+    return ArtifactNotFound(
+        f"No artifact has the SHA-256 {sha256}: send the image again, or run the simulation that made it."
+    )
+
+
+def extension_of(media_type: str) -> str:
+    """The extension of files of a media type. Raises `ValueError` if it is not in `MEDIA_TYPES`."""
     if media_type not in MEDIA_TYPES:
         raise ValueError(f"The media type {media_type!r} is not kept: use one of {', '.join(MEDIA_TYPES)}.")
     return MEDIA_TYPES[media_type]
-
-
-@contextmanager
-def _temporary_beside(target: Path) -> Generator[Path]:
-    """A name for a file that does not exist yet, on the target's own disk so that it can be renamed to it."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.parent / f".{uuid4().hex}.part"
-    try:
-        yield temporary
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _sync(file: BinaryIO) -> None:
-    file.flush()
-    os.fsync(file.fileno())
-
-
-@contextmanager
-def _storage_errors() -> Generator[None]:
-    try:
-        yield
-    except OSError as error:
-        if error.errno in _FULL:
-            raise StorageUnavailable("The disk of the data folder is full: free some space and try again.") from error
-        # The reason alone: the text of an OSError holds the path.
-        reason = os.strerror(error.errno) if error.errno else type(error).__name__
-        raise StorageUnavailable(
-            f"The data folder cannot be used ({reason}): make it a folder that the server may read and write."
-        ) from error

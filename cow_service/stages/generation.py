@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cow_service.generators.base import Generator, GeneratorInput
 from cow_service.generators.rearranging import with_put
 from cow_service.generators.removal import without_removed
-from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.artifacts import ArtifactWriter
 from cow_service.media.images import encode_png, fit_within
 from cow_service.media.overlay import Replaced, draw_overlay
 from cow_service.media.video import write_mp4
@@ -78,7 +78,17 @@ def generate(
 
     Raises `InvalidRequest`, `GeneratorOutOfMemory`, `Canceled`.
     """
-    request, scene, artifacts = run.request, run.scene, run.backends.artifacts
+    with run.backends.artifacts.batch() as artifacts:
+        clip = _clip(run, grounding, motion, trajectory, artifacts)
+    frames = (*clip.frames, *clip.factual_frames)
+    pictures = (*(frame.sha256 for frame in frames), *([] if clip.video is None else [clip.video.sha256]))
+    return StageResult(value=clip, artifacts=(*pictures, clip.overlay.sha256))
+
+
+def _clip(
+    run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory, artifacts: ArtifactWriter
+) -> Clip:
+    request, scene = run.request, run.scene
     with run.cpu():
         given, as_it_is = _inputs(run, grounding, motion, trajectory)
     with run.device():
@@ -92,15 +102,13 @@ def generate(
         placed = [_replaced(given, factual_given, each) for each in trajectory.placed]
         drawn = draw_overlay(scene.image, given.grounding, motion, trajectory, mover, removed, placed)
         overlay = artifacts.put(encode_png(drawn), "image/png")
-    clip = Clip(
+    return Clip(
         frames=frames,
         factual_frames=factual,
         video=video,
         overlay=overlay,
         generator=run.generator.describe(given),
     )
-    pictures = (*(frame.sha256 for frame in (*frames, *factual)), *([] if video is None else [video.sha256]))
-    return StageResult(value=clip, artifacts=(*pictures, overlay.sha256))
 
 
 def _inputs(
@@ -136,7 +144,7 @@ def _factual_frames(
     frames: Sequence[Frame],
     generator: Generator,
     request: SimulateRequest,
-    artifacts: ArtifactStore,
+    artifacts: ArtifactWriter,
     progress: Callable[[float], None],
 ) -> tuple[Frame, ...]:
     """The chosen frames of the scene as it is; a generator on a device of its own makes them only where they are
@@ -155,7 +163,7 @@ def _render(
     given: GeneratorInput,
     generator: Generator,
     request: SimulateRequest,
-    artifacts: ArtifactStore,
+    artifacts: ArtifactWriter,
     progress: Callable[[float], None],
 ) -> tuple[tuple[Frame, ...], Video | None]:
     """The chosen frames, and the video of all of them. Only those that are needed are rendered."""
@@ -178,14 +186,14 @@ def _render(
     return tuple(frames), video
 
 
-def _store_frame(pixels: Image, index: int, fps: float, max_side: int | None, artifacts: ArtifactStore) -> Frame:
+def _store_frame(pixels: Image, index: int, fps: float, max_side: int | None, artifacts: ArtifactWriter) -> Frame:
     picture = fit_within(pixels, max_side)
     artifact = artifacts.put(encode_png(picture), "image/png")
     height, width = picture.shape[:2]
     return Frame(index=index, time=index / fps, url=artifact.url, sha256=artifact.sha256, width=width, height=height)
 
 
-def _store_video(frames: Iterator[Image], fps: float, size: tuple[int, int], artifacts: ArtifactStore) -> Video:
+def _store_video(frames: Iterator[Image], fps: float, size: tuple[int, int], artifacts: ArtifactWriter) -> Video:
     with artifacts.scratch() as path:
         count = write_mp4(frames, path, fps=fps, width=size[0], height=size[1])
         artifact = artifacts.put_file(path, "video/mp4")

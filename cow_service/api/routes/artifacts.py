@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path as FilePath
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, RedirectResponse, Response
 from starlette import responses as starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
+from starlette.types import Receive, Scope, Send
 
 from cow_service import errors
 from cow_service.api.problems import documented
@@ -15,12 +20,31 @@ from cow_service.api.submission import owner_of
 from cow_service.jobs.engine import JobEngine
 
 CACHE_CONTROL = "max-age=31536000, immutable"  # bytes never change under their digest
+# A signed URL works for so long, and a caller may take it again for less: a video is read in pieces.
+SIGNED_SECONDS, REDIRECT_SECONDS = 900, 600
 
 
 class ArtifactResponse(FileResponse):
     """A file or the ranges of it that a request asks for (RFC 9110, section 14)."""
 
     max_ranges = 8  # more in one request are no way to read a video: the whole file is sent instead
+
+    def __init__(self, path: FilePath, release: Callable[[], None], **options: Any) -> None:
+        super().__init__(path, **options)
+        self._release = release
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Sends the file and releases it, also where the caller leaves."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            await run_in_threadpool(self._release)
+
+    @classmethod
+    def check_range(cls, request: Request, size: int) -> None:
+        """Raises `RangeNotSatisfiable` where another server is to answer, which would say it in its own words."""
+        if wanted := request.headers.get("range"):
+            cls._parse_range_header(wanted, size)
 
     @classmethod
     def _parse_range_header(cls, http_range: str, file_size: int) -> list[tuple[int, int]]:
@@ -54,6 +78,10 @@ def artifact_routes(engine: JobEngine) -> APIRouter:
                 "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}},
             },
             304: {"description": "The caller has them."},
+            307: {
+                "description": "Where the bytes are: a signed URL of an object store (`COW_ARTIFACTS`), which works "
+                "for 15 minutes, needs no key and answers `Range` itself."
+            },
             **documented(errors.ArtifactNotFound, errors.RangeNotSatisfiable, errors.StorageUnavailable),
         },
     )
@@ -63,7 +91,8 @@ def artifact_routes(engine: JobEngine) -> APIRouter:
         """Images, frames and videos that the service keeps. The ETag is the digest."""
         owner = owner_of(request)
         engine.may_read(sha256, owner)
-        stored = engine.service.artifacts.get(sha256)
+        store, redirects = engine.service.artifacts, engine.service.settings.artifacts_redirect
+        stored = store.get(sha256)
         etag = f'"{sha256}"'
         headers = {
             "ETag": etag,
@@ -73,6 +102,15 @@ def artifact_routes(engine: JobEngine) -> APIRouter:
         known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
         if etag in known or "*" in known:
             return Response(status_code=304, headers=headers)
-        return ArtifactResponse(stored.path, media_type=stored.artifact.media_type, headers=headers)
+        if redirects and (url := store.signed_url(sha256, SIGNED_SECONDS)) is not None:
+            if request.method == "HEAD":  # the URL is signed for GET alone
+                sizes = {"Content-Length": str(stored.size), "Accept-Ranges": "bytes"}
+                return Response(media_type=stored.media_type, headers=headers | sizes)
+            ArtifactResponse.check_range(request, stored.size)
+            return RedirectResponse(url, headers={"Cache-Control": f"private, max-age={REDIRECT_SECONDS}"})
+        with ExitStack() as stack:
+            path = stack.enter_context(store.local_file(sha256))
+            release = stack.pop_all().close
+        return ArtifactResponse(path, release, media_type=stored.media_type, headers=headers)
 
     return router

@@ -1,0 +1,298 @@
+"""Artifacts as objects of S3, Google Cloud Storage, Azure or what speaks like them, through obstore.
+
+An object is `<prefix>/<digest>`; its content type is the media type. The time of an object is that of its last use, but
+for `RENEWED_AFTER_SECONDS`: an object store sets it only when the bytes are sent, so that an object that is used again
+is sent again where that is longer ago. Bytes are compared with their digest once for each version (ETag) of an object
+and process, and whenever they are read. Credentials and endpoints come from the environment, as obstore reads them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import threading
+import time
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import obstore
+from obstore import exceptions
+from obstore.store import from_url
+
+from cow_service.errors import StorageUnavailable
+from cow_service.media.artifacts import (
+    MAX_VERIFIED,
+    MEDIA_TYPES,
+    ArtifactWriter,
+    ListedArtifact,
+    artifact_of,
+    check_digest,
+    extension_of,
+    is_digest,
+    not_found,
+)
+from cow_service.media.object_batch import ObjectBatch, scratch_errors, take_file
+from cow_service.media.temporary_files import remove_temporary_files, temporary_beside
+from cow_service.records import Artifact
+from cow_service.settings import SettingsError
+
+RENEWED_AFTER_SECONDS = 300.0
+REQUEST_SECONDS, CONNECT_SECONDS = 8.0, 3.0  # that a request with its bytes, and a connection, may take
+RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request that somebody may wait for
+# Of the bytes of a clip, which took long to make; an outage that lasts longer is waited for by the job.
+PATIENT_RETRY_SECONDS, MAX_PATIENT_RETRIES = 60.0, 1000
+FIRST_BACKOFF_SECONDS, MAX_BACKOFF_SECONDS = 0.1, 2.0
+MAX_PARALLEL = 8  # requests for one job
+CHECKED = "check"  # the object that shows that the store can be written and read
+_REFUSED = (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)
+
+log = logging.getLogger("cow_service")
+
+
+@dataclass(frozen=True)
+class _Object:
+    artifact: Artifact
+    e_tag: str | None
+    used_at: float  # seconds since 1970
+
+    @property
+    def is_fresh(self) -> bool:
+        return time.time() - self.used_at < RENEWED_AFTER_SECONDS
+
+
+class ObjectArtifacts:
+    """An `ArtifactStore` in an object store. Temporary files lie in a folder of this machine."""
+
+    def __init__(self, url: str, scratch_folder: Path) -> None:
+        self._url = url.rstrip("/")
+        self._scratch_folder = scratch_folder
+        self._verified: dict[str, str] = {}  # ETags of the objects whose bytes were compared with their digests
+        self._guard = threading.Lock()
+        self._store = _open(url, MAX_RETRIES, RETRY_SECONDS)
+        self._patient_store = _open(url, MAX_PATIENT_RETRIES, PATIENT_RETRY_SECONDS)
+
+    @property
+    def address(self) -> str:
+        """The URL of the settings."""
+        return self._url
+
+    def put(self, data: bytes, media_type: str) -> Artifact:
+        """Sends bytes, unless this process knows that the same bytes are there."""
+        extension_of(media_type)
+        return self._put(hashlib.sha256(data).hexdigest(), data, media_type)
+
+    def put_file(self, path: Path, media_type: str) -> Artifact:
+        """Sends the bytes of a file, and deletes it."""
+        extension_of(media_type)
+        return self.put(take_file(path), media_type)
+
+    def get(self, sha256: str) -> Artifact:
+        """Finds an object. Its bytes are not compared: whoever gets them from a signed URL can."""
+        return self._found(sha256).artifact
+
+    def read(self, sha256: str) -> bytes:
+        """Gets the bytes and compares them."""
+        check_digest(sha256)
+        found, data = self._fetch(sha256)
+        if not found.is_fresh:
+            self._send(sha256, data, found.artifact.media_type, self._store)
+        return data
+
+    def touch(self, *sha256: str) -> None:
+        """Gets bytes only where they were not compared, or where they must be sent again."""
+        if len(sha256) <= 1:
+            for one in sha256:
+                self._touch(one)
+            return
+        with ThreadPoolExecutor(min(len(sha256), MAX_PARALLEL)) as pool:
+            for _ in pool.map(self._touch, sha256):
+                pass  # what one of them raises is raised here
+
+    def _touch(self, sha256: str) -> None:
+        found = self._found(sha256)
+        if not (found.is_fresh and self._is_verified(found)):
+            self.read(sha256)
+
+    @contextmanager
+    def local_file(self, sha256: str) -> Generator[Path]:
+        """A temporary copy."""
+        check_digest(sha256)
+        _, data = self._fetch(sha256)
+        with self.scratch() as path:
+            with scratch_errors():
+                path.write_bytes(data)
+            yield path
+
+    def signed_url(self, sha256: str, seconds: float) -> str | None:
+        """A URL of the store itself; None where its credentials cannot sign."""
+        try:
+            return obstore.sign(self._store, "GET", sha256, timedelta(seconds=seconds))
+        except exceptions.BaseError as error:
+            log.warning("artifacts are streamed: the object store signs no URL (%s)", type(error).__name__)
+            return None
+
+    def delete(self, sha256: str, untouched_since: float) -> bool:
+        """Deletes the object unless it was used after that time (seconds since 1970)."""
+        with _store_errors():
+            try:
+                used_at = obstore.head(self._store, sha256)["last_modified"].timestamp()
+            except FileNotFoundError:
+                return False
+        if used_at > untouched_since:
+            return False
+        self._remove(sha256)
+        return True
+
+    def listed(self) -> Iterator[ListedArtifact]:
+        """All objects that are named by a digest; a request for each thousand."""
+        with _store_errors():
+            for chunk in obstore.list(self._store):
+                for one in chunk:
+                    if is_digest(one["path"]):
+                        yield ListedArtifact(one["path"], one["size"], one["last_modified"].timestamp())
+
+    @contextmanager
+    def scratch(self) -> Generator[Path]:
+        """A path in the folder for temporary files."""
+        with ExitStack() as stack:
+            with scratch_errors():
+                path = stack.enter_context(temporary_beside(self._scratch_folder / "scratch"))
+            yield path
+
+    @contextmanager
+    def batch(self) -> Generator[ArtifactWriter]:
+        """Sends in threads."""
+        with ThreadPoolExecutor(MAX_PARALLEL, thread_name_prefix="cow-artifacts") as pool:
+            batch = ObjectBatch(pool, partial(self._put, patiently=True), self.scratch)
+            yield batch
+            batch.wait()
+
+    def remove_leftovers(self, untouched_since: float) -> None:
+        """Looks for them in the folder for temporary files."""
+        with scratch_errors():
+            remove_temporary_files(self._scratch_folder, untouched_since)
+
+    def check(self) -> None:
+        """Sends a small object and gets it. Deleting needs a permission, too, but only once artifacts are old."""
+        with _store_errors():
+            obstore.put(self._store, CHECKED, b"\0", use_multipart=False)
+            obstore.get(self._store, CHECKED).bytes()
+
+    def _put(self, sha256: str, data: bytes, media_type: str, *, patiently: bool = False) -> Artifact:
+        if sha256 in self._verified:
+            found = self._head(sha256)
+            if found is not None and found.is_fresh and self._is_verified(found):
+                return found.artifact
+        self._send(sha256, data, media_type, self._patient_store if patiently else self._store)
+        return artifact_of(sha256, media_type, len(data))
+
+    def _found(self, sha256: str) -> _Object:
+        check_digest(sha256)
+        found = self._head(sha256)
+        if found is None:
+            raise not_found(sha256)
+        return found
+
+    def _head(self, sha256: str) -> _Object | None:
+        with _store_errors():
+            try:
+                return _object(sha256, obstore.get(self._store, sha256, options={"head": True}))
+            except FileNotFoundError:
+                return None
+
+    def _fetch(self, sha256: str) -> tuple[_Object, bytes]:
+        """An object and its bytes, which are those of its digest. Raises `ArtifactNotFound`."""
+        with _store_errors():
+            try:
+                result = obstore.get(self._store, sha256)
+                found, data = _object(sha256, result), bytes(result.bytes())
+            except FileNotFoundError as error:
+                raise not_found(sha256) from error
+        if found is None:
+            raise not_found(sha256)
+        if hashlib.sha256(data).hexdigest() != sha256:
+            log.error("artifact %s is damaged and was removed", sha256)
+            self._remove(sha256)
+            raise not_found(sha256)
+        self._note_verified(sha256, found.e_tag)
+        return found, data
+
+    def _send(self, sha256: str, data: bytes, media_type: str, store: Any) -> None:
+        with _store_errors():
+            # In one piece: an upload in parts takes three requests and more.
+            attributes = {"Content-Type": media_type}
+            result = obstore.put(store, sha256, data, attributes=attributes, use_multipart=False)
+        self._note_verified(sha256, result["e_tag"])
+
+    def _remove(self, sha256: str) -> None:
+        with self._guard:
+            self._verified.pop(sha256, None)
+        with _store_errors():
+            obstore.delete(self._store, sha256)
+
+    def _is_verified(self, found: _Object) -> bool:
+        return found.e_tag is not None and self._verified.get(found.artifact.sha256) == found.e_tag
+
+    def _note_verified(self, sha256: str, e_tag: str | None) -> None:
+        with self._guard:
+            if len(self._verified) >= MAX_VERIFIED:
+                self._verified.clear()
+            if e_tag is not None:
+                self._verified[sha256] = e_tag
+
+
+def _open(url: str, max_retries: int, retry_seconds: float) -> Any:
+    try:
+        return from_url(
+            url,
+            client_options={
+                "allow_http": True,  # for an endpoint of the environment that is one of http://
+                "timeout": timedelta(seconds=REQUEST_SECONDS),
+                "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
+            },
+            retry_config={
+                "max_retries": max_retries,
+                "retry_timeout": timedelta(seconds=retry_seconds),
+                "backoff": {
+                    "init_backoff": timedelta(seconds=FIRST_BACKOFF_SECONDS),
+                    "max_backoff": timedelta(seconds=MAX_BACKOFF_SECONDS),
+                    "base": 2,
+                },
+            },
+        )
+    except (exceptions.BaseError, ValueError) as error:
+        reason = str(error).partition("\n")[0]
+        raise SettingsError(f"Bad settings: the object store of COW_ARTIFACTS cannot be used: {reason}.") from error
+
+
+def _object(sha256: str, result: obstore.GetResult) -> _Object | None:
+    meta, media_type = result.meta, result.attributes.get("Content-Type", "")
+    if media_type not in MEDIA_TYPES:  # an object that somebody else has put there
+        return None
+    return _Object(artifact_of(sha256, media_type, meta["size"]), meta["e_tag"], meta["last_modified"].timestamp())
+
+
+@contextmanager
+def _store_errors() -> Generator[None]:
+    """Translates obstore's errors. Their own text is for the log: it is long, and holds addresses."""
+    try:
+        yield
+    except _REFUSED as error:
+        raise _unavailable("it refuses the credentials; see those of its provider, such as AWS_*", error) from error
+    except FileNotFoundError as error:
+        raise _unavailable("there is no such bucket", error) from error
+    except exceptions.BaseError as error:
+        raise _unavailable(
+            f"no answer, or no credentials ({type(error).__name__}): the log says more", error
+        ) from error
+
+
+def _unavailable(reason: str, error: Exception) -> StorageUnavailable:
+    log.warning("object store: %s", str(error).partition("\n")[0])
+    return StorageUnavailable(f"The object store of COW_ARTIFACTS cannot be used: {reason}.")
