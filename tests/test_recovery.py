@@ -15,9 +15,9 @@ from cow_service.jobs import workflows
 from cow_service.jobs.recovery import recover
 
 REMEDY = """
-jobs/recovery.py relies on SystemDatabase.reenqueue_for_recovery, which is private. If it is gone or acts otherwise: look
-for a public function that returns PENDING workflows of named executors to a queue, without reviving canceled ones and
-without resetting recovery_attempts; else do so with one UPDATE of workflow_status (status ENQUEUED, owner_xid and
+jobs/recovery.py relies on SystemDatabase.reenqueue_for_recovery, which is private. If it is gone or acts otherwise:
+look for a public function that returns PENDING workflows of named executors to a queue without reviving canceled ones,
+and without resetting recovery_attempts; else do so with one UPDATE of workflow_status (status ENQUEUED, owner_xid and
 started_at_epoch_ms NULL, queue_name the one that it had or else the light one, where status is PENDING and executor_id
 is one of them).
 """
