@@ -36,27 +36,24 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _parts(service: Service) -> tuple[JobEngine, Readiness]:
+def _parts(service: Service, pool: WorkerPool | None) -> tuple[JobEngine, Readiness]:
     """The engine of a server of its role, and what tells whether it is ready."""
     if service.settings.role == "api":
         return JobEngine(service, Elsewhere()), Readiness(service, lambda: None)
-    if not service.settings.workers:
+    if pool is None:
         return JobEngine(service), Readiness(service)
-    pool = WorkerPool(service.settings)
-    pool.start()  # it loads what the jobs need while the server starts
     return JobEngine(service, pool), Readiness(service, pool.check)
 
 
-def run_worker(service: Service) -> None:
+def run_worker(service: Service, pool: WorkerPool) -> None:
     """Computes jobs of the queues until a signal ends it. Raises the `CowError` for which its backends do not load."""
-    pool, ended = WorkerPool(service.settings), threading.Event()
+    ended = threading.Event()
 
     def end(number: int, frame: object) -> None:
         ended.set()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    pool.start()
     engine = JobEngine(service, pool)
     try:
         pool.check()
@@ -70,10 +67,13 @@ def run_worker(service: Service) -> None:
         service.close()
 
 
-def run_server(service: Service) -> None:
-    """Serves until a signal ends it. Raises the `CowError` for which the default request cannot be served."""
+def run_server(service: Service, pool: WorkerPool | None = None) -> None:
+    """Serves until a signal ends it. Jobs are computed by the pool, where there is one.
+
+    Raises the `CowError` for which the default request cannot be served.
+    """
     settings = service.settings
-    engine, readiness = _parts(service)
+    engine, readiness = _parts(service, pool)
     config = uvicorn.Config(
         create_app(engine, readiness),
         host=settings.host,

@@ -139,11 +139,17 @@ def serve(
 ) -> None:
     """Start the server."""
     service = _served(host=host, port=port, role=role)
+    from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
+
+    settings = service.settings
+    pool = WorkerPool(settings) if settings.workers and settings.role == "all" else None
+    if pool is not None:
+        pool.start()  # its processes start while the server is imported
     from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
     from cow_service.server import run_server  # noqa: PLC0415
 
-    warn_if_open(service.settings)
-    run_server(service)
+    warn_if_open(settings)
+    run_server(service, pool)
 
 
 @app.command()
@@ -156,9 +162,13 @@ def worker(
     """Compute the jobs of servers on the same job database."""
     named = None if queues is None else tuple(name.strip() for name in queues.split(",") if name.strip())
     service = _served(queues=named)
+    from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
+
+    pool = WorkerPool(service.settings)
+    pool.start()
     from cow_service.server import run_worker  # noqa: PLC0415
 
-    run_worker(service)
+    run_worker(service, pool)
 
 
 def _served(**overrides: Any) -> Service:

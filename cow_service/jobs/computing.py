@@ -1,6 +1,6 @@
 """The computation of one job: its stages, each result stored as soon as it is there. In any process that has a service.
 
-A job engine gives its jobs to a `Computer`: `InProcess` here, or worker processes (`cow_service.workers`).
+A job engine gives its jobs to a `Computer`: its own process (`in_process.py`), or others (`cow_service.workers`).
 """
 
 from __future__ import annotations
@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from cow_service.jobs.database import Database
-from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.outages import Outages
 from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.stage_cache import HoldKey, KeyLocks, StoredStep
+from cow_service.jobs.stage_cache import HoldKey, StoredStep
 from cow_service.media.images import DecodedImage
 from cow_service.pipeline import answer, simulate
 from cow_service.requests import AnswerRequest, ImageArtifact, Stage
@@ -60,29 +59,6 @@ class Computer(Protocol):
     def compute(self, work: Work) -> Outcome:
         """Computes one job. Raises the `CowError` that it fails with, `Canceled` where it was canceled."""
         ...
-
-
-class InProcess:
-    """Computes jobs in the threads that ask for it."""
-
-    def __init__(self, open_jobs: OpenJobs) -> None:
-        self._open_jobs = open_jobs
-        self._locks = KeyLocks()
-
-    def start(self) -> None:
-        """Does nothing."""
-
-    def close(self) -> None:
-        """Does nothing."""
-
-    def capacity(self, queue: str) -> int:
-        """Those that compute, and those that wait for an MLLM."""
-        settings = self._open_jobs.service.settings
-        return settings.concurrency + settings.mllm_concurrency
-
-    def compute(self, work: Work) -> Outcome:
-        """As the protocol says."""
-        return compute(work, self._open_jobs.service, self._open_jobs.database, self._locks.held)
 
 
 class Elsewhere:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import sys
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import psycopg
 import sqlalchemy as sa
 from sqlalchemy import event
 from sqlalchemy.exc import SQLAlchemyError
@@ -267,10 +267,16 @@ def database_errors() -> Generator[None]:
     """Translates the database's errors to `StorageUnavailable`. Their own text may hold addresses, and is left out."""
     try:
         yield
-    except (SQLAlchemyError, sqlite3.Error, psycopg.Error) as error:
+    except (SQLAlchemyError, sqlite3.Error, *_driver_errors()) as error:
         raise StorageUnavailable(
             f"The job database cannot be used ({type(error).__name__}): see COW_DATABASE_URL, and the disk it is on."
         ) from error
+
+
+def _driver_errors() -> tuple[type[Exception], ...]:
+    """Those of PostgreSQL's driver, which takes long to import where it is not needed."""
+    driver = sys.modules.get("psycopg")
+    return () if driver is None else (driver.Error,)
 
 
 def _chunks(values: list[str]) -> Iterable[list[str]]:

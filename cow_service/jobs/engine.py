@@ -12,6 +12,7 @@ import threading
 import uuid
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from http import HTTPStatus
 from typing import Any, cast
 
@@ -33,9 +34,10 @@ from cow_service.errors import (
     StorageUnavailable,
 )
 from cow_service.jobs import state, workflows
-from cow_service.jobs.computing import Computer, InProcess
+from cow_service.jobs.computing import Computer
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.dispatch import Dispatch
+from cow_service.jobs.in_process import InProcess
 from cow_service.jobs.leases import lease_of
 from cow_service.jobs.maintenance import Maintenance
 from cow_service.jobs.news import JobNews, news_of
@@ -217,7 +219,7 @@ class JobEngine:
             queue = queue_of(spec.reader, spec.generator, self.service.settings)
             starts_now = self.open_jobs.count(queue) < self._computer.capacity(queue)
             spec = spec.model_copy(update={"turn": self.open_jobs.next_turn(owner)})
-            self.open_jobs.record(job_id, OpenJob(spec.generator, owner, spec.turn, queue))
+            self.open_jobs.record(job_id, OpenJob(spec.generator, owner, spec.turn, queue, spec.created_at))
         try:
             # Before the job exists: its image and masks must not be removed before work on it starts.
             self.database.add_references(job_id, [image.info.sha256, *spec.masks])
@@ -237,6 +239,8 @@ class JobEngine:
         found = state.find(job_id, self.active, full=full)
         if found is None or (owner is not None and found.owner != owner):
             raise JobNotFound(f"There is no job {job_id[:64]!r}: it was deleted, or never was one of yours.")
+        if found.job.status == "queued":
+            return replace(found, job=found.job.model_copy(update=self.open_jobs.place_in_line(job_id)))
         return found
 
     def page(self, owner: str | None, filters: JobFilters) -> JobPage:

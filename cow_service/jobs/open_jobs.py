@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 
 from dbos import DBOS
 
@@ -11,6 +11,7 @@ from cow_service.errors import CowError
 from cow_service.jobs import state
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.database import Database, database_errors
+from cow_service.jobs.pace import Pace
 from cow_service.jobs.state import OpenJob
 from cow_service.jobs.webhooks import attempt_ids
 from cow_service.service import Service
@@ -25,6 +26,7 @@ class OpenJobs:
         self.active = ActiveJobs()
         self.lock = threading.RLock()
         self._open: dict[str, OpenJob] = {}
+        self._paces: defaultdict[str, Pace] = defaultdict(Pace)
         self._changes: list[tuple[str, OpenJob | None]] | None = None  # to the open jobs, while `recount` reads them
 
     def __len__(self) -> int:
@@ -39,6 +41,20 @@ class OpenJobs:
         """How many jobs of an owner are open."""
         with self.lock:
             return sum(each.owner == owner for each in self._open.values())
+
+    def place_in_line(self, job_id: str) -> dict[str, float | None]:
+        """`position` and `expected_wait` of a queued job."""
+        with self.lock:
+            own = self._open.get(job_id)
+            if own is None:
+                return {}
+            before = sum(
+                (each.turn, each.created_at) < (own.turn, own.created_at) and self.active.at(other) is None
+                for other, each in self._open.items()
+                if each.queue == own.queue
+            )
+            pace = self._paces[own.queue].jobs_per_second()
+        return {"position": before, "expected_wait": None if pace is None else round((before + 1) / pace, 1)}
 
     def next_turn(self, owner: str | None) -> int:
         """The turn of an owner's next job: behind their others, and no later than the first that is open of anybody.
@@ -57,7 +73,9 @@ class OpenJobs:
             if self._changes is not None:
                 self._changes.append((job_id, job))
             if job is None:
-                self._open.pop(job_id, None)
+                ended = self._open.pop(job_id, None)
+                if ended is not None:
+                    self._paces[ended.queue].note()
             else:
                 self._open[job_id] = job
 

@@ -7,7 +7,8 @@ from typing import Any
 
 from dbos import Serializer
 
-from cow_service.errors import CowError, FieldError, InternalError, kinds
+from cow_service.errors import CowError, InternalError
+from cow_service.jobs.stored_errors import error_as_json, error_from_json
 
 _ERROR = "cow_error"
 
@@ -23,8 +24,7 @@ class JsonSerializer(Serializer):
         """One value as JSON text. Any other exception becomes an internal error without its text."""
         if isinstance(data, BaseException):
             error = data if isinstance(data, CowError) else InternalError("The job met an error that nobody foresaw.")
-            fields = [{"pointer": field.pointer, "detail": field.detail} for field in error.errors]
-            data = {_ERROR: {"code": error.code, "detail": error.detail, "errors": fields, "usage": error.usage}}
+            data = {_ERROR: error_as_json(error)}
         return json.dumps(data, separators=(",", ":"))
 
     def deserialize(self, serialized_data: str) -> Any:
@@ -32,8 +32,4 @@ class JsonSerializer(Serializer):
         value = json.loads(serialized_data)
         if not isinstance(value, dict) or set(value) != {_ERROR}:
             return value
-        kept = value[_ERROR]
-        kind = kinds().get(kept["code"], InternalError)  # one of a later version may not be known here
-        error = kind(kept["detail"], errors=tuple(FieldError(**field) for field in kept["errors"]))
-        error.usage = kept.get("usage")
-        return error
+        return error_from_json(value[_ERROR])

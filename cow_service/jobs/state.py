@@ -133,6 +133,7 @@ class OpenJob:
     owner: str | None = None
     turn: int = 0
     queue: str = LIGHT
+    created_at: str = ""
 
 
 def open_jobs() -> dict[str, OpenJob]:
@@ -143,6 +144,7 @@ def open_jobs() -> dict[str, OpenJob]:
             one.authenticated_user,
             int(_attribute(one, ATTRIBUTE_TURN) or 0),
             queue_of(one),
+            _attribute(one, ATTRIBUTE_CREATED_AT),
         )
         for one in workflows_of_jobs(status=OPEN)
     }

@@ -53,6 +53,14 @@ class Job(Record):
     progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
     created_at: str = Field(description="RFC 3339, UTC.")
     finished_at: str | None = Field(default=None, description="RFC 3339, UTC.")
+    position: int | None = Field(
+        default=None,
+        ge=0,
+        description="Jobs that are taken before it, while it is queued and asked for by its id; null otherwise.",
+    )
+    expected_wait: float | None = Field(
+        default=None, ge=0, description="Seconds until it is taken, at the pace of the last minutes; null if not known."
+    )
     generator: str = Field(description="Who makes its frames.")
     result: Simulation | Answer | None = Field(default=None, description="Of a succeeded job, but not in lists.")
     problem: Problem | None = Field(default=None, description="Of a failed job.")

@@ -23,8 +23,8 @@ import psutil
 from cow_service.errors import Canceled, CowError, unforeseen
 from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
-from cow_service.jobs.serializer import JsonSerializer
 from cow_service.jobs.stage_cache import HoldKey as HoldKeyOf
+from cow_service.jobs.stored_errors import error_as_json
 from cow_service.observability import context, tracing
 from cow_service.observability import logging as logs
 from cow_service.readers.question.sentences import parse
@@ -112,10 +112,10 @@ class WorkerProcess:
         try:
             self._service.check()
         except CowError as error:
-            self._send(Loaded(JsonSerializer().serialize(error)))
+            self._send(Loaded(error_as_json(error)))
         except Exception:
             log.exception("the default backends could not be loaded")
-            self._send(Loaded(JsonSerializer().serialize(unforeseen())))
+            self._send(Loaded(error_as_json(unforeseen())))
         else:
             self._send(Loaded(None))
             parse("")  # it builds the grammar, for which the first job would have to wait
@@ -130,10 +130,10 @@ class WorkerProcess:
                 work, hold_key = self._work_of(start), self._hold_key_of(start.job_id)
                 message = Succeeded(start.job_id, compute(work, self._service, self._database, hold_key))
         except CowError as error:
-            message = Failed(start.job_id, JsonSerializer().serialize(error))
+            message = Failed(start.job_id, error_as_json(error))
         except Exception:
             log.exception("job %s failed", start.job_id)
-            message = Failed(start.job_id, JsonSerializer().serialize(unforeseen()))
+            message = Failed(start.job_id, error_as_json(unforeseen()))
         del self._jobs[start.job_id]
         self._send(message)
 

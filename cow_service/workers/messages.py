@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from cow_service.jobs.computing import Outcome
 from cow_service.jobs.spec import JobSpec
@@ -54,9 +55,9 @@ class Stop:
 
 @dataclass(frozen=True)
 class Loaded:
-    """The default backends are loaded, or the error, serialized, for which they are not."""
+    """The default backends are loaded, or the error, as JSON, for which they are not."""
 
-    error: str | None
+    error: dict[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -110,10 +111,10 @@ class Succeeded:
 
 @dataclass(frozen=True)
 class Failed:
-    """The job failed with an error, serialized as in the database; `Canceled` where it was canceled."""
+    """The job failed with an error, as JSON; `Canceled` where it was canceled."""
 
     job_id: str
-    error: str
+    error: dict[str, Any]
 
 
 ToWorker = Configure | Start | Cancel | KeyHeld | Stop

@@ -15,8 +15,8 @@ from queue import Empty, SimpleQueue
 
 from cow_service.errors import Canceled, CowError, JobTimeout
 from cow_service.jobs.computing import Outcome, Work
-from cow_service.jobs.serializer import JsonSerializer
 from cow_service.jobs.stage_cache import KeyLocks
+from cow_service.jobs.stored_errors import error_from_json
 from cow_service.settings import Settings
 from cow_service.workers.messages import (
     Cancel,
@@ -39,6 +39,7 @@ from cow_service.workers.messages import (
 
 POLL_SECONDS = 0.1  # how often a job at work is checked: whether it was canceled, whether its time is over
 CANCEL_SECONDS = 5.0  # that a canceled job is given to end; then its process is ended
+START_SECONDS = 60.0  # that a process is given to begin with its first job
 END_SECONDS = 5.0  # that a process is given to end by itself
 
 log = logging.getLogger("cow_service")
@@ -134,7 +135,7 @@ class Worker:
             raise WorkerGone(f"{self._reason} ({_how(self._process.wait())})", is_final=self._is_final)
 
     def _follow(self, work: Work, inbox: SimpleQueue[OfJob | None], keys: _Keys) -> Outcome:
-        until, canceled = time.monotonic() + self._job_timeout, False
+        until, canceled, begun = time.monotonic() + START_SECONDS + self._job_timeout, False, False
         while True:
             message = None
             try:
@@ -149,21 +150,27 @@ class Worker:
             except Canceled:
                 canceled, until = True, time.monotonic() + CANCEL_SECONDS
                 self._send(Cancel(work.job_id))
-            match message:
-                case Succeeded(outcome=outcome):
-                    return outcome
-                case Failed(error=error):
-                    raise JsonSerializer().deserialize(error)
-                case LookedFor(stage=stage, found=found):
-                    work.looked_for(stage, found)
-                case ReleaseKey(key=key):
-                    keys.release(key)
-                case None:
-                    self.check_alive()
-                case _:
-                    pass
+            if isinstance(message, Succeeded):
+                return message.outcome
+            self._note(message, work, keys)
+            if message is not None and not (begun or canceled):  # a new process had to start before
+                begun, until = True, time.monotonic() + self._job_timeout
             if time.monotonic() > until:
                 raise self._too_late(canceled=canceled)
+
+    def _note(self, message: OfJob | None, work: Work, keys: _Keys) -> None:
+        """Does what a message asks for. Raises the error that the job failed with, `WorkerGone`."""
+        match message:
+            case Failed(error=error):
+                raise error_from_json(error)
+            case LookedFor(stage=stage, found=found):
+                work.looked_for(stage, found)
+            case ReleaseKey(key=key):
+                keys.release(key)
+            case None:
+                self.check_alive()
+            case _:
+                pass
 
     def _too_late(self, *, canceled: bool) -> CowError:
         """Ends the process, as a job in it goes on after its time."""
@@ -184,7 +191,7 @@ class Worker:
                     case Heartbeat(memory_bytes=memory_bytes):
                         self.heard, self.memory_bytes = time.monotonic(), memory_bytes
                     case Loaded(error=error):
-                        self._load_error = None if error is None else JsonSerializer().deserialize(error)
+                        self._load_error = None if error is None else error_from_json(error)
                         self._loaded.set()
                     case message:
                         if (inbox := self._inboxes.get(message.job_id)) is not None:
