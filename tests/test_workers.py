@@ -83,6 +83,23 @@ def test_a_frozen_worker_is_replaced(served: Served) -> None:
     assert not {one.pid for one in frozen} & {one.pid for one in workers_of(served)}
 
 
+def test_a_worker_that_ends_without_a_job_is_replaced(served: Served) -> None:
+    for one in workers_of(served):
+        one.kill()
+    assert served.http.post("/simulate", json=slow(0.1, seed=108)).status_code == 200
+    assert served.http.get("/readyz").status_code == 200
+
+
+def test_a_queued_job_says_how_long_it_will_wait(served: Served) -> None:
+    jobs = [served.submit(slow(0.5, seed=110 + place)) for place in range(8)]
+    last = served.job(jobs[-1]["id"])
+    assert last["status"] == "queued"
+    assert 3 <= last["position"] <= 7
+    assert 0 < last["expected_wait"] < 60, "the tests before have shown the pace"
+    ended = served.ended(jobs[-1]["id"])
+    assert ended["position"] is ended["expected_wait"] is None
+
+
 def test_what_a_generator_needs_is_told_by_its_manifest() -> None:
     """The class says the same, where its libraries are installed."""
     from cow_service.generators.wan.generator import WanGenerator

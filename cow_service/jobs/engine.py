@@ -73,7 +73,7 @@ class JobEngine:
         self.webhooks = Webhooks(service.settings)
         self._lease = lease_of(self.database, service.settings.data_dir / "executors")
         self._polls = QueuePolls(self._computer.capacity)
-        self._news = news_of(self.database, self.active.awaited_elsewhere, self._is_over)
+        self._news = news_of(self.database, self.active.awaited_elsewhere, state.ended_of)
         self._maintenance = Maintenance(self.open_jobs, self._lease, self._news)
         self._stopping = False
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
@@ -340,16 +340,12 @@ class JobEngine:
         else:
             self.active.forget(job_id)
 
-    def _has_ended(self, job_id: str, *, or_is_gone: bool = True) -> bool:
+    def _has_ended(self, job_id: str) -> bool:
         try:
             found = state.find(job_id, self.active, full=False)
         except CowError:
             return False  # `recount` corrects the count, and waiters poll
-        return or_is_gone if found is None else found.ended is not None
-
-    def _is_over(self, job_id: str) -> bool:
-        """Whether a job has ended; one that is waited for may not be in the database yet."""
-        return self._has_ended(job_id, or_is_gone=False)
+        return found is None or found.ended is not None
 
     def _enqueue(self, job_id: str, spec: JobSpec, owner: str | None, queue: str) -> None:
         """Puts a job into a queue."""

@@ -25,6 +25,7 @@ CHANNEL = "cow_jobs"
 RECONNECT_SECONDS = 1.0  # after a session was lost
 LISTEN_SECONDS = 1.0  # of one wait, after which it is looked whether to stop
 ASK_SECONDS = 0.05  # between two questions to SQLite, where somebody waits
+ASK_SHARE = 20  # and so many times as long as one took
 PROGRESS_SECONDS = 0.2  # between two messages on the progress of a job
 
 log = logging.getLogger("cow_service")
@@ -110,8 +111,8 @@ class SessionNews:
 class AskedNews:
     """On SQLite: asks for the end of jobs that are waited for here and run elsewhere."""
 
-    def __init__(self, awaited: Callable[[], list[str]], has_ended: Callable[[str], bool]) -> None:
-        self._awaited, self._has_ended = awaited, has_ended
+    def __init__(self, awaited: Callable[[], list[str]], ended: Callable[[list[str]], list[str]]) -> None:
+        self._awaited, self._ended = awaited, ended
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -132,13 +133,17 @@ class AskedNews:
             self._thread = None
 
     def _ask(self, hear: Hear) -> None:
-        while not self._stop.wait(ASK_SECONDS):
-            for job_id in self._awaited():
-                if self._has_ended(job_id):
-                    hear(JobNews("ended", job_id))
+        took = 0.0
+        while not self._stop.wait(max(ASK_SECONDS, ASK_SHARE * took)):
+            began = time.monotonic()
+            if awaited := self._awaited():
+                with suppress(CowError):
+                    for job_id in self._ended(awaited):
+                        hear(JobNews("ended", job_id))
+            took = time.monotonic() - began
 
 
-def news_of(database: Database, awaited: Callable[[], list[str]], has_ended: Callable[[str], bool]) -> News:
-    """The news of a database. The functions say which jobs are waited for here and run elsewhere, and whether one has
-    ended."""
-    return SessionNews(database) if database.file is None else AskedNews(awaited, has_ended)
+def news_of(database: Database, awaited: Callable[[], list[str]], ended: Callable[[list[str]], list[str]]) -> News:
+    """The news of a database. The functions say which jobs are waited for here and run elsewhere, and which of them
+    have ended."""
+    return SessionNews(database) if database.file is None else AskedNews(awaited, ended)

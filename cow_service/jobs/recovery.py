@@ -23,8 +23,8 @@ def recover(executors: Iterable[str]) -> list[str]:
     if not ended:
         return []
     recovered = [one for one in state.pending_of(ended) if one.app_version == workflows.VERSION]
-    for one in recovered:
-        queue = PREFIX + state.queue_of(one)
+    for queue in {PREFIX + state.queue_of(one) for one in recovered}:
         DBOS.register_queue(queue, on_conflict="always_update")
-        database.reenqueue_for_recovery(one.workflow_id, ended, queue)
+    for one in recovered:
+        database.reenqueue_for_recovery(one.workflow_id, ended, PREFIX + state.queue_of(one))
     return [one.workflow_id for one in recovered]

@@ -172,6 +172,11 @@ def ended_before(moment: datetime, limit: int) -> list[str]:
     return [one.workflow_id for one in found]
 
 
+def ended_of(jobs: list[str]) -> list[str]:
+    """Those of some jobs that have ended."""
+    return [one.workflow_id for one in workflows_of_jobs(workflow_ids=jobs, status=ENDED)]
+
+
 def existing(jobs: list[str], owner: str | None = None) -> set[str]:
     """Those of some jobs that the database knows, of an owner where one is given."""
     return {one.workflow_id for one in workflows_of_jobs(workflow_ids=jobs, user=owner)}

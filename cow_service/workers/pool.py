@@ -40,6 +40,7 @@ class Group:
         self.name, self.size, self.jobs_each = name, size, jobs_each
         self.places = PrioritySemaphore(size * jobs_each)
         self.workers: list[Worker] = []
+        self.was_loaded = False  # whether a worker has loaded the default backends
         self.alone = threading.Lock()  # held by a job that is computed for itself, as its last worker crashed
         self._settings = settings
         self._lock = threading.Lock()
@@ -84,6 +85,10 @@ class Group:
     def _start(self) -> Worker:
         if self._closed:
             raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
+        for dead in [one for one in self.workers if not one.is_alive and not self._taken[one]]:  # ended without a job
+            self.workers.remove(dead)
+            del self._taken[dead]
+            dead.close()
         worker = Worker(f"{self.name}-{len(self.workers) + 1}", self._settings)
         self.workers.append(worker)
         self._taken[worker] = 0
@@ -140,10 +145,11 @@ class WorkerPool:
         return group.size * group.jobs_each
 
     def check(self) -> None:
-        """Waits until the default backends are loaded. Raises the `CowError` for which they cannot be."""
+        """Waits until the default backends were loaded once. Raises the `CowError` for which they cannot be."""
         for group in self.groups:
             for worker in tuple(group.workers)[:1]:
-                worker.wait_loaded()
+                # A worker that takes the place of another one may load for minutes: the server is ready all the same.
+                group.was_loaded |= worker.wait_loaded(0 if group.was_loaded else None)
 
     def compute(self, work: Work) -> Outcome:
         """Gives a job to a worker, in its turn. Raises the `CowError` that it fails with, `Canceled`, `WorkerEnded`."""
@@ -160,7 +166,7 @@ class WorkerPool:
                 except WorkerGone as gone:
                     crashes += alone
                     log.warning("the worker of job %s %s", work.job_id, gone)
-                    if crashes == MAX_CRASHES or gone.is_final:
+                    if crashes == MAX_CRASHES or (alone and gone.is_final):
                         raise WorkerEnded(f"The process that computed the job {gone}. It is not tried again.") from gone
                     alone = True  # the next crash is this job's own
 
@@ -185,7 +191,7 @@ class WorkerPool:
         while not self._closed.wait(WATCH_SECONDS):
             slept = time.monotonic() - looked > HEARTBEAT_TIMEOUT_SECONDS / 2  # this process was frozen itself
             looked = time.monotonic()
-            for worker in [one for group in self.groups for one in tuple(group.workers)]:
+            for worker in [one for group in self.groups for one in tuple(group.workers) if one.is_alive]:
                 if slept:
                     worker.heard = looked
                 elif looked - worker.heard > HEARTBEAT_TIMEOUT_SECONDS:

@@ -13,7 +13,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
 
-from cow_service.errors import Canceled, CowError, JobTimeout
+from cow_service.errors import Canceled, CowError, JobTimeout, WorkerEnded
 from cow_service.jobs.computing import Outcome, Work
 from cow_service.jobs.stage_cache import KeyLocks
 from cow_service.jobs.stored_errors import error_from_json
@@ -72,7 +72,7 @@ class Worker:
         self._loaded = threading.Event()
         self._load_error: CowError | None = None
         self._ended = threading.Event()
-        self._reason, self._is_final = "crashed", False
+        self._reason, self._is_final, self._stopped = "crashed", False, False
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "cow_service.workers.child", str(theirs.fileno())], pass_fds=[theirs.fileno()]
@@ -100,7 +100,7 @@ class Worker:
         loaded = self._loaded.wait(seconds)
         if self._load_error is not None:
             raise self._load_error
-        return loaded
+        return loaded and self.is_alive
 
     def run(self, work: Work, locks: KeyLocks) -> Outcome:
         """Computes a job. Raises the `CowError` that it fails with, `Canceled`, `JobTimeout`, `WorkerGone`."""
@@ -120,6 +120,7 @@ class Worker:
 
     def close(self) -> None:
         """Ends the process. It has no jobs."""
+        self._stopped = True
         self._send(Stop())
         try:
             self._process.wait(END_SECONDS)
@@ -197,6 +198,8 @@ class Worker:
                         if (inbox := self._inboxes.get(message.job_id)) is not None:
                             inbox.put(message)
         self._ended.set()
+        if not self._loaded.is_set() and not self._stopped:
+            self._load_error = WorkerEnded(f"A process that computes jobs {self._reason} while it loaded its backends.")
         self._loaded.set()
         for inbox in list(self._inboxes.values()):
             inbox.put(None)
