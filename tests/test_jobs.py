@@ -885,7 +885,7 @@ def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: py
     with Served(tmp_path_factory.mktemp("longer"), **own) as one, ThreadPoolExecutor(4) as pool:
         keys = [{"Idempotency-Key": str(seed)} for seed in (92, 93, 94)]
         waiting = [
-            pool.submit(one.http.post, "/simulate", json=slow(1 if place else 6, seed=92 + place), headers=key)
+            pool.submit(one.http.post, "/simulate", json=slow(4, seed=92 + place), headers=key)
             for place, key in enumerate(keys)
         ]
         eventually(lambda: len(one.http.get("/jobs").json()["jobs"]) == 3 and one.clips())
@@ -908,7 +908,7 @@ def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: py
             assert job["status"] == "succeeded", job
         assert one.ended(alone["id"])["status"] == "succeeded"
         for place, key in enumerate(keys):
-            again = one.http.post("/simulate", json=slow(1 if place else 6, seed=92 + place), headers=key)
+            again = one.http.post("/simulate", json=slow(4, seed=92 + place), headers=key)
             assert again.status_code == 200
             assert again.json()["generator"]["seed"] == 92 + place
 
