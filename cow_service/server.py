@@ -15,6 +15,7 @@ from cow_service.jobs.computing import Elsewhere
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
+from cow_service.settings import SettingsError
 from cow_service.workers.pool import WorkerPool
 
 LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
@@ -42,14 +43,14 @@ def _parts(service: Service) -> tuple[JobEngine, Readiness]:
         return JobEngine(service, Elsewhere()), Readiness(service, lambda: None)
     if not service.settings.workers:
         return JobEngine(service), Readiness(service)
-    pool = WorkerPool(service.settings)
+    pool = WorkerPool(service.settings, service.metrics)
     pool.start()  # it loads what the jobs need while the server starts
     return JobEngine(service, pool), Readiness(service, pool.check)
 
 
 def run_worker(service: Service) -> None:
     """Computes jobs of the queues until a signal ends it. Raises the `CowError` for which its backends do not load."""
-    pool, ended = WorkerPool(service.settings), threading.Event()
+    pool, ended = WorkerPool(service.settings, service.metrics), threading.Event()
 
     def end(number: int, frame: object) -> None:
         ended.set()
@@ -57,8 +58,9 @@ def run_worker(service: Service) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
     pool.start()
-    engine = JobEngine(service, pool)
+    engine = JobEngine(service, pool, "worker")
     try:
+        _serve_metrics(service)
         pool.check()
         engine.start()
         log.info("this worker takes jobs: %s", ", ".join(service.settings.queues) or "of all queues")
@@ -68,6 +70,17 @@ def run_worker(service: Service) -> None:
             engine.close()
         pool.close()
         service.close()
+
+
+def _serve_metrics(service: Service) -> None:
+    """Raises `SettingsError` where the port cannot be had."""
+    host, port = service.settings.host, service.settings.metrics_port
+    if port is None:
+        return
+    try:
+        service.metrics.serve(host, port)
+    except OSError as error:
+        raise SettingsError(f"Bad settings: COW_METRICS_PORT={port}: {error.strerror or error}.") from error
 
 
 def run_server(service: Service) -> None:

@@ -5,9 +5,12 @@ A job engine gives its jobs to a `Computer`: `InProcess` here, or worker process
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
+
+import psutil
 
 from cow_service.jobs.database import Database
 from cow_service.jobs.open_jobs import OpenJobs
@@ -15,7 +18,9 @@ from cow_service.jobs.outages import Outages
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.stage_cache import HoldKey, KeyLocks, StoredStep
 from cow_service.media.images import DecodedImage
+from cow_service.observability.gpus import gpu_memory
 from cow_service.pipeline import answer, simulate
+from cow_service.records import GpuMemory
 from cow_service.requests import AnswerRequest, ImageArtifact, Stage
 from cow_service.service import Service
 from cow_service.stages.run import Progress
@@ -42,6 +47,19 @@ class Outcome:
     timings: dict[str, float]
 
 
+@dataclass(frozen=True)
+class WorkerState:
+    """What computes jobs, as it is now."""
+
+    name: str
+    queue: str | None  # whose jobs it computes; None: of all queues
+    pid: int
+    memory_bytes: int
+    jobs_done: int
+    jobs: tuple[str, ...]  # at hand
+    gpus: tuple[GpuMemory, ...] = ()
+
+
 class Computer(Protocol):
     """Computes jobs, some at the same time."""
 
@@ -61,6 +79,10 @@ class Computer(Protocol):
         """Computes one job. Raises the `CowError` that it fails with, `Canceled` where it was canceled."""
         ...
 
+    def workers(self) -> tuple[WorkerState, ...]:
+        """What computes the jobs."""
+        ...
+
 
 class InProcess:
     """Computes jobs in the threads that ask for it."""
@@ -68,6 +90,7 @@ class InProcess:
     def __init__(self, open_jobs: OpenJobs) -> None:
         self._open_jobs = open_jobs
         self._locks = KeyLocks()
+        self._jobs_done = 0
 
     def start(self) -> None:
         """Does nothing."""
@@ -82,7 +105,16 @@ class InProcess:
 
     def compute(self, work: Work) -> Outcome:
         """As the protocol says."""
-        return compute(work, self._open_jobs.service, self._open_jobs.database, self._locks.held)
+        try:
+            return compute(work, self._open_jobs.service, self._open_jobs.database, self._locks.held)
+        finally:
+            self._jobs_done += 1
+
+    def workers(self) -> tuple[WorkerState, ...]:
+        """The process itself."""
+        memory = psutil.Process().memory_info().rss
+        jobs = tuple(self._open_jobs.active.ids())
+        return (WorkerState("server", None, os.getpid(), memory, self._jobs_done, jobs, gpu_memory()),)
 
 
 class Elsewhere:
@@ -101,6 +133,10 @@ class Elsewhere:
     def compute(self, work: Work) -> Outcome:
         """Is never called, as no job is taken."""
         raise NotImplementedError
+
+    def workers(self) -> tuple[WorkerState, ...]:
+        """None."""
+        return ()
 
 
 def compute(work: Work, service: Service, database: Database, hold_key: HoldKey) -> Outcome:

@@ -1,0 +1,123 @@
+"""What processes tell of themselves: `GET /workers`, `/readyz`, `cow top`, `cow doctor`, metrics."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from postgres import postgres_server
+from servers import Served, Worker, eventually, problem, slow
+
+pytestmark = pytest.mark.slow
+
+
+def workers_of(served: Served) -> dict[str, Any]:
+    response = served.http.get("/workers")
+    assert response.status_code == 200, response.text
+    return response.json()
+
+
+def queue_of(served: Served, name: str = "light") -> dict[str, Any]:
+    return next(queue for queue in workers_of(served)["queues"] if queue["name"] == name)
+
+
+def busy(served: Served) -> dict[str, Any] | None:
+    """A worker that has a job."""
+    return next((one for process in workers_of(served)["processes"] for one in process["workers"] if one["jobs"]), None)
+
+
+def cow(served: Served, *arguments: str, **settings: str) -> subprocess.CompletedProcess[str]:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
+    environment |= {"COW_DATA_DIR": str(served.data)} | settings
+    command = [sys.executable, "-m", "cow_service.cli.main", *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with Served(tmp_path_factory.mktemp("processes"), COW_CONCURRENCY="1") as one:
+        yield one
+
+
+def test_a_server_shows_its_workers_and_queues(served: Served) -> None:
+    job, waits = (served.submit(slow(6, seed=seed))["id"] for seed in (1, 2))
+    served.rendering(job)
+    worker = eventually(lambda: busy(served))
+    (process,) = workers_of(served)["processes"]
+    assert served.process is not None
+    assert (process["role"], process["pid"], process["queues"]["light"]) == ("all", served.process.pid, 1)
+    assert (worker["name"], worker["queue"]) == ("light-1", "light")
+    assert worker["memory_mb"] > 20
+    at_hand = worker["jobs"][0]
+    assert (at_hand["id"], at_hand["kind"], at_hand["stage"]) == (job, "simulate", "generation")
+    queue = eventually(lambda: found if (found := queue_of(served))["queued"] == 1 else None)
+    assert (queue["running"], queue["capacity"]) == (1, 1)
+    assert queue["oldest_seconds"] >= 0
+    for one in (job, waits):
+        served.http.post(f"/jobs/{one}/cancel")
+    eventually(lambda: queue_of(served)["queued"] == queue_of(served)["running"] == 0)
+    assert served.http.post("/simulate", json=slow(0.1, seed=3)).status_code == 200
+    eventually(lambda: queue_of(served)["jobs_per_minute"] > 0)
+
+
+def test_jobs_of_another_version_are_told_of(served: Served) -> None:
+    """As after a change of the workflow version with jobs in the queue."""
+    job, waits = (served.submit(slow(8, seed=seed))["id"] for seed in (4, 5))
+    served.rendering(job)
+
+    def set_version(version: str) -> None:
+        with sqlite3.connect(served.data / "jobs.sqlite3") as database:
+            database.execute(
+                "UPDATE workflow_status SET application_version = ? WHERE workflow_uuid = ?", (version, waits)
+            )
+
+    set_version("0")
+    served.http.post(f"/jobs/{job}/cancel")
+    eventually(lambda: served.http.get("/readyz").status_code == 503)
+    told = problem(served.http.get("/readyz"), 503, "not-ready")
+    assert "1 job of workflow version 0 waits, and no process takes them" in told["detail"]
+    assert workers_of(served)["unserved"] == [
+        {"queue": "light", "workflow_version": "0", "jobs": 1, "reason": "version"}
+    ]
+    report = cow(served, "doctor", "--json")
+    assert report.returncode == 1
+    (found,) = json.loads(report.stdout)["unserved"]
+    assert found["workflow_version"] == "0"
+    assert "Start a server or worker of a COW with workflow version 0" in cow(served, "doctor").stdout
+    set_version("1")
+    assert served.ended(waits)["status"] == "succeeded"
+    eventually(lambda: served.http.get("/readyz").status_code == 200)
+    assert cow(served, "doctor").returncode == 0
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[str]:
+    with postgres_server() as url:
+        yield url
+
+
+def test_an_api_server_is_ready_with_a_worker(postgres: str, tmp_path: Path) -> None:
+    own = {"COW_DATABASE_URL": postgres}
+    with Served(tmp_path, COW_ROLE="api", **own) as api:
+        told = problem(api.http.get("/readyz"), 503, "not-ready")
+        assert "`cow worker --queues light`" in told["detail"]
+        with Worker(tmp_path, log="worker", **own) as worker:
+            eventually(lambda: api.http.get("/readyz").status_code == 200)
+            assert [one["role"] for one in workers_of(api)["processes"]] == ["api", "worker"]
+            job = api.submit(slow(2))["id"]
+            assert eventually(lambda: busy(api))["jobs"][0]["id"] == job
+            assert api.ended(job)["status"] == "succeeded"
+            worker.processes()[-1].send_signal(signal.SIGTERM)
+            eventually(lambda: [one["role"] for one in workers_of(api)["processes"]] == ["api"])
+        waits = api.submit(slow(0.1))["id"]
+        eventually(lambda: workers_of(api)["unserved"])
+        assert workers_of(api)["unserved"][0]["jobs"] == 1
+        api.http.delete(f"/jobs/{waits}")
