@@ -15,6 +15,7 @@ from cow_service.cli import keys as keys_cli
 from cow_service.cli import mcp as mcp_cli
 from cow_service.cli import models as models_cli
 from cow_service.cli import options
+from cow_service.cli import top as top_cli
 from cow_service.cli import tracks as tracks_cli
 from cow_service.cli.errors import Commands
 from cow_service.cli.options import with_request_options
@@ -210,6 +211,7 @@ def _service(**overrides: Any) -> Service:
 
 app.command("batch")(batch_cli.batch)
 app.command("mcp")(mcp_cli.mcp)
+app.command("top")(top_cli.top)
 app.add_typer(keys_cli.app, name="keys")
 app.add_typer(models_cli.app, name="models")
 app.add_typer(tracks_cli.app, name="tracks")

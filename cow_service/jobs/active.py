@@ -142,6 +142,11 @@ class ActiveJobs:
         with self._lock:
             return [job for job, active in self._running.items() if not active.finished]
 
+    def ids_of_waiting(self) -> list[str]:
+        """Those of them that are not begun: they wait for a place."""
+        with self._lock:
+            return [job for job, active in self._running.items() if active.begun is None and not active.finished]
+
     def forget(self, job: str) -> None:
         """Drops the state of a job whose work is over."""
         with self._lock:

@@ -8,7 +8,7 @@ import sqlalchemy as sa
 
 from cow_service.jobs.database import Database
 from cow_service.jobs.overview import unserved
-from cow_service.jobs.process_table import ProcessTable
+from cow_service.jobs.process_table import Alive, ProcessTable
 from cow_service.jobs.queue_counts import has_jobs, open_counts
 from cow_service.records import Unserved
 from cow_service.settings import Settings
@@ -26,6 +26,7 @@ def unserved_jobs(settings: Settings) -> tuple[Unserved, ...]:
         if not has_jobs(engine):
             return ()
         table = ProcessTable(engine)
-        return unserved(table.alive() if table.exists() else (), open_counts(engine))
+        alive = table.alive() if table.exists() else Alive()
+        return unserved(alive.processes, open_counts(engine, alive.waiting))
     finally:
         engine.dispose()

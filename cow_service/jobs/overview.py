@@ -56,8 +56,8 @@ class Overview:
     def _read(self) -> None:
         if time.monotonic() - self._read_at < MAX_AGE_SECONDS:
             return
-        processes = self._table.alive()
-        counts = open_counts(self._engine)
+        alive = self._table.alive()
+        counts, processes = open_counts(self._engine, alive.waiting), alive.processes
         if self._settings.api_keys:
             processes = tuple(map(_without_ids, processes))
         self._counts = counts

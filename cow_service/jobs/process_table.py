@@ -5,10 +5,11 @@ Times are the database's: the clocks of machines differ.
 
 from __future__ import annotations
 
+import json
 import logging
+from dataclasses import dataclass
 
 import sqlalchemy as sa
-from pydantic import ValidationError
 
 from cow_service.jobs.database import database_errors
 from cow_service.records import ProcessInfo
@@ -22,6 +23,7 @@ _table = sa.Table(
     sa.Column("executor_id", sa.String(64), primary_key=True),
     sa.Column("seen", sa.Float, nullable=False),  # Unix time, s
     sa.Column("info", sa.Text, nullable=False),  # a `ProcessInfo` as JSON
+    sa.Column("waiting", sa.Text, nullable=False),  # ids of jobs that it has taken and not begun, as JSON
 )
 _NOW = {
     "sqlite": "(julianday('now') - 2440587.5) * 86400.0",
@@ -29,6 +31,14 @@ _NOW = {
 }
 
 log = logging.getLogger("cow_service")
+
+
+@dataclass(frozen=True)
+class Alive:
+    """The processes that were seen lately, by role, host and process id, and the jobs that wait in one of them."""
+
+    processes: tuple[ProcessInfo, ...] = ()
+    waiting: frozenset[str] = frozenset()
 
 
 class ProcessTable:
@@ -43,15 +53,17 @@ class ProcessTable:
         with database_errors():
             _table.create(self._engine, checkfirst=True)
 
-    def write(self, info: ProcessInfo) -> None:
-        """Notes that a process is alive, and what it does; deletes the rows of those long gone."""
+    def write(self, info: ProcessInfo, waiting: list[str]) -> None:
+        """Notes that a process is alive, what it does, and which jobs it has not begun; deletes rows of those long
+        gone."""
         with database_errors(), self._engine.begin() as connection:
             connection.execute(
                 sa.text(
-                    f"INSERT INTO cow_processes (executor_id, seen, info) VALUES (:executor_id, {self._now}, :info) "
-                    "ON CONFLICT (executor_id) DO UPDATE SET seen = excluded.seen, info = excluded.info"
+                    "INSERT INTO cow_processes (executor_id, seen, info, waiting) "
+                    f"VALUES (:executor_id, {self._now}, :info, :waiting) ON CONFLICT (executor_id) "
+                    "DO UPDATE SET seen = excluded.seen, info = excluded.info, waiting = excluded.waiting"
                 ),
-                {"executor_id": info.executor_id, "info": info.model_dump_json()},
+                {"executor_id": info.executor_id, "info": info.model_dump_json(), "waiting": json.dumps(waiting)},
             )
             connection.execute(
                 sa.text(f"DELETE FROM cow_processes WHERE seen < {self._now} - :age"), {"age": FORGOTTEN_SECONDS}
@@ -62,18 +74,22 @@ class ProcessTable:
         with database_errors(), self._engine.begin() as connection:
             connection.execute(sa.delete(_table).where(_table.c.executor_id == executor_id))
 
-    def alive(self) -> tuple[ProcessInfo, ...]:
-        """The processes that were seen lately, by role, host and process id."""
-        query = sa.text(f"SELECT executor_id, info FROM cow_processes WHERE seen > {self._now} - :age")
+    def alive(self) -> Alive:
+        """Who was seen in the last `ALIVE_SECONDS`."""
+        query = sa.text(f"SELECT executor_id, info, waiting FROM cow_processes WHERE seen > {self._now} - :age")
         with database_errors(), self._engine.connect() as connection:
             rows = connection.execute(query, {"age": ALIVE_SECONDS}).all()
         found: list[ProcessInfo] = []
-        for executor_id, info in rows:
+        waiting: set[str] = set()
+        for executor_id, info, jobs in rows:
             try:
-                found.append(ProcessInfo.model_validate_json(info))
-            except ValidationError:
+                # Fields that only a later version knows are passed over.
+                found.append(ProcessInfo.model_validate_json(info, extra="ignore"))
+                waiting.update(json.loads(jobs))
+            except ValueError:
                 log.warning("the process %s is of a version that this one does not understand", executor_id)
-        return tuple(sorted(found, key=lambda one: (one.role, one.host, one.pid)))
+        found.sort(key=lambda one: (one.role, one.host, one.pid))
+        return Alive(tuple(found), frozenset(waiting))
 
     def exists(self) -> bool:
         """Whether a process of this version ever used the database."""

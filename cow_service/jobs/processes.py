@@ -92,7 +92,8 @@ class Processes:
                 workflow_version=workflows.VERSION,
                 queues={} if self._draining else self._queues,
                 workers=self.workers(),
-            )
+            ),
+            self._open_jobs.active.ids_of_waiting(),
         )
 
     def _try(self, work: Callable[[], None]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -17,7 +18,6 @@ from cow_service.jobs.state import (
     ATTRIBUTE_QUEUE,
     KINDS,
     OPEN,
-    STATUS,
 )
 
 RATE_SECONDS = 300.0  # over which ended jobs are counted
@@ -36,14 +36,18 @@ class OpenCount:
     oldest_seconds: float  # since the first of them was created
 
 
-def open_counts(engine: sa.Engine) -> list[OpenCount]:
-    """The jobs that wait or run anywhere. Raises `StorageUnavailable`."""
+def open_counts(engine: sa.Engine, waiting: Iterable[str]) -> list[OpenCount]:
+    """The jobs that wait or run anywhere; `waiting` are those that a process has taken and not begun.
+
+    Raises `StorageUnavailable`.
+    """
     table = _workflows(engine)
     attributes = table.c.attributes
+    runs = sa.and_(table.c.status == "PENDING", table.c.workflow_uuid.not_in(list(waiting)))
     groups = (
         sa.func.coalesce(attributes[ATTRIBUTE_QUEUE].as_string(), LIGHT).label("queue"),
         sa.func.coalesce(attributes[ATTRIBUTE_GENERATOR].as_string(), "").label("generator"),
-        table.c.status,
+        sa.case((runs, "running"), else_="queued").label("state"),
         sa.func.coalesce(table.c.application_version, "").label("version"),
     )
     oldest = sa.func.min(attributes[ATTRIBUTE_CREATED_AT].as_string())
@@ -55,8 +59,8 @@ def open_counts(engine: sa.Engine) -> list[OpenCount]:
     with database_errors(), engine.connect() as connection:
         rows = connection.execute(query).all()
     return [
-        OpenCount(queue, generator, STATUS[status], version, jobs, _age(oldest))
-        for queue, generator, status, version, jobs, oldest in rows
+        OpenCount(queue, generator, state, version, jobs, _age(oldest))
+        for queue, generator, state, version, jobs, oldest in rows
     ]
 
 
@@ -84,6 +88,7 @@ def ended_lately(engine: sa.Engine) -> dict[str, int]:
 def _workflows(engine: sa.Engine) -> TableClause:
     return sa.table(
         "workflow_status",
+        sa.column("workflow_uuid", sa.Text),
         sa.column("name", sa.Text),
         sa.column("status", sa.Text),
         sa.column("application_version", sa.Text),

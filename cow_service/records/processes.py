@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from cow_service.records.base import Record
 from cow_service.records.service import JobKind
@@ -12,13 +12,7 @@ from cow_service.records.service import JobKind
 ProcessRole = Literal["all", "api", "worker"]
 
 
-class SharedRecord(Record):
-    """A record that processes of several versions read: fields that this version does not know are passed over."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", defer_build=True)
-
-
-class GpuMemory(SharedRecord):
+class GpuMemory(Record):
     """Memory of one GPU."""
 
     device: str = Field(description="Such as cuda:0.")
@@ -27,7 +21,7 @@ class GpuMemory(SharedRecord):
     total_mb: float = Field(ge=0, description="Of the device, MB.")
 
 
-class WorkerJob(SharedRecord):
+class WorkerJob(Record):
     """A job that is being computed: how far it is, never what was asked nor who asked."""
 
     id: str | None = Field(default=None, description="Null where the server has keys.")
@@ -37,7 +31,7 @@ class WorkerJob(SharedRecord):
     seconds: float = Field(ge=0, description="Since it began to be computed.")
 
 
-class WorkerInfo(SharedRecord):
+class WorkerInfo(Record):
     """What computes jobs: a worker process, or the threads of the server itself (`COW_WORKERS=0`)."""
 
     name: str = Field(description="Its queue and a number.")
@@ -49,7 +43,7 @@ class WorkerInfo(SharedRecord):
     gpus: tuple[GpuMemory, ...] = Field(default=(), description="That it uses.")
 
 
-class ProcessInfo(SharedRecord):
+class ProcessInfo(Record):
     """One process on the job database: a server, or `cow worker`."""
 
     executor_id: str
@@ -69,8 +63,8 @@ class QueueInfo(Record):
     """One queue."""
 
     name: str
-    queued: int = Field(ge=0, description="Jobs that wait in it.")
-    running: int = Field(ge=0, description="Jobs that a process has taken.")
+    queued: int = Field(ge=0, description="Jobs that wait.")
+    running: int = Field(ge=0, description="Jobs that are computed.")
     capacity: int = Field(ge=0, description="Jobs that all processes together take at the same time.")
     oldest_seconds: float | None = Field(default=None, ge=0, description="How long the oldest of `queued` has waited.")
     jobs_per_minute: float = Field(ge=0, description="That ended, over the last five minutes.")
