@@ -81,23 +81,27 @@ def test_a_server_shows_its_workers_and_queues(served: Served) -> None:
 
 def test_jobs_of_another_version_are_told_of(served: Served) -> None:
     """As after a change of the workflow version with jobs in the queue."""
-    job, waits = (served.submit(slow(seconds, seed=4))["id"] for seconds in (20, 0.1))
-    served.rendering(job)
+    *others, waits = (served.submit(slow(seconds, seed=4))["id"] for seconds in (20, 20, 0.1))
+    served.rendering(others[0])  # the second one is taken beside it, the third stays in the queue
 
     def set_version(version: str) -> None:
         with sqlite3.connect(served.data / "jobs.sqlite3") as database:
-            database.execute(
-                "UPDATE workflow_status SET application_version = ? WHERE workflow_uuid = ?", (version, waits)
+            changed = database.execute(
+                "UPDATE workflow_status SET application_version = ? WHERE workflow_uuid = ? AND status = 'ENQUEUED'",
+                (version, waits),
             )
+        assert changed.rowcount == 1
 
     set_version("0")
-    served.http.post(f"/jobs/{job}/cancel")
+    for job in others:
+        served.http.post(f"/jobs/{job}/cancel")
     eventually(lambda: served.http.get("/readyz").status_code == 503)
     told = problem(served.http.get("/readyz"), 503, "not-ready")
     assert "1 job of workflow version 0 waits, and no process takes them" in told["detail"]
     assert workers_of(served)["unserved"] == [
         {"queue": "light", "workflow_version": "0", "jobs": 1, "reason": "version"}
     ]
+    assert 'cow_queue_unserved{queue="light",reason="version"} 1.0' in served.http.get("/metrics").text
     report = cow(served, "doctor")
     assert report.returncode == 1
     assert "Start a server or worker of a COW with workflow version 0" in report.stdout

@@ -50,7 +50,8 @@ class Processes:
         self._draining = False
         self._stop.clear()
         metrics = self._open_jobs.service.metrics
-        metrics.queue_depth, metrics.queue_oldest, metrics.workers = self._depth, self._oldest, self.workers
+        metrics.queue_depth, metrics.queue_oldest = self._depth, self._oldest
+        metrics.queue_unserved, metrics.workers = self._unserved, self.workers
         self._thread = threading.Thread(target=self._tell_on, name="cow-processes", daemon=True)
         self._thread.start()
 
@@ -135,3 +136,9 @@ class Processes:
 
     def _oldest(self) -> Mapping[str, float]:
         return {one.name: one.oldest_seconds or 0.0 for one in self.overview.workers().queues}
+
+    def _unserved(self) -> Mapping[tuple[str, str], int]:
+        unserved: dict[tuple[str, str], int] = {}
+        for one in self.overview.workers().unserved:
+            unserved[one.queue, one.reason] = unserved.get((one.queue, one.reason), 0) + one.jobs
+        return unserved

@@ -24,6 +24,7 @@ _REQUEST_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30,
 _STAGE_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600, 1800)  # seconds
 
 QueueDepth = Callable[[], Mapping[tuple[str, str, str], int]]  # (queue, generator, "queued" | "running") -> jobs
+QueueUnserved = Callable[[], Mapping[tuple[str, str], int]]  # (queue, reason) -> jobs that no process takes
 QueueOldest = Callable[[], Mapping[str, float]]  # queue -> seconds that its oldest queued job has waited
 ListWorkers = Callable[[], Iterable[WorkerInfo]]
 OWN_PROCESS = ""  # the label `worker` of what this process itself uses
@@ -35,12 +36,13 @@ log = logging.getLogger("cow_service")
 class Metrics:
     """Counters and histograms, from several threads, and gauges that are read on request.
 
-    The job engine sets `queue_depth`, `queue_oldest` and `workers`.
+    The job engine sets `queue_depth`, `queue_oldest`, `queue_unserved` and `workers`.
     """
 
     def __init__(self) -> None:
         self.queue_depth: QueueDepth = dict
         self.queue_oldest: QueueOldest = dict
+        self.queue_unserved: QueueUnserved = dict
         self.workers: ListWorkers = tuple
         self._registry = registry = CollectorRegistry()
         self._requests = Counter(
@@ -104,11 +106,12 @@ class _Gauges(Collector):
 
     def describe(self) -> Iterable[GaugeMetricFamily]:
         """The gauges without values, so that registering them computes nothing."""
-        return (_depth_gauge(), _oldest_gauge(), _workers_gauge(), _worker_memory_gauge(), _gpu_gauge())
+        own = _workers_gauge(), _worker_memory_gauge(), _gpu_gauge()
+        return (_depth_gauge(), _oldest_gauge(), _unserved_gauge(), *own)
 
     def collect(self) -> Iterable[GaugeMetricFamily]:
         """The gauges as of now."""
-        for source in (self._depth, self._oldest, self._workers, self._worker_memory, self._gpus):
+        for source in (self._depth, self._oldest, self._unserved, self._workers, self._worker_memory, self._gpus):
             try:
                 yield source()
             except Exception as error:  # the other metrics are wanted all the more
@@ -124,6 +127,12 @@ class _Gauges(Collector):
         gauge = _oldest_gauge()
         for queue, seconds in self._metrics.queue_oldest().items():
             gauge.add_metric((queue,), seconds)
+        return gauge
+
+    def _unserved(self) -> GaugeMetricFamily:
+        gauge = _unserved_gauge()
+        for labels, number in self._metrics.queue_unserved().items():
+            gauge.add_metric(labels, number)
         return gauge
 
     def _workers(self) -> GaugeMetricFamily:
@@ -164,6 +173,11 @@ def _depth_gauge() -> GaugeMetricFamily:
 def _oldest_gauge() -> GaugeMetricFamily:
     text = "How long the oldest job has waited in a queue, s; 0 where none waits."
     return GaugeMetricFamily("cow_queue_oldest_seconds", text, labels=("queue",))
+
+
+def _unserved_gauge() -> GaugeMetricFamily:
+    text = "Jobs that wait, and that no process takes: none has their queue, or their workflow version."
+    return GaugeMetricFamily("cow_queue_unserved", text, labels=("queue", "reason"))
 
 
 def _workers_gauge() -> GaugeMetricFamily:
