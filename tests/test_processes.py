@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -12,11 +13,29 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
+import psycopg
 import pytest
+import sqlalchemy as sa
+import yaml
+from conftest import ROOT
+from engines import running_engine
 from postgres import postgres_server
 from servers import Served, Worker, eventually, problem, slow
 
+from cow_service.api.middleware.keys import hash_of
+from cow_service.jobs.overview import Overview
+from cow_service.jobs.process_table import ProcessTable
+from cow_service.records import ProcessInfo, WorkerInfo, WorkerJob
+from cow_service.settings import Settings
+
 pytestmark = pytest.mark.slow
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 def workers_of(served: Served) -> dict[str, Any]:
@@ -41,6 +60,13 @@ def cow(served: Served, *arguments: str, **settings: str) -> subprocess.Complete
     environment |= {"COW_DATA_DIR": str(served.data)} | settings
     command = [sys.executable, "-m", "cow_service.cli.main", *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+
+
+def queries() -> list[str]:
+    """Of jobs by which Kubernetes' workers are scaled, in the order of the file."""
+    scaling = (ROOT / "docker" / "kubernetes" / "scaling.yaml").read_text()
+    scaled = [one["spec"] for one in yaml.safe_load_all(scaling) if one["kind"] == "ScaledObject"]
+    return [spec["triggers"][0]["metadata"]["query"] for spec in scaled]
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +136,32 @@ def test_jobs_of_another_version_are_told_of(served: Served) -> None:
     eventually(lambda: served.http.get("/readyz").status_code == 200)
 
 
+def test_a_worker_that_crashes_is_counted(served: Served) -> None:
+    (process,) = workers_of(served)["processes"]
+    os.kill(process["workers"][0]["pid"], signal.SIGKILL)
+    eventually(lambda: 'cow_worker_ends_total{reason="crashed"} 1.0' in served.http.get("/metrics").text)
+
+
+def test_processes_are_shown_while_they_tell_of_themselves() -> None:
+    engine = running_engine().database.engine
+    table, keys = ProcessTable(engine), {"alice": hash_of("cow_alice")}
+    job = WorkerJob(id="secret", kind="answer", progress=0, seconds=1)
+    worker = WorkerInfo(name="light-1", queue="light", pid=2, memory_mb=1, jobs_done=0, jobs=(job,))
+    info = {"role": "worker", "host": "box", "pid": 1, "version": "9", "workflow_version": "9", "seen_at": "now"}
+    table.write(ProcessInfo(executor_id="other", workers=(worker,), queues={"light": 3}, **info), [])
+
+    def shown(settings: Settings) -> list[str | None]:
+        found = Overview(engine, settings).workers().processes
+        return [job.id for one in found if one.host == "box" for worker in one.workers for job in worker.jobs]
+
+    assert shown(Settings()) == ["secret"]
+    assert shown(Settings(api_keys=keys)) == [None], "an id is for the owner of the job"
+    with engine.begin() as connection:
+        connection.execute(sa.text("UPDATE cow_processes SET seen = seen - 11 WHERE executor_id = 'other'"))
+    assert shown(Settings()) == []
+    table.remove("other")
+
+
 @pytest.fixture(scope="module")
 def postgres() -> Iterator[str]:
     with postgres_server() as url:
@@ -121,15 +173,22 @@ def test_an_api_server_is_ready_with_a_worker(postgres: str, tmp_path: Path) -> 
     with Served(tmp_path, COW_ROLE="api", **own) as api:
         told = problem(api.http.get("/readyz"), 503, "not-ready")
         assert "`cow worker --queues light`" in told["detail"]
-        with Worker(tmp_path, log="worker", **own) as worker:
+        port = str(free_port())
+        with Worker(tmp_path, log="worker", COW_METRICS_PORT=port, **own) as worker:
             eventually(lambda: api.http.get("/readyz").status_code == 200)
             assert [one["role"] for one in workers_of(api)["processes"]] == ["api", "worker"]
             job = api.submit(slow(2))["id"]
             assert eventually(lambda: busy(api))["jobs"][0]["id"] == job
             assert api.ended(job)["status"] == "succeeded"
+            told = httpx.get(f"http://127.0.0.1:{port}/metrics").text
+            assert 'cow_stage_seconds_count{stage="generation"} 1.0' in told
+            assert 'cow_workers{queue="light",state="idle"} 1.0' in told
             worker.processes()[-1].send_signal(signal.SIGTERM)
             eventually(lambda: [one["role"] for one in workers_of(api)["processes"]] == ["api"])
         waits = api.submit(slow(0.1))["id"]
         eventually(lambda: workers_of(api)["unserved"])
         assert workers_of(api)["unserved"][0]["jobs"] == 1
+        with psycopg.connect(postgres) as database:  # what KEDA asks
+            numbers = [database.execute(query).fetchone() for query in queries()]
+        assert numbers == [(1,), (0,)], "one job for light workers, none for GPU workers"
         api.http.delete(f"/jobs/{waits}")
