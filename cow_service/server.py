@@ -15,6 +15,7 @@ from cow_service.jobs.computing import Elsewhere
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
+from cow_service.settings import SettingsError
 from cow_service.workers.pool import WorkerPool
 
 LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
@@ -54,8 +55,9 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    engine = JobEngine(service, pool)
+    engine = JobEngine(service, pool, "worker")
     try:
+        _serve_metrics(service)
         pool.check()
         engine.start()
         log.info("this worker takes jobs: %s", ", ".join(service.settings.queues) or "of all queues")
@@ -65,6 +67,17 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
             engine.close()
         pool.close()
         service.close()
+
+
+def _serve_metrics(service: Service) -> None:
+    """Raises `SettingsError` where the port cannot be had."""
+    host, port = service.settings.host, service.settings.metrics_port
+    if port is None:
+        return
+    try:
+        service.metrics.serve(host, port)
+    except OSError as error:
+        raise SettingsError(f"Bad settings: COW_METRICS_PORT={port}: {error.strerror or error}.") from error
 
 
 def run_server(service: Service, pool: WorkerPool | None = None) -> None:

@@ -124,6 +124,13 @@ class Settings(BaseSettings):
         description="What a server does: api takes requests and computes nothing, for which `cow worker` runs beside "
         "it on the same job database; all does both.",
     )
+    metrics_port: int | None = Field(
+        default=None,
+        ge=1,
+        le=65535,
+        description="Port on which `cow worker` serves its metrics, at the address of COW_HOST; by default none. "
+        "Servers have GET /metrics.",
+    )
     queues: tuple[str, ...] = Field(
         default=(),
         description="Queues from which jobs are taken, as JSON: light, and the name of each backend with a device of "

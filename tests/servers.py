@@ -100,7 +100,9 @@ class Served:
 
         self.http.close()  # to a server that ended by itself
         self.http = httpx.Client(base_url=eventually(address), timeout=PATIENCE)
-        eventually(lambda: self.http.get("/readyz").status_code == 200)
+        # One that only takes requests is ready once a worker is.
+        probe = "/livez" if self._environment.get("COW_ROLE") == "api" else "/readyz"
+        eventually(lambda: self.http.get(probe).status_code == 200)
 
     def log(self) -> str:
         return self._log_file.read_text(errors="replace")

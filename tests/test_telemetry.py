@@ -219,15 +219,15 @@ def test_stages_jobs_and_queues(caplog: pytest.LogCaptureFixture) -> None:
     metrics.job("simulate", "failed")
     metrics.stage_cache("generation", hit=True)
     metrics.stage_cache("generation", hit=False)
-    metrics.queue_depth = lambda: {("ati", "queued"): 3, ("ati", "running"): 1}
+    metrics.queue_depth = lambda: {("light", "ati", "queued"): 3, ("light", "ati", "running"): 1}
     seen = samples(metrics)
     assert seen["cow_stage_seconds_sum", ("grounding",)] == pytest.approx(0.2)
     assert seen["cow_jobs_total", ("simulate", "failed")] == 1
     assert seen["cow_stage_cache_total", ("hit", "generation")] == 1
     assert seen["cow_stage_cache_total", ("miss", "generation")] == 1
-    assert seen["cow_queue_depth", ("ati", "queued")] == 3
+    assert seen["cow_queue_depth", ("ati", "light", "queued")] == 3
 
-    def fail() -> dict[tuple[str, str], int]:
+    def fail() -> dict[tuple[str, str, str], int]:
         raise OSError("the database is gone")
 
     metrics.queue_depth = fail
@@ -247,7 +247,7 @@ def test_gpu_memory_is_told_where_the_process_uses_one(monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=used))
     seen = samples(Metrics())
     kinds = {"allocated": 10, "reserved": 20, "total": 30}
-    assert {kind: seen["cow_gpu_memory_bytes", ("cuda:0", kind)] for kind in kinds} == kinds
+    assert {kind: seen["cow_gpu_memory_bytes", ("cuda:0", kind, "")] for kind in kinds} == kinds
     used.is_initialized = lambda: False
     assert not [name for name, _ in samples(Metrics()) if name == "cow_gpu_memory_bytes"]
 

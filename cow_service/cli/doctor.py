@@ -14,7 +14,9 @@ from rich.table import Table
 
 from cow_service import __version__
 from cow_service.errors import CowError
-from cow_service.records import BackendInfo
+from cow_service.jobs.inspection import unserved_jobs
+from cow_service.jobs.overview import remedy, told
+from cow_service.records import BackendInfo, Unserved
 from cow_service.service import Service
 
 PACKAGES = (
@@ -44,21 +46,25 @@ class Report(BaseModel):
     free_disk_gb: float | None
     problem: str | None
     backends: list[BackendInfo]
+    unserved: list[Unserved]  # jobs that wait, and that no process takes
+    jobs_problem: str | None  # why the job database could not be read
 
     @property
     def healthy(self) -> bool:
-        """Whether the default request can be served."""
-        return self.problem is None
+        """Whether the default request can be served, and every queued job is taken."""
+        return self.problem is None and self.jobs_problem is None and not self.unserved
 
 
 def examine(service: Service) -> Report:
-    """Inspects this installation. Imports no heavy package, and writes only an empty file, which it removes."""
+    """Inspects this installation and its job database. Imports no model library, and writes only an empty file, which
+    it removes."""
     problem = None
     try:
         service.check()
     except CowError as error:
         problem = f"{error.code}: {error.detail}"
     models = service.models()
+    unserved, jobs_problem = _unserved(service)
     return Report(
         cow=__version__,
         python=platform.python_version(),
@@ -68,6 +74,8 @@ def examine(service: Service) -> Report:
         free_disk_gb=_free_disk(service),
         problem=problem,
         backends=[*models.readers, *models.generators],
+        unserved=list(unserved),
+        jobs_problem=jobs_problem,
     )
 
 
@@ -96,6 +104,18 @@ def print_report(report: Report, *, as_json: bool) -> None:
         console.print(f"[red]{report.problem}[/]", highlight=False)
     else:
         console.print("[green]The default request can be served.[/]")
+    if report.jobs_problem:
+        console.print(f"[red]{escape(report.jobs_problem)}[/]", highlight=False, soft_wrap=True)
+    for one in report.unserved:
+        console.print(f"[yellow]{escape(f'{told(one)} {remedy(one)}')}[/]", highlight=False, soft_wrap=True)
+
+
+def _unserved(service: Service) -> tuple[tuple[Unserved, ...], str | None]:
+    """Jobs that no process takes, or why that is not known."""
+    try:
+        return unserved_jobs(service.settings), None
+    except CowError as error:
+        return (), f"{error.code}: {error.detail}"
 
 
 def _installed(package: str) -> str | None:

@@ -15,6 +15,7 @@ from cow_service.cli import keys as keys_cli
 from cow_service.cli import mcp as mcp_cli
 from cow_service.cli import models as models_cli
 from cow_service.cli import options
+from cow_service.cli import top as top_cli
 from cow_service.cli import tracks as tracks_cli
 from cow_service.cli.errors import Commands
 from cow_service.cli.options import with_request_options
@@ -142,7 +143,7 @@ def serve(
     from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
     settings = service.settings
-    pool = WorkerPool(settings) if settings.workers and settings.role == "all" else None
+    pool = WorkerPool(settings, service.metrics) if settings.workers and settings.role == "all" else None
     if pool is not None:
         pool.start()  # its processes start while the server is imported
     from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
@@ -164,7 +165,7 @@ def worker(
     service = _served(queues=named)
     from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
-    pool = WorkerPool(service.settings)
+    pool = WorkerPool(service.settings, service.metrics)
     pool.start()
     from cow_service.server import run_worker  # noqa: PLC0415
 
@@ -220,6 +221,7 @@ def _service(**overrides: Any) -> Service:
 
 app.command("batch")(batch_cli.batch)
 app.command("mcp")(mcp_cli.mcp)
+app.command("top")(top_cli.top)
 app.add_typer(keys_cli.app, name="keys")
 app.add_typer(models_cli.app, name="models")
 app.add_typer(tracks_cli.app, name="tracks")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cow_service.client.batches import Outcome
     from cow_service.client.handles import AsyncJobHandle
     from cow_service.client.results import AsyncAnswer, AsyncSimulation
-    from cow_service.records import Models
+    from cow_service.records import Models, Workers
 
     _Base = BaseClient[
         httpx.AsyncClient,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         AsyncGenerator[Outcome[AsyncAnswer]],
         Coroutine[Any, Any, bytes],
         Coroutine[Any, Any, Models],
+        Coroutine[Any, Any, Workers],
         Coroutine[Any, Any, None],
     ]
 else:

@@ -29,6 +29,7 @@ SimulationsT = TypeVar("SimulationsT")
 AnswersT = TypeVar("AnswersT")
 BytesT = TypeVar("BytesT")
 ModelsT = TypeVar("ModelsT")
+WorkersT = TypeVar("WorkersT")
 NoneT = TypeVar("NoneT")
 
 
@@ -45,6 +46,7 @@ class BaseClient(
         AnswersT,
         BytesT,
         ModelsT,
+        WorkersT,
         NoneT,
     ]
 ):
@@ -250,3 +252,7 @@ class BaseClient(
     def models(self) -> ModelsT:
         """Readers and generators, what each needs, and whether it is ready."""
         return self._run(self._connection.models())
+
+    def workers(self) -> WorkersT:
+        """The processes on the server's job database, what each computes, and the queues."""
+        return self._run(self._connection.workers())

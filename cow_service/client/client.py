@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cow_service.client.batches import Outcome
     from cow_service.client.handles import JobHandle
     from cow_service.client.results import Answer, Simulation
-    from cow_service.records import Models
+    from cow_service.records import Models, Workers
 
     _Base = BaseClient[
         httpx.Client,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Generator[Outcome[Answer]],
         bytes,
         Models,
+        Workers,
         None,
     ]
 else:

@@ -31,7 +31,7 @@ from cow_service.client.serialization import job_in, object_in, plain, read
 from cow_service.client.settings import endpoint_of
 from cow_service.client.steps import Send, Shielded, Sleep, Steps
 from cow_service.errors import CowError
-from cow_service.records import TERMINAL, Job, JobKind, JobPage, Models
+from cow_service.records import TERMINAL, Job, JobKind, JobPage, Models, Workers
 
 FIRST_POLL_SECONDS, POLL_GROWTH, MAX_POLL_SECONDS = 0.1, 1.5, 2.0  # between two requests for the state of a job
 TIMEOUT_MARGIN_SECONDS = 1.0  # that a request may go on after the caller's timeout
@@ -181,6 +181,10 @@ class Operations:
     def models(self) -> Steps[Models]:
         """What the server can do."""
         return read(Models, object_in((yield from self._exchange(Send("GET", "/models")))))
+
+    def workers(self) -> Steps[Workers]:
+        """What the processes on the job database do."""
+        return read(Workers, object_in((yield from self._exchange(Send("GET", "/workers")))))
 
     def _exchange(self, send: Send, until: float | None = None, retries: int | None = None) -> Steps[httpx.Response]:
         """The response to a request, which is sent again where that may help (`retries.py`).

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from cow_service.errors import Canceled, CowError
 from cow_service.media.images import DecodedImage
+from cow_service.records import JobKind
 from cow_service.requests import Stage
 
 STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")
@@ -20,8 +22,10 @@ STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation
 class ActiveJob:
     """One job that this process works on."""
 
+    kind: JobKind
     at: tuple[Stage | None, float] = (None, 0.0)  # the stage, and the share of it that is done: one value, read at once
     cancel_requested: threading.Event = field(default_factory=threading.Event)
+    begun: float | None = None  # when its first stage began (`time.monotonic`)
     finished: bool = False  # the work is over, though the database may not have its outcome yet
 
     def check(self) -> None:
@@ -88,9 +92,9 @@ class ActiveJobs:
             self._images.pop(job, None)
 
     @contextmanager
-    def running(self, job: str) -> Generator[ActiveJob]:
+    def running(self, job: str, kind: JobKind) -> Generator[ActiveJob]:
         """Around the work on a job."""
-        active = ActiveJob()
+        active = ActiveJob(kind)
         with self._lock:
             self._running[job] = active
         try:
@@ -106,6 +110,7 @@ class ActiveJobs:
         if stage is None:
             return
         if stage != active.at[0] or done > active.at[1]:
+            active.begun = active.begun or time.monotonic()
             active.at = stage, done
             for waiter in self._waiters_of(job):
                 waiter.loop.call_soon_threadsafe(waiter.changed.set)
@@ -136,6 +141,11 @@ class ActiveJobs:
         """The jobs that this process works on."""
         with self._lock:
             return [job for job, active in self._running.items() if not active.finished]
+
+    def ids_of_waiting(self) -> list[str]:
+        """Those of them that are not begun: they wait for a place."""
+        with self._lock:
+            return [job for job, active in self._running.items() if active.begun is None and not active.finished]
 
     def forget(self, job: str) -> None:
         """Drops the state of a job whose work is over."""

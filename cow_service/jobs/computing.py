@@ -15,6 +15,7 @@ from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.stage_cache import HoldKey, StoredStep
 from cow_service.media.images import DecodedImage
 from cow_service.pipeline import answer, simulate
+from cow_service.records import GpuMemory
 from cow_service.requests import AnswerRequest, ImageArtifact, Stage
 from cow_service.service import Service
 from cow_service.stages.run import Progress
@@ -41,6 +42,19 @@ class Outcome:
     timings: dict[str, float]
 
 
+@dataclass(frozen=True)
+class WorkerState:
+    """What computes jobs, as it is now."""
+
+    name: str
+    queue: str | None  # whose jobs it computes; None: of all queues
+    pid: int
+    memory_bytes: int
+    jobs_done: int
+    jobs: tuple[str, ...]  # at hand
+    gpus: tuple[GpuMemory, ...] = ()
+
+
 class Computer(Protocol):
     """Computes jobs, some at the same time."""
 
@@ -60,6 +74,10 @@ class Computer(Protocol):
         """Computes one job. Raises the `CowError` that it fails with, `Canceled` where it was canceled."""
         ...
 
+    def workers(self) -> tuple[WorkerState, ...]:
+        """What computes the jobs."""
+        ...
+
 
 class Elsewhere:
     """Computes no jobs: worker processes that share the job database take them from its queues."""
@@ -77,6 +95,10 @@ class Elsewhere:
     def compute(self, work: Work) -> Outcome:
         """Is never called, as no job is taken."""
         raise NotImplementedError
+
+    def workers(self) -> tuple[WorkerState, ...]:
+        """None."""
+        return ()
 
 
 def compute(work: Work, service: Service, database: Database, hold_key: HoldKey) -> Outcome:

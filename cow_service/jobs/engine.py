@@ -42,6 +42,7 @@ from cow_service.jobs.leases import lease_of
 from cow_service.jobs.maintenance import Maintenance
 from cow_service.jobs.news import JobNews, news_of
 from cow_service.jobs.open_jobs import OpenJobs
+from cow_service.jobs.processes import Processes
 from cow_service.jobs.queues import WEBHOOKS, QueuePolls, queue_of
 from cow_service.jobs.serializer import JsonSerializer
 from cow_service.jobs.spec import JobSpec
@@ -53,7 +54,7 @@ from cow_service.jobs.state import (
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.jobs.worker import JobAborted, Worker
 from cow_service.media.images import DecodedImage
-from cow_service.records import TERMINAL, JobPage
+from cow_service.records import TERMINAL, JobPage, ProcessRole
 from cow_service.requests import Stage
 from cow_service.service import Service
 
@@ -65,8 +66,8 @@ log = logging.getLogger("cow_service")
 class JobEngine:
     """Runs the jobs of one service, from `start` to `close`. Its methods block: not for an event loop."""
 
-    def __init__(self, service: Service, computer: Computer | None = None) -> None:
-        """`computer`: who computes the jobs; by default this process."""
+    def __init__(self, service: Service, computer: Computer | None = None, role: ProcessRole | None = None) -> None:
+        """`computer`: who computes the jobs; by default this process. `role`: by default that of the settings."""
         self.open_jobs = OpenJobs(service)
         self._computer = computer or InProcess(self.open_jobs)
         self.active, self.database = self.open_jobs.active, self.open_jobs.database
@@ -75,6 +76,7 @@ class JobEngine:
         self._polls = QueuePolls(self._computer.capacity)
         self._news = news_of(self.database, self.active.awaited_elsewhere, state.ended_of)
         self._maintenance = Maintenance(self.open_jobs, self._lease, self._news)
+        self.processes = Processes(self.open_jobs, self._computer, role)
         self._stopping = False
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
         self._dispatch = Dispatch()
@@ -110,7 +112,7 @@ class JobEngine:
         self._computer.start()
         self._threads = ThreadPoolExecutor(thread_name_prefix="cow-job", max_workers=1024)
         self.open_jobs.recount()
-        self.service.metrics.queue_depth = self.open_jobs.depth
+        self.processes.start()
         self._polls.start()
         self._news.start(self._hear)
         self._maintenance.start()
@@ -146,6 +148,7 @@ class JobEngine:
         """
         if not self._stopping:
             self._stopping = True
+            self.processes.drain()
             self._grace = threading.Timer(self.service.settings.shutdown_grace, self._interrupt)
             self._grace.daemon = True
             self._grace.start()
@@ -166,16 +169,19 @@ class JobEngine:
         if self._threads is not None:
             self._threads.shutdown(wait=True, cancel_futures=True)
             self._threads = None
+        self.processes.stop()
         self._computer.close()
         workflows.set_runner(None)
         self.database.close()
         self._lease.release()
 
     def check(self) -> None:
-        """Raises `StorageUnavailable` where the database does not answer, `ShuttingDown` where the engine stops."""
+        """Raises `StorageUnavailable` where the database does not answer, `ShuttingDown` where the engine stops,
+        `NotReady` where jobs wait that no process takes."""
         if self._stopping:
             raise ShuttingDown("The server is stopping. Ask another one, or this one again in a while.")
         self.database.check()
+        self.processes.overview.check_served()
 
     def check_capacity(self, owner: str | None) -> None:
         """Raises `QueueFull` where another job would be too many, `ShuttingDown` where none is accepted."""

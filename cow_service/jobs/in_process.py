@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from cow_service.jobs.computing import Outcome, Work, compute
+import os
+
+import psutil
+
+from cow_service.jobs.computing import Outcome, Work, WorkerState, compute
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.stage_cache import KeyLocks
+from cow_service.observability.gpus import gpu_memory
 
 
 class InProcess:
@@ -13,6 +18,7 @@ class InProcess:
     def __init__(self, open_jobs: OpenJobs) -> None:
         self._open_jobs = open_jobs
         self._locks = KeyLocks()
+        self._jobs_done = 0
 
     def start(self) -> None:
         """Does nothing."""
@@ -27,4 +33,13 @@ class InProcess:
 
     def compute(self, work: Work) -> Outcome:
         """As the protocol says."""
-        return compute(work, self._open_jobs.service, self._open_jobs.database, self._locks.held)
+        try:
+            return compute(work, self._open_jobs.service, self._open_jobs.database, self._locks.held)
+        finally:
+            self._jobs_done += 1
+
+    def workers(self) -> tuple[WorkerState, ...]:
+        """The process itself."""
+        memory = psutil.Process().memory_info().rss
+        jobs = tuple(self._open_jobs.active.ids())
+        return (WorkerState("server", None, os.getpid(), memory, self._jobs_done, jobs, gpu_memory()),)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter, defaultdict
+from collections import defaultdict
 
 from dbos import DBOS
 
@@ -89,16 +89,6 @@ class OpenJobs:
             self._open = found
             for job_id, job in changes or ():  # what happened while the database was asked
                 self.record(job_id, job)
-
-    def depth(self) -> Counter[tuple[str, str]]:
-        """How many jobs of each generator are queued, and how many running."""
-        with self.lock:
-            jobs = dict(self._open)
-        depth: Counter[tuple[str, str]] = Counter()
-        for job_id, job in jobs.items():
-            active = self.active.get(job_id)
-            depth[job.generator, "queued" if active is None or active.at[0] is None else "running"] += 1
-        return depth
 
     def ended(self, job_id: str, outcome: str | CowError | None, created_at: str | None = None) -> None:
         """The database says that a job has ended. `outcome` and `created_at` as in `ActiveJobs.notify_ended`."""

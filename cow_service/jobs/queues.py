@@ -17,7 +17,7 @@ from dbos import _queue as dbos_queue  # pyright: ignore[reportPrivateUsage]
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.settings import Settings
-from cow_service.weights.manifests import find_manifest
+from cow_service.weights.manifests import find_manifest, load_manifests
 
 LIGHT = "light"
 PREFIX = "cow-"  # of the names of our queues in the job database
@@ -44,6 +44,13 @@ def places(name: str) -> int | None:
     """Jobs at the same time of a backend that has a device of its own, as its manifest says."""
     manifest = find_manifest(name)
     return None if manifest is None else manifest.concurrency
+
+
+def known_queues(settings: Settings) -> tuple[str, ...]:
+    """The light queue, and those of backends that have a device or a limit of their own and can be imported here."""
+    manifests = load_manifests().values()
+    with_device = [one.name for one in manifests if one.concurrency is not None and not one.missing_modules()]
+    return LIGHT, *dict.fromkeys([*with_device, *settings.generator_concurrency])
 
 
 class QueuePolls:

@@ -57,7 +57,7 @@ class Worker:
             with (
                 context.bound(request=job.request_id, job=job_id),
                 tracing.span(f"job {job.kind}", parent=job.traceparent, job_id=job_id),
-                self._open_jobs.active.running(job_id) as running,
+                self._open_jobs.active.running(job_id, job.kind) as running,
             ):
                 return self._outcome(job_id, job, running)
         finally:

@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable, Iterable, Mapping
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Histogram,
+    ProcessCollector,
+    generate_latest,
+    start_http_server,
+)
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
+
+from cow_service.observability.gpus import gpu_memory
+from cow_service.records import WorkerInfo
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _REQUEST_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600)  # seconds
 _STAGE_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600, 1800)  # seconds
 
-QueueDepth = Callable[[], Mapping[tuple[str, str], int]]  # (generator, "queued" | "running") -> how many jobs
+QueueDepth = Callable[[], Mapping[tuple[str, str, str], int]]  # (queue, generator, "queued" | "running") -> jobs
+QueueUnserved = Callable[[], Mapping[tuple[str, str], int]]  # (queue, reason) -> jobs that no process takes
+QueueOldest = Callable[[], Mapping[str, float]]  # queue -> seconds that its oldest queued job has waited
+ListWorkers = Callable[[], Iterable[WorkerInfo]]
+OWN_PROCESS = ""  # the label `worker` of what this process itself uses
+BYTES = 1e6  # of the MB in which records tell memory
 
 log = logging.getLogger("cow_service")
 
@@ -22,11 +36,14 @@ log = logging.getLogger("cow_service")
 class Metrics:
     """Counters and histograms, from several threads, and gauges that are read on request.
 
-    The job engine sets `queue_depth`.
+    The job engine sets `queue_depth`, `queue_oldest`, `queue_unserved` and `workers`.
     """
 
     def __init__(self) -> None:
-        self.queue_depth: QueueDepth | None = None
+        self.queue_depth: QueueDepth = dict
+        self.queue_oldest: QueueOldest = dict
+        self.queue_unserved: QueueUnserved = dict
+        self.workers: ListWorkers = tuple
         self._registry = registry = CollectorRegistry()
         self._requests = Counter(
             "cow_http_requests", "Requests answered.", ("method", "route", "status"), registry=registry
@@ -44,6 +61,9 @@ class Metrics:
         self._jobs = Counter("cow_jobs", "Jobs that ended.", ("kind", "outcome"), registry=registry)
         self._stage_cache = Counter(
             "cow_stage_cache", "Stages looked for among earlier results.", ("stage", "result"), registry=registry
+        )
+        self._worker_ends = Counter(
+            "cow_worker_ends", "Worker processes that ended, and why.", ("reason",), registry=registry
         )
         ProcessCollector(registry=registry)
         registry.register(_Gauges(self))
@@ -65,6 +85,14 @@ class Metrics:
         """One stage whose earlier result was looked for."""
         self._stage_cache.labels(stage, "hit" if hit else "miss").inc()
 
+    def worker_ended(self, reason: str) -> None:
+        """One worker process that `crashed`, was `frozen`, took too much `memory`, ... or was `stopped`."""
+        self._worker_ends.labels(reason).inc()
+
+    def serve(self, host: str, port: int) -> None:
+        """Serves the exposition over HTTP, on every path, until the process ends. Raises `OSError`."""
+        start_http_server(port, host, self._registry)
+
     def exposition(self) -> bytes:
         """Everything in Prometheus' text format, as `MEDIA_TYPE`."""
         return generate_latest(self._registry)
@@ -78,41 +106,88 @@ class _Gauges(Collector):
 
     def describe(self) -> Iterable[GaugeMetricFamily]:
         """The gauges without values, so that registering them computes nothing."""
-        return (_queue_gauge(), _gpu_gauge())
+        own = _workers_gauge(), _worker_memory_gauge(), _gpu_gauge()
+        return (_depth_gauge(), _oldest_gauge(), _unserved_gauge(), *own)
 
     def collect(self) -> Iterable[GaugeMetricFamily]:
         """The gauges as of now."""
-        for source in (self._queue, _gpu):
+        for source in (self._depth, self._oldest, self._unserved, self._workers, self._worker_memory, self._gpus):
             try:
                 yield source()
             except Exception as error:  # the other metrics are wanted all the more
                 log.error("A metric could not be read", exc_info=error)
 
-    def _queue(self) -> GaugeMetricFamily:
-        gauge = _queue_gauge()
-        if self._metrics.queue_depth is not None:
-            for (generator, state), number in self._metrics.queue_depth().items():
-                gauge.add_metric((generator, state), number)
+    def _depth(self) -> GaugeMetricFamily:
+        gauge = _depth_gauge()
+        for labels, number in self._metrics.queue_depth().items():
+            gauge.add_metric(labels, number)
+        return gauge
+
+    def _oldest(self) -> GaugeMetricFamily:
+        gauge = _oldest_gauge()
+        for queue, seconds in self._metrics.queue_oldest().items():
+            gauge.add_metric((queue,), seconds)
+        return gauge
+
+    def _unserved(self) -> GaugeMetricFamily:
+        gauge = _unserved_gauge()
+        for labels, number in self._metrics.queue_unserved().items():
+            gauge.add_metric(labels, number)
+        return gauge
+
+    def _workers(self) -> GaugeMetricFamily:
+        number: dict[tuple[str, str], int] = {}
+        for worker in self._metrics.workers():
+            for state, is_so in (("busy", bool(worker.jobs)), ("idle", not worker.jobs)):
+                key = worker.queue or "all", state
+                number[key] = number.get(key, 0) + is_so
+        gauge = _workers_gauge()
+        for labels, workers in number.items():
+            gauge.add_metric(labels, workers)
+        return gauge
+
+    def _worker_memory(self) -> GaugeMetricFamily:
+        gauge = _worker_memory_gauge()
+        for worker in self._metrics.workers():
+            gauge.add_metric((worker.name,), worker.memory_mb * BYTES)
+        return gauge
+
+    def _gpus(self) -> GaugeMetricFamily:
+        gauge = _gpu_gauge()
+        of_workers = [(worker.name, gpu) for worker in self._metrics.workers() for gpu in worker.gpus]
+        for name, gpu in of_workers or [(OWN_PROCESS, gpu) for gpu in gpu_memory()]:
+            for kind, megabytes in (
+                ("allocated", gpu.allocated_mb),
+                ("reserved", gpu.reserved_mb),
+                ("total", gpu.total_mb),
+            ):
+                gauge.add_metric((name, gpu.device, kind), megabytes * BYTES)
         return gauge
 
 
-def _queue_gauge() -> GaugeMetricFamily:
-    return GaugeMetricFamily("cow_queue_depth", "Jobs that wait or run.", labels=("generator", "state"))
+def _depth_gauge() -> GaugeMetricFamily:
+    labels = ("queue", "generator", "state")
+    return GaugeMetricFamily("cow_queue_depth", "Jobs on the job database that wait or run.", labels=labels)
+
+
+def _oldest_gauge() -> GaugeMetricFamily:
+    text = "How long the oldest job has waited in a queue, s; 0 where none waits."
+    return GaugeMetricFamily("cow_queue_oldest_seconds", text, labels=("queue",))
+
+
+def _unserved_gauge() -> GaugeMetricFamily:
+    text = "Jobs that wait, and that no process takes: none has their queue, or their workflow version."
+    return GaugeMetricFamily("cow_queue_unserved", text, labels=("queue", "reason"))
+
+
+def _workers_gauge() -> GaugeMetricFamily:
+    return GaugeMetricFamily("cow_workers", "Workers of this process.", labels=("queue", "state"))
+
+
+def _worker_memory_gauge() -> GaugeMetricFamily:
+    return GaugeMetricFamily("cow_worker_memory_bytes", "Resident memory of a worker.", labels=("worker",))
 
 
 def _gpu_gauge() -> GaugeMetricFamily:
-    text = "GPU memory: allocated and reserved by this process, total of the device."
-    return GaugeMetricFamily("cow_gpu_memory_bytes", text, labels=("device", "kind"))
-
-
-def _gpu() -> GaugeMetricFamily:
-    """Memory of the GPUs, where this process already uses them: asking starts neither PyTorch nor CUDA."""
-    gauge = _gpu_gauge()
-    cuda = getattr(sys.modules.get("torch"), "cuda", None)
-    if cuda is not None and cuda.is_available() and cuda.is_initialized():
-        for index in range(cuda.device_count()):
-            device = f"cuda:{index}"
-            gauge.add_metric((device, "allocated"), cuda.memory_allocated(index))
-            gauge.add_metric((device, "reserved"), cuda.memory_reserved(index))
-            gauge.add_metric((device, "total"), cuda.get_device_properties(index).total_memory)
-    return gauge
+    text = "GPU memory: allocated and reserved by a worker, total of the device."
+    return GaugeMetricFamily("cow_gpu_memory_bytes", text, labels=("worker", "device", "kind"))

@@ -42,6 +42,16 @@ from cow_service.records.motion import (
     Source,
     Until,
 )
+from cow_service.records.processes import (
+    GpuMemory,
+    ProcessInfo,
+    ProcessRole,
+    QueueInfo,
+    Unserved,
+    WorkerInfo,
+    WorkerJob,
+    Workers,
+)
 from cow_service.records.results import (
     Answer,
     AnswerOption,
@@ -118,6 +128,7 @@ __all__ = [
     "Gate",
     "GateReason",
     "GeneratorInfo",
+    "GpuMemory",
     "Grounding",
     "ImageInfo",
     "Intervention",
@@ -146,6 +157,9 @@ __all__ = [
     "Position",
     "Problem",
     "ProblemField",
+    "ProcessInfo",
+    "ProcessRole",
+    "QueueInfo",
     "ReaderInfo",
     "Record",
     "Sha256",
@@ -155,9 +169,13 @@ __all__ = [
     "State",
     "Trajectory",
     "TrajectoryUnits",
+    "Unserved",
     "Until",
     "Usage",
     "Vector",
     "Verdict",
     "Video",
+    "WorkerInfo",
+    "WorkerJob",
+    "Workers",
 ]

@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -27,6 +28,7 @@ from cow_service.jobs.stage_cache import HoldKey as HoldKeyOf
 from cow_service.jobs.stored_errors import error_as_json
 from cow_service.observability import context, tracing
 from cow_service.observability import logging as logs
+from cow_service.observability.gpus import gpu_memory
 from cow_service.readers.question.sentences import parse
 from cow_service.requests import Stage
 from cow_service.service import Service
@@ -104,9 +106,10 @@ class WorkerProcess:
             self._pipe.send(message)
 
     def _beat(self) -> None:
-        process, ended = psutil.Process(), threading.Event()
-        while not ended.wait(HEARTBEAT_SECONDS):
-            self._send(Heartbeat(process.memory_info().rss))
+        process = psutil.Process()
+        while True:
+            self._send(Heartbeat(process.memory_info().rss, gpu_memory()))
+            time.sleep(HEARTBEAT_SECONDS)
 
     def _load(self) -> None:
         try:

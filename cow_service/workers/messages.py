@@ -8,6 +8,7 @@ from typing import Any
 from cow_service.jobs.computing import Outcome
 from cow_service.jobs.spec import JobSpec
 from cow_service.media.images import DecodedImage
+from cow_service.records import GpuMemory
 from cow_service.requests import Stage
 from cow_service.settings import Settings
 
@@ -65,6 +66,7 @@ class Heartbeat:
     """The process is alive. `memory_bytes` is its resident set."""
 
     memory_bytes: int
+    gpus: tuple[GpuMemory, ...]
 
 
 @dataclass(frozen=True)

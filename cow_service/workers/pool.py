@@ -11,14 +11,16 @@ import math
 import threading
 import time
 from functools import partial
+from itertools import count
 
 import psutil
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import ShuttingDown, WorkerEnded
-from cow_service.jobs.computing import Outcome, Work
+from cow_service.jobs.computing import Outcome, Work, WorkerState
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
 from cow_service.jobs.stage_cache import KeyLocks
+from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings
 from cow_service.stages.run import priority_of
 from cow_service.weights.manifests import find_manifest
@@ -36,13 +38,13 @@ log = logging.getLogger("cow_service")
 class Group:
     """The workers for one kind of jobs. They are started when they are first needed."""
 
-    def __init__(self, name: str, settings: Settings, size: int, jobs_each: int) -> None:
+    def __init__(self, name: str, settings: Settings, size: int, jobs_each: int, metrics: Metrics) -> None:
         self.name, self.size, self.jobs_each = name, size, jobs_each
         self.places = PrioritySemaphore(size * jobs_each)
         self.workers: list[Worker] = []
         self.was_loaded = False  # whether a worker has loaded the default backends
         self.alone = threading.Lock()  # held by a job that is computed for itself, as its last worker crashed
-        self._settings = settings
+        self._settings, self._metrics = settings, metrics
         self._lock = threading.Lock()
         self._taken: dict[Worker, int] = {}
         self._closed = False
@@ -72,7 +74,14 @@ class Group:
             if ends:
                 del self._taken[worker]
         if ends:
-            threading.Thread(target=worker.close, name="cow-worker-end", daemon=True).start()
+            threading.Thread(target=worker.close, args=("renewed",), name="cow-worker-end", daemon=True).start()
+
+    def states(self) -> list[WorkerState]:
+        """Its workers that are alive."""
+        with self._lock:
+            alive = [one for one in self._taken if one.is_alive]
+        given = ((one.name, self.name, one.pid, one.memory_bytes, one.jobs_done, one.jobs, one.gpus) for one in alive)
+        return [WorkerState(*each) for each in given]
 
     def close(self) -> None:
         """Ends all workers."""
@@ -89,7 +98,9 @@ class Group:
             self.workers.remove(dead)
             del self._taken[dead]
             dead.close()
-        worker = Worker(f"{self.name}-{len(self.workers) + 1}", self._settings)
+        names = {one.name for one in self._taken}
+        name = next(name for number in count(1) if (name := f"{self.name}-{number}") not in names)
+        worker = Worker(name, self._settings, self._metrics.worker_ended)
         self.workers.append(worker)
         self._taken[worker] = 0
         return worker
@@ -98,8 +109,8 @@ class Group:
 class WorkerPool:
     """All workers of this process. A `Computer` of a job engine."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+        self._settings, self._metrics = settings, metrics
         self._locks = KeyLocks()
         self._guard = threading.Lock()
         self._groups: dict[str, Group] = {}
@@ -144,6 +155,10 @@ class WorkerPool:
         group = self._group(name)
         return group.size * group.jobs_each
 
+    def workers(self) -> tuple[WorkerState, ...]:
+        """All that are alive."""
+        return tuple(state for group in self.groups for state in group.states())
+
     def check(self) -> None:
         """Waits until the default backends were loaded once. Raises the `CowError` for which they cannot be."""
         for group in self.groups:
@@ -182,7 +197,7 @@ class WorkerPool:
     def _group(self, name: str) -> Group:
         with self._guard:
             if name not in self._groups:
-                self._groups[name] = _new_group(name, self._settings)
+                self._groups[name] = _new_group(name, self._settings, self._metrics)
             return self._groups[name]
 
     def _watch(self) -> None:
@@ -195,12 +210,13 @@ class WorkerPool:
                 if slept:
                     worker.heard = looked
                 elif looked - worker.heard > HEARTBEAT_TIMEOUT_SECONDS:
-                    worker.kill(f"was ended, as it said nothing for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
+                    worker.kill("frozen", f"was ended, as it said nothing for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
                 elif worker.memory_bytes > self._memory_limit:
-                    worker.kill(f"was ended, as it took {worker.memory_bytes / 1e6:.0f} MB", is_final=True)
+                    reason = f"was ended, as it took {worker.memory_bytes / 1e6:.0f} MB"
+                    worker.kill("memory", reason, is_final=True)
 
 
-def _new_group(name: str, settings: Settings) -> Group:
+def _new_group(name: str, settings: Settings, metrics: Metrics) -> Group:
     waiting = settings.mllm_concurrency if settings.mllm else 0  # jobs that compute nothing, as they wait for an MLLM
     if name == LIGHT:
         size, cpu, generator = settings.concurrency, 1, settings.generator
@@ -215,4 +231,4 @@ def _new_group(name: str, settings: Settings) -> Group:
         size, cpu, generator, waiting = 1, settings.concurrency, settings.generator, settings.mllm_concurrency
         jobs_each = cpu + waiting
     own = {"concurrency": cpu, "mllm_concurrency": max(1, waiting), "generator": generator}
-    return Group(name, settings.model_copy(update=own), size, jobs_each)
+    return Group(name, settings.model_copy(update=own), size, jobs_each, metrics)

@@ -8,15 +8,18 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
+from typing import Literal
 
 from cow_service.errors import Canceled, CowError, JobTimeout, WorkerEnded
 from cow_service.jobs.computing import Outcome, Work
 from cow_service.jobs.stage_cache import KeyLocks
 from cow_service.jobs.stored_errors import error_from_json
+from cow_service.records import GpuMemory
 from cow_service.settings import Settings
 from cow_service.workers.messages import (
     Cancel,
@@ -42,6 +45,9 @@ CANCEL_SECONDS = 5.0  # that a canceled job is given to end; then its process is
 START_SECONDS = 60.0  # that a process is given to begin with its first job
 END_SECONDS = 5.0  # that a process is given to end by itself
 
+# Why a process ended: renewed and stopped in peace; timeout: it went on with a job that had to end.
+EndReason = Literal["crashed", "frozen", "memory", "timeout", "renewed", "stopped"]
+
 log = logging.getLogger("cow_service")
 
 
@@ -59,11 +65,13 @@ class WorkerGone(Exception):
 class Worker:
     """One worker process, from its start to its end. Safe to use from every thread."""
 
-    def __init__(self, name: str, settings: Settings) -> None:
+    def __init__(self, name: str, settings: Settings, on_end: Callable[[EndReason], None]) -> None:
+        """`on_end` is called once, when the process has ended."""
         ours, theirs = Pipe()
         self.name = name
         self.jobs_done = 0
         self.memory_bytes = 0
+        self.gpus: tuple[GpuMemory, ...] = ()
         self.heard = time.monotonic()  # when it last sent a heartbeat
         self._job_timeout = settings.job_timeout
         self._pipe: Connection[ToWorker, FromWorker] = ours
@@ -73,6 +81,8 @@ class Worker:
         self._load_error: CowError | None = None
         self._ended = threading.Event()
         self._reason, self._is_final, self._stopped = "crashed", False, False
+        self._end_reason: EndReason = "crashed"
+        self._on_end = on_end
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "cow_service.workers.child", str(theirs.fileno())], pass_fds=[theirs.fileno()]
@@ -113,19 +123,21 @@ class Worker:
             del self._inboxes[work.job_id]
             self.jobs_done += 1
 
-    def kill(self, reason: str, *, is_final: bool = False) -> None:
-        """Ends the process at once, also one that is stopped. Its jobs raise `WorkerGone`."""
-        self._reason, self._is_final = reason, is_final
+    def kill(self, end_reason: EndReason, reason: str, *, is_final: bool = False) -> None:
+        """Ends the process at once, also one that is stopped. Its jobs raise `WorkerGone`, which says the reason."""
+        self._end_reason, self._reason, self._is_final = end_reason, reason, is_final
         self._process.kill()
 
-    def close(self) -> None:
+    def close(self, end_reason: EndReason = "stopped") -> None:
         """Ends the process. It has no jobs."""
         self._stopped = True
+        if self.is_alive:
+            self._end_reason = end_reason
         self._send(Stop())
         try:
             self._process.wait(END_SECONDS)
         except subprocess.TimeoutExpired:
-            self.kill("did not end")
+            self.kill(end_reason, "did not end")
             self._process.wait()
         self._ended.wait()
         self._pipe.close()
@@ -175,7 +187,7 @@ class Worker:
 
     def _too_late(self, *, canceled: bool) -> CowError:
         """Ends the process, as a job in it goes on after its time."""
-        self.kill("was ended, as another job of it had to end")
+        self.kill("timeout", "was ended, as another job of it had to end")
         if canceled:
             return Canceled("The job was canceled.")
         return JobTimeout(f"The job computed for more than {self._job_timeout:g} s, which COW_JOB_TIMEOUT allows.")
@@ -189,8 +201,8 @@ class Worker:
         with contextlib.suppress(EOFError, OSError):
             while True:
                 match self._pipe.recv():
-                    case Heartbeat(memory_bytes=memory_bytes):
-                        self.heard, self.memory_bytes = time.monotonic(), memory_bytes
+                    case Heartbeat(memory_bytes=memory_bytes, gpus=gpus):
+                        self.heard, self.memory_bytes, self.gpus = time.monotonic(), memory_bytes, gpus
                     case Loaded(error=error):
                         self._load_error = None if error is None else error_from_json(error)
                         self._loaded.set()
@@ -203,6 +215,7 @@ class Worker:
         self._loaded.set()
         for inbox in list(self._inboxes.values()):
             inbox.put(None)
+        self._on_end(self._end_reason)
 
 
 class _Keys:

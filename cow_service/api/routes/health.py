@@ -1,4 +1,4 @@
-"""`GET /livez`, `GET /readyz`, `GET /models` and `GET /metrics`."""
+"""`GET /livez`, `GET /readyz`, `GET /models`, `GET /workers` and `GET /metrics`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cow_service.api.problems import documented
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.observability.metrics import MEDIA_TYPE
-from cow_service.records import Models
+from cow_service.records import Models, Workers
 
 
 class Health(BaseModel):
@@ -45,8 +45,9 @@ def health_routes(engine: JobEngine, readiness: Readiness) -> APIRouter:
         ),
     )
     def readyz() -> Health:
-        """Checks that the database answers, that the data folder can be written and has room, and that the default
-        reader and generator are loaded.
+        """Checks that the database answers, that the data folder can be written and has room, that the default
+        reader and generator are loaded, by a worker where the server computes nothing, and that no job waits for a
+        workflow version that no process has.
         """
         readiness.check()
         engine.check()
@@ -58,6 +59,19 @@ def health_routes(engine: JobEngine, readiness: Readiness) -> APIRouter:
         return engine.service.models()
 
     @router.get(
+        "/workers",
+        operation_id="workers",
+        tags=["health"],
+        summary="Processes, their workers, and the queues",
+        responses=documented(errors.StorageUnavailable),
+    )
+    def workers() -> Workers:
+        """Every process on the job database, what its workers compute, how full the queues are, and jobs that no
+        process takes. A second old at most; processes tell of themselves every two seconds.
+        """
+        return engine.processes.overview.workers()
+
+    @router.get(
         "/metrics",
         operation_id="metrics",
         tags=["health"],
@@ -65,7 +79,7 @@ def health_routes(engine: JobEngine, readiness: Readiness) -> APIRouter:
         response_class=PlainTextResponse,
     )
     def metrics() -> Response:
-        """Requests, stages, jobs, queues, memory of the process and of its GPUs, in Prometheus' text format."""
+        """Requests, stages, jobs, queues, workers, memory of the process and of GPUs, in Prometheus' text format."""
         return Response(engine.service.metrics.exposition(), headers={"Content-Type": MEDIA_TYPE})
 
     return router

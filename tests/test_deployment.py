@@ -1,0 +1,133 @@
+"""Files for Kubernetes, Prometheus and Grafana, held against schemas, settings and a real server's metrics."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+from conftest import ROOT
+from servers import Served
+from test_docker import IMAGES, check_cow, check_settings, longest_stop, pairs, texts
+
+KUBERNETES = ROOT / "docker" / "kubernetes"
+OLDEST_KUBERNETES = "1.30"  # that the files are for
+ALERTS = yaml.safe_load((ROOT / "docker" / "prometheus" / "alerts.yaml").read_text())
+RULES: list[dict[str, Any]] = [rule for group in ALERTS["groups"] for rule in group["rules"]]
+DASHBOARD = json.loads((ROOT / "docker" / "grafana" / "cow.json").read_text())
+OF_PROMETHEUS = {"up"}  # that it makes itself
+RUNBOOK = (ROOT / "docs" / "runbook.md").read_text()
+
+
+def resources() -> list[dict[str, Any]]:
+    listed = yaml.safe_load((KUBERNETES / "kustomization.yaml").read_text())["resources"]
+    assert set(listed) == {path.name for path in KUBERNETES.glob("*.yaml")} - {"kustomization.yaml"}
+    return [one for name in listed for one in yaml.safe_load_all((KUBERNETES / name).read_text())]
+
+
+RESOURCES = resources()
+BUILT_IN = [one for one in RESOURCES if not one["apiVersion"].startswith("keda.sh/")]
+DEPLOYMENTS = {one["metadata"]["name"]: one for one in RESOURCES if one["kind"] == "Deployment"}
+SCALED = [one for one in RESOURCES if one["kind"] == "ScaledObject"]
+
+
+def container_of(workload: dict[str, Any]) -> dict[str, Any]:
+    (container,) = workload["spec"]["template"]["spec"]["containers"]
+    return container
+
+
+@pytest.mark.parametrize("resource", BUILT_IN, ids=lambda one: f"{one['kind']}-{one['metadata']['name']}")
+def test_resources_are_those_of_kubernetes(resource: dict[str, Any]) -> None:
+    for version in (OLDEST_KUBERNETES, kubernetes_validate.latest_version()):
+        kubernetes_validate.validate(resource, version, strict=True)
+
+
+@pytest.mark.parametrize("name", DEPLOYMENTS)
+def test_deployments_are_set_up(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec, container = DEPLOYMENTS[name]["spec"], container_of(DEPLOYMENTS[name])
+    shared = next(one["data"] for one in RESOURCES if one["kind"] == "ConfigMap")
+    image = IMAGES[container["image"]]
+    own = {one["name"]: one["value"] for one in container["env"]}
+    settings = check_settings(monkeypatch, pairs(image, "ENV") | shared | own)
+    check_cow(list(container["args"]))
+    labels = spec["template"]["metadata"]["labels"]
+    assert spec["selector"]["matchLabels"] == labels
+    before = container.get("lifecycle", {}).get("preStop", {}).get("sleep", {}).get("seconds", 0)
+    assert spec["template"]["spec"]["terminationGracePeriodSeconds"] > before + longest_stop(settings)
+    (port,) = container["ports"]
+    assert port["containerPort"] == (settings.port if name == "cow-api" else settings.metrics_port)
+    assert container["livenessProbe"]["httpGet"]["port"] == port["name"]
+    (volumes,) = texts(image, "VOLUME")
+    assert {one["mountPath"] for one in container["volumeMounts"]} == {*json.loads(volumes), "/tmp"}
+    assert {one["name"] for one in container["volumeMounts"]} == {
+        one["name"] for one in spec["template"]["spec"]["volumes"]
+    }
+    budget = next(one for one in RESOURCES if one["kind"] == "PodDisruptionBudget" and one["metadata"]["name"] == name)
+    assert budget["spec"]["selector"]["matchLabels"] == labels
+
+
+def test_each_queue_is_scaled_by_its_own_jobs() -> None:
+    assert {one["metadata"]["name"] for one in SCALED} == DEPLOYMENTS.keys() - {"cow-api"}
+    for scaled in SCALED:
+        container = container_of(DEPLOYMENTS[scaled["spec"]["scaleTargetRef"]["name"]])
+        (trigger,) = scaled["spec"]["triggers"]
+        queue = container["args"][container["args"].index("--queues") + 1]
+        assert f"attributes ->> 'queue' = '{queue}'" in trigger["metadata"]["query"]
+        given = {one["name"]: one["value"] for one in container["env"]}
+        assert trigger["metadata"]["targetQueryValue"] == given.get("COW_CONCURRENCY", "1")
+
+
+def test_every_alarm_is_in_the_runbook() -> None:
+    assert {rule["alert"] for rule in RULES} == set(re.findall(r"^### (Cow\w+)$", RUNBOOK, re.MULTILINE))
+    for rule in RULES:
+        assert set(rule) <= {"alert", "expr", "for", "labels", "annotations"}
+        assert rule["labels"]["severity"] in ("critical", "warning")
+        assert rule["annotations"]["summary"]
+
+
+@pytest.fixture(scope="module")
+def metrics(tmp_path_factory: pytest.TempPathFactory) -> Iterator[set[str]]:
+    """The names of the series of a real server."""
+    with Served(tmp_path_factory.mktemp("metrics")) as served:
+        told = re.findall(r"^# TYPE (\S+) (\S+)", served.http.get("/metrics").text, re.MULTILINE)
+        parts = {"histogram": ("_bucket", "_sum", "_count")}
+        yield {name + part for name, kind in told for part in parts.get(kind, ("",))}
+
+
+def names_in(expression: str) -> set[str]:
+    return set(re.findall(r"\b(?:cow|process)_[a-z_]+|\bup\b", expression)) - OF_PROMETHEUS
+
+
+@pytest.mark.slow
+def test_alarms_and_panels_are_of_metrics_that_exist(metrics: set[str]) -> None:
+    panels = [target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", ())]
+    for expression in [rule["expr"] for rule in RULES] + panels:
+        assert names_in(expression) <= metrics, expression
+    shown = {name for expression in panels for name in names_in(expression)}
+    assert {name for name in metrics if name.startswith("cow_")} - shown <= {
+        name for name in metrics if name.endswith(("_sum", "_count", "_created"))
+    }
+
+
+def test_the_dashboard_has_a_data_source_to_choose() -> None:
+    (variable,) = DASHBOARD["templating"]["list"]
+    assert (variable["type"], variable["query"]) == ("datasource", "prometheus")
+    identifiers = [panel["id"] for panel in DASHBOARD["panels"]]
+    assert len(set(identifiers)) == len(identifiers)
+    for panel in DASHBOARD["panels"]:
+        place = panel["gridPos"]
+        assert place["x"] + place["w"] <= 24
+        for target in panel.get("targets", ()):
+            assert target["datasource"]["uid"] == "${" + variable["name"] + "}"
+            assert target["expr"].count("(") == target["expr"].count(")")
+
+
+def test_secrets_stand_in_no_file() -> None:
+    assert not [one for one in RESOURCES if one["kind"] == "Secret"]
+    for workload in DEPLOYMENTS.values():
+        names = {one["name"] for one in container_of(workload)["env"]}
+        assert not [name for name in names if re.search("KEY|SECRET|PASSWORD|TOKEN|DATABASE_URL", name)]
