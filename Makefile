@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 # One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 3
 
 .PHONY: demo serve test test-fast soak lint openapi bench clean
 
@@ -15,7 +15,7 @@ demo: $(VENV)/.base ## run the main job on an example
 serve: $(VENV)/.base ## start the server on 127.0.0.1:8000
 	$(BIN)/cow serve
 
-test: $(VENV)/.test ## all tests, slow ones included; of long tables of cases a third
+test: $(VENV)/.test ## all tests, slow ones included; of long tables of cases a sixth
 	$(PYTEST)
 
 test-fast: $(VENV)/.test ## the tests that take seconds

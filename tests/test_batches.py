@@ -371,6 +371,7 @@ def test_looks_at_jobs_are_words_of_the_server(monkeypatch: pytest.MonkeyPatch) 
     assert len(heard) > 2, "only the end of the question was heard"
 
 
+@pytest.mark.soak_only
 @pytest.mark.slow
 def test_a_batch_without_a_folder_that_is_left_ends_its_jobs(tmp_path: Path) -> None:
     quick = {**asked(1)[0], "id": "quick", "seed": 99}
@@ -567,6 +568,7 @@ def fast(tmp_path: Path) -> Iterator[Served]:
         yield served
 
 
+@pytest.mark.soak_only
 @pytest.mark.slow
 @pytest.mark.soak
 @pytest.mark.timeout(600)

@@ -28,6 +28,7 @@ from conftest import EXAMPLES, ROOT
 from hub import Blob
 from hub import running as hub_running
 
+LONG_PAGES = ("docs/models.md", "docs/sdk.md")  # whose commands take longest: they are run by `make soak`
 PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))
 LANGUAGES = {"sh", "python", "toml", "yaml", "json", "text"}
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -221,7 +222,10 @@ def test_links_lead_somewhere() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=pytest.mark.soak_only) if page in LONG_PAGES else page for page in PAGES],
+)
 def test_commands_and_programs_run_as_they_stand_there(checkout: Checkout, page: str) -> None:
     ran = 0
     for number, block in enumerate(blocks(page)):

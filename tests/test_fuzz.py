@@ -56,6 +56,7 @@ def contract(tmp_path_factory: pytest.TempPathFactory):
         ("POST", "/jobs/{id}/cancel", GenerationMode.POSITIVE),
         ("DELETE", "/jobs/{id}", GenerationMode.POSITIVE),
         ("GET", "/models", GenerationMode.POSITIVE),
+        ("GET", "/workers", GenerationMode.POSITIVE),
         ("GET", "/metrics", GenerationMode.POSITIVE),
         ("GET", "/livez", GenerationMode.POSITIVE),
         ("GET", "/readyz", GenerationMode.POSITIVE),
@@ -97,6 +98,6 @@ def test_a_real_server_keeps_the_contract(server: Server) -> None:
 
 def test_the_contract_has_no_other_operations(contract) -> None:
     jobs = {"/jobs", "/jobs/{id}", "/jobs/{id}/events", "/jobs/{id}/cancel"}
-    others = {"/artifacts/{sha256}", "/models", "/livez", "/readyz", "/metrics"}
+    others = {"/artifacts/{sha256}", "/models", "/workers", "/livez", "/readyz", "/metrics"}
     chat = {"/v1/chat/completions", "/v1/responses", "/v1/models", "/v1/models/{model}"}
     assert set(contract) == {"/simulate", "/answer"} | chat | jobs | others

@@ -967,6 +967,7 @@ def stage_results(served: Served, job_id: str) -> dict[str, float]:
         return dict(found.fetchall())
 
 
+@pytest.mark.soak_only
 @pytest.mark.slow
 def test_two_servers_on_one_data_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("two")

@@ -682,6 +682,7 @@ torch.distributed.destroy_process_group()
 """
 
 
+@pytest.mark.soak_only
 @pytest.mark.slow
 def test_two_processes_compute_what_one_does(tmp_path: Path):
     """Over gloo: every rank holds the whole result, with and without a cache."""

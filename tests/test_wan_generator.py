@@ -19,6 +19,7 @@ from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
+from cow_service.weights.manifests import load_manifests
 
 BALL = example("ball-and-mug")
 SHORT = {"num_frames": 17, "frames": {"indices": list(range(17)), "max_side": None}}
@@ -401,3 +402,11 @@ def test_parts_of_ones_own_carry_no_pulled_revision(tmp_path: Path) -> None:
         checkpoints = {"ati": tmp_path / own} if own else {}
         settings = Settings(data_dir=tmp_path, checkpoints=checkpoints)
         assert sorted(_revisions(manifest, profile, settings)) == parts
+
+
+def test_what_a_generator_needs_is_told_by_its_manifest() -> None:
+    """The class says the same, where its libraries are installed."""
+    assert {load_manifests()[name].concurrency for name in ("ati", "wan-move", "tiny-ati")} == {
+        WanGenerator.concurrency
+    }
+    assert load_manifests()["cutout"].concurrency is None

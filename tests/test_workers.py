@@ -14,8 +14,6 @@ from conftest import SCALE
 from postgres import postgres_server
 from servers import ASYNC, BODY, Served, Worker, eventually, problem, slow
 
-from cow_service.weights.manifests import load_manifests
-
 pytestmark = pytest.mark.slow
 
 
@@ -27,7 +25,7 @@ def poison(how: str, seed: int = 0) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with Served(tmp_path_factory.mktemp("workers"), COW_WORKER_MEMORY_MB="1000", COW_JOB_TIMEOUT="6") as one:
+    with Served(tmp_path_factory.mktemp("workers"), COW_WORKER_MEMORY_MB="1000", COW_JOB_TIMEOUT="15") as one:
         yield one
 
 
@@ -46,7 +44,8 @@ def test_a_crash_harms_the_job_that_caused_it_and_no_other(served: Served) -> No
     assert ended["status"] == "failed"
     assert ended["problem"]["type"] == "urn:cow:problem:worker-ended"
     assert "signal 9" in ended["problem"]["detail"]
-    assert {served.ended(one)["status"] for one in innocents} == {"succeeded"}
+    others = [served.ended(one) for one in innocents]
+    assert [one["problem"] for one in others if one["status"] != "succeeded"] == []
     assert served.clips().count(100) == 3, "it is tried again: the crash may have been no fault of the job"
     assert all(served.clips().count(seed) == 1 for seed in range(1, 13)), "nobody else was begun twice"
 
@@ -58,6 +57,7 @@ def test_too_much_memory_ends_the_job_alone(served: Served) -> None:
     assert served.http.post("/simulate", json=slow(0.1, seed=102)).status_code == 200
 
 
+@pytest.mark.soak_only
 def test_a_job_that_never_ends_is_ended(served: Served) -> None:
     problem(served.http.post("/simulate", json=poison("hang", seed=103)), 504, "job-timeout")
     assert served.http.post("/simulate", json=slow(0.1, seed=104)).status_code == 200
@@ -98,16 +98,6 @@ def test_a_queued_job_says_how_long_it_will_wait(served: Served) -> None:
     assert 0 < last["expected_wait"] < 60, "the tests before have shown the pace"
     ended = served.ended(jobs[-1]["id"])
     assert ended["position"] is ended["expected_wait"] is None
-
-
-def test_what_a_generator_needs_is_told_by_its_manifest() -> None:
-    """The class says the same, where its libraries are installed."""
-    from cow_service.generators.wan.generator import WanGenerator
-
-    assert {load_manifests()[name].concurrency for name in ("ati", "wan-move", "tiny-ati")} == {
-        WanGenerator.concurrency
-    }
-    assert load_manifests()["cutout"].concurrency is None
 
 
 @pytest.fixture(scope="module")
