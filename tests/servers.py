@@ -70,6 +70,8 @@ class Served:
             "COW_HOST": "127.0.0.1",
             "PYTHONPATH": str(SLOW_GENERATOR),
             "SLOW_JOURNAL": str(self.journal),
+            # Where who computes does not matter: processes that are started for each server take most of a test's time.
+            "COW_WORKERS": "false",
         }
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
         self._environment |= own | settings

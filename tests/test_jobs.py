@@ -49,7 +49,7 @@ FRESH = {"Cache-Control": "no-cache"}
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with Served(tmp_path_factory.mktemp("served")) as one:
+    with Served(tmp_path_factory.mktemp("served"), COW_WORKERS="true") as one:
         yield one
 
 
@@ -921,7 +921,7 @@ def hear_until_cut(served: Served, job_id: str, heard: list[str]) -> None:
 
 @pytest.mark.slow
 def test_after_a_crash_jobs_go_on_where_they_were(tmp_path_factory: pytest.TempPathFactory) -> None:
-    with Served(tmp_path_factory.mktemp("crash")) as one:
+    with Served(tmp_path_factory.mktemp("crash"), COW_WORKERS="true") as one:
         key = {"Idempotency-Key": "crash"}
         job = one.submit(slow(5, seed=96), **key)
         done = one.ended(one.submit({**BODY, "image": data_url(picture(7))})["id"])

@@ -39,7 +39,7 @@ def served(tmp_path_factory, objects, keys) -> Iterator[Served]:
     hashes = json.dumps({name: hash_of(key) for name, key in keys.items()})
     settings = {"COW_ARTIFACTS": objects.url, **objects.environment}
     # Readiness is asked without a key; everything else is Alice's.
-    with Served(tmp_path_factory.mktemp("redirecting"), COW_API_KEYS=hashes, **settings) as one:
+    with Served(tmp_path_factory.mktemp("redirecting"), COW_WORKERS="true", COW_API_KEYS=hashes, **settings) as one:
         one.http.headers["Authorization"] = f"Bearer {keys['alice']}"
         yield one
 

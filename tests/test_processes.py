@@ -71,7 +71,7 @@ def queries() -> list[str]:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with Served(tmp_path_factory.mktemp("processes"), COW_CONCURRENCY="1") as one:
+    with Served(tmp_path_factory.mktemp("processes"), COW_WORKERS="true", COW_CONCURRENCY="1") as one:
         yield one
 
 
