@@ -290,6 +290,7 @@ def test_a_second_call_finds_everything(server: Server, http: httpx.Client, tmp_
     assert (out / "items" / "q0" / "overlay.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.soak_only
 @pytest.mark.slow
 def test_an_async_batch_that_is_canceled_leaves_its_jobs_to_the_next(tmp_path: Path) -> None:
     items = asked(4, generator="slow", generator_options={"seconds": 2.0}, num_frames=80)

@@ -63,6 +63,7 @@ def answers(service: Service) -> list[Answer]:
 
 
 @pytest.mark.soak
+@pytest.mark.soak_only
 @pytest.mark.parametrize("place", ["remote"] if SCALE == 1 else ["local", "remote"])
 def test_from_grounding_to_answer(place: str, request: pytest.FixtureRequest) -> None:
     service: Service = request.getfixturevalue(place)

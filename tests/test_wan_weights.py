@@ -83,6 +83,7 @@ def settings(home: Path, **given: Any) -> Settings:
     return Settings(data_dir=home / "data", profile="portable", device="cpu", **given)
 
 
+@pytest.mark.soak_only
 def test_pulled_checked_loaded_and_used(home: Path, hub: Hub) -> None:
     before = cow(home, hub, "models", "check", "ati")
     assert before.returncode == 1
