@@ -15,7 +15,7 @@ demo: $(VENV)/.base ## run the main job on an example
 serve: $(VENV)/.base ## start the server on 127.0.0.1:8000
 	$(BIN)/cow serve
 
-test: $(VENV)/.test ## all tests, slow ones included; of long tables of cases a sixth
+test: $(VENV)/.test ## all tests, slow ones included; of long tables of cases a twelfth
 	$(PYTEST)
 
 test-fast: $(VENV)/.test ## the tests that take seconds

@@ -82,7 +82,7 @@ def all_scenes() -> list[Path]:
     return folders + shared[:: max(1, 3 // SCALE)]
 
 
-LONG_TABLE = 8  # cases of one test; of longer ones every sixth is run, all of them in `make soak`
+LONG_TABLE = 8  # cases of one test; of longer ones every twelfth is run, all of them in `make soak`
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -97,11 +97,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def thin_out(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leaves every sixth case of long tables, and nothing that is for `make soak` alone."""
+    """Leaves every twelfth case of long tables, and nothing that is for `make soak` alone."""
     of_test: dict[str, list[pytest.Item]] = {}
     for item in items:
         of_test.setdefault(item.nodeid.partition("[")[0], []).append(item)
-    kept = (item for cases in of_test.values() for item in (cases[::6] if len(cases) > LONG_TABLE else cases))
+    kept = (item for cases in of_test.values() for item in (cases[::12] if len(cases) > LONG_TABLE else cases))
     left = {id(item) for item in kept if item.get_closest_marker("soak_only") is None}
     config.hook.pytest_deselected(items=[item for item in items if id(item) not in left])
     items[:] = [item for item in items if id(item) in left]

@@ -717,6 +717,7 @@ def relay() -> Iterator[Relay]:
     one.close()
 
 
+@pytest.mark.soak_only
 @pytest.mark.slow
 def test_a_wait_outlives_a_server_that_is_killed(connect: Connect, relay: Relay, tmp_path: Path) -> None:
     with Served(tmp_path) as served:

@@ -152,4 +152,4 @@ class Jobs(RuleBasedStateMachine):
 
 TestJobs = Jobs.TestCase
 TestJobs.settings = settings(max_examples=SCALE, stateful_step_count=12, suppress_health_check=list(HealthCheck))
-TestJobs.pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.timeout(600 * SCALE)]
+TestJobs.pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.soak_only, pytest.mark.timeout(600 * SCALE)]

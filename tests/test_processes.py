@@ -168,6 +168,7 @@ def postgres() -> Iterator[str]:
         yield url
 
 
+@pytest.mark.soak_only
 def test_an_api_server_is_ready_with_a_worker(postgres: str, tmp_path: Path) -> None:
     own = {"COW_DATABASE_URL": postgres}
     with Served(tmp_path, COW_ROLE="api", **own) as api:

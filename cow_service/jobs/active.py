@@ -15,6 +15,7 @@ from cow_service.records import JobKind
 from cow_service.requests import Stage
 
 STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")
+BEGIN_SECONDS = 10.0  # within which a job that was taken from its queue begins
 STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation the last is left out
 
 
@@ -69,6 +70,7 @@ class ActiveJobs:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._running: dict[str, ActiveJob] = {}
+        self._canceled: dict[str, float] = {}  # when the end of jobs was requested that did not run
         self._elsewhere: dict[str, tuple[Stage | None, float]] = {}  # how far jobs are that other processes run
         self._waiters: dict[str, list[Waiter]] = {}
         self._images: dict[str, DecodedImage] = {}
@@ -97,6 +99,8 @@ class ActiveJobs:
         active = ActiveJob(kind)
         with self._lock:
             self._running[job] = active
+            if time.monotonic() - self._canceled.pop(job, -BEGIN_SECONDS) < BEGIN_SECONDS:
+                active.cancel_requested.set()
         try:
             yield active
         finally:
@@ -155,10 +159,18 @@ class ActiveJobs:
                 del self._running[job]
 
     def request_cancel(self, job: str) -> None:
-        """Has the work on a job end at its next step."""
-        active = self.get(job)
+        """Has the work on a job end at its next step, also where it was taken from its queue and is about to begin."""
+        active, now = self.get(job), time.monotonic()
         if active is not None:
             active.cancel_requested.set()
+            return
+        with self._lock:
+            self._canceled = {one: at for one, at in self._canceled.items() if now - at < BEGIN_SECONDS} | {job: now}
+
+    def expect(self, job: str) -> None:
+        """A new job has this id: what was asked of an earlier one is over."""
+        with self._lock:
+            self._canceled.pop(job, None)
 
     @contextmanager
     def waiting(self, job: str) -> Generator[Waiter]:

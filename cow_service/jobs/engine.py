@@ -226,6 +226,7 @@ class JobEngine:
             starts_now = self.open_jobs.count(queue) < self._computer.capacity(queue)
             spec = spec.model_copy(update={"turn": self.open_jobs.next_turn(owner)})
             self.open_jobs.record(job_id, OpenJob(spec.generator, owner, spec.turn, queue, spec.created_at))
+        self.active.expect(job_id)
         try:
             # Before the job exists: its image and masks must not be removed before work on it starts.
             self.database.add_references(job_id, [image.info.sha256, *spec.masks])
