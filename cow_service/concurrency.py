@@ -48,6 +48,7 @@ class PrioritySemaphore:
         try:
             while not waiter.granted.wait(CANCEL_POLL_SECONDS):
                 check_canceled()
+            check_canceled()  # since the last look, or by the one who gave the permit back
         except BaseException:
             with self._lock:
                 if waiter.granted.is_set():

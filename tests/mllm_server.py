@@ -30,13 +30,15 @@ class MllmServer:
     asked: list[dict[str, Any]] = field(default_factory=list)
     at_once: int = 0
     most_at_once: int = 0
+    scripts: int = 0  # that were begun
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def say(self, *script: str | Reply) -> None:
         """Starts a new script."""
         with self.lock:
             self.script, self.asked = list(script), []
-            self.at_once = self.most_at_once = 0
+            self.at_once, self.most_at_once = 0, 0
+            self.scripts += 1
 
     def next(self) -> str | Reply:
         return self.script.pop(0) if len(self.script) > 1 else self.script[0]
@@ -84,6 +86,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_state: MllmServer
     body: dict[str, Any]  # of the call that is being answered
+    of_script: int
 
     def log_message(self, format: str, *args: object) -> None:
         pass
@@ -94,6 +97,7 @@ class _Handler(BaseHTTPRequestHandler):
         with state.lock:
             self.body = body | {"authorization": self.headers.get("authorization")}
             state.asked.append(self.body)
+            self.of_script = state.scripts
             state.at_once += 1  # only what waits counts itself out again
             state.most_at_once = max(state.most_at_once, state.at_once)
             reply = state.next()
@@ -136,7 +140,8 @@ def slow(seconds: float, text: str = "{}") -> Reply:
     def reply(handler: _Handler) -> None:
         time.sleep(seconds)
         with handler.server_state.lock:  # before the reply: who gets it may ask again at once
-            handler.server_state.at_once -= 1
+            # A caller of an earlier script may have left before its reply.
+            handler.server_state.at_once -= handler.of_script == handler.server_state.scripts
         with suppress(OSError):  # the caller may have given up
             handler.send(200, completion(text))
 

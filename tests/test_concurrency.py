@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -64,6 +65,30 @@ def test_a_canceled_wait_leaves_its_permit_to_others() -> None:
     with pytest.raises(CanceledError):
         semaphore.acquire("a", canceled)
     semaphore.release()
+    semaphore.acquire("b")
+    semaphore.release()
+
+
+def test_who_was_canceled_before_a_permit_came_does_not_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cow_service.concurrency.CANCEL_POLL_SECONDS", 60.0)  # no look between the two
+    semaphore, canceled, began = PrioritySemaphore(1), threading.Event(), threading.Event()
+    semaphore.acquire()
+
+    def check() -> None:
+        if canceled.is_set():
+            raise CanceledError
+
+    def work() -> None:
+        with suppress(CanceledError), semaphore.held("a", check):
+            began.set()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    until_waiting(semaphore, 1)
+    canceled.set()
+    semaphore.release()
+    thread.join(5)
+    assert not began.is_set()
     semaphore.acquire("b")
     semaphore.release()
 
