@@ -194,6 +194,14 @@ class Settings(BaseSettings):
             raise ValueError("two names have the same key")
         return hashes
 
+    @field_validator("key_weights")
+    @classmethod
+    def _of_keys(cls, weights: dict[str, float], info: ValidationInfo) -> dict[str, float]:
+        unknown = weights.keys() - info.data.get("api_keys", {}).keys()
+        if unknown:
+            raise ValueError(f"{min(unknown)[:64]!r} is no name of COW_API_KEYS")
+        return weights
+
     @field_validator("cors_origins")
     @classmethod
     def _not_everybody(cls, origins: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
@@ -206,6 +214,11 @@ class Settings(BaseSettings):
         description="Job database: sqlite:///FILE or postgresql://USER:PASSWORD@HOST/NAME; by default a file in the "
         "data folder.",
     )
+    migrate: bool = Field(
+        default=True,
+        description="Create and update the tables of the job database at the start; false where `cow migrate` does so "
+        "before, with rights that servers and workers need not have.",
+    )
     queue_limit: int = Field(
         default=1000, ge=1, le=1_000_000, description="Jobs that wait or run; more are refused with queue-full."
     )
@@ -214,6 +227,17 @@ class Settings(BaseSettings):
         ge=1,
         le=1_000_000,
         description="Of them, those of one key; by default half of them where there are several keys.",
+    )
+    running_limit_per_key: int | None = Field(
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description="Jobs of one key that are computed at the same time, in all processes together; to be set for "
+        "workers, too. By default as many as there are places.",
+    )
+    key_weights: dict[str, Annotated[float, Field(ge=0.01, le=100, allow_inf_nan=False)]] = Field(
+        default_factory=dict,
+        description="Shares of keys while several have jobs that wait, by their names, as JSON; by default 1 for each.",
     )
     job_retention_hours: float = Field(
         default=168, gt=0, le=87_600, allow_inf_nan=False, description="Age at which finished jobs are removed, hours."

@@ -70,6 +70,23 @@ def test_deployments_are_set_up(name: str, monkeypatch: pytest.MonkeyPatch) -> N
     assert budget["spec"]["selector"]["matchLabels"] == labels
 
 
+@pytest.mark.parametrize(
+    "job", [one for one in RESOURCES if one["kind"] == "Job"], ids=lambda one: one["metadata"]["name"]
+)
+def test_jobs_are_commands_that_there_are(job: dict[str, Any]) -> None:
+    container = container_of(job)
+    check_cow(list(container["args"]))
+    (volumes,) = texts(IMAGES[container["image"]], "VOLUME")
+    assert {one["mountPath"] for one in container["volumeMounts"]} == {*json.loads(volumes), "/tmp"}
+
+
+def test_one_job_creates_the_tables_and_nobody_else() -> None:
+    shared = next(one["data"] for one in RESOURCES if one["kind"] == "ConfigMap")
+    migrating = [one for one in RESOURCES if one["kind"] == "Job" and container_of(one)["args"] == ["migrate"]]
+    assert (len(migrating), shared["COW_MIGRATE"]) == (1, "false")
+    assert container_of(migrating[0])["envFrom"] == container_of(DEPLOYMENTS["cow-api"])["envFrom"]
+
+
 def test_each_queue_is_scaled_by_its_own_jobs() -> None:
     assert {one["metadata"]["name"] for one in SCALED} == DEPLOYMENTS.keys() - {"cow-api"}
     for scaled in SCALED:

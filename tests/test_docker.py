@@ -460,7 +460,8 @@ def compose() -> File:
     return File.model_validate({name: part for name, part in raw.items() if not name.startswith("x-")})
 
 
-OURS = ("cow", "cow-mllm", "api", "worker", "gpu-worker")
+WORKERS = ("worker", "gpu-worker")
+OURS = ("migration", "cow", "cow-mllm", "api", *WORKERS)
 SERVERS = ("cow", "cow-mllm", "api")  # that take requests
 
 
@@ -468,9 +469,9 @@ def interpolated(environment: dict[str, str]) -> dict[str, str]:
     return {name: re.sub(r"\$\{[^}]*\}", "secret", value) for name, value in environment.items()}
 
 
-def test_without_a_profile_it_is_the_service_and_its_database() -> None:
+def test_without_a_profile_it_is_the_service_and_what_it_needs() -> None:
     services = compose().services
-    assert {name for name, service in services.items() if not service.profiles} == {"cow", "postgres"}
+    assert {name for name, service in services.items() if not service.profiles} == {"cow", "migration", "postgres"}
     assert {name for name, service in services.items() if service.build} == set(OURS)
     for name in OURS:
         build = services[name].build
@@ -484,11 +485,14 @@ def test_a_service_waits_for_others_that_start_with_it() -> None:
     for service in services.values():
         for name, needs in service.depends_on.items():
             assert set(services[name].profiles) <= set(service.profiles)
-            assert needs.condition == "service_healthy"
-            assert services[name].healthcheck is not None
+            if needs.condition == "service_healthy":
+                assert services[name].healthcheck is not None
+            else:
+                assert (needs.condition, services[name].restart) == ("service_completed_successfully", "no")
             assert set(services[name].networks) & set(service.networks)
-    assert set(services["cow"].depends_on) == {"postgres"}
-    assert set(services["cow-mllm"].depends_on) == {"postgres", "vllm"}
+    assert set(services["migration"].depends_on) == {"postgres"}
+    assert set(services["cow"].depends_on) == {"migration"}
+    assert set(services["cow-mllm"].depends_on) == {"migration", "vllm"}
 
 
 def test_names_are_declared_and_used() -> None:
@@ -553,10 +557,11 @@ def test_the_service_is_set_up_and_may_do_little(name: str, monkeypatch: pytest.
     assert seconds(service.stop_grace_period) > longest_stop(settings)
     assert service.read_only
     assert service.init
+    assert not settings.migrate, "that is the service `migration`"
     assert service.user is None, "that of the image"
     if service.command:
         check_cow(service.command)
-    if name not in SERVERS:
+    if name in WORKERS:
         assert settings.metrics_port == settings.port, "the image's health check looks there"
 
 

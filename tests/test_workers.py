@@ -14,6 +14,9 @@ from conftest import SCALE
 from postgres import postgres_server
 from servers import ASYNC, BODY, Served, Worker, eventually, problem, slow
 
+from cow_service.jobs.queues import check_queues
+from cow_service.settings import Settings, SettingsError
+
 pytestmark = pytest.mark.slow
 
 
@@ -164,3 +167,16 @@ def test_an_api_server_takes_jobs_for_models_that_it_does_not_have(fleet: tuple[
     job = api.submit(wrong | {"generator_options": {"steps": 4}})
     assert api.job(job["id"])["status"] in ("queued", "running", "failed")
     api.http.delete(f"/jobs/{job['id']}")
+
+
+@pytest.mark.parametrize("name", ["lihgt", "cutout"])
+def test_a_queue_that_does_not_exist_is_told_before_a_worker_starts(name: str) -> None:
+    check_queues(Settings(queues=("light", "tiny-ati")))
+    with pytest.raises(SettingsError, match=f"no queue '{name}' here. There are light, .*tiny-ati"):
+        check_queues(Settings(queues=("light", name)))
+
+
+def test_a_queue_whose_backend_is_not_installed_is_told_with_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cow_service.weights.manifests.find_spec", lambda name: None)
+    with pytest.raises(SettingsError, match=r"ati lacks .*torch.*: pip install \"cow-service\[wan\]\""):
+        check_queues(Settings(queues=("ati",)))

@@ -218,7 +218,7 @@ class Submitter:
         if image is None:
             sha256, image = service.image_of(body.image)
         kept = ImageArtifact(artifact=sha256 or image.info.sha256)
-        asks = service.keep_masks(body).model_copy(update={"image": kept, "webhook": None})
+        asks = service.keep_masks(body).model_copy(update={"image": kept, "webhook": None, "priority": "normal"})
         spec = JobSpec(
             kind=submission.kind,
             request=asks.model_dump(mode="json", exclude_defaults=True),
@@ -227,6 +227,7 @@ class Submitter:
             created_at=now(),
             fresh=submission.prefer.fresh,
             webhook=body.webhook,
+            priority=body.priority,
             request_id=context.request_id.get(),
             traceparent=context.traceparent(),
         )

@@ -175,12 +175,27 @@ def worker(
 def _served(**overrides: Any) -> Service:
     """The service of a process that goes on, with its logs and traces."""
     service = _service(**overrides)
+    from cow_service.jobs.queues import check_queues  # noqa: PLC0415
     from cow_service.observability import logging as logs  # noqa: PLC0415
     from cow_service.observability import tracing  # noqa: PLC0415
 
+    check_queues(service.settings)
     logs.set_up(service.settings)
     tracing.start()
     return service
+
+
+@app.command()
+def migrate() -> None:
+    """Create or update the tables of the job database.
+
+    Servers and workers do so themselves when they start, unless COW_MIGRATE is false.
+    """
+    from cow_service.jobs.migration import migrate as run  # noqa: PLC0415
+    from cow_service.settings import load_settings  # noqa: PLC0415
+
+    run(load_settings())
+    typer.echo("The job database is up to date.")
 
 
 @app.command()

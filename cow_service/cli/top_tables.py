@@ -14,6 +14,7 @@ from cow_service.cli.errors import printable
 from cow_service.records import GpuMemory, ProcessInfo, WorkerInfo, WorkerJob, Workers
 
 BAR_WIDTH = 8  # characters
+ROLES = {"all": "server", "api": "API server", "worker": "worker"}
 ID_LENGTH = 8  # characters that are shown of a job's id
 
 
@@ -67,7 +68,7 @@ def _processes(processes: Iterable[ProcessInfo]) -> RenderableType:
     parts: list[RenderableType] = []
     for process in processes:
         takes = ", ".join(map(printable, process.queues)) or "nothing"
-        head = Text(f"{process.role} {printable(process.host)}", style="bold")
+        head = Text(f"{ROLES[process.role]} on {printable(process.host)}", style="bold")
         head.append(f"  pid {process.pid}, COW {printable(process.version)}, takes {takes}", style="not bold dim")
         parts.append(head)
         if process.workers:

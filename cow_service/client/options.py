@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         MotionRequest,
         ObjectRequest,
         OptionRequest,
+        Priority,
         TrajectoryRequest,
     )
 
@@ -48,6 +49,7 @@ class SimulateOptions(TypedDict, total=False):
     video: bool
     frames: FramesRequest | Given
     generator_options: Given
+    priority: Priority
     webhook: str | None
 
 

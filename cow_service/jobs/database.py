@@ -20,45 +20,17 @@ from sqlalchemy import event
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
+from cow_service.jobs.tables import METADATA, REFERENCES, RESULTS, STAGES
 from cow_service.settings import Settings, SettingsError
 
 BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
 MAX_IDS = 500  # in one statement
 CONNECT_SECONDS = 4  # for a connection to PostgreSQL
 MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log, beyond which it is cut when it begins anew
+TABLES_LOCK = 0x434F5701  # of PostgreSQL, held while tables are created
 INCREMENTAL = 2  # SQLite's number of that mode
 VACUUM_PAGES, KEPT_FREE_PAGES = 500, 500  # of 4 kB: given back at a time, and kept for what is written next
 
-_metadata = sa.MetaData()
-_results = sa.Table(
-    "cow_stage_results",
-    _metadata,
-    sa.Column("key", sa.String(64), primary_key=True),
-    sa.Column("job_id", sa.String(64), nullable=False, index=True),
-    sa.Column("stage", sa.String(32), nullable=False),
-    sa.Column("result", sa.Text, nullable=False),
-    sa.Column("created_at", sa.Float, nullable=False),
-)
-_references = sa.Table(
-    "cow_holds",
-    _metadata,
-    sa.Column("sha256", sa.String(64), primary_key=True),
-    sa.Column("job_id", sa.String(64), primary_key=True, index=True),
-)
-# The stages of each job that are done, whoever computed their results.
-_stages = sa.Table(
-    "cow_job_stages",
-    _metadata,
-    sa.Column("job_id", sa.String(64), primary_key=True),
-    sa.Column("stage", sa.String(32), primary_key=True),
-)
-# Where the artifacts of all jobs are: one row, once a server has started.
-_stores = sa.Table(
-    "cow_artifact_store",
-    _metadata,
-    sa.Column("id", sa.Integer, primary_key=True),  # always 1
-    sa.Column("address", sa.Text, nullable=False),
-)
 # These run several times in every job: as plain text they take a fifth of the time that expressions do.
 _FIND = "SELECT job_id, result FROM cow_stage_results WHERE key = ?"
 # A result that lost its artifacts is computed again, and replaces the one that was there.
@@ -83,8 +55,17 @@ class Database:
         """Makes our tables where they are missing, and the folder of a file."""
         if self.file is not None:
             self.file.parent.mkdir(parents=True, exist_ok=True)
+        with database_errors(), self.engine.begin() as connection:
+            if self.file is None:  # two processes that create the same table at the same time would fail one another
+                connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": TABLES_LOCK})
+            METADATA.create_all(connection)
+
+    def check_tables(self) -> None:
+        """Raises `StorageUnavailable` where a table of ours is missing."""
         with database_errors():
-            _metadata.create_all(self.engine)
+            missing = METADATA.tables.keys() - set(sa.inspect(self.engine).get_table_names())
+        if missing:
+            raise StorageUnavailable(f"The job database has no table {min(missing)}: run `cow migrate` first.")
 
     def claim(self, address: str) -> None:
         """Notes where the artifacts of all jobs are. Raises `StorageUnavailable` where they are elsewhere.
@@ -190,7 +171,7 @@ class Database:
 
     def finished_stages(self, job: str) -> set[str]:
         """The stages of a job that are done."""
-        return self._column(sa.select(_stages.c.stage).where(_stages.c.job_id == job))
+        return self._column(sa.select(STAGES.c.stage).where(STAGES.c.job_id == job))
 
     def add_references(self, job: str, artifacts: Iterable[str]) -> None:
         """Notes that a job needs some artifacts."""
@@ -202,34 +183,34 @@ class Database:
         artifacts: set[str] = set()
         with database_errors(), self.engine.begin() as connection:
             for chunk in _chunks(jobs):
-                theirs = sa.select(_references.c.sha256).where(_references.c.job_id.in_(chunk)).distinct()
+                theirs = sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(chunk)).distinct()
                 artifacts |= set(connection.execute(theirs).scalars())
-                connection.execute(sa.delete(_references).where(_references.c.job_id.in_(chunk)))
-                connection.execute(sa.delete(_results).where(_results.c.job_id.in_(chunk)))
-                connection.execute(sa.delete(_stages).where(_stages.c.job_id.in_(chunk)))
+                connection.execute(sa.delete(REFERENCES).where(REFERENCES.c.job_id.in_(chunk)))
+                connection.execute(sa.delete(RESULTS).where(RESULTS.c.job_id.in_(chunk)))
+                connection.execute(sa.delete(STAGES).where(STAGES.c.job_id.in_(chunk)))
         return list(artifacts - self.referenced(artifacts))
 
     def referenced(self, artifacts: Iterable[str]) -> set[str]:
         """Those of some artifacts that a job needs."""
         found: set[str] = set()
         for chunk in _chunks(list(artifacts)):
-            found |= self._column(sa.select(_references.c.sha256).where(_references.c.sha256.in_(chunk)))
+            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.sha256.in_(chunk)))
         return found
 
     def artifacts_of(self, jobs: Iterable[str]) -> set[str]:
         """The artifacts that some jobs need."""
         found: set[str] = set()
         for chunk in _chunks(list(jobs)):
-            found |= self._column(sa.select(_references.c.sha256).where(_references.c.job_id.in_(chunk)))
+            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(chunk)))
         return found
 
     def jobs_with(self, sha256: str) -> list[str]:
         """The jobs that need an artifact."""
-        return list(self._column(sa.select(_references.c.job_id).where(_references.c.sha256 == sha256)))
+        return list(self._column(sa.select(REFERENCES.c.job_id).where(REFERENCES.c.sha256 == sha256)))
 
     def job_ids(self) -> list[str]:
         """The jobs that have results or references."""
-        return list(self._column(sa.union(sa.select(_references.c.job_id), sa.select(_results.c.job_id))))
+        return list(self._column(sa.union(sa.select(REFERENCES.c.job_id), sa.select(RESULTS.c.job_id))))
 
     def _column(self, query: Any) -> set[str]:
         with database_errors(), self._reading.connect() as connection:

@@ -14,7 +14,13 @@ from cow_service.jobs import workflows
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.queues import PREFIX
 from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.state import ATTRIBUTE_CREATED_AT, ATTRIBUTE_GENERATOR, ATTRIBUTE_QUEUE, ATTRIBUTE_TURN
+from cow_service.jobs.state import (
+    ATTRIBUTE_CREATED_AT,
+    ATTRIBUTE_GENERATOR,
+    ATTRIBUTE_PRIORITY,
+    ATTRIBUTE_QUEUE,
+    ATTRIBUTE_TURN,
+)
 
 
 class Dispatch:
@@ -47,6 +53,7 @@ def _attributes(job_id: str, spec: JobSpec, owner: str | None, queue: str) -> Ge
         ATTRIBUTE_CREATED_AT: spec.created_at,
         ATTRIBUTE_TURN: str(spec.turn),
         ATTRIBUTE_QUEUE: queue,
+        ATTRIBUTE_PRIORITY: spec.priority,
     }
     attributes = SetWorkflowAttributes(kept)
     with SetWorkflowID(job_id), DBOSContextSetAuth(owner, None), attributes:

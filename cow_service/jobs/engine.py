@@ -16,11 +16,7 @@ from dataclasses import replace
 from http import HTTPStatus
 from typing import Any, cast
 
-from dbos import (
-    DBOS,
-    DBOSConfig,
-    WorkflowHandle,
-)
+from dbos import DBOS, WorkflowHandle
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -31,20 +27,19 @@ from cow_service.errors import (
     JobNotFound,
     QueueFull,
     ShuttingDown,
-    StorageUnavailable,
 )
 from cow_service.jobs import state, workflows
 from cow_service.jobs.computing import Computer
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.dispatch import Dispatch
 from cow_service.jobs.in_process import InProcess
+from cow_service.jobs.launching import launch
 from cow_service.jobs.leases import lease_of
 from cow_service.jobs.maintenance import Maintenance
 from cow_service.jobs.news import JobNews, news_of
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.processes import Processes
-from cow_service.jobs.queues import WEBHOOKS, QueuePolls, queue_of
-from cow_service.jobs.serializer import JsonSerializer
+from cow_service.jobs.queues import QueuePolls, queue_of
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.state import (
     JobFilters,
@@ -53,6 +48,7 @@ from cow_service.jobs.state import (
 )
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.jobs.worker import JobAborted, Worker
+from cow_service.jobs.workflow_table import move_back
 from cow_service.media.images import DecodedImage
 from cow_service.records import TERMINAL, JobPage, ProcessRole
 from cow_service.requests import Stage
@@ -71,16 +67,16 @@ class JobEngine:
         self.open_jobs = OpenJobs(service)
         self._computer = computer or InProcess(self.open_jobs)
         self.active, self.database = self.open_jobs.active, self.open_jobs.database
-        self.webhooks = Webhooks(service.settings)
+        self.webhooks = Webhooks(service.settings, service.metrics)
         self._lease = lease_of(self.database, service.settings.data_dir / "executors")
-        self._polls = QueuePolls(self._computer.capacity)
+        self._polls = QueuePolls(self._computer.capacity, self._followed_of)
         self._news = news_of(self.database, self.active.awaited_elsewhere, state.ended_of)
         self._maintenance = Maintenance(self.open_jobs, self._lease, self._news)
         self.processes = Processes(self.open_jobs, self._computer, role)
         self._stopping = False
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
         self._dispatch = Dispatch()
-        self._followed: set[str] = set()  # jobs whose end a thread waits for
+        self._followed: dict[str, str] = {}  # the queues of jobs started at once, whose end a thread waits for
         self._submit_lock, self._cancel_lock = threading.Lock(), threading.Lock()
         self._threads: ThreadPoolExecutor | None = None
 
@@ -104,7 +100,7 @@ class JobEngine:
         self.service.artifacts.check()
         workflows.set_runner(Worker(self.open_jobs, self.webhooks, self._computer, self._news, self.work_ended))
         try:
-            self._launch()
+            launch(self.database, self.service.settings, self.service.artifacts.address, self._lease.acquire())
         except BaseException:
             self._lease.release()
             raise
@@ -116,30 +112,6 @@ class JobEngine:
         self._polls.start()
         self._news.start(self._hear)
         self._maintenance.start()
-
-    def _launch(self) -> None:
-        """Has DBOS run on the database. Of its queues it looks after that of the webhooks; `QueuePolls` has ours."""
-        self.database.create_tables()
-        self.database.claim(self.service.artifacts.address)
-        config = DBOSConfig(
-            name="cow",
-            system_database_url=self.database.url,
-            system_database_engine=self.database.engine,
-            application_version=workflows.VERSION,
-            executor_id=self._lease.acquire(),
-            serializer=JsonSerializer(),
-            use_listen_notify=False,
-            log_level="WARNING",
-        )
-        try:
-            DBOS(config=config)
-            DBOS.listen_queues([WEBHOOKS])
-            DBOS.launch()
-        except (SQLAlchemyError, dbos_error.DBOSException) as error:
-            DBOS.destroy()
-            raise StorageUnavailable(
-                f"The job database cannot be used ({type(error).__name__}): see COW_DATABASE_URL."
-            ) from error
 
     def drain(self) -> None:
         """Accepts no more jobs, and answers callers who wait for a job that does not run.
@@ -223,9 +195,11 @@ class JobEngine:
         with self.open_jobs.lock:  # the count must not change between the check and the record
             self.check_capacity(owner)
             queue = queue_of(spec.reader, spec.generator, self.service.settings)
-            starts_now = self.open_jobs.count(queue) < self._computer.capacity(queue)
-            spec = spec.model_copy(update={"turn": self.open_jobs.next_turn(owner)})
-            self.open_jobs.record(job_id, OpenJob(spec.generator, owner, spec.turn, queue, spec.created_at))
+            starts_now = self.open_jobs.count(queue) < self._computer.capacity(queue) and not self._runs_enough(owner)
+            turn = self.open_jobs.take_turn(owner, queue, spec.priority)
+            spec = spec.model_copy(update={"turn": turn.number})
+            opened = OpenJob(spec.generator, owner, spec.turn, queue, spec.created_at, spec.priority)
+            self.open_jobs.record(job_id, opened)
         self.active.expect(job_id)
         try:
             # Before the job exists: its image and masks must not be removed before work on it starts.
@@ -234,11 +208,18 @@ class JobEngine:
                 self.active.put_image(job_id, image)
                 self._start(job_id, spec, owner, queue)
             else:
+                if turn.moves_others:
+                    move_back(self.database.engine, owner, queue, spec.priority, turn.number, turn.step)
                 self._enqueue(job_id, spec, owner, queue)
         except BaseException:
             self.active.drop_image(job_id)
             self.open_jobs.record(job_id, None)
             raise
+
+    def _runs_enough(self, owner: str | None) -> bool:
+        """Whether another job of an owner must wait for the end of others of theirs."""
+        limit = self.service.settings.running_limit_per_key
+        return owner is not None and limit is not None and self.open_jobs.count_of(owner) >= limit
 
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> JobState:
         """The state of a job. Raises `JobNotFound`, also for the job of another owner."""
@@ -318,12 +299,12 @@ class JobEngine:
     def _start(self, job_id: str, spec: JobSpec, owner: str | None, queue: str) -> None:
         """Starts a job in this process; it is in the database when this returns."""
         assert self._threads is not None
-        self._followed.add(job_id)
+        self._followed[job_id] = queue
         try:
             handle = self._dispatch.start(job_id, spec, owner, queue)
             self._threads.submit(self._follow, job_id, spec.created_at, handle)
         except BaseException:
-            self._followed.discard(job_id)
+            self._followed.pop(job_id, None)
             raise
 
     def _follow(self, job_id: str, created_at: str, handle: WorkflowHandle[str]) -> None:
@@ -339,13 +320,18 @@ class JobEngine:
             if self._stopping:
                 return  # interrupted: it continues after the next start
         finally:
-            self._followed.discard(job_id)
+            self._followed.pop(job_id, None)
+            self._polls.wake()
         # A job of the same id, of a key that was used again after a deletion, may not have ended.
         if outcome is not None or self._has_ended(job_id):
             self.open_jobs.ended(job_id, outcome, created_at)
             self._news.tell(JobNews("ended", job_id))
         else:
             self.active.forget(job_id)
+
+    def _followed_of(self, queue: str) -> int:
+        """How many jobs of a queue were started without waiting in it, and are at work."""
+        return list(self._followed.values()).count(queue)
 
     def _has_ended(self, job_id: str) -> bool:
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import defaultdict
+from dataclasses import dataclass, replace
 
 from dbos import DBOS
 
@@ -13,8 +14,19 @@ from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.pace import Pace
 from cow_service.jobs.state import OpenJob
+from cow_service.jobs.turns import moves, next_turn, step_of
 from cow_service.jobs.webhooks import attempt_ids
+from cow_service.requests import Priority
 from cow_service.service import Service
+
+
+@dataclass(frozen=True)
+class Turn:
+    """When a new job comes to work, and whether jobs of its owner move back by `step` for it."""
+
+    number: int
+    step: int
+    moves_others: bool
 
 
 class OpenJobs:
@@ -56,16 +68,20 @@ class OpenJobs:
             pace = self._paces[own.queue].jobs_per_second()
         return {"position": before, "expected_wait": None if pace is None else round((before + 1) / pace, 1)}
 
-    def next_turn(self, owner: str | None) -> int:
-        """The turn of an owner's next job: behind their others, and no later than the first that is open of anybody.
-
-        Owners so take turns, however many jobs each of them has (start-time fair queuing, with the lowest turn that is
-        open for the time of the server).
-        """
+    def take_turn(self, owner: str | None, queue: str, priority: Priority) -> Turn:
+        """The turn of an owner's next job in a queue; moves back what comes behind it, here and not in the database."""
         with self.lock:
-            turns = [each.turn for each in self._open.values()]
-            own = [each.turn for each in self._open.values() if each.owner == owner]
-            return max(min(turns, default=0), max(own, default=-1) + 1)
+            step = step_of(self.service.settings.key_weights.get(owner or "", 1.0))
+            jobs = [each for each in self._open.values() if each.queue == queue]
+            turn = next_turn(jobs, owner, priority, step)
+            behind = [
+                (job_id, each)
+                for job_id, each in self._open.items()
+                if each.queue == queue and moves(each, owner, priority, turn)
+            ]
+            for job_id, each in behind:
+                self.record(job_id, replace(each, turn=each.turn + step))
+        return Turn(turn, step, bool(behind))
 
     def record(self, job_id: str, job: OpenJob | None) -> None:
         """A job is open, or, with None, no longer open."""

@@ -12,19 +12,12 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 
 from cow_service.jobs.database import database_errors
+from cow_service.jobs.tables import PROCESSES
 from cow_service.records import ProcessInfo
 
 ALIVE_SECONDS = 10.0  # since its last row, that a process is shown
 FORGOTTEN_SECONDS = 3600.0  # after which a row is deleted
 
-_table = sa.Table(
-    "cow_processes",
-    sa.MetaData(),
-    sa.Column("executor_id", sa.String(64), primary_key=True),
-    sa.Column("seen", sa.Float, nullable=False),  # Unix time, s
-    sa.Column("info", sa.Text, nullable=False),  # a `ProcessInfo` as JSON
-    sa.Column("waiting", sa.Text, nullable=False),  # ids of jobs that it has taken and not begun, as JSON
-)
 _NOW = {
     "sqlite": "(julianday('now') - 2440587.5) * 86400.0",
     "postgresql": "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS double precision)",
@@ -48,11 +41,6 @@ class ProcessTable:
         self._engine = engine
         self._now = _NOW[engine.dialect.name]
 
-    def create(self) -> None:
-        """Makes the table where it is missing."""
-        with database_errors():
-            _table.create(self._engine, checkfirst=True)
-
     def write(self, info: ProcessInfo, waiting: list[str]) -> None:
         """Notes that a process is alive, what it does, and which jobs it has not begun; deletes rows of those long
         gone."""
@@ -72,7 +60,7 @@ class ProcessTable:
     def remove(self, executor_id: str) -> None:
         """Deletes the row of a process that ends."""
         with database_errors(), self._engine.begin() as connection:
-            connection.execute(sa.delete(_table).where(_table.c.executor_id == executor_id))
+            connection.execute(sa.delete(PROCESSES).where(PROCESSES.c.executor_id == executor_id))
 
     def alive(self) -> Alive:
         """Who was seen in the last `ALIVE_SECONDS`."""
@@ -94,4 +82,4 @@ class ProcessTable:
     def exists(self) -> bool:
         """Whether a process of this version ever used the database."""
         with database_errors():
-            return sa.inspect(self._engine).has_table(_table.name)
+            return sa.inspect(self._engine).has_table(PROCESSES.name)

@@ -72,9 +72,6 @@ class Processes:
         return tuple(map(self._info, self._computer.workers()))
 
     def _tell_on(self) -> None:
-        while not self._try(self._table.create):
-            if self._stop.wait(TELL_SECONDS):
-                return
         capacities = ((name, self._computer.capacity(name)) for name in known_queues(self._open_jobs.service.settings))
         self._queues = {name: capacity for name, capacity in capacities if capacity > 0}
         while not self._stop.is_set():
@@ -97,14 +94,12 @@ class Processes:
             self._open_jobs.active.ids_of_waiting(),
         )
 
-    def _try(self, work: Callable[[], None]) -> bool:
-        """Whether work succeeded: what is told is for people, and no job depends on it."""
+    def _try(self, work: Callable[[], None]) -> None:
+        """Does it, and goes on where it fails: what is told is for people, and no job depends on it."""
         try:
             work()
         except CowError as error:
             log.warning("what this process does could not be told: %s", error.detail)
-            return False
-        return True
 
     def _info(self, state: WorkerState) -> WorkerInfo:
         return WorkerInfo(

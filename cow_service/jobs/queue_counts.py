@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from datetime import datetime
 
 import sqlalchemy as sa
-from sqlalchemy.sql.selectable import TableClause
 
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.queues import LIGHT
@@ -19,9 +18,9 @@ from cow_service.jobs.state import (
     KINDS,
     OPEN,
 )
+from cow_service.jobs.workflow_table import workflow_table
 
 RATE_SECONDS = 300.0  # over which ended jobs are counted
-SCHEMA = "dbos"  # of the tables of DBOS in PostgreSQL; in SQLite they have none
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ def open_counts(engine: sa.Engine, waiting: Iterable[str]) -> list[OpenCount]:
 
     Raises `StorageUnavailable`.
     """
-    table = _workflows(engine)
+    table = workflow_table(engine)
     attributes = table.c.attributes
     runs = sa.and_(table.c.status == "PENDING", table.c.workflow_uuid.not_in(list(waiting)))
     groups = (
@@ -66,14 +65,14 @@ def open_counts(engine: sa.Engine, waiting: Iterable[str]) -> list[OpenCount]:
 
 def has_jobs(engine: sa.Engine) -> bool:
     """Whether a database has the table of DBOS. Raises `StorageUnavailable`."""
-    table = _workflows(engine)
+    table = workflow_table(engine)
     with database_errors():
         return sa.inspect(engine).has_table(table.name, schema=table.schema)
 
 
 def ended_lately(engine: sa.Engine) -> dict[str, int]:
     """How many jobs of each queue ended, well or not, in the last `RATE_SECONDS`. Raises `StorageUnavailable`."""
-    table = _workflows(engine)
+    table = workflow_table(engine)
     queue = sa.func.coalesce(table.c.attributes[ATTRIBUTE_QUEUE].as_string(), LIGHT)
     since = int((time.time() - RATE_SECONDS) * 1000)
     query = (
@@ -83,19 +82,6 @@ def ended_lately(engine: sa.Engine) -> dict[str, int]:
     )
     with database_errors(), engine.connect() as connection:
         return {row[0]: row[1] for row in connection.execute(query)}
-
-
-def _workflows(engine: sa.Engine) -> TableClause:
-    return sa.table(
-        "workflow_status",
-        sa.column("workflow_uuid", sa.Text),
-        sa.column("name", sa.Text),
-        sa.column("status", sa.Text),
-        sa.column("application_version", sa.Text),
-        sa.column("completed_at", sa.BigInteger),  # Unix time, ms
-        sa.column("attributes", sa.JSON),
-        schema=SCHEMA if engine.dialect.name == "postgresql" else None,
-    )
 
 
 def _age(created_at: str | None) -> float:

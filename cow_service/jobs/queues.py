@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from dbos import DBOS
@@ -16,7 +17,7 @@ from dbos import _dbos as dbos_instances  # pyright: ignore[reportPrivateUsage]
 from dbos import _queue as dbos_queue  # pyright: ignore[reportPrivateUsage]
 from sqlalchemy.exc import SQLAlchemyError
 
-from cow_service.settings import Settings
+from cow_service.settings import Settings, SettingsError
 from cow_service.weights.manifests import find_manifest, load_manifests
 
 LIGHT = "light"
@@ -53,11 +54,28 @@ def known_queues(settings: Settings) -> tuple[str, ...]:
     return LIGHT, *dict.fromkeys([*with_device, *settings.generator_concurrency])
 
 
+def check_queues(settings: Settings) -> None:
+    """Raises `SettingsError` where COW_QUEUES names what is no queue here."""
+    known = known_queues(settings)
+    for name in settings.queues:
+        if name in known:
+            continue
+        manifest = find_manifest(name)
+        if manifest is None or manifest.concurrency is None:
+            remedy = (
+                f"There are {', '.join(known)}; {LIGHT} has the jobs of all backends without a device of their own."
+            )
+        else:
+            remedy = f"{name} lacks {', '.join(manifest.missing_modules())}: {manifest.install_line()}."
+        raise SettingsError(f"Bad settings: COW_QUEUES has no queue {name[:64]!r} here. {remedy}")
+
+
 class QueuePolls:
     """Threads that take jobs from the queues of which this process has a capacity."""
 
-    def __init__(self, capacity: Callable[[str], int]) -> None:
-        self._capacity = capacity
+    def __init__(self, capacity: Callable[[str], int], taken: Callable[[str], int]) -> None:
+        """By the name of a queue: the jobs that are computed at the same time, and those that did not wait in it."""
+        self._capacity, self._taken = capacity, taken
         self._polls: dict[str, tuple[threading.Thread, _Waking]] = {}
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -100,18 +118,30 @@ class QueuePolls:
         capacity = self._capacity(name.removeprefix(PREFIX))
         if capacity == 0:
             return
-        # A queue of this process alone: the capacity of one that DBOS reads from the database would be everybody's.
-        queue = dbos_queue.Queue(
-            name,
-            worker_concurrency=capacity,
-            polling_interval_sec=POLL_SECONDS,
-            token=dbos_queue._INTERNAL_QUEUE_CONSTRUCTION,  # pyright: ignore[reportPrivateUsage]
-        )
+        queue = _Queue(name, capacity, partial(self._taken, name.removeprefix(PREFIX)))
         waking = _Waking()
         given: tuple[Any, ...] = waking, dbos_instances._get_dbos_instance(), queue  # pyright: ignore[reportPrivateUsage]
         thread = threading.Thread(target=dbos_queue.queue_worker_thread, args=given, name=name, daemon=True)
         thread.start()
         self._polls[name] = thread, waking
+
+
+class _Queue(dbos_queue.Queue):
+    """A queue of this process alone: the capacity of one that DBOS reads from the database would be everybody's."""
+
+    def __init__(self, name: str, capacity: int, taken: Callable[[], int]) -> None:
+        self._taken = taken
+        token = dbos_queue._INTERNAL_QUEUE_CONSTRUCTION  # pyright: ignore[reportPrivateUsage]
+        super().__init__(name, worker_concurrency=capacity, polling_interval_sec=POLL_SECONDS, token=token)
+
+    @property
+    def _worker_concurrency(self) -> int | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The capacity less the jobs that were started at once: DBOS counts only those from the queue."""
+        return None if self._capacity is None else max(0, self._capacity - self._taken())
+
+    @_worker_concurrency.setter
+    def _worker_concurrency(self, capacity: int | None) -> None:
+        self._capacity = capacity
 
 
 class _Waking(threading.Event):

@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import Field
 
 from cow_service.records import JobKind, Record
-from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.requests import AnswerRequest, Priority, SimulateRequest
 from cow_service.stages.results import digest_of
 
 
@@ -21,6 +21,7 @@ class JobSpec(Record):
     created_at: str = Field(description="RFC 3339, UTC.")
     fresh: bool = Field(default=False, description="Take no results of other jobs.")
     webhook: str | None = Field(default=None, description="URL to call when the job has ended.")
+    priority: Priority = Field(default="normal", description="Among the waiting jobs of its key.")
     turn: int = Field(default=0, ge=0, description="Its place among the jobs of all keys: the lower comes first.")
     request_id: str | None = None
     traceparent: str | None = None

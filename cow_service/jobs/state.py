@@ -17,10 +17,12 @@ from cow_service.jobs.database import database_errors
 from cow_service.jobs.queues import LIGHT
 from cow_service.observability.timestamps import rfc3339
 from cow_service.records import Answer, Job, JobKind, JobPage, JobStatus, Problem, Simulation
+from cow_service.requests import Priority
 
 KINDS: tuple[JobKind, ...] = get_args(JobKind)
 # What DBOS keeps beside a workflow.
-ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT, ATTRIBUTE_TURN, ATTRIBUTE_QUEUE = "generator", "created_at", "turn", "queue"
+ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT, ATTRIBUTE_QUEUE = "generator", "created_at", "queue"
+ATTRIBUTE_TURN, ATTRIBUTE_PRIORITY = "turn", "priority"
 STATUS: dict[str, JobStatus] = {
     "ENQUEUED": "queued",
     "DELAYED": "queued",
@@ -134,6 +136,7 @@ class OpenJob:
     turn: int = 0
     queue: str = LIGHT
     created_at: str = ""
+    priority: Priority = "normal"
 
 
 def open_jobs() -> dict[str, OpenJob]:
@@ -142,9 +145,10 @@ def open_jobs() -> dict[str, OpenJob]:
         one.workflow_id: OpenJob(
             _attribute(one, ATTRIBUTE_GENERATOR),
             one.authenticated_user,
-            int(_attribute(one, ATTRIBUTE_TURN) or 0),
+            _turn(one),
             queue_of(one),
             _attribute(one, ATTRIBUTE_CREATED_AT),
+            cast(Priority, _attribute(one, ATTRIBUTE_PRIORITY) or "normal"),
         )
         for one in workflows_of_jobs(status=OPEN)
     }
@@ -180,6 +184,11 @@ def ended_of(jobs: list[str]) -> list[str]:
 def existing(jobs: list[str], owner: str | None = None) -> set[str]:
     """Those of some jobs that the database knows, of an owner where one is given."""
     return {one.workflow_id for one in workflows_of_jobs(workflow_ids=jobs, user=owner)}
+
+
+def _turn(status: WorkflowStatus) -> int:
+    """That of one in a queue is its priority number in DBOS less one: it may have moved back since it came."""
+    return status.priority - 1 if status.priority else int(_attribute(status, ATTRIBUTE_TURN) or 0)
 
 
 def _attribute(status: WorkflowStatus, name: str) -> str:

@@ -22,6 +22,7 @@ from cow_service.errors import WebhookNotAllowed
 from cow_service.jobs import workflows
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.queues import WEBHOOKS
+from cow_service.observability.metrics import Metrics
 from cow_service.records import Job
 from cow_service.settings import Settings
 
@@ -42,8 +43,8 @@ log = logging.getLogger("cow_service")
 class Webhooks:
     """Signs and sends. Tests give an `egress` of their own."""
 
-    def __init__(self, settings: Settings, egress: Egress | None = None) -> None:
-        self._secret = settings.webhook_secret
+    def __init__(self, settings: Settings, metrics: Metrics, egress: Egress | None = None) -> None:
+        self._secret, self._metrics = settings.webhook_secret, metrics
         self._given = egress
         self._registered = False
 
@@ -84,18 +85,22 @@ class Webhooks:
             status = self._egress.post(url, body, self._headers(message, body))
         except NotAllowed as error:
             log.warning("webhook of job %s: %s", job.id, error)
+            self._metrics.webhook("not-allowed")
             return None  # a retry would not be allowed either
         except Unreachable as error:
             log.info("webhook of job %s, attempt %d: %s", job.id, attempt, error)
             status = None
         if status in SUCCESS or status == GONE:
+            self._metrics.webhook("delivered" if status in SUCCESS else "gone")
             return None
+        self._metrics.webhook("unreachable" if status is None else "refused")
         return self.wait_after(job.id, attempt, f"the last answer was {status}")
 
     def wait_after(self, job_id: str, attempt: int, reason: str) -> float | None:
         """Seconds until the attempt after this one; None after the last."""
         if attempt > len(RETRY_SECONDS):
             log.warning("webhook of job %s: given up after %d attempts, %s", job_id, attempt, reason)
+            self._metrics.webhook_given_up()
             return None
         return RETRY_SECONDS[attempt - 1] * random.uniform(1 - JITTER, 1 + JITTER)  # so that retries spread
 

@@ -65,6 +65,15 @@ class Metrics:
         self._worker_ends = Counter(
             "cow_worker_ends", "Worker processes that ended, and why.", ("reason",), registry=registry
         )
+        self._webhooks = Counter(
+            "cow_webhook_attempts",
+            "Attempts to call a webhook, and what came of them.",
+            ("outcome",),
+            registry=registry,
+        )
+        self._webhooks_given_up = Counter(
+            "cow_webhooks_given_up", "Webhooks that were not delivered after the last attempt.", registry=registry
+        )
         ProcessCollector(registry=registry)
         registry.register(_Gauges(self))
 
@@ -88,6 +97,14 @@ class Metrics:
     def worker_ended(self, reason: str) -> None:
         """One worker process that `crashed`, was `frozen`, took too much `memory`, ... or was `stopped`."""
         self._worker_ends.labels(reason).inc()
+
+    def webhook(self, outcome: str) -> None:
+        """One attempt that was `delivered`, `refused`, `unreachable`, `gone` or `not-allowed`."""
+        self._webhooks.labels(outcome).inc()
+
+    def webhook_given_up(self) -> None:
+        """One webhook whose last attempt has failed."""
+        self._webhooks_given_up.inc()
 
     def serve(self, host: str, port: int) -> None:
         """Serves the exposition over HTTP, on every path, until the process ends. Raises `OSError`."""

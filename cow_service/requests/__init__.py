@@ -9,10 +9,19 @@ from cow_service.requests.motion import (
     TrajectoryRequest,
 )
 from cow_service.requests.places import GroundingRequest, ObjectRequest, PlaceRequest
-from cow_service.requests.simulation import AnswerRequest, FramesRequest, OptionRequest, SimulateRequest, Stage
+from cow_service.requests.simulation import (
+    PRIORITIES,
+    AnswerRequest,
+    FramesRequest,
+    OptionRequest,
+    Priority,
+    SimulateRequest,
+    Stage,
+)
 from cow_service.requests.values import Finite, Flag, ImageArtifact, ImageRef, ImageUrl, MaskRef, Whole
 
 __all__ = [
+    "PRIORITIES",
     "AnswerRequest",
     "CameraRequest",
     "Finite",
@@ -30,6 +39,7 @@ __all__ = [
     "OptionRequest",
     "OtherMotionRequest",
     "PlaceRequest",
+    "Priority",
     "SimulateRequest",
     "Stage",
     "TrajectoryRequest",

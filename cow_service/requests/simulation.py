@@ -15,6 +15,8 @@ from cow_service.requests.places import MAX_OBJECTS, GroundingRequest, ObjectReq
 from cow_service.requests.values import Finite, Flag, ImageRef, MaskRef, Name, Whole, Words, writable
 
 MAX_FRAMES = 481
+Priority = Literal["low", "normal", "high"]
+PRIORITIES: tuple[Priority, ...] = ("low", "normal", "high")
 MAX_OPTIONS = 26
 MAX_OPTION_LEVELS = 8
 
@@ -104,6 +106,11 @@ class SimulateRequest(Record):
     video: Flag = Field(default=True, description="Whether to make the mp4 of the whole clip.")
     frames: FramesRequest = FramesRequest()
     generator_options: dict[str, Any] = Field(default_factory=dict, description="As the generator defines them.")
+    priority: Priority = Field(
+        default="normal",
+        description="Among the jobs that wait with the same API key: the higher come first. The share of the key stays "
+        "what it is.",
+    )
     webhook: str | None = Field(
         default=None,
         min_length=1,
