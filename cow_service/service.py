@@ -20,7 +20,7 @@ from cow_service.errors import (
 )
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifact_stores import open_artifact_store
-from cow_service.media.artifacts import media_type_of
+from cow_service.media.artifacts import Patience, media_type_of, try_once
 from cow_service.media.data_urls import decode_data_url
 from cow_service.media.images import DecodedImage, decode
 from cow_service.net.images import ImageUrls
@@ -95,6 +95,7 @@ class Service:
         progress: Progress = ignore_progress,
         image: DecodedImage | None = None,
         step: Step = compute_directly,
+        patience: Patience = try_once,
         run_id: str | None = None,
         created_at: str | None = None,
         turn: int = 0,
@@ -112,7 +113,7 @@ class Service:
         # Also with an image at hand: a run begins in its turn, and its job counts as queued until then.
         with self.cpu.held(priority_of(turn, created_at), partial(progress, None, 0.0)):
             image = image or self.image_of(request.image)[1]
-        return Run(request, image, backends, progress, step, run_id or str(uuid.uuid4()), created_at, turn)
+        return Run(request, image, backends, progress, step, patience, run_id or str(uuid.uuid4()), created_at, turn)
 
     def keep_masks(self, request: Request) -> Request:
         """The request with its masks as artifacts: those that are data URLs are kept, and not decoded before they are

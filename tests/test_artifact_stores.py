@@ -87,6 +87,22 @@ def test_what_a_killed_process_left_goes_after_a_while(store, settings):
         assert not list(settings.data_dir.rglob("*.part"))
 
 
+def test_every_put_of_a_batch_is_done_by_the_patience_of_its_owner(store):
+    done = []
+
+    def patience(work):
+        done.append(work())
+        return done[-1]
+
+    with store.batch(patience) as batch:
+        first = batch.put(DATA, "image/png")
+        batch.put(DATA, "image/png")  # one that is known to be there is asked for with the same patience
+        with batch.scratch() as path:
+            path.write_bytes(DATA * 2)
+            clip = batch.put_file(path, "video/mp4")
+    assert sorted(each.sha256 for each in done) == sorted(each.sha256 for each in (first, first, clip))
+
+
 def test_a_batch_is_there_when_its_block_ends(store):
     with store.batch() as batch:
         artifacts = [batch.put(name.encode() * 500, "image/png") for name in ("ab", "cd", "ef")]
@@ -178,8 +194,6 @@ def test_a_store_that_is_away_or_refuses_is_a_typed_error(objects, store_of_obje
         absent.check()
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     away = open_artifact_store(Settings(data_dir=tmp_path, artifacts=objects.url))
-
-    monkeypatch.setattr(away, "_patient_store", away.__dict__["_store"])  # nobody waits for a minute here
 
     def put_in_a_batch() -> None:
         with away.batch() as batch:

@@ -243,6 +243,7 @@ class Submitter:
         if created_at not in (None, found.job.created_at):
             raise Canceled("The job was deleted before it was done.")
         if found.job.status not in TERMINAL:
+            self.engine.storage.check()
             return None
         if found.error is not None:
             raise found.error

@@ -19,12 +19,16 @@ BEGIN_SECONDS = 10.0  # within which a job that was taken from its queue begins
 STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation the last is left out
 
 
+At = tuple[Stage | None, float]
+"""A stage, and the share of it that is done."""
+
+
 @dataclass
 class ActiveJob:
     """One job that this process works on."""
 
     kind: JobKind
-    at: tuple[Stage | None, float] = (None, 0.0)  # the stage, and the share of it that is done: one value, read at once
+    at: At = (None, 0.0)  # one value, read at once
     cancel_requested: threading.Event = field(default_factory=threading.Event)
     begun: float | None = None  # when its first stage began (`time.monotonic`)
     finished: bool = False  # the work is over, though the database may not have its outcome yet
@@ -71,7 +75,7 @@ class ActiveJobs:
         self._lock = threading.Lock()
         self._running: dict[str, ActiveJob] = {}
         self._canceled: dict[str, float] = {}  # when the end of jobs was requested that did not run
-        self._elsewhere: dict[str, tuple[Stage | None, float]] = {}  # how far jobs are that other processes run
+        self._elsewhere: dict[str, At] = {}  # how far jobs are that other processes run
         self._waiters: dict[str, list[Waiter]] = {}
         self._images: dict[str, DecodedImage] = {}
 
@@ -124,10 +128,18 @@ class ActiveJobs:
         with self._lock:
             return self._running.get(job)
 
-    def at(self, job: str) -> tuple[Stage | None, float] | None:
+    def at(self, job: str) -> At | None:
         """The stage and the share of it that is done, of a job that any process runs; None where that is not known."""
         active = self.get(job)
         return self._elsewhere.get(job) if active is None else active.at
+
+    def all_at(self) -> dict[str, At]:
+        """As `at`, of all jobs of which it is known.
+
+        To be asked before the database is: a job may end in between, and would seem not to have begun.
+        """
+        with self._lock:
+            return self._elsewhere | {job: active.at for job, active in self._running.items()}
 
     def heard(self, job: str, stage: Stage | None, done: float) -> None:
         """Another process told how far a job is; wakes its waiters."""

@@ -117,7 +117,7 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     )
     request = spec.parsed()
     assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
-    given = work.progress, work.image(), step, work.job_id, spec.created_at, spec.turn
+    given = work.progress, work.image(), step, outages.wait_through, work.job_id, spec.created_at, spec.turn
     if isinstance(request, AnswerRequest):
         result = answer(outages.wait_through(lambda: service.prepare(request, *given)))
     else:

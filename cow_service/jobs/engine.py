@@ -40,12 +40,14 @@ from cow_service.jobs.news import JobNews, news_of
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.processes import Processes
 from cow_service.jobs.queues import QueuePolls, queue_of
+from cow_service.jobs.retries import without_retries
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.state import (
     JobFilters,
     JobState,
     OpenJob,
 )
+from cow_service.jobs.storage_check import StorageCheck
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.jobs.worker import JobAborted, Worker
 from cow_service.jobs.workflow_table import move_back
@@ -79,6 +81,7 @@ class JobEngine:
         self._followed: dict[str, str] = {}  # the queues of jobs started at once, whose end a thread waits for
         self._submit_lock, self._cancel_lock = threading.Lock(), threading.Lock()
         self._threads: ThreadPoolExecutor | None = None
+        self.storage = StorageCheck(lambda: self.service.artifacts)
 
     @property
     def service(self) -> Service:
@@ -170,6 +173,7 @@ class JobEngine:
                 "again when some of them have ended."
             )
 
+    @without_retries
     def submit(self, job_id: str, spec: JobSpec, owner: str | None, key: str | None, image: DecodedImage) -> bool:
         """Accepts a job; returns whether it is new. It is in the database when this returns.
 
@@ -221,6 +225,7 @@ class JobEngine:
         limit = self.service.settings.running_limit_per_key
         return owner is not None and limit is not None and self.open_jobs.count_of(owner) >= limit
 
+    @without_retries
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> JobState:
         """The state of a job. Raises `JobNotFound`, also for the job of another owner."""
         self.database.check_server()
@@ -231,11 +236,13 @@ class JobEngine:
             return replace(found, job=found.job.model_copy(update=self.open_jobs.place_in_line(job_id)))
         return found
 
+    @without_retries
     def page(self, owner: str | None, filters: JobFilters) -> JobPage:
         """Jobs of an owner, newest first."""
         self.database.check_server()
         return state.page(owner, filters, self.active)
 
+    @without_retries
     def cancel(self, job_id: str, owner: str | None) -> JobState:
         """Cancels a job unless it has ended; a worker stops at its next step."""
         with self._cancel_lock:  # one at a time: a job that has ended does not change
@@ -256,6 +263,7 @@ class JobEngine:
             self.service.metrics.job(found.job.kind, "canceled")
         return found
 
+    @without_retries
     def delete(self, job_id: str, owner: str | None) -> None:
         """Cancels a job if it has not ended, and removes it with the artifacts that no other job refers to."""
         found = self.find(job_id, owner, full=False)
@@ -263,6 +271,7 @@ class JobEngine:
             found = self.cancel(job_id, owner)
         self.open_jobs.remove([job_id], found.ended or 0)
 
+    @without_retries
     def may_read(self, sha256: str, owner: str | None) -> None:
         """Raises `ArtifactNotFound` for an artifact that no job of the owner refers to."""
         if owner is None:

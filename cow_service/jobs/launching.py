@@ -11,6 +11,7 @@ from cow_service.jobs import workflows
 from cow_service.jobs.database import Database
 from cow_service.jobs.migration import USE_LISTEN_NOTIFY
 from cow_service.jobs.queues import WEBHOOKS
+from cow_service.jobs.retries import let_callers_not_wait
 from cow_service.jobs.running_limit import bound_running_jobs
 from cow_service.jobs.serializer import JsonSerializer
 from cow_service.settings import Settings
@@ -45,5 +46,6 @@ def launch(database: Database, settings: Settings, artifacts: str, executor_id: 
         DBOS.destroy()
         remedy = "see COW_DATABASE_URL" if settings.migrate else "run `cow migrate` first, and see COW_DATABASE_URL"
         raise StorageUnavailable(f"The job database cannot be used ({type(error).__name__}): {remedy}.") from error
+    let_callers_not_wait()
     if settings.running_limit_per_key is not None:
         bound_running_jobs(settings.running_limit_per_key)

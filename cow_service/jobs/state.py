@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, cast, get_args
@@ -12,7 +13,7 @@ from typing import Any, cast, get_args
 from dbos import DBOS, WorkflowStatus
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest
-from cow_service.jobs.active import ActiveJobs, share_done
+from cow_service.jobs.active import ActiveJobs, At, share_done
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.queues import LIGHT
 from cow_service.observability.timestamps import rfc3339
@@ -71,8 +72,9 @@ class JobState:
 
 def find(job_id: str, active: ActiveJobs, *, full: bool = True) -> JobState | None:
     """A job by its id; without its result and problem unless `full`."""
+    at = active.all_at()
     found = workflows_of_jobs(workflow_ids=[job_id], load_output=full)
-    return _state(found[0], active) if found else None
+    return _state(found[0], at) if found else None
 
 
 def page(owner: str | None, filters: JobFilters, active: ActiveJobs) -> JobPage:
@@ -84,11 +86,12 @@ def page(owner: str | None, filters: JobFilters, active: ActiveJobs) -> JobPage:
     jobs: list[Job] = []
     while True:
         most = max(filters.limit, MIN_BATCH) if after or latest or filters.status else filters.limit
+        at = active.all_at()
         rest = [one for one in _listed(owner, filters, before, most + len(seen) + 1) if one.workflow_id not in seen]
         taken = 0
         for one in rest[:most]:
             taken += 1
-            job = _state(one, active).job
+            job = _state(one, at).job
             came = datetime.fromisoformat(job.created_at)
             fits = not filters.status or job.status in filters.status
             if fits and (after is None or after <= came) and (latest is None or came <= latest):
@@ -195,10 +198,10 @@ def _attribute(status: WorkflowStatus, name: str) -> str:
     return (status.attributes or {}).get(name, "")
 
 
-def _state(status: WorkflowStatus, active: ActiveJobs) -> JobState:
+def _state(status: WorkflowStatus, all_at: Mapping[str, At]) -> JobState:
     kind = cast(JobKind, status.name)
     shown = STATUS[status.status]
-    at = active.at(status.workflow_id) if shown == "running" else None
+    at = all_at.get(status.workflow_id) if shown == "running" else None
     stage, progress = None, 1.0 if shown == "succeeded" else 0.0
     if at is not None:
         stage, done = at

@@ -7,11 +7,11 @@ and they come back when the same bytes are sent or computed again.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from cow_service.errors import ArtifactNotFound
 from cow_service.records import Artifact
@@ -24,6 +24,8 @@ MEDIA_TYPES = {
     "application/json": "json",
 }
 MAX_VERIFIED = 10_000  # digests that a process remembers to have compared with their bytes
+
+Value = TypeVar("Value")
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -47,6 +49,19 @@ class ListedArtifact:
     sha256: str
     size: int  # bytes
     used_at: float
+
+
+class Patience(Protocol):
+    """Does what writes to a store, and tries it again while the store is away, for as long as its owner waits."""
+
+    def __call__(self, work: Callable[[], Value], /) -> Value:
+        """What `work` returns. Raises `StorageUnavailable` after the last try, and `Canceled`."""
+        ...
+
+
+def try_once(work: Callable[[], Value], /) -> Value:
+    """A `Patience` that has none."""
+    return work()
 
 
 class ArtifactWriter(Protocol):
@@ -107,10 +122,11 @@ class ArtifactStore(ArtifactWriter, Protocol):
         """All artifacts, in no particular order."""
         ...
 
-    def batch(self) -> AbstractContextManager[ArtifactWriter]:
+    def batch(self, patience: Patience = try_once) -> AbstractContextManager[ArtifactWriter]:
         """A writer several of whose puts may run at the same time; all are done when its block ends.
 
-        The end of the block raises what any of them raises.
+        Each of them is done by `patience`: what is written took long to make, and is not made again for an outage. The
+        end of the block raises what any of them raises.
         """
         ...
 

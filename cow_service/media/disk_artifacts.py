@@ -12,7 +12,7 @@ import logging
 import os
 import threading
 from collections.abc import Generator, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -26,11 +26,13 @@ from cow_service.media.artifacts import (
     MEDIA_TYPES,
     ArtifactWriter,
     ListedArtifact,
+    Patience,
     artifact_of,
     check_digest,
     extension_of,
     is_digest,
     not_found,
+    try_once,
 )
 from cow_service.media.temporary_files import remove_temporary_files, temporary_beside
 from cow_service.records import Artifact
@@ -147,9 +149,9 @@ class DiskArtifacts:
             yield path
 
     @contextmanager
-    def batch(self) -> Generator[ArtifactWriter]:
-        """The store itself: one disk writes no faster for several threads."""
-        yield self
+    def batch(self, patience: Patience = try_once) -> Generator[ArtifactWriter]:
+        """One after another: a disk writes no faster for several threads."""
+        yield _Batch(self, patience)
 
     def remove_leftovers(self, untouched_since: float) -> None:
         """Looks for them beside the artifacts."""
@@ -221,6 +223,22 @@ class DiskArtifacts:
         if stored is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
         return stored.artifact
+
+
+class _Batch:
+    """An `ArtifactWriter` that waits while the disk is full or away."""
+
+    def __init__(self, store: DiskArtifacts, patience: Patience) -> None:
+        self._store, self._patience = store, patience
+
+    def put(self, data: bytes, media_type: str) -> Artifact:
+        return self._patience(lambda: self._store.put(data, media_type))
+
+    def put_file(self, path: Path, media_type: str) -> Artifact:
+        return self._patience(lambda: self._store.put_file(path, media_type))
+
+    def scratch(self) -> AbstractContextManager[Path]:
+        return self._store.scratch()
 
 
 def _state(path: Path) -> tuple[int, ...]:

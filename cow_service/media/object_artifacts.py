@@ -31,11 +31,13 @@ from cow_service.media.artifacts import (
     MEDIA_TYPES,
     ArtifactWriter,
     ListedArtifact,
+    Patience,
     artifact_of,
     check_digest,
     extension_of,
     is_digest,
     not_found,
+    try_once,
 )
 from cow_service.media.object_batch import ObjectBatch, scratch_errors, take_file
 from cow_service.media.temporary_files import remove_temporary_files, temporary_beside
@@ -44,9 +46,7 @@ from cow_service.settings import SettingsError
 
 RENEWED_AFTER_SECONDS = 300.0
 REQUEST_SECONDS, CONNECT_SECONDS = 8.0, 3.0  # that a request with its bytes, and a connection, may take
-RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request that somebody may wait for
-# Of the bytes of a clip, which took long to make; an outage that lasts longer is waited for by the job.
-PATIENT_RETRY_SECONDS, MAX_PATIENT_RETRIES = 60.0, 1000
+RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request
 FIRST_BACKOFF_SECONDS, MAX_BACKOFF_SECONDS = 0.1, 2.0
 MAX_PARALLEL = 8  # requests for one job
 CHECKED = "check"  # the object that shows that the store can be written and read
@@ -74,8 +74,7 @@ class ObjectArtifacts:
         self._scratch_folder = scratch_folder
         self._verified: dict[str, str] = {}  # ETags of the objects whose bytes were compared with their digests
         self._guard = threading.Lock()
-        self._store = _open(url, MAX_RETRIES, RETRY_SECONDS)
-        self._patient_store = _open(url, MAX_PATIENT_RETRIES, PATIENT_RETRY_SECONDS)
+        self._store = _open(url)
 
     @property
     def address(self) -> str:
@@ -101,7 +100,7 @@ class ObjectArtifacts:
         check_digest(sha256)
         found, data = self._fetch(sha256)
         if not found.is_fresh:
-            self._send(sha256, data, found.artifact.media_type, self._store)
+            self._send(sha256, data, found.artifact.media_type)
         return data
 
     def touch(self, *sha256: str) -> None:
@@ -166,10 +165,14 @@ class ObjectArtifacts:
             yield path
 
     @contextmanager
-    def batch(self) -> Generator[ArtifactWriter]:
+    def batch(self, patience: Patience = try_once) -> Generator[ArtifactWriter]:
         """Sends in threads."""
+
+        def send(sha256: str, data: bytes, media_type: str) -> Artifact:
+            return patience(partial(self._put, sha256, data, media_type))
+
         with ThreadPoolExecutor(MAX_PARALLEL, thread_name_prefix="cow-artifacts") as pool:
-            batch = ObjectBatch(pool, partial(self._put, patiently=True), self.scratch)
+            batch = ObjectBatch(pool, send, self.scratch)
             yield batch
             batch.wait()
 
@@ -184,12 +187,12 @@ class ObjectArtifacts:
             obstore.put(self._store, CHECKED, b"\0", use_multipart=False)
             obstore.get(self._store, CHECKED).bytes()
 
-    def _put(self, sha256: str, data: bytes, media_type: str, *, patiently: bool = False) -> Artifact:
+    def _put(self, sha256: str, data: bytes, media_type: str) -> Artifact:
         if sha256 in self._verified:
             found = self._head(sha256)
             if found is not None and found.is_fresh and self._is_verified(found):
                 return found.artifact
-        self._send(sha256, data, media_type, self._patient_store if patiently else self._store)
+        self._send(sha256, data, media_type)
         return artifact_of(sha256, media_type, len(data))
 
     def _found(self, sha256: str) -> _Object:
@@ -223,11 +226,11 @@ class ObjectArtifacts:
         self._note_verified(sha256, found.e_tag)
         return found, data
 
-    def _send(self, sha256: str, data: bytes, media_type: str, store: Any) -> None:
+    def _send(self, sha256: str, data: bytes, media_type: str) -> None:
         with _store_errors():
             # In one piece: an upload in parts takes three requests and more.
             attributes = {"Content-Type": media_type}
-            result = obstore.put(store, sha256, data, attributes=attributes, use_multipart=False)
+            result = obstore.put(self._store, sha256, data, attributes=attributes, use_multipart=False)
         self._note_verified(sha256, result["e_tag"])
 
     def _remove(self, sha256: str) -> None:
@@ -247,7 +250,7 @@ class ObjectArtifacts:
                 self._verified[sha256] = e_tag
 
 
-def _open(url: str, max_retries: int, retry_seconds: float) -> Any:
+def _open(url: str) -> Any:
     try:
         return from_url(
             url,
@@ -257,8 +260,8 @@ def _open(url: str, max_retries: int, retry_seconds: float) -> Any:
                 "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
             },
             retry_config={
-                "max_retries": max_retries,
-                "retry_timeout": timedelta(seconds=retry_seconds),
+                "max_retries": MAX_RETRIES,
+                "retry_timeout": timedelta(seconds=RETRY_SECONDS),
                 "backoff": {
                     "init_backoff": timedelta(seconds=FIRST_BACKOFF_SECONDS),
                     "max_backoff": timedelta(seconds=MAX_BACKOFF_SECONDS),

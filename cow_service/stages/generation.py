@@ -78,7 +78,7 @@ def generate(
 
     Raises `InvalidRequest`, `GeneratorOutOfMemory`, `Canceled`.
     """
-    with run.backends.artifacts.batch() as artifacts:
+    with run.backends.artifacts.batch(run.patience) as artifacts:
         clip = _clip(run, grounding, motion, trajectory, artifacts)
     frames = (*clip.frames, *clip.factual_frames)
     pictures = (*(frame.sha256 for frame in frames), *([] if clip.video is None else [clip.video.sha256]))

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import CowError
 from cow_service.generators.base import Generator
-from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.artifacts import ArtifactStore, Patience, try_once
 from cow_service.media.images import DecodedImage
 from cow_service.observability.timestamps import rfc3339
 from cow_service.readers.base import CallLog, MotionHints, Reader, ReaderInput
@@ -86,6 +86,7 @@ class Run(Generic[Request_co]):
     backends: Backends
     progress: Progress = ignore_progress
     step: Step = compute_directly
+    patience: Patience = try_once  # for the store of the artifacts
     id: str = field(default_factory=lambda: str(uuid.uuid4()))
     created_at: str = field(default_factory=now)
     turn: int = 0  # of the job, among those of all callers: the lower comes first

@@ -1,0 +1,48 @@
+"""Callers are told of a database that is away; jobs wait for it."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from cow_service.errors import StorageUnavailable
+from cow_service.jobs.retries import _Retries, without_retries  # pyright: ignore[reportPrivateUsage]
+from cow_service.jobs.storage_check import StorageCheck
+from cow_service.media.disk_artifacts import DiskArtifacts
+
+
+def test_only_the_thread_that_answers_a_caller_does_not_wait() -> None:
+    retries, seen = _Retries(), {}
+
+    @without_retries
+    def inner() -> None:
+        seen["inner"] = bool(retries)
+
+    @without_retries
+    def answering() -> None:
+        inner()
+        seen["after"] = bool(retries)
+        thread = threading.Thread(target=lambda: seen.update(job=bool(retries)))
+        thread.start()
+        thread.join()
+
+    answering()
+    assert seen == {"inner": False, "after": False, "job": True}
+    assert retries
+
+
+def test_who_waits_for_a_job_is_told_of_a_store_that_is_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cow_service.jobs.storage_check.MAX_AGE_SECONDS", 0.0)
+    folder = tmp_path / "artifacts"
+    check = StorageCheck(lambda: DiskArtifacts(folder))
+    check.check()
+    for path in folder.iterdir():
+        path.unlink()
+    folder.rmdir()
+    folder.write_text("in its place")
+    with pytest.raises(StorageUnavailable, match=r"cannot be used .* The job goes on when that is over"):
+        check.check()
+    folder.unlink()
+    check.check()
