@@ -8,9 +8,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist lo
 .PHONY: demo serve test test-fast soak lint openapi bench clean
 
 demo: $(VENV)/.base ## run the main job on an example
-	$(BIN)/cow simulate examples/ball-and-mug/image.jpg \
-	  "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?" \
-	  --frames events --out demo
+	$(BIN)/cow demo --out demo
 
 serve: $(VENV)/.base ## start the server on 127.0.0.1:8000
 	$(BIN)/cow serve

@@ -15,9 +15,10 @@ from cow_service.jobs.computing import Elsewhere
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
-from cow_service.settings import SettingsError
+from cow_service.settings import Settings, SettingsError
 from cow_service.workers.pool import WorkerPool
 
+EVERYWHERE = ("0.0.0.0", "::")  # addresses at which a server listens, and nobody asks
 LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
 CLOSE_SECONDS = 5.0  # for open connections, after the grace period of running jobs
 
@@ -31,10 +32,26 @@ class Server(uvicorn.Server):
         super().__init__(config)
         self._engine = engine
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listens, and says how to begin."""
+        await super().startup(sockets)
+        if self.started:
+            port = self.servers[0].sockets[0].getsockname()[1]
+            log.info("try it: %s", _example_call(self._engine.service.settings, port))
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Accepts no more jobs, then closes connections, then lets the app end."""
         self._engine.drain()
         await super().shutdown(sockets)
+
+
+def _example_call(settings: Settings, port: int) -> str:
+    """A request from this machine, for a shell."""
+    host = "127.0.0.1" if settings.host in EVERYWHERE else settings.host
+    address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    key = ' -H "Authorization: Bearer $COW_API_KEY"' if settings.api_keys else ""
+    question = "If the ball falls freely, what does it hit?"
+    return f'curl{key} -F image=@photo.jpg -F question="{question}" http://{address}/simulate'
 
 
 def _parts(service: Service, pool: WorkerPool | None) -> tuple[JobEngine, Readiness]:

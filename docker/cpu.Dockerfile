@@ -20,6 +20,7 @@ RUN python -m venv --without-pip /opt/cow
 COPY pyproject.toml README.md LICENSE ./
 COPY models models
 COPY prompts prompts
+COPY examples/ball-and-mug/image.jpg examples/ball-and-mug/
 COPY cow_service cow_service
 RUN --mount=type=cache,target=/root/.cache/pip \
     pip install "/src[providers,otel,mcp,objects]"

@@ -32,6 +32,7 @@ RUN --mount=type=cache,target=/root/.cache/pip \
 COPY pyproject.toml README.md LICENSE ./
 COPY models models
 COPY prompts prompts
+COPY examples/ball-and-mug/image.jpg examples/ball-and-mug/
 COPY cow_service cow_service
 RUN --mount=type=cache,target=/root/.cache/pip \
     pip install "torch==${TORCH_VERSION}" "/src[wan,fp8,local,providers,otel,mcp,objects]"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from drawn import ball, block, floor, png_bytes
-from PIL import Image
+from PIL import Image, ImageSequence
 from typer.testing import CliRunner
 
 from cow_service import __version__
@@ -43,25 +44,53 @@ def cow(tmp_path: Path, *arguments: str, **environment: str) -> subprocess.Compl
 
 def test_simulate_writes_frames_video_overlay_and_record(tmp_path: Path, picture: Path) -> None:
     result = cow(
-        tmp_path, "simulate", str(picture), QUESTION, "--num-frames", "41", "--frames", "uniform", "--out", "out"
-    )
+        tmp_path, "simulate", str(picture), QUESTION, "--num-frames", "41", "--frames", "uniform", "--out", "out",
+        "--format", "gif", "--format", "webp", "--format", "sheet",
+    )  # fmt: skip
     assert result.returncode == 0, result.stderr
     out = tmp_path / "out"
     names = {"frame_000.png", "frame_020.png", "frame_040.png", "overlay.png", "simulation.json", "video.mp4"}
-    assert {path.name for path in out.iterdir()} == names
+    assert {path.name for path in out.iterdir()} == names | {"clip.gif", "clip.webp", "sheet.png"}
     simulation = Simulation.model_validate_json((out / "simulation.json").read_text())
     assert simulation.grounding.object == "red ball"
     with Image.open(out / "frame_020.png") as frame:
         assert frame.size == (512, 320)
+    for name in ("clip.gif", "clip.webp"):
+        with Image.open(out / name) as clip:
+            seconds = sum(frame.load() and frame.info["duration"] for frame in ImageSequence.Iterator(clip)) / 1000
+            assert (clip.size, clip.n_frames) == ((480, 300), 41)
+            assert seconds == pytest.approx(41 / 16, abs=0.05), name
+    with Image.open(out / "sheet.png") as sheet:
+        assert sheet.size == (4 * 320 + 3 * 4, 3 * 200 + 2 * 4)
     for told in ("grounding", "red ball at (150, 200)", "linear (+1.00, +0.00)", "touches blue cube", "41-frame video"):
         assert told in result.stdout
     assert not result.stderr
 
 
+def test_the_demo_needs_nothing(tmp_path: Path) -> None:
+    result = cow(tmp_path, "demo")
+    assert result.returncode == 0, result.stderr
+    simulation = Simulation.model_validate_json((tmp_path / "cow-demo" / "simulation.json").read_text())
+    assert [encounter.object for encounter in simulation.trajectory.encounters] == ["blue mug"]
+    shown = [frame.index for frame in simulation.frames]
+    assert simulation.trajectory.encounters[0].first_frame in shown, "people are shown the encounter"
+
+
+def test_a_port_that_is_taken_is_told_before_anything_is_loaded(tmp_path: Path) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        result = cow(tmp_path, "serve", "--port", str(port))
+    assert result.returncode == 2
+    assert f"COW_PORT={port}: another program listens there" in result.stderr
+    assert not (tmp_path / "data").exists()
+
+
 def test_json_and_overrides(tmp_path: Path, picture: Path) -> None:
     result = cow(
         tmp_path, "simulate", str(picture), "?", "--point", "150,200", "--object", "it", "--direction", "0,-1",
-        "--speed", "50", "--no-video", "--max-side", "0", "--count", "1", "--json",
+        "--speed", "50", "--no-video", "--max-side", "0", "--frames", "initial", "--count", "1", "--json",
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     simulation = Simulation.model_validate_json(result.stdout)

@@ -150,7 +150,7 @@ def test_what_is_copied_is_there(dockerfile: Path) -> None:
 @pytest.mark.parametrize(
     "path",
     [".git/config", ".venv/bin/python", "tests/test_docker.py", "demo/video.mp4", "docker/.env", ".env", "dist/a.whl",
-     "examples/ball-and-mug/image.jpg", "cow_service/__pycache__/cli.pyc", "cow_service/api/__pycache__/app.pyc"],
+     "examples/ball-and-mug/meta.json", "cow_service/__pycache__/cli.pyc", "cow_service/api/__pycache__/app.pyc"],
 )  # fmt: skip
 def test_what_has_no_business_in_an_image_stays_out(path: str) -> None:
     assert ignored(path)
@@ -177,6 +177,7 @@ def test_the_wheel_can_be_built_from_what_is_copied(dockerfile: Path, tmp_path: 
         ("cow_service", ""),
         ("models", "cow_service/_shipped/"),
         ("prompts", "cow_service/_shipped/"),
+        ("examples/ball-and-mug/image.jpg", "cow_service/_shipped/"),
     ):
         for file in files_of(ROOT / folder):
             path = file.relative_to(ROOT).as_posix()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +17,7 @@ from cow_service.cli.errors import HINTS
 from cow_service.cli.options import read_file
 from cow_service.client.wording import asked_words, contacts_words, encounters_words, gate_words, outcome_words
 from cow_service.errors import CowError, InvalidRequest
+from cow_service.media.animations import FORMATS, frames_of
 from cow_service.media.images import DecodedImage
 from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
@@ -26,14 +27,27 @@ from cow_service.service import Service
 Body = TypeVar("Body", bound=SimulateRequest)
 
 
-def run_simulation(service: Service, image: Path, body: dict[str, Any], out: Path, *, as_json: bool) -> None:
-    """Simulates with progress of each stage, writes the results into a folder, and prints a summary."""
+def run_simulation(
+    service: Service,
+    image: Path,
+    body: dict[str, Any],
+    out: Path,
+    formats: Sequence[str] = (),
+    *,
+    as_json: bool,
+) -> None:
+    """Simulates with progress of each stage, writes the results into a folder, and prints a summary.
+
+    `formats` are names of `animations.FORMATS`. Raises `InvalidRequest` where one is wanted and no video.
+    """
+    if formats and not body["video"]:
+        raise InvalidRequest("--format makes its file of the video: leave --no-video out.")
     console = console_for(as_json)
     make_folder(out)
     request, decoded = read_request(service, image, body, SimulateRequest)
     with stages_shown(console) as show:
         simulation = service.simulate(request, show, decoded)
-    written = save(service, simulation, out)
+    written = [*save(service, simulation, out), *_save_formats(out, formats)]
     if as_json:
         print(simulation.model_dump_json(indent=2))
         return
@@ -135,6 +149,18 @@ def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
             (out / name).write_bytes(service.artifacts.read(sha256))
         (out / "simulation.json").write_text(simulation.model_dump_json(indent=2) + "\n", encoding="utf-8")
     return [*files, "simulation.json"]
+
+
+def _save_formats(out: Path, formats: Sequence[str]) -> list[str]:
+    """Writes the clip of a folder in other forms; returns their names."""
+    if not formats:
+        return []
+    frames, fps = frames_of((out / "video.mp4").read_bytes())
+    made = dict(FORMATS[each] for each in formats)
+    with writable(out):
+        for name, make in made.items():
+            (out / name).write_bytes(make(frames, fps))
+    return list(made)
 
 
 @contextmanager

@@ -60,6 +60,11 @@ def simulate(
         Path | None, typer.Option("--out", "-o", help="Folder for the results.", show_default="./<image>-cow")
     ] = None,
     video: Annotated[bool, typer.Option(help="Make the mp4.")] = True,
+    formats: Annotated[
+        list[options.Format] | None,
+        typer.Option("--format", help="Also an animated gif or webp, or a contact sheet; may be repeated."),
+    ] = None,
+    open_it: Annotated[bool, typer.Option("--open", help="Open the video, or the overlay, when it is done.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the simulation as JSON, and nothing else.")] = False,
     *,
     request: dict[str, Any],
@@ -71,8 +76,26 @@ def simulate(
     from cow_service.cli.console import run_simulation  # noqa: PLC0415
 
     body = {**request, "question": question, "video": video}
+    out = out or Path(f"{image.stem}-cow")
     with _service() as service:
-        run_simulation(service, image, body, out or Path(f"{image.stem}-cow"), as_json=as_json)
+        run_simulation(service, image, body, out, tuple(formats or ()), as_json=as_json)
+    if open_it:
+        typer.launch(str(out / ("video.mp4" if video else "overlay.png")))
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("cow-demo"),
+    open_it: Annotated[bool, typer.Option("--open", help="Open the video when it is done.")] = False,
+) -> None:
+    """Imagine the future of an example: a ball is pushed towards a mug."""
+    from cow_service.cli.console import run_simulation  # noqa: PLC0415
+    from cow_service.cli.demo import QUESTION, example_image  # noqa: PLC0415
+
+    with _service() as service, example_image() as image:
+        run_simulation(service, image, {"question": QUESTION, "frames": {"policy": "events"}}, out, as_json=False)
+    if open_it:
+        typer.launch(str(out / "video.mp4"))
 
 
 @app.command()
@@ -140,6 +163,9 @@ def serve(
 ) -> None:
     """Start the server."""
     service = _served(host=host, port=port, role=role)
+    from cow_service.cli.ports import check_port  # noqa: PLC0415
+
+    check_port(service.settings)
     from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
     settings = service.settings

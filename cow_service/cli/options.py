@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from enum import StrEnum
 from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
@@ -13,6 +14,15 @@ import typer
 
 from cow_service.cli.interventions import intervention_fields
 from cow_service.errors import CowError, InvalidRequest
+
+
+class Format(StrEnum):
+    """What a clip can be made into, beside the mp4."""
+
+    GIF = "gif"
+    WEBP = "webp"
+    SHEET = "sheet"
+
 
 Policy = Literal["initial", "uniform", "events"]
 Kind = Literal["linear", "projectile", "fall", "static"]
@@ -80,7 +90,7 @@ def request_body(
     seed: Annotated[
         int | None, typer.Option(help="For what draws random numbers.", show_default="0, and none for an MLLM")
     ] = None,
-    frames: Annotated[Policy, typer.Option(help="Which frames to keep as pictures.")] = "initial",
+    frames: Annotated[Policy, typer.Option(help="Which frames to keep as pictures.")] = "events",
     count: Annotated[int, typer.Option(help="How many of them.")] = 3,
     max_side: Annotated[int, typer.Option(help="Their longest side, px; 0 for the clip's own size.")] = 512,
 ) -> dict[str, Any]:

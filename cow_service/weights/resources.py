@@ -1,4 +1,4 @@
-"""Finds the prompts and manifests that ship with the package, in a checkout and in an installed wheel alike.
+"""Finds the prompts, manifests and an example that ship with the package, in a checkout and an installed wheel alike.
 
 In a checkout they are folders beside the package; a wheel carries them inside it, under `_shipped`.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Resources:
-    """The text files of one kind."""
+    """The files of one kind."""
 
     folder: str
     suffix: str
@@ -25,11 +25,15 @@ class Resources:
 
     def read(self, name: str) -> str:
         """The text of one. Raises `LookupError`, naming those that exist."""
+        return self.file(name).read_text(encoding="utf-8")
+
+    def file(self, name: str) -> Traversable:
+        """One as it lies in the package. Raises `LookupError`, naming those that exist."""
         # Looked up among the names that exist, never joined to a path: a name cannot lead out of the folder.
         found = self._files()
         if name not in found:
             raise LookupError(f"No {self.kind} is named {name!r}; there are: {', '.join(found) or 'none'}.")
-        return found[name].read_text(encoding="utf-8")
+        return found[name]
 
     def _files(self) -> dict[str, Traversable]:
         # The wheel's own copy comes first: what lies beside an installed package is site-packages, not ours.
@@ -44,3 +48,4 @@ class Resources:
 PROMPTS = Resources("prompts", ".md", "prompt")
 MANIFESTS = Resources("models", ".yaml", "model manifest")
 FAMILIES = Resources("models/families", ".yaml", "family of MLLMs")
+EXAMPLE = Resources("examples/ball-and-mug", ".jpg", "picture")
