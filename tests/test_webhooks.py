@@ -6,6 +6,7 @@ import base64
 import hashlib
 import hmac
 import json
+import re
 import socket
 import threading
 import time
@@ -30,6 +31,7 @@ from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError, load_settings
 
 SECRET = b"0123456789abcdef0123456789abcdef"
+OUTCOMES = ("refused", "delivered")
 LOST = {**BODY, "grounding": None, "motion": None, "question": "If the pink car turns, what happens?"}
 
 
@@ -104,7 +106,7 @@ def app(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FastAPI]:
     hooks = running_engine().webhooks
     monkeypatch.setitem(vars(hooks), "_egress", Egress(None, permitted=lambda address: address == "127.0.0.1"))
     yield app
-    hooks.use(Settings(data_dir=tmp_path / "data"))
+    hooks.use(Settings(data_dir=tmp_path / "data"), service.metrics)
 
 
 @pytest.fixture
@@ -123,6 +125,12 @@ def attempts(job: str) -> list[str]:
     """How the attempts to tell of a job's end have ended, as far as they were made."""
     found = [DBOS.get_workflow_status(name) for name in webhooks.attempt_ids(job)]
     return [one.status for one in found if one is not None]
+
+
+def counted(http: TestClient) -> dict[str, float]:
+    """What the metrics say of webhooks."""
+    found = re.findall(r"^cow_(webhook\S*_total\S*) (\S+)$", http.get("/metrics").text, re.MULTILINE)
+    return {name: float(value) for name, value in found}
 
 
 def told_of(receiver: Receiver, count: int = 1) -> list[Message]:
@@ -239,6 +247,8 @@ def test_whoever_did_not_take_it_is_asked_again(http: TestClient, receiver: Rece
     assert first.headers["webhook-id"] == second.headers["webhook-id"]
     all_done(job)
     assert len(receiver.heard) == 2
+    attempts_of = {outcome: counted(http)[f'webhook_attempts_total{{outcome="{outcome}"}}'] for outcome in OUTCOMES}
+    assert attempts_of == {"refused": 1, "delivered": 1}
 
 
 @pytest.mark.slow
@@ -250,6 +260,7 @@ def test_it_is_given_up_in_the_end(http: TestClient, receiver: Receiver) -> None
     assert attempts(job) == ["SUCCESS"] * 3
     assert len(receiver.heard) == 3
     assert http.get(f"/jobs/{job}").json()["status"] == "succeeded"
+    assert counted(http) == {'webhook_attempts_total{outcome="refused"}': 3, "webhooks_given_up_total": 1}
 
 
 @pytest.mark.slow
@@ -257,6 +268,7 @@ def test_nobody_there_is_no_end_either(http: TestClient, receiver: Receiver) -> 
     job = submitted(http, {**BODY, "webhook": "http://127.0.0.1:1/"})
     eventually(lambda: len(attempts(job)) == 3)
     all_done(job)
+    assert counted(http) == {'webhook_attempts_total{outcome="unreachable"}': 3, "webhooks_given_up_total": 1}
 
 
 def test_silent_receivers_hold_up_their_own_calls_alone(http: TestClient, receiver: Receiver) -> None:

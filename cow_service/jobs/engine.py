@@ -91,7 +91,7 @@ class JobEngine:
     def use(self, service: Service) -> None:
         """Runs the jobs of another service from now on, on the same database. Only tests do this."""
         self.open_jobs.service = service
-        self.webhooks.use(service.settings)
+        self.webhooks.use(service.settings, service.metrics)
 
     @property
     def is_running(self) -> bool:

@@ -54,9 +54,9 @@ class Webhooks:
 
         return Egress(None) if self._given is None else self._given
 
-    def use(self, settings: Settings) -> None:
-        """Takes the secret from other settings. Only tests do this."""
-        self._secret = settings.webhook_secret
+    def use(self, settings: Settings, metrics: Metrics) -> None:
+        """Takes the secret from other settings, and counts elsewhere. Only tests do this."""
+        self._secret, self._metrics = settings.webhook_secret, metrics
 
     def check(self, url: str) -> None:
         """Raises `WebhookNotAllowed` for a URL that would not be called."""
