@@ -199,7 +199,7 @@ class Settings(BaseSettings):
     def _of_keys(cls, weights: dict[str, float], info: ValidationInfo) -> dict[str, float]:
         unknown = weights.keys() - info.data.get("api_keys", {}).keys()
         if unknown:
-            raise ValueError(f"{min(unknown)[:64]!r} is no name of COW_API_KEYS")
+            raise ValueError(f"{min(unknown)[:64]!r} is no name of COW_API_KEYS: `cow keys new` makes one")
         return weights
 
     @field_validator("cors_origins")
@@ -320,7 +320,7 @@ def _message(item: Any) -> str:
             '("sha256:" and 64 hexadecimal digits), a different one for each; it takes no plain keys. '
             "`cow keys new NAME` makes both"
         )
-    return f"COW_{name.upper()}={item['input']!r}: {item['msg']}"
+    return f"COW_{name.upper()}={item['input']!r}: {item['msg'].removeprefix('Value error, ')}"
 
 
 def load_settings(**overrides: Any) -> Settings:

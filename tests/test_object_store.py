@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import httpx
 import object_store
@@ -135,6 +136,20 @@ def test_a_store_that_is_away_for_a_while_is_waited_for(served, objects):
         objects.start()
     assert served.ended(job["id"])["status"] == "succeeded"
     assert served.clips().count(77) == 2, "no clip is made again for an outage"
+
+
+def test_who_waits_for_a_job_is_told_that_the_store_is_away(served, objects):
+    with ThreadPoolExecutor(1) as pool:
+        call = pool.submit(served.http.post, "/simulate", json=slow(1.0, seed=78))
+        eventually(lambda: 78 in served.clips())
+        objects.stop()
+        try:
+            told = call.result(60)  # while the store is still away
+        finally:
+            objects.start()
+    problem(told, 503, "storage-unavailable")
+    assert "The job goes on" in told.json()["detail"]
+    assert served.ended(told.headers["location"].removeprefix("/jobs/"))["status"] == "succeeded"
 
 
 def test_another_server_passes_the_bytes_on(served, objects, tmp_path):

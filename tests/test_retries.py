@@ -6,6 +6,8 @@ import threading
 from pathlib import Path
 
 import pytest
+from dbos import _dbos as dbos_instances  # pyright: ignore[reportPrivateUsage]
+from engines import running_engine
 
 from cow_service.errors import StorageUnavailable
 from cow_service.jobs.retries import _Retries, without_retries  # pyright: ignore[reportPrivateUsage]
@@ -31,6 +33,12 @@ def test_only_the_thread_that_answers_a_caller_does_not_wait() -> None:
     answering()
     assert seen == {"inner": False, "after": False, "job": True}
     assert retries
+
+
+def test_dbos_asks_the_thread_whether_to_wait() -> None:
+    assert running_engine().is_running
+    database = dbos_instances._get_dbos_instance()._sys_db  # pyright: ignore[reportPrivateUsage]
+    assert isinstance(database._retry_connection_errors, _Retries)  # pyright: ignore[reportPrivateUsage]
 
 
 def test_who_waits_for_a_job_is_told_of_a_store_that_is_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

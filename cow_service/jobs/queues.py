@@ -62,9 +62,7 @@ def check_queues(settings: Settings) -> None:
             continue
         manifest = find_manifest(name)
         if manifest is None or manifest.concurrency is None:
-            remedy = (
-                f"There are {', '.join(known)}; {LIGHT} has the jobs of all backends without a device of their own."
-            )
+            remedy = f"Known: {', '.join(known)}. Backends without a device of their own share {LIGHT}."
         else:
             remedy = f"{name} lacks {', '.join(manifest.missing_modules())}: {manifest.install_line()}."
         raise SettingsError(f"Bad settings: COW_QUEUES has no queue {name[:64]!r} here. {remedy}")

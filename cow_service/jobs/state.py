@@ -72,9 +72,9 @@ class JobState:
 
 def find(job_id: str, active: ActiveJobs, *, full: bool = True) -> JobState | None:
     """A job by its id; without its result and problem unless `full`."""
-    at = active.all_at()
+    at = active.at(job_id)  # before the database is asked: see `all_at`
     found = workflows_of_jobs(workflow_ids=[job_id], load_output=full)
-    return _state(found[0], at) if found else None
+    return _state(found[0], {} if at is None else {job_id: at}) if found else None
 
 
 def page(owner: str | None, filters: JobFilters, active: ActiveJobs) -> JobPage:
