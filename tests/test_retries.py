@@ -9,8 +9,9 @@ import pytest
 from dbos import _dbos as dbos_instances  # pyright: ignore[reportPrivateUsage]
 from engines import running_engine
 
-from cow_service.errors import StorageUnavailable
+from cow_service.errors import ShuttingDown, StorageUnavailable
 from cow_service.jobs.retries import _Retries, without_retries  # pyright: ignore[reportPrivateUsage]
+from cow_service.jobs.state import JobFilters
 from cow_service.jobs.storage_check import StorageCheck
 from cow_service.media.disk_artifacts import DiskArtifacts
 
@@ -54,3 +55,11 @@ def test_who_waits_for_a_job_is_told_of_a_store_that_is_away(tmp_path: Path, mon
         check.check()
     folder.unlink()
     check.check()
+
+
+def test_who_asks_while_the_server_ends_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = running_engine()
+    monkeypatch.setattr(dbos_instances, "_dbos_global_instance", None)  # as after `DBOS.destroy`
+    for asking in (lambda: engine.find("job", None), lambda: engine.page(None, JobFilters())):
+        with pytest.raises(ShuttingDown, match="is stopping"):
+            asking()

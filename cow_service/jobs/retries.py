@@ -11,6 +11,9 @@ from functools import wraps
 from typing import ParamSpec, TypeVar
 
 from dbos import _dbos as dbos_instances  # pyright: ignore[reportPrivateUsage]
+from dbos import error as dbos_error
+
+from cow_service.errors import ShuttingDown
 
 Given = ParamSpec("Given")
 Value = TypeVar("Value")
@@ -32,7 +35,10 @@ def let_callers_not_wait() -> None:
 
 
 def without_retries(work: Callable[Given, Value]) -> Callable[Given, Value]:
-    """`work` raises where the database is away, also in the middle. What it starts in other threads waits."""
+    """`work` raises where the database is away, also in the middle. What it starts in other threads waits.
+
+    Raises `ShuttingDown` where DBOS ended meanwhile: requests that poll for jobs go on until connections close.
+    """
 
     @wraps(work)
     def answering(*args: Given.args, **kwargs: Given.kwargs) -> Value:
@@ -40,6 +46,10 @@ def without_retries(work: Callable[Given, Value]) -> Callable[Given, Value]:
         _thread.answers_a_caller = True
         try:
             return work(*args, **kwargs)
+        except dbos_error.DBOSException as error:
+            if dbos_instances._dbos_global_instance is not None:  # pyright: ignore[reportPrivateUsage]
+                raise
+            raise ShuttingDown("The server is stopping. Ask again in a while: its jobs go on then.") from error
         finally:
             _thread.answers_a_caller = before
 
