@@ -37,7 +37,9 @@ class Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             port = self.servers[0].sockets[0].getsockname()[1]
-            log.info("try it: %s", _example_call(self._engine.service.settings, port))
+            address = _address(self._engine.service.settings.host, port)
+            log.info("open %s/ in a browser", address)
+            log.info("or try: %s", _example_call(self._engine.service.settings, address))
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Accepts no more jobs, then closes connections, then lets the app end."""
@@ -45,13 +47,17 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _example_call(settings: Settings, port: int) -> str:
+def _address(host: str, port: int) -> str:
+    """Of the server, as this machine reaches it."""
+    name = "127.0.0.1" if host in EVERYWHERE else host
+    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
+
+
+def _example_call(settings: Settings, address: str) -> str:
     """A request from this machine, for a shell."""
-    host = "127.0.0.1" if settings.host in EVERYWHERE else settings.host
-    address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     key = ' -H "Authorization: Bearer $COW_API_KEY"' if settings.api_keys else ""
     question = "If the ball falls freely, what does it hit?"
-    return f'curl{key} -F image=@photo.jpg -F question="{question}" http://{address}/simulate'
+    return f'curl{key} -F image=@photo.jpg -F question="{question}" {address}/simulate'
 
 
 def _parts(service: Service, pool: WorkerPool | None) -> tuple[JobEngine, Readiness]:

@@ -21,6 +21,9 @@ COPY pyproject.toml README.md LICENSE ./
 COPY models models
 COPY prompts prompts
 COPY examples/ball-and-mug/image.jpg examples/ball-and-mug/
+COPY examples/falling-ball/image.jpg examples/falling-ball/
+COPY examples/bottle-passes-cylinder/image.jpg examples/bottle-passes-cylinder/
+COPY examples/thrown-ball/image.jpg examples/thrown-ball/
 COPY cow_service cow_service
 RUN --mount=type=cache,target=/root/.cache/pip \
     pip install "/src[providers,otel,mcp,objects]"

@@ -30,6 +30,7 @@ from cow_service.jobs.engine import HANDOVER_SECONDS
 from cow_service.server import CLOSE_SECONDS
 from cow_service.settings import Settings, load_settings
 from cow_service.weights.manifests import load_manifests
+from cow_service.weights.resources import EXAMPLES
 
 DOCKER = ROOT / "docker"
 IMAGES = {"cow:cpu": DOCKER / "cpu.Dockerfile", "cow:cuda": DOCKER / "cuda.Dockerfile"}
@@ -177,7 +178,7 @@ def test_the_wheel_can_be_built_from_what_is_copied(dockerfile: Path, tmp_path: 
         ("cow_service", ""),
         ("models", "cow_service/_shipped/"),
         ("prompts", "cow_service/_shipped/"),
-        ("examples/ball-and-mug/image.jpg", "cow_service/_shipped/"),
+        *((f"examples/{name}/image.jpg", "cow_service/_shipped/") for name in EXAMPLES),
     ):
         for file in files_of(ROOT / folder):
             path = file.relative_to(ROOT).as_posix()

@@ -15,6 +15,7 @@ from cow_service.api.openai.completing import Completer
 from cow_service.api.openai.errors import ChatProblems
 from cow_service.api.openai.routes import chat_routes
 from cow_service.api.openapi import contract
+from cow_service.api.page import page_routes
 from cow_service.api.problems import install_problem_handlers
 from cow_service.api.routes.artifacts import artifact_routes
 from cow_service.api.routes.health import health_routes
@@ -71,6 +72,7 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
         job_routes(engine),
         artifact_routes(engine),
         health_routes(engine, readiness),
+        page_routes(lambda: engine.service.artifacts, service.settings.artifacts_redirect),
     ):
         app.include_router(router)
     app.openapi = lambda: contract(app)

@@ -48,4 +48,7 @@ class Resources:
 PROMPTS = Resources("prompts", ".md", "prompt")
 MANIFESTS = Resources("models", ".yaml", "model manifest")
 FAMILIES = Resources("models/families", ".yaml", "family of MLLMs")
-EXAMPLE = Resources("examples/ball-and-mug", ".jpg", "picture")
+EXAMPLES = {  # each has one, `image`
+    name: Resources(f"examples/{name}", ".jpg", "picture")
+    for name in ("ball-and-mug", "falling-ball", "bottle-passes-cylinder", "thrown-ball")
+}

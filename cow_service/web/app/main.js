@@ -1,0 +1,51 @@
+// Starts the page: what comes from the whole window goes to what people do at the page.
+
+import { html, render } from "../vendor/htm-preact.js";
+import { Page, isTyping } from "../ui/page.js";
+import { choosePicture, loadModels, openJob, redo, undo } from "./asking.js";
+import { onKeyWanted } from "./keys.js";
+import { set } from "./store.js";
+
+onKeyWanted((reason, answer) => set({ keyWanted: { reason, answer } }));
+
+function take(files) {
+  const file = [...(files ?? [])].find((each) => each.type.startsWith("image/")) ?? files?.[0];
+  if (file) void choosePicture(file, file.name || "pasted picture");
+}
+
+addEventListener("dragover", (event) => {
+  event.preventDefault();
+  document.body.classList.add("dropping");
+});
+addEventListener("dragleave", (event) => {
+  if (!event.relatedTarget) document.body.classList.remove("dropping");
+});
+addEventListener("drop", (event) => {
+  event.preventDefault();
+  document.body.classList.remove("dropping");
+  take(event.dataTransfer.files);
+});
+addEventListener("paste", (event) => {
+  if (event.clipboardData.files.length) take(event.clipboardData.files);
+});
+addEventListener("keydown", (event) => {
+  if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "z" || isTyping(event.target)) return;
+  event.preventDefault();
+  if (event.shiftKey) redo();
+  else undo();
+});
+
+function openAddress() {
+  const job = new URLSearchParams(location.search).get("job");
+  if (job) void openJob(job);
+  else set({ view: "case", picture: null, result: null, run: null, problem: null });
+}
+
+addEventListener("popstate", (event) => {
+  if (location.hash) return;
+  openAddress(event);
+});
+
+render(html`<${Page} />`, document.getElementById("app"));
+if (location.search) openAddress();
+void loadModels();

@@ -1,0 +1,86 @@
+// Pictures made of masks in the browser: the outline of an object, and the object cut out.
+
+import { useEffect, useState } from "../vendor/htm-preact.js";
+import { artifactAddress } from "./artifacts.js";
+
+const THRESHOLD = 128; // of a mask's grey levels
+const OUTLINE = [255, 196, 0]; // RGB, as in the server's overlay
+const MOST_SIDE = 1024; // px: outlines of larger pictures are made at this size
+
+async function loaded(url) {
+  const image = new Image();
+  image.src = url;
+  await image.decode();
+  return image;
+}
+
+function drawn(image, width, height) {
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [width, height];
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(image, 0, 0, width, height);
+  return context;
+}
+
+const urlOf = (canvas) => new Promise((resolve) => canvas.toBlob((blob) => resolve(URL.createObjectURL(blob))));
+
+function outlineIn(context, width, height, thickness) {
+  const data = context.getImageData(0, 0, width, height);
+  const inside = new Uint8Array(width * height);
+  for (let i = 0; i < inside.length; i += 1) inside[i] = data.data[4 * i] >= THRESHOLD ? 1 : 0;
+  const out = context.createImageData(width, height);
+  for (let y = 0; y < height; y += 1) {
+    for (let x = 0; x < width; x += 1) {
+      const i = y * width + x;
+      if (!inside[i]) continue;
+      const edge = x < thickness || y < thickness || x >= width - thickness || y >= height - thickness
+        || !inside[i - thickness] || !inside[i + thickness] || !inside[i - thickness * width] || !inside[i + thickness * width];
+      if (edge) out.data.set([...OUTLINE, 255], 4 * i);
+    }
+  }
+  context.putImageData(out, 0, 0);
+}
+
+/** A picture of the outline of a mask, and the masked part of the image alone. */
+async function madeOf(imageUrl, maskSha256, bbox) {
+  const [image, mask] = await Promise.all([loaded(imageUrl), artifactAddress(maskSha256).then(loaded)]);
+  const scale = Math.min(1, MOST_SIDE / Math.max(mask.width, mask.height));
+  const [width, height] = [Math.round(mask.width * scale), Math.round(mask.height * scale)];
+  const context = drawn(mask, width, height);
+  const levels = context.getImageData(0, 0, width, height);
+  outlineIn(context, width, height, Math.max(1, Math.round(width / 640)));
+  const outline = await urlOf(context.canvas);
+  const patch = drawn(image, width, height);
+  const pixels = patch.getImageData(0, 0, width, height);
+  for (let i = 3; i < pixels.data.length; i += 4) pixels.data[i] = levels.data[i - 3];
+  patch.putImageData(pixels, 0, 0);
+  const [x0, y0, x1, y1] = bbox.map((value) => Math.round(value * scale));
+  const cut = document.createElement("canvas");
+  [cut.width, cut.height] = [Math.max(1, x1 - x0), Math.max(1, y1 - y0)];
+  cut.getContext("2d").drawImage(patch.canvas, -x0, -y0);
+  return { outline, cutout: await urlOf(cut) };
+}
+
+/** {outline, cutout} of a mask as addresses; null until they are made, and where there is no mask. */
+export function useCutout(imageUrl, mask, bbox) {
+  const [made, setMade] = useState({ of: null });
+  const of = mask && imageUrl ? `${mask.sha256} ${imageUrl}` : null;
+  useEffect(() => {
+    let wanted = true;
+    let urls = null;
+    if (of) {
+      madeOf(imageUrl, mask.sha256, bbox).then((found) => {
+        urls = found;
+        if (wanted) setMade({ of, ...found });
+        else release(found);
+      }, () => {});
+    }
+    return () => {
+      wanted = false;
+      if (urls) release(urls);
+    };
+  }, [of]);
+  return made.of === of && of ? made : null;
+}
+
+const release = (urls) => Object.values(urls).forEach((url) => URL.revokeObjectURL(url));

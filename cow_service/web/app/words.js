@@ -1,0 +1,63 @@
+// Numbers, times and states in words.
+
+export const percent = (share) => `${Math.round(100 * share)}%`;
+export const seconds = (value) => (value < 10 ? `${value.toFixed(value < 1 ? 2 : 1)} s` : `${Math.round(value)} s`);
+export const plural = (count, one, many = `${one}s`) => `${count} ${count === 1 ? one : many}`;
+
+export const MEETS = { touches: "hits", occludes: "passes in front of", "occluded-by": "passes behind" };
+
+export const STAGES = {
+  gating: "First answers",
+  grounding: "Find the object",
+  motion: "Read the motion",
+  trajectory: "Compute the world",
+  generation: "Make the frames",
+  answering: "Look and answer",
+};
+
+export const SIMULATE_STAGES = ["grounding", "motion", "trajectory", "generation"];
+
+/** The stages of a request, in their order. */
+export function stagesOf(settings) {
+  if (settings.kind !== "answer") return SIMULATE_STAGES;
+  const stages = settings.imagine === "never" ? [] : SIMULATE_STAGES;
+  return [...(settings.imagine === "auto" ? ["gating"] : []), ...stages, "answering"];
+}
+
+export const DOUBTS = {
+  speed: "how fast it is",
+  heading: "which way it goes",
+  camera: "where the camera is",
+  size: "how large things are",
+  place: "how far away things are",
+  friction: "how slippery the floor is",
+};
+
+/** An answer in words. */
+export function answerWords(verdict) {
+  if (verdict.answer === null) return "Not sure";
+  return verdict.option ? `${verdict.answer}: ${verdict.option}` : verdict.answer;
+}
+
+export function encounterWords(encounter, trajectory) {
+  const who = encounter.subject === 0 ? "" : `${trajectory.bodies[encounter.subject]?.object ?? "another"} `;
+  const sure = encounter.probability === null ? "" : `, ${percent(encounter.probability)}`;
+  return `${who}${MEETS[encounter.kind] ?? encounter.kind} ${encounter.object}${sure}`;
+}
+
+/** The time of a job, for people. */
+export function when(time) {
+  const then = new Date(time);
+  const today = then.toDateString() === new Date().toDateString();
+  return today ? then.toLocaleTimeString() : then.toLocaleString();
+}
+
+const REMEDIES = {
+  "cannot-ground": "Draw a box around what moves: choose “What moves” above the picture.",
+  "cannot-read-direction": "Draw the direction: choose “Direction” above the picture, and drag from the object to where it goes.",
+  "artifact-not-found": "The picture is no longer kept by the server. Choose it again.",
+  "job-not-found": "It was deleted, or belongs to another key.",
+};
+
+/** What a person at this page can do about a problem; empty where its detail says all. */
+export const remedyOf = (problem) => REMEDIES[problem.code] ?? "";

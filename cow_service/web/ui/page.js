@@ -1,0 +1,79 @@
+// The whole page.
+
+import { html } from "../vendor/htm-preact.js";
+import { address, pageAddress } from "../app/address.js";
+import { currentKey, forgetKey } from "../app/keys.js";
+import { get, set, useStore } from "../app/store.js";
+import { Correct } from "./correct.js";
+import { Jobs } from "./jobs.js";
+import { AwayNotice, KeyDialog, ProblemNotice } from "./notices.js";
+import { Question } from "./question.js";
+import { Result } from "./answer.js";
+import { Scene } from "./scene.js";
+import { Stages } from "./stages.js";
+import { Choose, Start } from "./start.js";
+import { Take } from "./take.js";
+
+function show(view) {
+  return (event) => {
+    event.preventDefault();
+    set({ view, problem: null });
+  };
+}
+
+function restart(event) {
+  event.preventDefault();
+  history.pushState(null, "", pageAddress());
+  set({ view: "case", picture: null, question: "", result: null, run: null, problem: null, found: [], compared: [] });
+}
+
+function Header({ state }) {
+  const { view } = state;
+  return html`<header>
+    <a class="brand" href=${pageAddress()} onClick=${restart}><b>COW</b> <span>Causal Object World model</span></a>
+    <nav aria-label="Page">
+      <a href="#try" aria-current=${view === "case" ? "page" : undefined} onClick=${show("case")}>Try</a>
+      <a href="#jobs" aria-current=${view === "jobs" ? "page" : undefined} onClick=${show("jobs")}>Jobs</a>
+      <a href=${address("/docs")}>API</a>
+      ${currentKey() !== null && html`<button class="plain" onClick=${() => {
+        forgetKey();
+        set({});
+      }}>Forget the key</button>`}
+    </nav>
+  </header>`;
+}
+
+function Case({ state }) {
+  const { picture, run, result, problem, settings } = state;
+  if (!picture) return html`<${Start} />`;
+  return html`<div class="case">
+    <div class="left"><${Scene} state=${state} /></div>
+    <div class="right">
+      <${Question} state=${state} />
+      ${problem && html`<${ProblemNotice} problem=${problem} />`}
+      <${Stages} run=${run} result=${result} settings=${settings} />
+      ${result && html`<${Result} state=${state} />`}
+      <${Correct} state=${state} />
+      ${state.question.trim() && html`<${Take} state=${state} />`}
+      <${Choose} short />
+    </div>
+  </div>`;
+}
+
+export function Page() {
+  const state = useStore();
+  const { view, away, keyWanted, problem, picture } = state;
+  return html`<div class="page">
+    <${Header} state=${state} />
+    <main id="main" tabindex="-1">
+      ${away && html`<${AwayNotice} />`}
+      ${problem && (view === "jobs" || !picture) && html`<${ProblemNotice} problem=${problem} />`}
+      ${view === "jobs" ? html`<${Jobs} />` : html`<${Case} state=${state} />`}
+    </main>
+    ${keyWanted && html`<${KeyDialog} wanted=${keyWanted} />`}
+  </div>`;
+}
+
+export const isTyping = (target) => target instanceof Element && target.closest("input, textarea, select, [contenteditable]") !== null;
+
+export const hasPicture = () => get().picture !== null;

@@ -1,0 +1,116 @@
+// Plays a clip, or its path alone where there is no video: which frame is shown, and the controls.
+
+import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
+import { useArtifact } from "../app/artifacts.js";
+import { clamp } from "../app/geometry.js";
+import { encounterWords, seconds } from "../app/words.js";
+
+const calm = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+/** The state of a player of a simulation: {frame, count, fps, playing, video, seek, toggle}. */
+export function usePlayer(simulation) {
+  const [frame, setFrame] = useState(0);
+  const [playing, setPlaying] = useState(false);
+  const element = useRef(null);
+  const video = simulation?.video ?? null;
+  const url = useArtifact(video?.sha256 ?? null);
+  const count = simulation ? simulation.trajectory.paths[0].points.length : 0;
+  const fps = video?.fps ?? simulation?.trajectory.fps ?? 1;
+
+  useEffect(() => {
+    setFrame(0);
+    setPlaying(false);
+  }, [simulation?.id]);
+
+  // The film starts by itself once it can, unless less motion is wanted.
+  useEffect(() => {
+    if (simulation && !calm() && (url || !video)) setPlaying(true);
+  }, [simulation?.id, url]);
+
+  useEffect(() => {
+    if (!playing || !count) return undefined;
+    const film = element.current;
+    let handle = 0;
+    let wanted = true;
+    const stop = () => {
+      if (wanted) setPlaying(false);
+    };
+    if (film && url) {
+      const shown = (_, meta) => {
+        if (!wanted) return;
+        setFrame(clamp(Math.floor(meta.mediaTime * fps + 0.01), 0, count - 1));
+        handle = film.requestVideoFrameCallback(shown);
+      };
+      handle = film.requestVideoFrameCallback(shown);
+      film.addEventListener("ended", stop);
+      film.play().catch(stop);
+      return () => {
+        wanted = false;
+        film.cancelVideoFrameCallback(handle);
+        film.removeEventListener("ended", stop);
+        film.pause();
+      };
+    }
+    const began = performance.now() - (1000 * frame) / fps;
+    const tick = (now) => {
+      const next = Math.floor(((now - began) * fps) / 1000);
+      setFrame(clamp(next, 0, count - 1));
+      if (next >= count - 1) stop();
+      else handle = requestAnimationFrame(tick);
+    };
+    handle = requestAnimationFrame(tick);
+    return () => {
+      wanted = false;
+      cancelAnimationFrame(handle);
+    };
+  }, [playing, url, simulation?.id]);
+
+  const seek = (wanted) => {
+    const next = clamp(wanted, 0, count - 1);
+    setPlaying(false);
+    setFrame(next);
+    if (element.current) element.current.currentTime = (next + 0.5) / fps;
+  };
+  const toggle = () => {
+    if (!playing && frame >= count - 1) {
+      setFrame(0);
+      if (element.current) element.current.currentTime = 0;
+    }
+    setPlaying(!playing);
+  };
+  return { frame, count, fps, playing, url, element, seek, toggle };
+}
+
+function marksOf(trajectory, fps) {
+  const meets = trajectory.encounters.map((encounter) => ({
+    frame: encounter.first_frame,
+    kind: encounter.kind,
+    text: encounterWords(encounter, trajectory),
+  }));
+  const floor = trajectory.contacts.filter((contact) => contact.b === null).map((contact) => ({
+    frame: Math.round(contact.time * fps),
+    kind: "floor",
+    text: `${trajectory.bodies[contact.a]?.object ?? "It"} meets the floor`,
+  }));
+  return [...meets, ...floor].sort((a, b) => a.frame - b.frame).slice(0, 40);
+}
+
+/** Play, a slider by frames, and when what happens. */
+export function Transport({ player, trajectory }) {
+  const { frame, count, fps, playing } = player;
+  const last = Math.max(1, count - 1);
+  const marks = marksOf(trajectory, fps);
+  return html`<div class="transport" dir="ltr">
+    <button class="round" onClick=${player.toggle} aria-label=${playing ? "Pause" : "Play"}>${playing ? "❚❚" : "▶"}</button>
+    <div class="timeline">
+      <div class="marks">
+        ${marks.map((mark) => html`<button key=${`${mark.frame} ${mark.text}`} class=${`mark ${mark.kind}`} style=${{ left: `${(100 * mark.frame) / last}%` }}
+          title=${`${seconds(mark.frame / fps)}: ${mark.text}`} aria-label=${`Go to ${seconds(mark.frame / fps)}: ${mark.text}`}
+          onClick=${() => player.seek(mark.frame)}></button>`)}
+      </div>
+      <input type="range" min="0" max=${last} value=${frame} aria-label="Frame of the clip"
+        aria-valuetext=${`Frame ${frame} of ${last}, ${seconds(frame / fps)}`} onInput=${(event) => player.seek(Number(event.target.value))} />
+    </div>
+    <output class="time">${(frame / fps).toFixed(2)} s <small>frame ${frame}</small></output>
+  </div>`;
+}

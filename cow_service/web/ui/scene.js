@@ -1,0 +1,205 @@
+// The picture with what was found in it: to look at, to play, and to correct.
+
+import { html, useCallback, useEffect, useRef, useState } from "../vendor/htm-preact.js";
+import { correct } from "../app/asking.js";
+import { boxBetween, directionBetween, isBox, lineOf, middleOf, movedBox, pulledPath, rounded, tipOf, waypointFrames } from "../app/geometry.js";
+import { useCutout } from "../app/pixels.js";
+import { groundingOf, isDirected, motionOf, roleOf } from "../app/request.js";
+import { get, set } from "../app/store.js";
+import { BoxHandles, Handle, pointIn } from "./handles.js";
+import { Arrow, Labels, Moment, Rect, World, labelsOf } from "./marks.js";
+import { Transport, usePlayer } from "./player.js";
+import { Filmstrip } from "./filmstrip.js";
+import { Tools } from "./tools.js";
+
+const LAYERS = { names: true, path: true, band: true, futures: true };
+
+/** The size of a CSS pixel in pixels of the image, as an element is shown now. */
+function useUnit(element, width) {
+  const [unit, setUnit] = useState(1);
+  useEffect(() => {
+    const seen = () => {
+      const { clientWidth } = element.current;
+      if (clientWidth) setUnit(width / clientWidth);
+    };
+    const observer = new ResizeObserver(seen);
+    observer.observe(element.current);
+    seen();
+    return () => observer.disconnect();
+  }, [width]);
+  return unit;
+}
+
+/** The motion of a request in which the direction is another one. */
+export function directed(simulation, corrections, direction) {
+  const base = corrections.motion ?? (simulation ? motionOf(simulation.motion) : {});
+  if (!isDirected(base.kind)) return { ...(base.law ? { law: base.law } : {}), kind: "linear", direction };
+  const depth = Math.abs(base.depth ?? 0) > 0.95 ? 0 : base.depth;
+  return { ...base, direction, ...(depth === undefined ? {} : { depth }) };
+}
+
+export function Scene({ state }) {
+  const { picture, result, corrections, tool, found, question } = state;
+  const simulation = result?.simulation ?? null;
+  const size = { width: picture.width, height: picture.height };
+  const frame = useRef(null);
+  const unit = useUnit(frame, picture.width);
+  const [layers, setLayers] = useState(LAYERS);
+  const [draft, setDraft] = useState(null);
+  const [pending, setPending] = useState(null); // the box of an object that has no name yet
+  const player = usePlayer(simulation);
+  const cutout = useCutout(picture.url, simulation?.grounding.mask ?? null, simulation?.grounding.bbox ?? null);
+
+  useEffect(() => {
+    setDraft(null);
+  }, [simulation?.id, corrections, state.problem]);
+  useEffect(() => setPending(null), [picture.url]);
+
+  const moverBox = draft?.mover ?? corrections.grounding?.bbox ?? simulation?.grounding.bbox ?? null;
+  const moverName = corrections.grounding?.object ?? simulation?.grounding.object ?? "what moves";
+  const origin = corrections.grounding?.point ?? (draft?.mover || corrections.grounding?.bbox ? middleOf(moverBox) : simulation?.grounding.point ?? null);
+  const direction = draft?.direction ?? (corrections.motion ? corrections.motion.direction : simulation?.motion.direction) ?? null;
+  const path = simulation?.trajectory.paths[0] ?? null;
+  const frames = path && !corrections.motion?.steps?.length ? waypointFrames(path) : [];
+  const points = draft?.points ?? path?.points ?? [];
+  const editing = !player.playing && tool === "select";
+
+  const ownNames = new Set(corrections.objects.map((object) => object.object));
+  const world = simulation ? labelsOf(simulation.trajectory) : found.map((body) => ({ text: body.object, box: body.bbox, kind: "body" }));
+  const labels = [
+    ...(moverBox ? [{ text: moverName, box: moverBox, kind: "mover" }] : []),
+    ...corrections.objects.filter((object) => object.bbox).map((object, place) => ({ text: object.object, box: draft?.object === place ? draft.box : object.bbox, kind: "own" })),
+    ...world.filter((label) => !ownNames.has(label.text)),
+  ];
+
+  const endOfBox = useCallback((box) => {
+    const { tool: chosen, result: shown, corrections: now } = get();
+    if (!isBox(box)) return;
+    if (chosen === "mover") {
+      const name = now.grounding?.object ?? shown?.simulation?.grounding.object;
+      correct({ grounding: { ...(name ? { object: name } : {}), bbox: box }, trajectory: null });
+    } else setPending(box);
+  }, []);
+
+  const drawing = {
+    onPointerDown(event) {
+      if (tool === "select" || event.button) return;
+      event.preventDefault();
+      event.currentTarget.setPointerCapture(event.pointerId);
+      const at = pointIn(event.currentTarget, event).map((value) => rounded(value));
+      setDraft({ tool, from: at, to: at });
+    },
+    onPointerMove(event) {
+      if (!draft?.from) return;
+      const to = pointIn(event.currentTarget, event);
+      const aim = draft.tool === "direction" ? { direction: directionBetween(origin ?? draft.from, to) } : { box: boxBetween(draft.from, to, size) };
+      setDraft({ ...draft, to, ...aim });
+    },
+    onPointerUp() {
+      if (!draft?.from) return;
+      const { box, direction: aimed, from } = draft;
+      setDraft(null);
+      if (draft.tool !== "direction") {
+        if (box) endOfBox(box);
+        set({ tool: "select" });
+      } else if (aimed) {
+        const place = origin ? {} : { grounding: { point: from } };
+        correct({ ...place, motion: directed(simulation, corrections, aimed), trajectory: null });
+      }
+    },
+    onPointerCancel: () => setDraft(null),
+  };
+
+  const moverMoves = {
+    onMove: (handle, dx, dy) => setDraft({ mover: movedBox(simulation ? corrections.grounding?.bbox ?? simulation.grounding.bbox : corrections.grounding.bbox, handle, dx, dy, size) }),
+    onEnd: (handle, dx, dy) => {
+      setDraft(null);
+      if (Math.hypot(dx, dy) < 2 * unit) return;
+      const box = movedBox(corrections.grounding?.bbox ?? simulation.grounding.bbox, handle, dx, dy, size);
+      correct({ grounding: { ...(moverName === "what moves" ? {} : { object: moverName }), bbox: box }, trajectory: null });
+    },
+  };
+
+  const shownDirection = direction && origin ? direction : null;
+  const aimedAt = (dx, dy) => {
+    const known = (corrections.motion ? corrections.motion.direction : simulation?.motion.direction) ?? [1, 0];
+    const [tx, ty] = tipOf(origin, known, size);
+    return directionBetween(origin, [tx + dx, ty + dy]);
+  };
+  const pulled = (place, dx, dy) => pulledPath(path.points, frames, place, [dx, dy]);
+  const ownObject = (place) => ({
+    onMove: (handle, dx, dy) => setDraft({ object: place, box: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) }),
+    onEnd: (handle, dx, dy) => {
+      setDraft(null);
+      if (Math.hypot(dx, dy) < 2 * unit) return;
+      const moved = { ...corrections.objects[place], bbox: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) };
+      correct({ objects: corrections.objects.map((object, index) => (index === place ? moved : object)) });
+    },
+  });
+
+  return html`<section class="scene" aria-label="Picture">
+    <${Tools} state=${state} layers=${layers} setLayers=${setLayers} hasFutures=${(path?.futures ?? []).length > 0} />
+    <div class=${`frame tool-${tool}`} ref=${frame} style=${{ aspectRatio: `${size.width} / ${size.height}`, "--ratio": size.width / size.height }}>
+      <img src=${picture.url} alt=${`The picture: ${picture.name}`} draggable=${false} />
+      ${player.url && html`<video key=${player.url} ref=${player.element} src=${player.url} muted playsinline preload="auto" tabindex="-1" aria-label="The imagined clip"
+        class=${player.frame > 0 || player.playing ? "" : "waiting"}></video>`}
+      <svg viewBox=${`0 0 ${size.width} ${size.height}`} role="group" aria-label="What was found" ...${drawing}>
+        ${!simulation && found.map((body, place) => html`<${Rect} key=${place} box=${body.bbox} kind="body" />`)}
+        ${simulation && html`<${World} simulation=${simulation} unit=${unit} size=${size} layers=${layers} line=${draft?.points ? lineOf({ points, visible: path.visible }) : null} />`}
+        ${cutout && !draft?.mover && !player.playing && html`<image class="outline" href=${cutout.outline} x="0" y="0" width=${size.width} height=${size.height} />`}
+        ${moverBox && html`<${Rect} box=${moverBox} kind=${cutout && !draft?.mover ? "mover thin" : "mover"} />`}
+        ${corrections.objects.map((object, place) => {
+          const box = draft?.object === place ? draft.box : object.bbox;
+          return box && html`<${Rect} key=${`own ${place}`} box=${box} kind="own" />`;
+        })}
+        ${simulation && html`<${Moment} simulation=${simulation} frame=${player.frame} unit=${unit} layers=${layers} cutout=${cutout?.cutout} />`}
+        ${layers.names && html`<${Labels} labels=${labels} unit=${unit} size=${size} />`}
+        ${shownDirection && !player.playing && html`<${Arrow} from=${origin} direction=${shownDirection} size=${size} unit=${unit} />`}
+        ${origin && !player.playing && html`<circle class="point" cx=${origin[0]} cy=${origin[1]} r=${3.5 * unit} />`}
+        ${draft?.from && draft.tool === "direction" && draft.direction && !origin && html`<${Arrow} from=${draft.from} direction=${draft.direction} size=${size} unit=${unit} />`}
+        ${draft?.from && draft.box && html`<${Rect} box=${draft.box} kind=${draft.tool === "mover" ? "mover" : "own"} />`}
+        ${pending && html`<${Rect} box=${pending} kind="own" />`}
+        ${editing && moverBox && (simulation || corrections.grounding?.bbox) && html`<${BoxHandles} box=${moverBox} unit=${unit} name=${moverName} kind="of-mover" ...${moverMoves} />`}
+        ${editing && corrections.objects.map((object, place) => object.bbox && html`<${BoxHandles} key=${`handles ${place}`} box=${draft?.object === place ? draft.box : object.bbox}
+          unit=${unit} name=${object.object} kind="of-own" ...${ownObject(place)} />`)}
+        ${editing && frames.map((at, place) => html`<${Handle} key=${`way ${place}`} at=${points[at]} unit=${unit} kind="waypoint" label=${`Point ${place + 1} of the path.`}
+          onMove=${(dx, dy) => setDraft({ points: pulled(place, dx, dy) })}
+          onEnd=${(dx, dy) => {
+            setDraft(null);
+            if (Math.hypot(dx, dy) < 2 * unit) return;
+            correct({ trajectory: { points: pulled(place, dx, dy), fps: simulation.trajectory.fps }, grounding: corrections.grounding ?? groundingOf(simulation.grounding) });
+          }} />`)}
+        ${editing && shownDirection && html`<${Handle} at=${tipOf(origin, shownDirection, size)} unit=${unit} kind="tip" label="Tip of the direction arrow."
+          onMove=${(dx, dy) => setDraft({ direction: aimedAt(dx, dy) })}
+          onEnd=${(dx, dy) => {
+            const aimed = aimedAt(dx, dy);
+            if (aimed && Math.hypot(dx, dy) >= 2 * unit) correct({ motion: directed(simulation, corrections, aimed), trajectory: null });
+            else setDraft(null);
+          }} />`}
+      </svg>
+    </div>
+    ${pending && html`<${NameForm} onName=${(name) => {
+      setPending(null);
+      const object = { object: name, bbox: pending, role: roleOf(name, question) };
+      correct({ objects: [...corrections.objects, object] });
+    }} onCancel=${() => setPending(null)} />`}
+    ${simulation && html`<${Transport} player=${player} trajectory=${simulation.trajectory} />`}
+    ${simulation && html`<${Filmstrip} simulation=${simulation} player=${player} />`}
+  </section>`;
+}
+
+/** Asks for the name of an object that was drawn. */
+function NameForm({ onName, onCancel }) {
+  const field = useRef(null);
+  useEffect(() => field.current.focus(), []);
+  const submit = (event) => {
+    event.preventDefault();
+    const name = field.current.value.trim();
+    if (name) onName(name);
+  };
+  return html`<form class="name-form" onSubmit=${submit}>
+    <label>What is in the box? <input ref=${field} maxlength="200" required placeholder="such as wooden crate" dir="auto" autocomplete="off" /></label>
+    <button class="primary">Add it</button>
+    <button type="button" onClick=${onCancel}>Cancel</button>
+  </form>`;
+}

@@ -1,0 +1,46 @@
+// The stages of a request: which are done, which one runs, which were found again.
+
+import { html } from "../vendor/htm-preact.js";
+import { STAGES, percent, plural, seconds, stagesOf } from "../app/words.js";
+
+function running(run, settings) {
+  const stages = stagesOf(settings);
+  const at = stages.indexOf(run.job.stage);
+  const done = run.done.length ? Math.max(...run.done.map((stage) => stages.indexOf(stage))) : -1;
+  return stages.map((stage, place) => {
+    if (place <= done || place < at) return { stage, state: "done", text: "" };
+    return place === at ? { stage, state: "now", text: "" } : { stage, state: "next", text: "" };
+  });
+}
+
+function ended(result) {
+  const made = result.answer ?? result.simulation;
+  const timings = { ...(result.simulation?.timings ?? {}), ...made.timings };
+  const reused = new Set([...(result.simulation?.reused ?? []), ...made.reused]);
+  return stagesOf(result.settings).filter((stage) => stage in timings || reused.has(stage)).map((stage) => ({
+    stage,
+    state: reused.has(stage) ? "kept" : "done",
+    text: reused.has(stage) ? "kept" : seconds(timings[stage]),
+  }));
+}
+
+function waiting({ status, position, expected_wait: wait, progress }) {
+  if (status === "sending") return "Sending the picture…";
+  if (status === "opening") return "Opening the job…";
+  if (status === "queued") {
+    const ahead = position ? `${plural(position, "job is", "jobs are")} before it` : "It is the next";
+    return `In the queue: ${ahead}${wait ? `, about ${seconds(wait)}` : ""}.`;
+  }
+  return `Running: ${percent(progress)}`;
+}
+
+export function Stages({ run, result, settings }) {
+  if (!run && !result) return null;
+  const stages = run ? running(run, settings) : ended(result);
+  return html`<section class="stages" aria-label="Stages">
+    <ol>${stages.map(({ stage, state, text }) => html`<li key=${stage} class=${state} data-stage=${stage} data-state=${state}><span class="dot" aria-hidden="true"></span>${STAGES[stage]}
+      <small>${text || { now: "now", next: "", done: "done" }[state]}</small></li>`)}</ol>
+    ${run && html`<p role="status" class="waiting-text">${waiting(run.job)}</p>
+      <progress max="1" value=${run.job.status === "running" ? run.job.progress : undefined} aria-label="Progress"></progress>`}
+  </section>`;
+}
