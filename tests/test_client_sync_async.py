@@ -142,7 +142,15 @@ def _handle(client: Any) -> Any:
     handle = client.submit(IMAGE, QUESTION, **SMALL)
     events = [(one.name, one.number) for one in handle.events() if one.name != "progress"]
     found = client.job(handle.id)
-    told = [handle.job.kind, events, handle.wait(), found.wait(timeout=1), found.refresh(), handle.cancel()]
+    told = [
+        handle.job.kind,
+        handle.request(),
+        events,
+        handle.wait(),
+        found.wait(timeout=1),
+        found.refresh(),
+        handle.cancel(),
+    ]
     handle.delete()
     try:
         handle.refresh()

@@ -210,13 +210,36 @@ def test_what_can_be_told_at_once_makes_no_job(served: Served) -> None:
     assert ids(served.http.get("/jobs", params={"limit": 500})) == before
 
 
-@pytest.mark.parametrize("call", ["GET /jobs/{}", "GET /jobs/{}/events", "POST /jobs/{}/cancel", "DELETE /jobs/{}"])
+@pytest.mark.parametrize(
+    "call",
+    ["GET /jobs/{}", "GET /jobs/{}/request", "GET /jobs/{}/events", "POST /jobs/{}/cancel", "DELETE /jobs/{}"],
+)
 def test_there_is_no_such_job(served: Served, call: str) -> None:
     method, path = call.split()
     for name in (str(uuid4()), "x", "0" * 64):
         problem(served.http.request(method, path.format(name)), 404, "job-not-found")
     for name in ("a" * 65, "a_b", "%C3%A4", f"{uuid4()}.webhook.1"):
         problem(served.http.request(method, path.format(name)), 422, "invalid-request")
+
+
+def test_the_request_of_a_job_can_be_sent_again(served: Served) -> None:
+    mask = np.zeros((160, 240), np.uint8)
+    mask[60:98, 170:205] = 255
+    cube = {"object": "blue cube", "role": "obstacle"}
+    body = {**BODY, "objects": [{**cube, "mask": data_url(png_bytes(mask))}], "priority": "low", "question": "?" * 300}
+    job = served.ended(served.submit(body)["id"])
+    assert (job["question"], job["image"]) == (body["question"], job["result"]["image"]["sha256"])
+    assert served.http.get("/jobs", params={"limit": 1}).json()["jobs"][0] | {"result": job["result"]} == job | {
+        "question": "?" * 199 + "…"
+    }
+    told = served.http.get(f"/jobs/{job['id']}/request").json()
+    digest = told["request"]["objects"][0]["mask"]["artifact"]
+    artifacts = {"image": {"artifact": job["image"]}, "objects": [{**cube, "mask": {"artifact": digest}}]}
+    assert told == {"kind": "simulate", "request": {**body, **artifacts}}
+    again = served.ended(served.submit(told["request"])["id"])
+    assert plain(again["result"]) == plain(job["result"]) | {"usage": again["result"]["usage"]}
+    assert again["result"]["reused"] == STAGES
+    assert served.http.get(f"/jobs/{again['id']}/request").json() == told
 
 
 # --- GET /jobs ---

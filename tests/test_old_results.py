@@ -44,6 +44,8 @@ def test_the_jobs_of_an_older_version_are_read(tmp_path: Path) -> None:
             assert simulation is not None
             assert simulation.trajectory.path.points[0] == (275.5, 225.5)
             assert "yellow ball" in repr(simulation)
+            job = served.http.get(f"/jobs/{job}").json()
+            assert (job["question"], job["image"]) == (None, None)
 
 
 def test_the_spec_of_an_older_version_is_read() -> None:
@@ -62,3 +64,5 @@ def _store(served: Served, job: str, result: str) -> None:
             "UPDATE workflow_output SET output = ? WHERE workflow_uuid = ?", (json.dumps(result), job)
         )
         assert stored.rowcount == 1
+        # It kept neither the question nor the image beside the workflow.
+        database.execute("UPDATE workflow_status SET attributes = json_remove(attributes, '$.question', '$.image')")

@@ -184,6 +184,7 @@ def test_an_end_is_told_once_and_signed(
     all_done(job)
     assert attempts(job) == ["SUCCESS"]
     assert len(receiver.heard) == 1
+    assert "webhook" not in http.get(f"/jobs/{job}/request").json()["request"]
     stages = [e["data"]["stage"] for e in events_of(http.get(f"/jobs/{job}/events")) if e["event"] == "stage"]
     assert set(stages) <= {"grounding", "motion", "trajectory", "generation"}
 

@@ -8,17 +8,18 @@ from typing import Any, Generic, TypeVar
 from cow_service.client.events import Event
 from cow_service.client.progress import ProgressLike
 from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
-from cow_service.records import Job
+from cow_service.records import AcceptedRequest, Job
 
 ResultT_co = TypeVar("ResultT_co", covariant=True)
 JobT_co = TypeVar("JobT_co", covariant=True)
+RequestT_co = TypeVar("RequestT_co", covariant=True)
 NoneT_co = TypeVar("NoneT_co", covariant=True)
 EventsT_co = TypeVar("EventsT_co", covariant=True)
 R_co = TypeVar("R_co", bound=Simulation | Answer, covariant=True)
 AsyncR_co = TypeVar("AsyncR_co", bound=AsyncSimulation | AsyncAnswer, covariant=True)
 
 
-class BaseJobHandle(Generic[ResultT_co, JobT_co, NoneT_co, EventsT_co]):
+class BaseJobHandle(Generic[ResultT_co, JobT_co, RequestT_co, NoneT_co, EventsT_co]):
     """The calls of both handles. The type parameters are what they return: values, or coroutines of them."""
 
     def __init__(self, connection: Any, job: Job) -> None:
@@ -36,6 +37,13 @@ class BaseJobHandle(Generic[ResultT_co, JobT_co, NoneT_co, EventsT_co]):
     def refresh(self) -> JobT_co:
         """Gets the state of the job. Raises `JobNotFound` where it was deleted."""
         return self._connection.run(self._connection.refresh(self))
+
+    def request(self) -> RequestT_co:
+        """Gets the request that became the job: `client.submit(**request.request, kind=request.kind)` sends it again.
+
+        Raises `JobNotFound` where the job was deleted.
+        """
+        return self._connection.run(self._connection.request_of(self))
 
     def wait(
         self, timeout: float | None = None, *, progress: ProgressLike = False, minimal: bool = False
@@ -62,13 +70,17 @@ class BaseJobHandle(Generic[ResultT_co, JobT_co, NoneT_co, EventsT_co]):
         return self._connection.events(self, after)
 
 
-class JobHandle(BaseJobHandle[R_co, Job, None, Iterator[Event]]):
+class JobHandle(BaseJobHandle[R_co, Job, AcceptedRequest, None, Iterator[Event]]):
     """A job on the server, which goes on whether or not anybody holds this. `job` is its last known state."""
 
 
 class AsyncJobHandle(
     BaseJobHandle[
-        Coroutine[Any, Any, AsyncR_co], Coroutine[Any, Any, Job], Coroutine[Any, Any, None], AsyncIterator[Event]
+        Coroutine[Any, Any, AsyncR_co],
+        Coroutine[Any, Any, Job],
+        Coroutine[Any, Any, AcceptedRequest],
+        Coroutine[Any, Any, None],
+        AsyncIterator[Event],
     ]
 ):
     """A job on the server, which goes on whether or not anybody holds this. `job` is its last known state."""

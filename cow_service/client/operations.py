@@ -31,7 +31,7 @@ from cow_service.client.serialization import job_in, object_in, plain, read
 from cow_service.client.settings import endpoint_of
 from cow_service.client.steps import Send, Shielded, Sleep, Steps
 from cow_service.errors import CowError
-from cow_service.records import TERMINAL, Job, JobKind, JobPage, Models, Workers
+from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, Models, Workers
 
 FIRST_POLL_SECONDS, POLL_GROWTH, MAX_POLL_SECONDS = 0.1, 1.5, 2.0  # between two requests for the state of a job
 TIMEOUT_MARGIN_SECONDS = 1.0  # that a request may go on after the caller's timeout
@@ -140,6 +140,10 @@ class Operations:
         """The job as it is; the handle holds it."""
         handle.job = job_in((yield from self._exchange(Send("GET", _path(handle.id)))))
         return handle.job
+
+    def request_of(self, handle: Any) -> Steps[AcceptedRequest]:
+        """The request that became the job."""
+        return read(AcceptedRequest, object_in((yield from self._exchange(Send("GET", f"{_path(handle.id)}/request")))))
 
     def cancel(self, handle: Any) -> Steps[Job]:
         """The canceled job; the handle holds it."""

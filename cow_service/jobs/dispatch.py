@@ -17,7 +17,9 @@ from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.state import (
     ATTRIBUTE_CREATED_AT,
     ATTRIBUTE_GENERATOR,
+    ATTRIBUTE_IMAGE,
     ATTRIBUTE_PRIORITY,
+    ATTRIBUTE_QUESTION,
     ATTRIBUTE_QUEUE,
     ATTRIBUTE_TURN,
 )
@@ -54,6 +56,8 @@ def _attributes(job_id: str, spec: JobSpec, owner: str | None, queue: str) -> Ge
         ATTRIBUTE_TURN: str(spec.turn),
         ATTRIBUTE_QUEUE: queue,
         ATTRIBUTE_PRIORITY: spec.priority,
+        ATTRIBUTE_QUESTION: spec.question,
+        ATTRIBUTE_IMAGE: spec.image,
     }
     attributes = SetWorkflowAttributes(kept)
     with SetWorkflowID(job_id), DBOSContextSetAuth(owner, None), attributes:

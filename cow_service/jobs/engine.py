@@ -42,17 +42,13 @@ from cow_service.jobs.processes import Processes
 from cow_service.jobs.queues import QueuePolls, queue_of
 from cow_service.jobs.retries import without_retries
 from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.state import (
-    JobFilters,
-    JobState,
-    OpenJob,
-)
+from cow_service.jobs.state import JobFilters, JobState, OpenJob
 from cow_service.jobs.storage_check import StorageCheck
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.jobs.worker import JobAborted, Worker
 from cow_service.jobs.workflow_table import move_back
 from cow_service.media.images import DecodedImage
-from cow_service.records import TERMINAL, JobPage, ProcessRole
+from cow_service.records import TERMINAL, AcceptedRequest, JobPage, ProcessRole
 from cow_service.requests import Stage
 from cow_service.service import Service
 
@@ -231,10 +227,19 @@ class JobEngine:
         self.database.check_server()
         found = state.find(job_id, self.active, full=full)
         if found is None or (owner is not None and found.owner != owner):
-            raise JobNotFound(f"There is no job {job_id[:64]!r}: it was deleted, or never was one of yours.")
+            raise _no_job(job_id)
         if found.job.status == "queued":
             return replace(found, job=found.job.model_copy(update=self.open_jobs.place_in_line(job_id)))
         return found
+
+    @without_retries
+    def request_of(self, job_id: str, owner: str | None) -> AcceptedRequest:
+        """The request that became a job. Raises as `find` does."""
+        self.find(job_id, owner, full=False)
+        spec = self._spec(job_id)
+        if spec is None:
+            raise _no_job(job_id)
+        return spec.accepted()
 
     @without_retries
     def page(self, owner: str | None, filters: JobFilters) -> JobPage:
@@ -389,3 +394,7 @@ def new_job_id(owner: str | None, key: str | None) -> str:
     if key is None:
         return str(uuid.uuid4())
     return str(uuid.uuid5(uuid.NAMESPACE_URL, f"cow:{owner or ''}:{key}"))
+
+
+def _no_job(job_id: str) -> JobNotFound:
+    return JobNotFound(f"There is no job {job_id[:64]!r}: it was deleted, or never was one of yours.")

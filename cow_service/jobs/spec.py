@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import Field
 
-from cow_service.records import JobKind, Record
+from cow_service.records import AcceptedRequest, JobKind, Record
 from cow_service.requests import AnswerRequest, Priority, SimulateRequest
 from cow_service.stages.results import digest_of
 
@@ -32,6 +32,12 @@ class JobSpec(Record):
         return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
 
     @property
+    def question(self) -> str:
+        """What was asked."""
+        question: str = self.request["question"]
+        return question
+
+    @property
     def image(self) -> str:
         """The digest of the image."""
         digest: str = self.request["image"]["artifact"]
@@ -42,6 +48,11 @@ class JobSpec(Record):
         """The digests of the masks that the request gives."""
         places = [self.request.get("grounding") or {}, *self.request.get("objects", ())]
         return [place["mask"]["artifact"] for place in places if place.get("mask")]
+
+    def accepted(self) -> AcceptedRequest:
+        """The request as its caller may send it again."""
+        priority = {} if self.priority == "normal" else {"priority": self.priority}
+        return AcceptedRequest(kind=self.kind, request=self.request | priority)
 
     def parsed(self) -> SimulateRequest | AnswerRequest:
         """The request, as it was validated when it came."""

@@ -24,6 +24,7 @@ KINDS: tuple[JobKind, ...] = get_args(JobKind)
 # What DBOS keeps beside a workflow.
 ATTRIBUTE_GENERATOR, ATTRIBUTE_CREATED_AT, ATTRIBUTE_QUEUE = "generator", "created_at", "queue"
 ATTRIBUTE_TURN, ATTRIBUTE_PRIORITY = "turn", "priority"
+ATTRIBUTE_QUESTION, ATTRIBUTE_IMAGE = "question", "image"
 STATUS: dict[str, JobStatus] = {
     "ENQUEUED": "queued",
     "DELAYED": "queued",
@@ -35,6 +36,7 @@ STATUS: dict[str, JobStatus] = {
 }
 OPEN = ["ENQUEUED", "DELAYED", "PENDING"]
 ENDED = [name for name in STATUS if name not in OPEN]
+MAX_LISTED_QUESTION = 200  # characters of a question in lists
 MIN_BATCH = 200  # jobs read at a time where filters may drop some of them
 MAX_DELAY = timedelta(seconds=30)  # from the creation of a job to its row: as long as writers wait
 EPOCH = datetime.fromtimestamp(0, UTC)
@@ -95,7 +97,7 @@ def page(owner: str | None, filters: JobFilters, active: ActiveJobs) -> JobPage:
             came = datetime.fromisoformat(job.created_at)
             fits = not filters.status or job.status in filters.status
             if fits and (after is None or after <= came) and (latest is None or came <= latest):
-                jobs.append(job)
+                jobs.append(_listed_job(job))
             if len(jobs) == filters.limit:
                 break
         more = len(rest) > taken
@@ -121,6 +123,12 @@ def _listed(owner: str | None, filters: JobFilters, before: datetime | None, lim
         sort_desc=True,
         limit=limit,
     )
+
+
+def _listed_job(job: Job) -> Job:
+    if job.question is None or len(job.question) <= MAX_LISTED_QUESTION:
+        return job
+    return job.model_copy(update={"question": job.question[: MAX_LISTED_QUESTION - 1] + "…"})
 
 
 def workflows_of_jobs(**filters: Any) -> list[WorkflowStatus]:
@@ -216,6 +224,8 @@ def _state(status: WorkflowStatus, all_at: Mapping[str, At]) -> JobState:
         status=shown,
         stage=stage,
         progress=progress,
+        question=_attribute(status, ATTRIBUTE_QUESTION) or None,
+        image=_attribute(status, ATTRIBUTE_IMAGE) or None,
         created_at=created,
         # Times in SQLite may be whole seconds, and before the job came.
         finished_at=None if status.completed_at is None else max(_time(status.completed_at), created),

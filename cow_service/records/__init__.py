@@ -72,6 +72,7 @@ from cow_service.records.results import (
 )
 from cow_service.records.service import (
     TERMINAL,
+    AcceptedRequest,
     BackendInfo,
     Job,
     JobKind,
@@ -103,6 +104,7 @@ __all__ = [
     "FALLING_KINDS",
     "MEETINGS",
     "TERMINAL",
+    "AcceptedRequest",
     "AlsoMoving",
     "Answer",
     "AnswerOption",

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
-from cow_service.records.base import Record
+from cow_service.records.base import Record, Sha256
 from cow_service.records.results import Answer, Problem, Simulation
 
 
@@ -51,6 +51,14 @@ class Job(Record):
     status: JobStatus
     stage: str | None = Field(default=None, description="The stage that it is in, or was in when it ended.")
     progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
+    question: str | None = Field(
+        default=None,
+        description="The request's; in lists at most 200 characters of it, the last of them `…` where it is longer. "
+        "Null for jobs of earlier versions.",
+    )
+    image: Sha256 | None = Field(
+        default=None, description="The artifact that the request's image is kept as; null for jobs of earlier versions."
+    )
     created_at: str = Field(description="RFC 3339, UTC.")
     finished_at: str | None = Field(default=None, description="RFC 3339, UTC.")
     position: int | None = Field(
@@ -64,6 +72,16 @@ class Job(Record):
     generator: str = Field(description="Who makes its frames.")
     result: Simulation | Answer | None = Field(default=None, description="Of a succeeded job, but not in lists.")
     problem: Problem | None = Field(default=None, description="Of a failed job.")
+
+
+class AcceptedRequest(Record):
+    """The request that became a job."""
+
+    kind: JobKind = Field(description="`simulate`: of `POST /simulate`; `answer`: of `POST /answer`.")
+    request: dict[str, Any] = Field(
+        description="The body, which can be sent again as it stands: image and masks as artifacts, without fields that "
+        "have their default, and without the webhook."
+    )
 
 
 class JobPage(Record):

@@ -1,4 +1,4 @@
-"""`GET /jobs`, `GET /jobs/{id}`, its events, cancellation and deletion."""
+"""`GET /jobs`, `GET /jobs/{id}`, its request and events, cancellation and deletion."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cow_service.api.submission import json_response, owner_of
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.events import END, follow
 from cow_service.jobs.state import JobFilters
-from cow_service.records import TERMINAL, Job, JobKind, JobPage, JobStatus
+from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, JobStatus
 
 JobId = Annotated[str, Path(max_length=64, pattern=r"^[A-Za-z0-9-]+$", description="As the job says.")]
 GONE = (errors.JobNotFound, errors.InvalidRequest, errors.StorageUnavailable)
@@ -78,6 +78,16 @@ def job_routes(engine: JobEngine) -> APIRouter:
         if not preferences_of(request.headers).minimal:
             return json_response(found)
         return json_response(minimal_job(found), headers=MINIMAL_APPLIED)
+
+    @router.get(
+        "/jobs/{id}/request",
+        operation_id="request_of",
+        summary="The request that became a job",
+        responses=documented(*GONE),
+    )
+    def request_of(request: Request, id: JobId) -> AcceptedRequest:
+        """As it was accepted, to be sent again or changed: its image need not be sent with it."""
+        return engine.request_of(id, owner_of(request))
 
     @router.post(
         "/jobs/{id}/cancel",

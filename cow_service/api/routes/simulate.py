@@ -30,7 +30,7 @@ ACCEPTED: dict[int | str, dict[str, Any]] = {
         },
         "links": {
             name: {"operationId": name, "parameters": {"id": "$response.body#/id"}}
-            for name in ("job", "events", "cancel", "delete")
+            for name in ("job", "request_of", "events", "cancel", "delete")
         },
     }
 }
