@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import doctest
 import html
 import importlib
@@ -343,6 +344,8 @@ def test_pictures_are_downloaded_once_and_when_asked_for(connect: Connect, addre
     simulation.pil_frames()
     simulation.video_bytes()
     assert len(seen) == before == 1 + 3 + 1 + 1
+    client.simulate(simulation.image, ASKED, num_frames=9).load()
+    assert len(seen) == before + 1 + 3 + 1 + 1
 
 
 def test_a_simulation_without_video_says_so(client: Any) -> None:
@@ -364,7 +367,7 @@ def test_what_is_saved_is_the_result(client: Any, tmp_path: Path) -> None:
     assert again.model_dump() == answer.simulation.model_dump()
     with pytest.raises(ValueError, match="artifact"):
         again.pil_frames()
-    assert again._repr_html_().count("not downloaded") == 4
+    assert again._repr_html_().count("not downloaded") == 5
     assert again._repr_png_() is None
 
 
@@ -402,15 +405,52 @@ def test_reprs_are_short(client: Any) -> None:
 
 
 def test_notebooks_show_pictures_and_need_no_network(client: Any) -> None:
-    answer = client.answer(PHOTO, ASKED, baseline=True, votes=3).load()
+    answer = client.answer(PHOTO, ASKED, baseline=True, votes=3, video=True).load()
     page = answer._repr_html_()
     assert "B: No" in page
     assert page.count("data:image/png;base64,") == 4
-    assert not re.search(r'(?:src|href)="(?!data:image/png;base64,)|url\(|<script|@import|/artifacts/', page)
+    coded = re.findall(r'<video controls loop muted playsinline [^>]*src="data:video/mp4;base64,([^"]+)"', page)
+    assert [base64.b64decode(one) for one in coded] == [answer.simulation.video_bytes()]
+    assert "band: where 80% of 50 worlds have it" in page
+    assert not re.search(
+        r'(?:src|href)="(?!data:(?:image/png|video/mp4);base64)|url\(|<script|@import|/artifacts/', page
+    )
+    assert "band" not in client.simulate(IMAGE, QUESTION, ensemble=0, **SMALL)._repr_html_()
     assert answer._repr_png_().startswith(b"\x89PNG")
     with Image.open(io.BytesIO(answer._repr_png_())) as strip:
         assert strip.height == 240
         assert strip.width > 4 * 240
+
+
+def test_a_video_that_is_too_large_for_a_notebook_is_named(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = client.simulate(PHOTO, ASKED, num_frames=9).load()
+    monkeypatch.setattr("cow_service.client.display.MAX_VIDEO_BYTES", len(simulation.video_bytes()) - 1)
+    page = simulation._repr_html_()
+    assert "<video" not in page
+    assert "save(folder) writes it" in page
+
+
+def test_models_are_a_table(client: Any) -> None:
+    models = client.models()
+    lines = str(models).splitlines()
+    assert lines == repr(models).splitlines()
+    assert len(lines) == len(models.readers) + len(models.generators)
+    assert "generator  cutout (default)    yes" in lines
+    assert "generator  ati                 needs its weights; cow models pull ati" in lines
+    page = models._repr_html_()
+    assert page.count("<tr>") == 1 + len(lines)
+    for said in ("<code>cow models pull ati</code>", "bytedance-research/ATI", "Apache-2.0", "needs COW_MLLM"):
+        assert said in page
+
+
+def test_names_in_the_table_of_models_are_no_markup() -> None:
+    evil = "<img src=x onerror=alert(1)>\n"
+    backend = {"name": evil, "default": True, "ready": False, "summary": evil, "licence": evil, "weights": evil}
+    backend |= {"missing": [evil], "install": evil, "pull": evil}
+    models = cow_service.client.Models.model_validate({"readers": [backend], "generators": [], "mllms": [evil]})
+    assert "<img" not in models._repr_html_()
+    assert models._repr_html_().count(html.escape(evil).strip()) == 8
+    assert len(str(models).splitlines()) == 1
 
 
 def test_what_callers_and_models_write_is_no_markup() -> None:
@@ -713,9 +753,9 @@ from typing import assert_type
 from PIL import Image
 
 from cow_service.client import (
-    Answer, AsyncAnswer, AsyncClient, AsyncSimulation, Client, CowError, Event, JobHandle, Simulation, errors,
+    Answer, AsyncAnswer, AsyncClient, AsyncSimulation, Client, CowError, Event, JobHandle, Models, Simulation, errors,
 )
-from cow_service.records import Job, Models
+from cow_service.records import Job
 from cow_service.requests import FramesRequest
 
 client = Client(timeout=5, retries=2)

@@ -15,7 +15,14 @@ from rich.table import Table
 
 from cow_service.cli.errors import HINTS
 from cow_service.cli.options import read_file
-from cow_service.client.wording import asked_words, contacts_words, encounters_words, gate_words, outcome_words
+from cow_service.client.wording import (
+    asked_words,
+    contacts_words,
+    encounters_words,
+    gate_words,
+    outcome_words,
+    readiness_words,
+)
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.media.animations import FORMATS, frames_of
 from cow_service.media.images import DecodedImage
@@ -189,11 +196,8 @@ def print_models(models: Models, *, as_json: bool) -> None:
 
 
 def _readiness(backend: BackendInfo) -> str:
-    if backend.ready is None:
-        return "unknown"
-    if backend.ready:
-        return "[green]yes[/]"
-    return f"[yellow]needs {', '.join(backend.missing) or 'its weights'}[/]"
+    words = escape(readiness_words(backend))
+    return words if backend.ready is None else f"[{'green' if backend.ready else 'yellow'}]{words}[/]"
 
 
 def _stage_lines(simulation: Simulation) -> dict[Stage, str]:

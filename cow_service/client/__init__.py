@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from cow_service.client.events import Event
     from cow_service.client.handles import AsyncJobHandle, JobHandle
     from cow_service.client.inputs import ImageLike
+    from cow_service.client.models import Models
     from cow_service.client.questions import Question, QuestionLike
     from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
 
@@ -35,6 +36,7 @@ __all__ = [
     "Event",
     "ImageLike",
     "JobHandle",
+    "Models",
     "Outcome",
     "Question",
     "QuestionLike",
@@ -54,6 +56,7 @@ _MODULES = {
     "Event": "events",
     "ImageLike": "inputs",
     "JobHandle": "handles",
+    "Models": "models",
     "Outcome": "batches",
     "Question": "questions",
     "QuestionLike": "questions",

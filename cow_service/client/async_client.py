@@ -13,8 +13,9 @@ if TYPE_CHECKING:
 
     from cow_service.client.batches import Outcome
     from cow_service.client.handles import AsyncJobHandle
+    from cow_service.client.models import Models
     from cow_service.client.results import AsyncAnswer, AsyncSimulation
-    from cow_service.records import Models, Workers
+    from cow_service.records import Workers
 
     _Base = BaseClient[
         httpx.AsyncClient,

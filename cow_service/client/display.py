@@ -1,4 +1,4 @@
-"""Results in a notebook: overlay, filmstrip and answer as HTML, or as one picture."""
+"""Results in a notebook: overlay, video, filmstrip and answer as HTML, or as one picture."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from cow_service.client.wording import contacts_words, encounters_words, gate_words, outcome_words
-from cow_service.records import Answer, Frame, Simulation, Verdict
+from cow_service.client.wording import band_words, contacts_words, encounters_words, gate_words, outcome_words
+from cow_service.records import Answer, Frame, Simulation, Verdict, Video
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,12 +17,14 @@ if TYPE_CHECKING:
     from PIL import Image
 
 GetBytes = Callable[[str], bytes | None]  # the bytes of an artifact by its digest, where they are available
+MAX_VIDEO_BYTES = 4 * 1024**2  # of a video that stands in the HTML: a notebook keeps it, a third larger, in its file
+LARGE_PX, SMALL_PX = 260, 168  # heights: of overlay and video, and of frames
 ROW_HEIGHT_PX, PICTURES_PER_ROW, GAP_PX = 240, 4, 6  # of the filmstrip
 # Inherited colours, dimmed by opacity: notebooks are light or dark. Long words of callers and models break.
-_TEXT = "font:14px/1.45 system-ui,sans-serif;max-width:72em;overflow-wrap:anywhere"
-_DIM = "opacity:.7"
-_PICTURE = "max-height:168px;max-width:100%;border-radius:4px;display:block"
-_PLACEHOLDER = f"border:1px dashed;border-radius:4px;display:grid;place-items:center;{_DIM}"
+TEXT_STYLE = "font:14px/1.45 system-ui,sans-serif;max-width:72em;overflow-wrap:anywhere"
+DIM_STYLE = "opacity:.7"
+_PICTURE = "max-width:100%;border-radius:4px;display:block"
+_PLACEHOLDER = f"border:1px dashed;border-radius:4px;display:grid;place-items:center;{DIM_STYLE}"
 _LONG_TEXT = "white-space:pre-wrap;max-height:14em;overflow:auto;margin:4px 0"
 
 
@@ -55,7 +57,7 @@ def describe_answer(answer: Verdict) -> str:
 
 
 def simulation_html(simulation: Simulation, get: GetBytes) -> str:
-    """The overlay, the frames side by side, and what was found, as HTML that needs nothing from the network."""
+    """Overlay, video, the frames side by side, and what was found, as HTML that needs nothing from the network."""
     return _block(escape(simulation.question), _body(simulation, get))
 
 
@@ -66,11 +68,11 @@ def answer_html(answer: Answer, get: GetBytes) -> str:
         parts.append(f'<div style="{_LONG_TEXT}">{escape(answer.reasoning)}</div>')
     if sum(answer.votes.values()) > 1:
         votes = ", ".join(f"{name} {count}" for name, count in answer.votes.items())
-        parts.append(f'<div style="{_DIM}">votes: {escape(votes)}</div>')
+        parts.append(f'<div style="{DIM_STYLE}">votes: {escape(votes)}</div>')
     if answer.gate is not None:
-        parts.append(f'<div style="{_DIM}">before looking: {escape(gate_words(answer.gate))}</div>')
+        parts.append(f'<div style="{DIM_STYLE}">before looking: {escape(gate_words(answer.gate))}</div>')
     if answer.baseline is not None:
-        parts.append(f'<div style="{_DIM}">without frames: {escape(describe_answer(answer.baseline))}</div>')
+        parts.append(f'<div style="{DIM_STYLE}">without frames: {escape(describe_answer(answer.baseline))}</div>')
     if answer.simulation is not None:
         parts.append(_body(answer.simulation, get))
         own = [warning for warning in answer.warnings if warning not in answer.simulation.warnings]
@@ -102,15 +104,21 @@ def filmstrip_png(simulation: Simulation, get: GetBytes) -> bytes | None:
 
 
 def _block(heading: str, body: str) -> str:
-    return f'<div style="{_TEXT}"><div style="{_DIM};{_LONG_TEXT}">{heading}</div>{body}</div>'
+    return f'<div style="{TEXT_STYLE}"><div style="{DIM_STYLE};{_LONG_TEXT}">{heading}</div>{body}</div>'
 
 
 def _body(simulation: Simulation, get: GetBytes) -> str:
     image = simulation.image
-    pictures = [_figure(get(simulation.overlay.sha256), image.width / image.height, "what was found")]
-    pictures += [_figure(get(frame.sha256), frame.width / frame.height, _caption(frame)) for frame in simulation.frames]
-    strip = f'<div style="display:flex;flex-wrap:wrap;gap:10px {GAP_PX}px;margin:8px 0">{"".join(pictures)}</div>'
     trajectory = simulation.trajectory
+    found = "; ".join(filter(None, ("what was found", band_words(trajectory))))
+    large = [_picture(get(simulation.overlay.sha256), image.width / image.height, LARGE_PX, found)]
+    if simulation.video is not None:
+        large.append(_video(get(simulation.video.sha256), simulation.video))
+    frames = [
+        _picture(get(frame.sha256), frame.width / frame.height, SMALL_PX, _caption(frame))
+        for frame in simulation.frames
+    ]
+    shown = _row(large) + _row(frames)
     said = simulation.motion.sentence
     if simulation.encounters_known:
         said += f" It {encounters_words(trajectory)}."
@@ -121,22 +129,50 @@ def _body(simulation: Simulation, get: GetBytes) -> str:
         told.append(f"Outcome: {outcome}.")
     if trajectory.moving_until is not None:
         told.append(f"Nothing moves in the image from {trajectory.moving_until:.1f} s on.")
-    return strip + "".join(f"<div>{escape(text)}</div>" for text in told) + _warnings(simulation.warnings)
+    return shown + "".join(f"<div>{escape(text)}</div>" for text in told) + _warnings(simulation.warnings)
 
 
 def _caption(frame: Frame) -> str:
     return f"frame {frame.index}, {frame.time:.2f} s"
 
 
-def _figure(data: bytes | None, ratio: float, caption: str) -> str:
+def _row(figures: Sequence[str]) -> str:
+    return f'<div style="display:flex;flex-wrap:wrap;gap:10px {GAP_PX}px;margin:8px 0">{"".join(figures)}</div>'
+
+
+def _picture(data: bytes | None, ratio: float, height: int, caption: str) -> str:
     if data is None:
-        size = f"height:166px;max-width:100%;aspect-ratio:{ratio:.3f}"
-        inner = f'<div style="{size};{_PLACEHOLDER}">not downloaded</div>'
+        return _figure(_placeholder("not downloaded", ratio, height), ratio, height, caption)
+    source = f"data:image/png;base64,{base64.b64encode(data).decode()}"
+    style = f"max-height:{height}px;{_PICTURE}"
+    return _figure(f'<img src="{source}" alt="{escape(caption)}" style="{style}">', ratio, height, caption)
+
+
+def _video(data: bytes | None, video: Video) -> str:
+    """The clip as a player; where it is not there, or too large for the file of a notebook, what to do instead."""
+    ratio, caption = video.width / video.height, f"video, {video.num_frames / video.fps:.1f} s"
+    if data is None:
+        inner = _placeholder("video not downloaded", ratio, LARGE_PX)
+    elif len(data) > MAX_VIDEO_BYTES:
+        note = f"The video has {len(data) / 1024**2:.1f} MB, too much to be shown here: save(folder) writes it."
+        inner = _placeholder(note, ratio, LARGE_PX)
     else:
-        coded = base64.b64encode(data).decode()
-        inner = f'<img src="data:image/png;base64,{coded}" alt="{escape(caption)}" style="{_PICTURE}">'
-    return f'<figure style="margin:0">{inner}<figcaption style="{_DIM}">{escape(caption)}</figcaption></figure>'
+        source = f"data:video/mp4;base64,{base64.b64encode(data).decode()}"
+        style = f"max-height:{LARGE_PX}px;{_PICTURE}"
+        inner = f'<video controls loop muted playsinline aria-label="{caption}" src="{source}" style="{style}"></video>'
+    return _figure(inner, ratio, LARGE_PX, caption)
+
+
+def _placeholder(text: str, ratio: float, height: int) -> str:
+    size = f"height:{height - 2}px;max-width:100%;aspect-ratio:{ratio:.3f}"
+    return f'<div style="{size};{_PLACEHOLDER}">{escape(text)}</div>'
+
+
+def _figure(inner: str, ratio: float, height: int, caption: str) -> str:
+    """A picture or a video, with words below it that are no wider."""
+    said = f'<figcaption style="{DIM_STYLE}">{escape(caption)}</figcaption>'
+    return f'<figure style="margin:0;max-width:{max(ratio * height, height):.0f}px">{inner}{said}</figure>'
 
 
 def _warnings(warnings: Sequence[Any]) -> str:
-    return "".join(f'<div style="{_DIM}">Note: {escape(str(warning))}</div>' for warning in warnings)
+    return "".join(f'<div style="{DIM_STYLE}">Note: {escape(str(warning))}</div>' for warning in warnings)

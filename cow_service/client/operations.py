@@ -25,13 +25,14 @@ from cow_service.client.errors import (
 from cow_service.client.events import EventCursor
 from cow_service.client.inputs import ImageLike
 from cow_service.client.job_request import MINIMAL, JobRequest, job_request
+from cow_service.client.models import Models
 from cow_service.client.progress import ProgressLike, reporting
 from cow_service.client.retries import pause_before_retry
 from cow_service.client.serialization import job_in, object_in, plain, read
 from cow_service.client.settings import endpoint_of
 from cow_service.client.steps import Send, Shielded, Sleep, Steps
 from cow_service.errors import CowError
-from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, Models, Workers
+from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, Workers
 
 FIRST_POLL_SECONDS, POLL_GROWTH, MAX_POLL_SECONDS = 0.1, 1.5, 2.0  # between two requests for the state of a job
 TIMEOUT_MARGIN_SECONDS = 1.0  # that a request may go on after the caller's timeout

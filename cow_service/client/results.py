@@ -94,7 +94,7 @@ class _Simulation(records.Simulation):
         return filmstrip_png(self, self._picture)
 
     def _picture(self, sha256: str) -> bytes | None:
-        """The bytes of a picture for a notebook; None where they are not available."""
+        """The bytes of a picture or the video for a notebook; None where they are not available."""
         return self._files.held.get(sha256)
 
     def _pil(self, sha256: str) -> Steps[Image.Image]:
@@ -117,6 +117,8 @@ class _Simulation(records.Simulation):
     def _load(self) -> Steps[Self]:
         for sha256 in self.pictures.values():
             yield from self._files.fetch(sha256)
+        if self.video is not None:
+            yield from self._files.fetch(self.video.sha256)
         return self
 
     def save_steps(self, folder: str | Path) -> Steps[Path]:
@@ -192,7 +194,7 @@ class Simulation(_Simulation):
         return _run(self, self._video_bytes())
 
     def load(self) -> Self:
-        """Downloads overlay and frames now."""
+        """Downloads overlay, frames and video now."""
         return _run(self, self._load())
 
     def save(self, folder: str | Path) -> Path:
@@ -229,7 +231,7 @@ class AsyncSimulation(_Simulation):
         return await _async_run(self, self._video_bytes())
 
     async def load(self) -> Self:
-        """Downloads overlay and frames now."""
+        """Downloads overlay, frames and video now."""
         return await _async_run(self, self._load())
 
     async def save(self, folder: str | Path) -> Path:
@@ -251,7 +253,7 @@ class Answer(_Answer):
     simulation: Simulation | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: nobody assigns it
 
     def load(self) -> Self:
-        """Downloads overlay and frames now."""
+        """Downloads overlay, frames and video now."""
         return _run(self.simulation, self._load())
 
     def save(self, folder: str | Path) -> Path:
@@ -265,7 +267,7 @@ class AsyncAnswer(_Answer):
     simulation: AsyncSimulation | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen, too
 
     async def load(self) -> Self:
-        """Downloads overlay and frames now."""
+        """Downloads overlay, frames and video now."""
         return await _async_run(self.simulation, self._load())
 
     async def save(self, folder: str | Path) -> Path:

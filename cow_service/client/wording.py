@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from cow_service.records import MEETINGS, Contact, Encounter, Gate, Outcome, Trajectory, Usage
+from cow_service.records import MEETINGS, BackendInfo, Contact, Encounter, Gate, Outcome, Trajectory, Usage
+from cow_service.records.world import BAND_PERCENTILES
 
 MAX_CONTACTS = 6  # that are told
 
@@ -14,10 +15,25 @@ def asked_words(usage: Usage) -> str:
     return f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out"
 
 
+def readiness_words(backend: BackendInfo) -> str:
+    """Whether a reader or generator can be used, and what is missing where it cannot."""
+    if backend.ready is None:
+        return "unknown"
+    return "yes" if backend.ready else f"needs {', '.join(backend.missing) or 'its weights'}"
+
+
 def gate_words(gate: Gate) -> str:
     """What was answered before looking, and what came of it."""
     votes = ", ".join(f"{name} {count}" for name, count in gate.votes.items()) or "no vote"
     return f"{votes} of {gate.asked}; {gate.reason}: {'imagined' if gate.imagined else 'not imagined'}"
+
+
+def band_words(trajectory: Trajectory) -> str:
+    """What the band of an overlay says; empty where it has none."""
+    if trajectory.law != "contact" or not trajectory.ensemble:
+        return ""
+    low, high = BAND_PERCENTILES
+    return f"band: where {high - low}% of {trajectory.ensemble} worlds have it, across and down apart"
 
 
 def worlds(probability: float) -> str:

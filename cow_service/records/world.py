@@ -16,6 +16,7 @@ MEETINGS: dict[EncounterKind, str] = {
     "occludes": "passes in front of",
     "occluded-by": "passes behind",
 }  # what the mover does with the other object, in words
+BAND_PERCENTILES = (10, 90)  # of the points over the ensemble, across and down apart: what `Path.band` lies between
 Doubt = Literal["speed", "heading", "camera", "size", "place", "friction"]
 """What a world is uncertain of: `place` is how far from the camera and how high bodies are."""
 CameraSource = Literal["shadow", "edges", "request", "prior"]

@@ -15,6 +15,7 @@ from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.projection import SeenPaths, rotation, rotation_where_put, seen_paths, states
 from cow_service.physics.world import Worlds
 from cow_service.records import Body, CameraDeviations, CameraEstimate, Contact, Path, Point
+from cow_service.records.world import BAND_PERCENTILES
 from cow_service.stages.shown import shown_body, was_put
 from cow_service.vision.types import Floats
 
@@ -22,7 +23,6 @@ MOVED = 0.5  # px: what moves less in the image stays where it is
 PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
 SETTLED = 0.25  # px per frame: what moves less is at rest
 LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
-LOW, HIGH = 10, 90  # percentiles of the band
 
 
 def camera_record(fit: CameraFit, worlds: Worlds, around: Worlds | None) -> CameraEstimate:
@@ -141,7 +141,7 @@ def tracks(seen: SeenBody, start: Floats, points: Floats, scale: Floats, turned:
 def _band(around: Worlds, body: int, shift: Floats, num_frames: int) -> tuple[tuple[float, float, float, float], ...]:
     """Per frame the 10th and 90th percentile over the worlds of the ensemble."""
     points = seen_paths(around, body).points
-    low, high = np.percentile(points, [LOW, HIGH], axis=0)
+    low, high = np.percentile(points, BAND_PERCENTILES, axis=0)
     frames = np.arange(num_frames) / around.every
     stamps = np.arange(points.shape[1])
     columns = [np.interp(frames, stamps, edge[:, axis]) + shift[:, axis] for edge in (low, high) for axis in (0, 1)]
