@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -12,6 +13,7 @@ from importlib.resources.abc import Traversable
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Request, Response
+from PIL import Image
 
 from cow_service.errors import NotFound
 from cow_service.media.artifacts import ArtifactStore
@@ -27,6 +29,7 @@ MEDIA_TYPES = {
 }
 PRELOADS = "<!-- preloads -->"  # in the page: the place for its modules, which it would find one after another
 SIGNED_SECONDS = 60  # of a URL that is signed only to learn where the object store is
+THUMBNAIL_SIDE = 400  # px
 ANY_DIGEST = "0" * 64
 
 
@@ -57,8 +60,19 @@ def static_files() -> dict[str, StaticFile]:
     page = found["index.html"]
     found["index.html"] = StaticFile(page.body.replace(PRELOADS.encode(), links.encode()), page.media_type)
     for name, example in EXAMPLES.items():
-        found[f"examples/{name}.jpg"] = StaticFile(example.file("image").read_bytes(), MEDIA_TYPES[".jpg"])
+        image = example.file("image").read_bytes()
+        found[f"examples/{name}.jpg"] = StaticFile(image, MEDIA_TYPES[".jpg"])
+        found[f"examples/{name}-small.jpg"] = StaticFile(_thumbnail(image), MEDIA_TYPES[".jpg"])
     return found
+
+
+def _thumbnail(image: bytes) -> bytes:
+    """A JPEG of at most `THUMBNAIL_SIDE` px."""
+    with Image.open(io.BytesIO(image)) as opened:
+        opened.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
+        out = io.BytesIO()
+        opened.save(out, "JPEG", quality=75, optimize=True)
+    return out.getvalue()
 
 
 def _files_in(folder: Traversable, prefix: str) -> list[tuple[str, StaticFile]]:

@@ -49,10 +49,12 @@ function Gate({ gate }) {
 }
 
 export function Result({ state }) {
-  const { result, compared, models, settings } = state;
+  const { result, compared, models, settings, run } = state;
   const { answer, simulation } = result;
-  const warnings = [...new Set([...(answer?.warnings ?? []), ...(simulation?.warnings ?? [])])];
-  return html`<section class="result" aria-label="Result" aria-live="polite" data-job=${result.jobId}>
+  // Why nothing was imagined is told as a problem, with what can be done.
+  const told = answer?.simulation_problem ? [] : [...(answer?.warnings ?? []), ...(simulation?.warnings ?? [])];
+  const warnings = [...new Set(told)];
+  return html`<section class=${run ? "result old" : "result"} aria-label="Result" aria-busy=${Boolean(run)} data-job=${result.jobId}>
     ${answer && html`<div class="verdicts">
       <${Verdict} title=${simulation ? "After looking" : "From the picture alone"} verdict=${answer} kind="looked" />
       ${answer.baseline && html`<${Verdict} title="Without imagination" verdict=${answer.baseline} kind="baseline" />`}

@@ -3,7 +3,8 @@
 import { html } from "../vendor/htm-preact.js";
 import { address, pageAddress } from "../app/address.js";
 import { currentKey, forgetKey } from "../app/keys.js";
-import { get, set, useStore } from "../app/store.js";
+import { set, useStore } from "../app/store.js";
+import { answerWords } from "../app/words.js";
 import { Correct } from "./correct.js";
 import { Jobs } from "./jobs.js";
 import { AwayNotice, KeyDialog, ProblemNotice } from "./notices.js";
@@ -60,6 +61,12 @@ function Case({ state }) {
   </div>`;
 }
 
+/** What a screen reader says when something has ended. */
+function heard({ result, run }) {
+  if (run || !result) return "";
+  return result.answer ? `Answer: ${answerWords(result.answer)}` : "The frames are ready.";
+}
+
 export function Page() {
   const state = useStore();
   const { view, away, keyWanted, problem, picture } = state;
@@ -70,10 +77,9 @@ export function Page() {
       ${problem && (view === "jobs" || !picture) && html`<${ProblemNotice} problem=${problem} />`}
       ${view === "jobs" ? html`<${Jobs} />` : html`<${Case} state=${state} />`}
     </main>
+    <p class="heard" role="status">${heard(state)}</p>
     ${keyWanted && html`<${KeyDialog} wanted=${keyWanted} />`}
   </div>`;
 }
 
 export const isTyping = (target) => target instanceof Element && target.closest("input, textarea, select, [contenteditable]") !== null;
-
-export const hasPicture = () => get().picture !== null;

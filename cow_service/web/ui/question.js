@@ -72,6 +72,7 @@ function Settings({ settings, models }) {
         options=${[["events", "where something happens"], ["initial", "the first ones"], ["uniform", "all over the clip"]]} />
       <${Whole} label="How many frames" value=${settings.frames.count ?? 3} min="1" max="64" onChange=${(count) => changeSettings({ frames: { ...settings.frames, count } })} />
       ${answering && html`<${Whole} label="Votes" value=${settings.votes} min="1" max="32" onChange=${(votes) => changeSettings({ votes })} />`}
+      <${Whole} label="Length of the clip, frames" value=${settings.num_frames} min="2" max="481" onChange=${(num_frames) => changeSettings({ num_frames })} />
       <${Whole} label="Worlds" value=${settings.ensemble} min="0" max="500" onChange=${(ensemble) => changeSettings({ ensemble })} />
       <${Whole} label="Seed" value=${settings.seed ?? ""} min="0" max=${2 ** 32 - 1} onChange=${(seed) => changeSettings({ seed })} />
     </div>

@@ -43,6 +43,6 @@ export function Start() {
     <div class="drop"><p>Drop or paste a picture here</p><${Choose} /></div>
     <h2>Or try one of these</h2>
     <ul class="examples">${EXAMPLES.map(([name, question]) => html`<li key=${name}><button onClick=${() => takeExample(name, question)}>
-      <img src=${exampleAddress(name)} alt="" width="200" height="150" /><span>${question}</span></button></li>`)}</ul>
+      <img src=${exampleAddress(`${name}-small`)} alt="" width="400" height="300" /><span>${question}</span></button></li>`)}</ul>
   </section>`;
 }
