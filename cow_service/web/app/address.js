@@ -8,6 +8,9 @@ export const address = (path) => new URL(path.replace(/^\//, ""), BASE).href;
 /** The address of the page that shows a job. */
 export const jobAddress = (id) => `${BASE.pathname}?job=${encodeURIComponent(id)}`;
 
+/** The address of the page that lists the jobs. */
+export const jobsAddress = () => `${BASE.pathname}?view=jobs`;
+
 /** The address of the page itself. */
 export const pageAddress = () => BASE.pathname;
 

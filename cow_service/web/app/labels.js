@@ -18,7 +18,9 @@ export function placed(labels, unit, size) {
     const [above, below] = [label.box[1] - height - unit, label.box[3] + unit];
     const sides = label.below ? [below, below + height, above] : [above, above - height, below, below + height];
     const places = sides.filter((y) => y >= 0 && y + height <= size.height).map((y) => ({ x, y, width, height }));
-    const place = places.find((one) => !done.some((other) => overlap(one, other))) ?? places[0] ?? { x, y: Math.max(0, Math.min(above, size.height - height)), width, height };
+    const free = places.find((one) => !done.some((other) => overlap(one, other)));
+    if (!free && label.kind === "body") continue; // a crowd: its boxes are drawn all the same
+    const place = free ?? places[0] ?? { x, y: Math.max(0, Math.min(above, size.height - height)), width, height };
     done.push({ ...label, ...place, text });
   }
   return done;

@@ -4,7 +4,7 @@ import { html, render } from "../vendor/htm-preact.js";
 import { Page, isTyping } from "../ui/page.js";
 import { choosePicture, loadModels, openJob, redo, undo } from "./asking.js";
 import { onKeyWanted } from "./keys.js";
-import { set } from "./store.js";
+import { get, set } from "./store.js";
 
 onKeyWanted((reason, answer) => set({ keyWanted: { reason, answer } }));
 
@@ -35,15 +35,18 @@ addEventListener("keydown", (event) => {
   else undo();
 });
 
+/** Shows what the address says: a job, the list of jobs, or the start. */
 function openAddress() {
-  const job = new URLSearchParams(location.search).get("job");
-  if (job) void openJob(job);
+  const query = new URLSearchParams(location.search);
+  const job = query.get("job");
+  if (query.get("view") === "jobs") set({ view: "jobs", problem: null });
+  else if (job && get().result?.jobId === job) set({ view: "case", problem: null });
+  else if (job) void openJob(job);
   else set({ view: "case", picture: null, result: null, run: null, problem: null });
 }
 
-addEventListener("popstate", (event) => {
-  if (location.hash) return;
-  openAddress(event);
+addEventListener("popstate", () => {
+  if (!location.hash) openAddress();
 });
 
 render(html`<${Page} />`, document.getElementById("app"));

@@ -6,6 +6,8 @@ import { jobAddress } from "../app/address.js";
 import { DOUBTS, answerWords, percent, plural, seconds } from "../app/words.js";
 import { Shot } from "./filmstrip.js";
 
+const FIRST_WARNINGS = 2; // that are shown before somebody asks for the rest
+
 function Votes({ votes }) {
   const all = Object.entries(votes);
   const total = all.reduce((sum, [, count]) => sum + count, 0);
@@ -48,6 +50,13 @@ function Gate({ gate }) {
   return html`<p class="gate">${gate.imagined ? "Imagined" : "Not imagined"}: ${why[gate.reason]} (${percent(gate.agreement)} of ${plural(gate.asked, "vote")}).</p>`;
 }
 
+function Warnings({ warnings }) {
+  const item = (text) => html`<li key=${text} dir="auto">${text}</li>`;
+  const rest = warnings.slice(FIRST_WARNINGS);
+  return html`<div class="warnings"><ul>${warnings.slice(0, FIRST_WARNINGS).map(item)}</ul>
+    ${rest.length > 0 && html`<details><summary>${plural(rest.length, "more note")}</summary><ul>${rest.map(item)}</ul></details>`}</div>`;
+}
+
 export function Result({ state }) {
   const { result, compared, models, settings, run } = state;
   const { answer, simulation } = result;
@@ -63,7 +72,7 @@ export function Result({ state }) {
     ${simulation && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p><${Outcome} trajectory=${simulation.trajectory} said=${answer?.reasoning} />`}
     ${simulation?.trajectory.placement && html`<p>${`It ends ${simulation.trajectory.placement.result.replaceAll("-", " ")}.`}</p>`}
     <${Cost} made=${answer ?? simulation} />
-    ${warnings.length > 0 && html`<ul class="warnings">${warnings.map((text) => html`<li key=${text} dir="auto">${text}</li>`)}</ul>`}
+    <${Warnings} warnings=${warnings} />
     ${models && html`<${Others} models=${models} settings=${settings} compared=${compared} />`}
   </section>`;
 }

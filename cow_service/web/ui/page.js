@@ -1,7 +1,7 @@
 // The whole page.
 
 import { html } from "../vendor/htm-preact.js";
-import { address, pageAddress } from "../app/address.js";
+import { address, jobAddress, jobsAddress, pageAddress } from "../app/address.js";
 import { currentKey, forgetKey } from "../app/keys.js";
 import { set, useStore } from "../app/store.js";
 import { answerWords } from "../app/words.js";
@@ -15,26 +15,23 @@ import { Stages } from "./stages.js";
 import { Choose, Start } from "./start.js";
 import { Take } from "./take.js";
 
-function show(view) {
-  return (event) => {
-    event.preventDefault();
-    set({ view, problem: null });
-  };
+function go(event, href, change) {
+  if (event.ctrlKey || event.metaKey || event.shiftKey) return;
+  event.preventDefault();
+  history.pushState(null, "", href);
+  set({ problem: null, ...change });
 }
 
-function restart(event) {
-  event.preventDefault();
-  history.pushState(null, "", pageAddress());
-  set({ view: "case", picture: null, question: "", result: null, run: null, problem: null, found: [], compared: [] });
-}
+const RESTARTED = { view: "case", picture: null, question: "", result: null, run: null, found: [], compared: [] };
 
 function Header({ state }) {
-  const { view } = state;
+  const { view, result } = state;
+  const caseAddress = result ? jobAddress(result.jobId) : pageAddress();
   return html`<header>
-    <a class="brand" href=${pageAddress()} onClick=${restart}><b>COW</b> <span>Causal Object World model</span></a>
+    <a class="brand" href=${pageAddress()} onClick=${(event) => go(event, pageAddress(), RESTARTED)}><b>COW</b> <span>Causal Object World model</span></a>
     <nav aria-label="Page">
-      <a href="#try" aria-current=${view === "case" ? "page" : undefined} onClick=${show("case")}>Try</a>
-      <a href="#jobs" aria-current=${view === "jobs" ? "page" : undefined} onClick=${show("jobs")}>Jobs</a>
+      <a href=${caseAddress} aria-current=${view === "case" ? "page" : undefined} onClick=${(event) => go(event, caseAddress, { view: "case" })}>Try</a>
+      <a href=${jobsAddress()} aria-current=${view === "jobs" ? "page" : undefined} onClick=${(event) => go(event, jobsAddress(), { view: "jobs" })}>Jobs</a>
       <a href=${address("/docs")}>API</a>
       ${currentKey() !== null && html`<button class="plain" onClick=${() => {
         forgetKey();
