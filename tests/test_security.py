@@ -30,12 +30,15 @@ OPERATIONS = [
     for method in operations
 ]
 UNKNOWN = [
-    ("GET", "/"),
+    ("POST", "/"),
+    ("POST", "/docs"),
+    ("GET", "/docs.json"),
+    ("GET", "/web"),
     ("GET", "/openapi.json"),
     ("GET", "/nowhere"),
     ("POST", "/livez"),
     ("GET", "/livez/"),
-    ("GET", "//livez"),
+    ("GET", "/%2Flivez"),
     ("GET", "/livez/../models"),
     ("DELETE", "/models"),
     ("OPTIONS", "/models"),
@@ -93,6 +96,13 @@ def test_nothing_but_probes_without_a_key(closed: FastAPI, method: str, path: st
             assert response.headers["www-authenticate"] == "Bearer"
             assert response.headers["x-content-type-options"] == "nosniff"
             assert "cow_eve" not in response.text
+
+
+def test_pages_are_served_without_a_key(closed: FastAPI) -> None:
+    asked = [(method, path) for method in ("GET", "HEAD") for path in ("/docs", "/docs/start.js")]
+    assert [response.status_code for response in ask(closed, *asked)] == [200] * 4
+    (unknown,) = ask(closed, ("GET", "/docs/nothing.js"))
+    assert unknown.status_code == 404
 
 
 def test_no_keys_no_questions(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from cow_service.api.openapi import contract
 from cow_service.api.page import page_routes
 from cow_service.api.problems import install_problem_handlers
 from cow_service.api.routes.artifacts import artifact_routes
+from cow_service.api.routes.docs import docs_routes
 from cow_service.api.routes.health import health_routes
 from cow_service.api.routes.jobs import job_routes
 from cow_service.api.routes.simulate import simulate_routes
@@ -54,7 +55,7 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
         title="COW",
         version=__version__,
         summary=SUMMARY,
-        docs_url=None,
+        docs_url=None,  # the framework's page loads its script from elsewhere; ours is in `routes/docs.py`
         redoc_url=None,
         redirect_slashes=False,
         lifespan=lifespan,
@@ -73,6 +74,7 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
         artifact_routes(engine),
         health_routes(engine, readiness),
         page_routes(lambda: engine.service.artifacts, service.settings.artifacts_redirect),
+        docs_routes(),
     ):
         app.include_router(router)
     app.openapi = lambda: contract(app)

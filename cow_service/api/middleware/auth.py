@@ -1,4 +1,4 @@
-"""API keys: where the server has any, only the probes are served without one."""
+"""API keys: where the server has any, only probes and pages are served without one."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from cow_service.api.middleware.keys import KeyRing
+from cow_service.api.middleware.pages import is_page
 from cow_service.api.middleware.rate_limit import Buckets, address_of, is_probe, rate_limited
 from cow_service.api.problems import respond
 from cow_service.errors import CowError, Unauthorized
@@ -16,8 +17,8 @@ MAX_FAILURES = 30  # per minute from one address, before it has to wait
 class ApiKeys:
     """ASGI middleware: finds the owner of the key of each request, `scope["state"]["owner"]`.
 
-    The owner is None where the server has no keys, and for probes. It stands before the router, so that a route that
-    is added tomorrow is closed as well.
+    The owner is None where the server has no keys, and for probes and pages. It stands before the router, so that a
+    route that is added tomorrow is closed as well.
     """
 
     def __init__(self, app: ASGIApp, keys: KeyRing, count_failures: bool) -> None:
@@ -30,7 +31,7 @@ class ApiKeys:
         if scope["type"] != "lifespan":
             state = scope.setdefault("state", {})
             state["owner"] = None
-            if self.keys and not is_probe(scope):
+            if self.keys and not is_probe(scope) and not is_page(scope):
                 key = _bearer(scope)
                 owner = None if key is None else self.keys.owner_of(key)
                 if owner is None:
