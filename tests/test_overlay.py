@@ -55,6 +55,17 @@ def test_every_path_its_band_and_the_contacts_are_drawn() -> None:
     assert not near(canvas, ENCOUNTERS["touches"], 300, 320, 8)
 
 
+def test_a_wide_band_leaves_the_picture_to_be_seen() -> None:
+    image = floor()
+    across = [(200 + 20.0 * i, 200.0) for i in range(9)]
+    change = np.abs(drawn(image, [path(across, spread=150)]).astype(int) - image).max(axis=2)
+    assert 0 < change[100, 280] < 25  # inside, off the line
+    assert change[48:54, 280].max() > 60  # at its edge
+    assert change[20, 280] == 0
+    narrow = np.abs(drawn(image, [path(across, spread=15)]).astype(int) - image).max(axis=2)
+    assert narrow[190, 290] > 40
+
+
 def test_the_outline_takes_the_place_of_the_box() -> None:
     ys, xs = np.mgrid[:400, :640]
     mask = np.hypot(xs - 80, ys - 80) < 15

@@ -19,7 +19,9 @@ ENCOUNTERS = {"touches": (255, 82, 82), "occludes": (190, 120, 255), "occluded-b
 REMOVED = (255, 120, 120)  # what is taken away
 PLACED = (130, 255, 130)  # what is put somewhere before the motion
 HATCH, DASH = 9, 6  # line widths from one line of a hatching to the next, and of a dash
-BAND_OPACITY = 0.3
+BAND_OPACITY, WIDE_BAND_OPACITY = 0.3, 0.06  # of a narrow band, and the least that a wide one comes to
+NARROW_BAND = 0.015  # share of the image up to which a box of a band is narrow
+BAND_EDGE_OPACITY = 0.6  # of the line around a band
 AT_REST = 0.25  # px per frame: what moves less rests
 SUBPIXEL = 4  # binary places of the coordinates handed to OpenCV
 FARTHEST = 20_000  # px: OpenCV draws no farther
@@ -64,7 +66,7 @@ def draw_overlay(
         _draw_removed(canvas, each.old_mask, PLACED, thin)
         _draw_outline(canvas, each.mask, PLACED, thin)
     for number, path in reversed(list(enumerate(trajectory.paths))):
-        _draw_band(canvas, path, PUSHED if number else PATH)
+        _draw_band(canvas, path, PUSHED if number else PATH, thin)
     for encounter in trajectory.encounters:
         _rectangle(canvas, encounter.bbox, ENCOUNTERS[encounter.kind], thin)
     for number, path in reversed(list(enumerate(trajectory.paths))):
@@ -119,8 +121,12 @@ def _words(encounter: Encounter, fps: float) -> str:
     return f"{kind} {encounter.object} {encounter.first_frame / fps:.1f} s{sure}"
 
 
-def _draw_band(canvas: Image, path: Path, colour: Colour) -> None:
-    """The boxes between the 10th and 90th percentile, joined along the path until it rests; translucent."""
+def _draw_band(canvas: Image, path: Path, colour: Colour, thin: int) -> None:
+    """The boxes between the 10th and 90th percentile, joined along the path until it rests, with a line around them.
+
+    Translucent, and the more so the wider a box is: where worlds have gone different ways it covers much of the image,
+    which must still be seen, and says little.
+    """
     if not path.band:
         return
     height, width = canvas.shape[:2]
@@ -128,17 +134,23 @@ def _draw_band(canvas: Image, path: Path, colour: Colour) -> None:
     moving = int(np.flatnonzero(steps > AT_REST).max(initial=-1)) + 2
     boxes = np.clip(np.array(path.band[:moving], np.float64), -FARTHEST, FARTHEST)
     corners = boxes[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 4, 2)
-    covered = np.zeros((height, width), np.uint8)
+    hulls: list[tuple[int, NDArray[np.int32]]] = []
     for before, after, seen in zip(corners, corners[1:], path.visible[1:], strict=False):
         if seen:
             hull = cv2.convexHull(np.concatenate([before, after]).astype(np.float32))
-            cv2.fillConvexPoly(covered, np.rint(hull).astype(np.int32), 1)
-    rows, columns = (np.nonzero(covered.any(axis=axis))[0] for axis in (1, 0))
+            share = cv2.contourArea(hull) / (height * width)
+            opacity = max(WIDE_BAND_OPACITY, BAND_OPACITY * min(1.0, NARROW_BAND / max(share, 1e-9)))
+            hulls.append((round(255 * opacity), np.rint(hull).astype(np.int32)))
+    opacities = np.zeros((height, width), np.uint8)  # 255: opaque
+    for opacity, hull in sorted(hulls, key=lambda each: each[0]):
+        cv2.fillConvexPoly(opacities, hull, opacity)
+    outlines, _ = cv2.findContours(opacities, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(opacities, outlines, -1, round(255 * BAND_EDGE_OPACITY), thin)
+    rows, columns = (np.nonzero(opacities.any(axis=axis))[0] for axis in (1, 0))
     if len(rows):
         window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         part = canvas[window]
-        mixed = part + BAND_OPACITY * (np.array(colour, np.float32) - part)
-        part[:] = np.where(covered[window][..., None] > 0, mixed, part).astype(np.uint8)
+        part[:] = part + opacities[window][..., None] / np.float32(255) * (np.array(colour, np.float32) - part)
 
 
 def _draw_path(canvas: Image, path: Path, fps: float, colour: Colour, thin: int) -> None:
