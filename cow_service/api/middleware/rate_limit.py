@@ -10,6 +10,7 @@ from ipaddress import ip_address, ip_network
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from cow_service.api.middleware.pages import is_page
 from cow_service.api.problems import respond
 from cow_service.errors import RateLimited
 
@@ -74,7 +75,7 @@ class RateLimit:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Passes a request on, or answers that it came too soon."""
-        if scope["type"] != "lifespan" and not is_probe(scope):
+        if scope["type"] != "lifespan" and not is_probe(scope) and not is_page(scope):
             owner = scope["state"]["owner"]
             wait = self.buckets.take(f"key {owner}" if owner is not None else f"address {address_of(scope)}")
             if wait:
