@@ -30,6 +30,7 @@
     ├── GeneratorOutOfMemory       generator-out-of-memory  503
     ├── ModelNotFound              model-not-found          404
     ├── JobNotFound                job-not-found            404
+    ├── DownloadUnavailable        download-unavailable     409
     ├── IdempotencyKeyReused       idempotency-key-reused   422
     ├── WebhookNotAllowed          webhook-not-allowed      422
     ├── QueueFull                  queue-full               503
@@ -284,6 +285,12 @@ class JobNotFound(CowError):
     """There is no such job."""
 
     code, status = "job-not-found", 404
+
+
+class DownloadUnavailable(CowError):
+    """The job has no such file."""
+
+    code, status = "download-unavailable", 409
 
 
 class IdempotencyKeyReused(CowError):

@@ -69,6 +69,7 @@ OTHERS = (
     "internal-error",
     "range-not-satisfiable",
     "job-not-found",
+    "download-unavailable",
     "not-ready",
 )
 

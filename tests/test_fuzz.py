@@ -53,6 +53,7 @@ def contract(tmp_path_factory: pytest.TempPathFactory):
         ("GET", "/jobs/{id}", GenerationMode.POSITIVE),
         ("GET", "/jobs/{id}", GenerationMode.NEGATIVE),
         ("GET", "/jobs/{id}/request", GenerationMode.POSITIVE),
+        ("GET", "/jobs/{id}/download", GenerationMode.POSITIVE),
         ("GET", "/jobs/{id}/events", GenerationMode.POSITIVE),
         ("POST", "/jobs/{id}/cancel", GenerationMode.POSITIVE),
         ("DELETE", "/jobs/{id}", GenerationMode.POSITIVE),
@@ -98,7 +99,7 @@ def test_a_real_server_keeps_the_contract(server: Server) -> None:
 
 
 def test_the_contract_has_no_other_operations(contract) -> None:
-    jobs = {"/jobs", "/jobs/{id}", "/jobs/{id}/request", "/jobs/{id}/events", "/jobs/{id}/cancel"}
+    jobs = {"/jobs", "/jobs/{id}", *(f"/jobs/{{id}}/{part}" for part in ("request", "download", "events", "cancel"))}
     others = {"/artifacts/{sha256}", "/models", "/workers", "/livez", "/readyz", "/metrics"}
     chat = {"/v1/chat/completions", "/v1/responses", "/v1/models", "/v1/models/{model}"}
     assert set(contract) == {"/simulate", "/answer"} | chat | jobs | others

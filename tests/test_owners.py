@@ -86,7 +86,7 @@ def test_a_job_is_its_owners_alone(alice: Caller, bob: Caller) -> None:
     job = alice.ended({**BODY, "video": True})
     assert job["status"] == "succeeded"
     url = f"/jobs/{job['id']}"
-    asked = ["", "/request", "/events"]
+    asked = ["", "/request", "/download", "/events"]
     strangers = [bob.http.get(f"{url}{part}") for part in asked]
     strangers += [bob.http.post(f"{url}/cancel"), bob.http.delete(url)]
     never = bob.http.get("/jobs/00000000-0000-0000-0000-000000000000")

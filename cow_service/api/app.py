@@ -19,6 +19,7 @@ from cow_service.api.page import page_routes
 from cow_service.api.problems import install_problem_handlers
 from cow_service.api.routes.artifacts import artifact_routes
 from cow_service.api.routes.docs import docs_routes
+from cow_service.api.routes.downloads import download_routes
 from cow_service.api.routes.health import health_routes
 from cow_service.api.routes.jobs import job_routes
 from cow_service.api.routes.simulate import simulate_routes
@@ -71,6 +72,7 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
         simulate_routes(submitter),
         chat_routes(submitter, completer),
         job_routes(engine),
+        download_routes(engine),
         artifact_routes(engine),
         health_routes(engine, readiness),
         page_routes(lambda: engine.service.artifacts, service.settings.artifacts_redirect),

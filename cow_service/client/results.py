@@ -123,13 +123,7 @@ class _Simulation(records.Simulation):
 
     def save_steps(self, folder: str | Path) -> Steps[Path]:
         """The steps of `save`."""
-        folder = _made(folder)
-        for name, sha256 in self.pictures.items():
-            (folder / name).write_bytes((yield from self._files.fetch(sha256)))
-        if self.video is not None:
-            (folder / "video.mp4").write_bytes((yield from self._video_bytes()))
-        _write(folder / "simulation.json", self)
-        return folder
+        return (yield from _saved(folder, self, self._files))
 
 
 class _Answer(records.Answer):
@@ -160,11 +154,8 @@ class _Answer(records.Answer):
 
     def save_steps(self, folder: str | Path) -> Steps[Path]:
         """The steps of `save`."""
-        folder = _made(folder)
-        if (simulation := _simulation_of(self)) is not None:
-            yield from simulation.save_steps(folder)
-        _write(folder / "answer.json", self)
-        return folder
+        simulation = _simulation_of(self)
+        return (yield from _saved(folder, self, Files() if simulation is None else simulation._files))
 
 
 class Simulation(_Simulation):
@@ -289,11 +280,12 @@ async def _async_run(simulation: AsyncSimulation | None, steps: Steps[T]) -> T:
     return finished(steps) if connection is None else await connection.run(steps)
 
 
-def _made(folder: str | Path) -> Path:
+def _saved(folder: str | Path, result: records.Simulation | records.Answer, files: Files) -> Steps[Path]:
+    """Writes a result and its artifacts into a folder, which is made if missing."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    for name, sha256 in records.artifacts_of(result).items():
+        (folder / name).write_bytes((yield from files.fetch(sha256)))
+    for name, text in records.documents_of(result).items():
+        (folder / name).write_text(text, encoding="utf-8")
     return folder
-
-
-def _write(path: Path, record: records.Record) -> None:
-    path.write_text(record.model_dump_json(indent=2) + "\n", encoding="utf-8")

@@ -21,12 +21,13 @@ WEBP_QUALITY = 80
 Pixels = NDArray[np.uint8]
 
 
-def frames_of(video: bytes) -> tuple[list[Pixels], float]:
-    """All frames [h, w, 3] of an mp4, RGB, and how many there are in a second."""
+def frames_of(video: bytes, max_side: int | None = None) -> tuple[list[Pixels], float]:
+    """All frames [h, w, 3] of an mp4, RGB, at most `max_side` px, and how many there are in a second."""
     with av.open(io.BytesIO(video), "r") as container:
         stream = container.streams.video[0]
         rate = float(stream.average_rate or 1)
-        return [np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in container.decode(stream)], rate
+        frames = (np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in container.decode(stream))
+        return [fit_within(frame, max_side) for frame in frames], rate
 
 
 def gif(frames: Sequence[Pixels], fps: float) -> bytes:
@@ -61,6 +62,12 @@ FORMATS: dict[str, tuple[str, Callable[[Sequence[Pixels], float], bytes]]] = {
     "sheet": ("sheet.png", contact_sheet),
 }
 """By the name of a format: the file that it makes, and what makes its bytes of frames and their rate."""
+
+
+def animation(video: bytes, format: str) -> bytes:
+    """The file of a format of `FORMATS`, made of an mp4. Its frames are held as small as they will be in the file."""
+    frames, fps = frames_of(video, SHEET_SIDE if format == "sheet" else MAX_SIDE)
+    return FORMATS[format][1](frames, fps)
 
 
 def _sheet(pictures: Sequence[Image.Image], columns: int) -> Image.Image:

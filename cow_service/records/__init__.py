@@ -70,6 +70,7 @@ from cow_service.records.results import (
     Verdict,
     Video,
 )
+from cow_service.records.saved import VIDEO_FILE, artifacts_of, documents_of
 from cow_service.records.service import (
     TERMINAL,
     AcceptedRequest,
@@ -104,6 +105,7 @@ __all__ = [
     "FALLING_KINDS",
     "MEETINGS",
     "TERMINAL",
+    "VIDEO_FILE",
     "AcceptedRequest",
     "AlsoMoving",
     "Answer",
@@ -180,4 +182,6 @@ __all__ = [
     "WorkerInfo",
     "WorkerJob",
     "Workers",
+    "artifacts_of",
+    "documents_of",
 ]

@@ -16,7 +16,7 @@ from cow_service.requests import AnswerRequest, SimulateRequest
 _ELSEWHERE = (  # errors of the server as a whole, and of other operations
     errors.CowError, errors.InternalError, errors.NotFound, errors.MethodNotAllowed, errors.Unauthorized,
     errors.OriginNotAllowed, errors.RateLimited, errors.RangeNotSatisfiable, errors.ModelNotFound, errors.JobNotFound,
-    errors.NotReady,
+    errors.DownloadUnavailable, errors.NotReady,
 )  # fmt: skip
 FAILURES = tuple(kind for kind in errors.kinds().values() if kind not in _ELSEWHERE)
 ACCEPTED: dict[int | str, dict[str, Any]] = {
@@ -30,7 +30,7 @@ ACCEPTED: dict[int | str, dict[str, Any]] = {
         },
         "links": {
             name: {"operationId": name, "parameters": {"id": "$response.body#/id"}}
-            for name in ("job", "request_of", "events", "cancel", "delete")
+            for name in ("job", "request_of", "download", "events", "cancel", "delete")
         },
     }
 }

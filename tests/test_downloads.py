@@ -1,0 +1,104 @@
+"""`GET /jobs/{id}/download`, asked of a real server: a job as a zip, as animated pictures and as a contact sheet."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+from servers import BODY, IMAGE, Served, eventually, problem, slow
+
+from cow_service.client import Client
+
+ANSWERED: dict[str, Any] = {
+    **BODY,
+    "objects": [{"object": "blue cube", "bbox": [170, 60, 205, 98]}],
+    "interventions": [{"kind": "remove", "object": "blue cube"}],
+    "num_frames": 20,
+    "video": True,
+}
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with Served(tmp_path_factory.mktemp("served")) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def answered(served: Served) -> str:
+    """The id of an answer with all that there can be."""
+    job = served.ended(served.submit(ANSWERED, "/answer")["id"])
+    assert job["status"] == "succeeded", job
+    return job["id"]
+
+
+def test_a_zip_holds_what_the_sdk_saves_and_what_was_asked(served: Served, answered: str, tmp_path: Path) -> None:
+    response = served.http.get(f"/jobs/{answered}/download")
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "application/zip"
+    assert response.headers["content-disposition"] == f'attachment; filename="cow-{answered}.zip"'
+    assert served.http.get(f"/jobs/{answered}/download?format=zip").content == response.content
+    with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+        held = {name: archive.read(name) for name in archive.namelist()}
+    assert held.pop("image.png") == IMAGE
+    request = json.loads(held.pop("request.json"))
+    assert request == served.http.get(f"/jobs/{answered}/request").json()["request"]
+    with Client(str(served.http.base_url)) as client:
+        folder = client.job(answered).wait(60).save(tmp_path / "saved")
+    assert held == {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert {"answer.json", "simulation.json", "overlay.png", "video.mp4", "frame_001.png", "factual_001.png"} <= set(
+        held
+    )
+    # Nothing is left of it on the server.
+    eventually(lambda: not list(served.data.rglob(".*.part")))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "name", "kind", "frames"),
+    [("gif", ".gif", "GIF", 20), ("webp", ".webp", "WEBP", 20), ("sheet", "-sheet.png", "PNG", 1)],
+)
+def test_the_video_as_pictures(served: Served, answered: str, wanted: str, name: str, kind: str, frames: int) -> None:
+    response = served.http.get(f"/jobs/{answered}/download", params={"format": wanted})
+    assert response.status_code == 200, response.text
+    assert response.headers["content-disposition"] == f'attachment; filename="cow-{answered}{name}"'
+    with Image.open(io.BytesIO(response.content)) as picture:
+        assert response.headers["content-type"] == Image.MIME[kind]
+        assert (picture.format, getattr(picture, "n_frames", 1)) == (kind, frames)
+        assert picture.size == ((240, 160) if frames > 1 else (4 * 240 + 3 * 4, 3 * 160 + 2 * 4))
+
+
+def test_where_there_is_no_such_file_the_problem_says_what_to_send(served: Served) -> None:
+    def told(job_id: str, wanted: str) -> str:
+        response = served.http.get(f"/jobs/{job_id}/download", params={"format": wanted})
+        return problem(response, 409, "download-unavailable")["detail"]
+
+    running = served.submit(slow(30))["id"]
+    assert "ask again when it has succeeded" in told(running, "zip")
+    served.http.post(f"/jobs/{running}/cancel")
+    assert "was canceled: GET" in told(running, "gif")
+    question = {"grounding": None, "motion": None, "question": "If the pink car turns, what happens?"}
+    failed = served.ended(served.submit({**BODY, **question})["id"])["id"]
+    assert "failed (cannot-ground): GET" in told(failed, "zip")
+    without = served.ended(served.submit(BODY)["id"])["id"]
+    assert "`video: true`" in told(without, "sheet")
+    seen = served.ended(served.submit({**BODY, "imagine": "never"}, "/answer")["id"])["id"]
+    assert "`imagine: always`" in told(seen, "webp")
+    with zipfile.ZipFile(io.BytesIO(served.http.get(f"/jobs/{seen}/download").content)) as archive:
+        assert set(archive.namelist()) == {"answer.json", "request.json", "image.png"}
+    problem(served.http.get("/jobs/x/download"), 404, "job-not-found")
+    problem(served.http.get(f"/jobs/{seen}/download?format=mp4"), 422, "invalid-request")
+
+
+def test_an_artifact_that_is_gone_is_a_problem_and_no_broken_zip(served: Served) -> None:
+    job = served.ended(served.submit({**BODY, "seed": 7, "fps": 9})["id"])
+    sha256 = job["result"]["overlay"]["sha256"]
+    (path,) = served.data.rglob(f"{sha256}.png")
+    path.unlink()
+    problem(served.http.get(f"/jobs/{job['id']}/download"), 404, "artifact-not-found")
