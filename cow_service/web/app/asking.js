@@ -10,11 +10,13 @@ import { NOTHING_CORRECTED, get, set } from "./store.js";
 const MOST_UNDONE = 50;
 let running = null; // the AbortController of the job that the page waits for
 
-const tellAway = (away) => {
+/** Shows whether the server is away. */
+export const tellAway = (away) => {
   if (get().away !== away) set({ away });
 };
 
-function shownProblem(error) {
+/** What went wrong, as the page shows it; null for what somebody broke off. */
+export function shownProblem(error) {
   if (error?.name === "AbortError") return null;
   if (error?.code) return error;
   console.error(error);

@@ -29,6 +29,7 @@ addEventListener("paste", (event) => {
   if (event.clipboardData.files.length) take(event.clipboardData.files);
 });
 addEventListener("keydown", (event) => {
+  if (event.key === "Escape") set({ tool: "select" });
   if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "z" || isTyping(event.target)) return;
   event.preventDefault();
   if (event.shiftKey) redo();

@@ -1,7 +1,7 @@
 // Calls of the HTTP API: problems, keys, and a server that is away.
 
 import { address } from "./address.js";
-import { askForKey, currentKey } from "./keys.js";
+import { askForKey, currentKey, forgetKey } from "./keys.js";
 
 /** What the server answered instead of a result (RFC 9457). */
 export class Problem extends Error {
@@ -51,7 +51,9 @@ export async function call(path, { method = "GET", body, headers = {}, signal } 
     if (response.ok) return response;
     const problem = await problemOf(response);
     if (problem.code !== "unauthorized") throw problem;
-    if (key === currentKey() && !(await askForKey(key === null ? "" : problem.detail))) throw problem;
+    if (key !== currentKey()) continue; // another request was given a new one meanwhile
+    if (key !== null) forgetKey();
+    if (!(await askForKey(key === null ? "" : "The server does not know that key."))) throw problem;
   }
 }
 

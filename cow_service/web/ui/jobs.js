@@ -1,9 +1,9 @@
 // The caller's jobs: what each is, how far it is, and what went wrong.
 
 import { html, useEffect, useState } from "../vendor/htm-preact.js";
-import { openJob } from "../app/asking.js";
+import { openJob, shownProblem, tellAway } from "../app/asking.js";
 import { jobAddress } from "../app/address.js";
-import { call, callJson } from "../app/server.js";
+import { call, callJson, persist } from "../app/server.js";
 import { set } from "../app/store.js";
 import { percent, remedyOf, when } from "../app/words.js";
 import { Shot } from "./filmstrip.js";
@@ -14,11 +14,11 @@ const REFRESH_SECONDS = 2; // while a job is in the making
 
 const isOpen = (job) => job.status === "queued" || job.status === "running";
 
-async function read(filters, cursor) {
+async function read(filters, cursor, signal) {
   const query = new URLSearchParams({ limit: LIMIT });
   for (const [name, value] of Object.entries(filters)) if (value) query.set(name, value);
   if (cursor) query.set("cursor", cursor);
-  return callJson(`/jobs?${query}`);
+  return persist(() => callJson(`/jobs?${query}`, { signal }), tellAway, signal);
 }
 
 export function Jobs() {
@@ -27,11 +27,10 @@ export function Jobs() {
   const [refreshed, refresh] = useState(0);
 
   useEffect(() => {
-    let wanted = true;
-    read(filters).then((found) => wanted && setPage(found), (problem) => wanted && set({ problem }));
-    return () => {
-      wanted = false;
-    };
+    const controller = new AbortController();
+    const { signal } = controller;
+    read(filters, null, signal).then((found) => !signal.aborted && setPage(found), (error) => !signal.aborted && set({ problem: shownProblem(error) }));
+    return () => controller.abort();
   }, [filters, refreshed]);
   useEffect(() => {
     if (!page?.jobs.some(isOpen)) return undefined;
@@ -42,9 +41,8 @@ export function Jobs() {
   const act = async (path, method) => {
     try {
       await call(path, { method });
-    } catch (problem) {
-      if (!problem.code) throw problem;
-      set({ problem });
+    } catch (error) {
+      set({ problem: shownProblem(error) });
     }
     refresh(refreshed + 1);
   };
