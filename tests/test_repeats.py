@@ -281,6 +281,38 @@ def test_the_command_line_passes_the_gate_on(tmp_path: Path, monkeypatch: pytest
         assert told_there.gate is None or told_there.gate.threshold == 0.5
 
 
+def test_the_place_is_not_looked_for_again_where_the_motion_is_given(service: Service, mllm: MllmServer) -> None:
+    """What the model said of the motion, here of a trail, then changes nothing."""
+    image = floor(240, 160)
+    for x in (40, 100, 160):
+        image = ball(image, (x, 80), 15, (210, 20, 20))
+    scene, given = {"image": data_url(png_bytes(image))}, {"motion": {"direction": [0, -1]}}
+    place = {"label": "red ball", "bbox_2d": [604, 406, 729, 594], "cue": "trail", "direction": [167, 500, 667, 500]}
+
+    def reply(handler: Any) -> None:
+        prompt = say.text_of(handler.body)
+        said = BALL if "sets in motion" in prompt else place
+        handler.send(200, say.completion(json.dumps({"answer": "A"} if "`answer`" in prompt else said)))
+
+    mllm.say(reply)
+    (read,) = asked(service, **scene)
+    assert (read["simulation"]["motion"]["cue"], len(mllm.asked)) == ("trail", 3)
+    (kept,) = asked(service, **scene, **given)
+    assert (kept["reused"], kept["usage"]["calls"], len(mllm.asked)) == (["grounding"], 1, 4)
+    (fresh,) = asked(service, headers={"Cache-Control": "no-cache"}, **scene, **given)
+    assert (fresh["reused"], len(mllm.asked)) == ([], 7)
+    for part in ("grounding", "motion", "trajectory", "frames", "warnings"):
+        assert kept["simulation"][part] == fresh["simulation"][part], part
+
+
+def test_rules_do_not_look_again_either_where_the_motion_is_given(tmp_path: Path) -> None:
+    with Service(Settings(data_dir=tmp_path)) as service:
+        assert asked(service)[0]["reused"] == []
+        (kept,) = asked(service, motion={"direction": [0, -1]})
+        assert kept["reused"] == ["grounding"]
+        assert kept["simulation"]["motion"]["direction"] == [0, -1]
+
+
 class _Crash(BaseException):
     """The process ends here."""
 

@@ -86,6 +86,23 @@ def test_a_result_is_found_by_other_jobs_only_where_it_may_be(database: Database
     assert database.finished_stages("two") == {"motion"}
 
 
+def test_a_result_that_says_more_is_taken_where_there_is_none_of_its_own(database: Database, tmp_path: Path) -> None:
+    alone = StageKey("c" * 64, also=(SHARED.digest,))
+
+    def speed_of(job_id: str, key: StageKey, computed: float, **how: Any) -> tuple[float, bool]:
+        found, reused = step(database, tmp_path, job_id, **how)("motion", key, lambda: result(computed))
+        return found.value.speed, reused
+
+    assert speed_of("one", SHARED, 1) == (1, False)
+    assert speed_of("two", alone, 2) == (1, True)
+    assert speed_of("two", alone, 2) == (1, True)  # after a restart
+    assert database.finished_stages("two") == {"motion"}
+    assert speed_of("three", alone, 3, fresh=True) == (3, False)
+    assert speed_of("four", alone, 4, owner="alice") == (4, False)
+    assert speed_of("five", StageKey(alone.digest), 5) == (5, False)
+    assert speed_of("six", alone, 6) == (5, True)  # its own first
+
+
 def test_nothing_is_stored_for_a_job_that_was_canceled_meanwhile(database: Database, tmp_path: Path) -> None:
     def canceled() -> None:
         raise Canceled("The job was canceled.")

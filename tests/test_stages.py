@@ -334,6 +334,14 @@ class TestKeys:
         assert self.key(scene, "grounding", grounding=POINT, **path) == self.key(scene, "grounding", **path)
         assert self.key(scene, "trajectory", grounding=POINT, **path) != self.key(scene, "trajectory", **path)
 
+    def test_a_place_read_together_with_the_motion_is_one_read_alone(self, scene: Scene) -> None:
+        both, alone = self.key(scene, "grounding"), self.key(scene, "grounding", motion={"kind": "fall"})
+        assert both.digest != alone.digest
+        assert (both.also, alone.also) == ((), (both.digest,))
+        assert self.key(scene, "grounding", motion={"kind": "fall"}, seed=1).also != alone.also
+        assert self.key(scene, "grounding", grounding=POINT, motion={"kind": "fall"}).also == ()
+        assert self.key(scene, "motion", grounding=POINT).also == ()
+
     def test_objects_law_ensemble_and_camera_decide_their_stages(self, scene: Scene) -> None:
         mug = {"objects": [{"object": "mug", "bbox": [0, 0, 90, 90]}]}
         for place in ({}, {"grounding": POINT}):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -68,13 +68,9 @@ class StoredStep:
         self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
     ) -> tuple[StageResult[Any], bool]:
         """The stage's result, and whether another job had computed it."""
-        digest = key.digest
-        if self.fresh or not key.shareable:
-            digest = digest_of({"job": self.job_id, "key": key.digest})
-        elif self.owner is not None:
-            digest = digest_of({"owner": self.owner, "key": key.digest})
+        digest, *also = (self._stored_as(each, key.shareable) for each in (key.digest, *key.also))
         with self.hold_key(digest, self.outages.check_canceled):
-            found = self.outages.wait_through(lambda: self._find(stage, digest))
+            found = self.outages.wait_through(lambda: self._find_any(stage, [digest, *also]))
             if found is not None:
                 result, reused = found
                 self.looked_for(stage, reused)
@@ -87,6 +83,17 @@ class StoredStep:
             kept = digest, self.job_id, stage, result.model_dump_json(), result.artifacts
             self.outages.wait_through(lambda: self.database.store_result(*kept))
             return result, False
+
+    def _stored_as(self, digest: str, shareable: bool) -> str:
+        """What a result is stored under, where not all jobs may find it."""
+        if self.fresh or not shareable:
+            return digest_of({"job": self.job_id, "key": digest})
+        return digest if self.owner is None else digest_of({"owner": self.owner, "key": digest})
+
+    def _find_any(self, stage: Stage, digests: Sequence[str]) -> tuple[StageResult[Any], bool] | None:
+        """The first of several results that is there, as `_find` does."""
+        found = (self._find(stage, digest) for digest in digests)
+        return next((each for each in found if each is not None), None)
 
     def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:
         """A stored result all of whose artifacts are there, and whether it is another job's."""

@@ -29,6 +29,7 @@ class StageKey:
 
     digest: str  # SHA-256, hexadecimal
     shareable: bool = True  # False: this job's alone, since it is sampled, or its backend does not say what decides it
+    also: tuple[str, ...] = ()  # digests of other requests' results that say all that this one would
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,21 @@ class KeyFields:
     always: tuple[str, ...] = ()  # ... together with these, which decide in either case
     prompt: str | None = None  # whose version decides, too
     votes: str | None = None  # the field that says how many answers are drawn, of the stages that draw answers
+    read_with: str | None = None  # a stage: where the reader reads for it, too, it says no less of this one
 
 
 READER_FIELDS = ("question", "seed", "left_to_reader")
 TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "ensemble", "question", "num_frames", "fps")
 KEY_FIELDS: dict[Stage, KeyFields] = {
     "gating": KeyFields(("question", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
-    "grounding": KeyFields(READER_FIELDS, "reader", set_by_request=("place",), always=("objects", "interventions")),
+    "grounding": KeyFields(
+        READER_FIELDS,
+        "reader",
+        set_by_request=("place",),
+        always=("objects", "interventions"),
+        # The reader is asked the same of the place; hints for the motion are not used where the request gives it.
+        read_with="motion",
+    ),
     "motion": KeyFields(
         READER_FIELDS,
         "reader",
@@ -94,7 +103,16 @@ def key_of(
         return StageKey(digest_of(parts))
     identity = identity_of(decided.backend)
     sampled = decided.votes is not None and not repeats_answers(getattr(request, decided.votes))
-    return StageKey(digest_of(parts | {"backend": identity}), shareable=identity is not None and not sampled)
+    parts["backend"] = identity
+    return StageKey(digest_of(parts), identity is not None and not sampled, _read_with_more(parts, decided.read_with))
+
+
+def _read_with_more(parts: Mapping[str, Any], stage: str | None) -> tuple[str, ...]:
+    """The digest of the same stage where one more is left to the reader; none where the request leaves it that, too."""
+    left: list[str] = parts["request"].get("left_to_reader", [])
+    if stage is None or stage in left:
+        return ()
+    return (digest_of({**parts, "request": parts["request"] | {"left_to_reader": sorted([*left, stage])}}),)
 
 
 def _digest(value: Record | None) -> str | None:

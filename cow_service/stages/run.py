@@ -203,8 +203,12 @@ class Run(Generic[Request_co]):
 
     @property
     def hints(self) -> MotionHints | None:
-        """What stage 1 learned for stage 2."""
-        return self.results["grounding"].hints if "grounding" in self.results else None
+        """What stage 1 learned for stage 2, where that is left to the reader.
+
+        Else they are not heeded: a grounding that was found again may have some, one of this request would have none.
+        """
+        wanted = "motion" in self.request.left_to_reader and "grounding" in self.results
+        return self.results["grounding"].hints if wanted else None
 
     def repeats_answers(self, votes: int) -> bool:
         """Whether the reader's answers are the same each time; one of another package that does not say is sampled."""
