@@ -76,6 +76,20 @@ def test_the_demo_needs_nothing(tmp_path: Path) -> None:
     assert simulation.trajectory.encounters[0].first_frame in shown, "people are shown the encounter"
 
 
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    result = cow(tmp_path, "demo", "--out", "file/below")
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[0] == "folder-not-writable: The results cannot be written."
+    assert "'file/below' cannot be written: Not a directory. Choose another folder with --out." in result.stderr
+
+
+def test_a_choice_that_there_is_not_is_told_without_the_validator(tmp_path: Path, picture: Path) -> None:
+    result = cow(tmp_path, "simulate", str(picture), QUESTION, "--format", "jpg")
+    assert result.returncode == 2
+    assert "Invalid value for '--format': 'jpg' is not one of 'gif', 'webp', 'sheet'." in result.stderr
+
+
 def test_a_port_that_is_taken_is_told_before_anything_is_loaded(tmp_path: Path) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
-from cow_service.cli.errors import HINTS
+from cow_service.cli.errors import HINTS, FolderNotWritable
 from cow_service.cli.options import read_file
 from cow_service.client.wording import (
     asked_words,
@@ -23,7 +23,7 @@ from cow_service.client.wording import (
     outcome_words,
     readiness_words,
 )
-from cow_service.errors import CowError, InvalidRequest
+from cow_service.errors import InvalidRequest
 from cow_service.media.animations import FORMATS, frames_of
 from cow_service.media.images import DecodedImage
 from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Verdict
@@ -172,11 +172,12 @@ def _save_formats(out: Path, formats: Sequence[str]) -> list[str]:
 
 @contextmanager
 def writable(out: Path) -> Generator[None]:
-    """Translates `OSError` to a `CowError` that names the folder."""
+    """Translates `OSError` to `FolderNotWritable`, which names the folder."""
     try:
         yield
     except OSError as error:
-        raise CowError(f"'{out}' cannot be written: {error.strerror}. Choose another folder with --out.") from error
+        detail = f"'{out}' cannot be written: {error.strerror}. Choose another folder with --out."
+        raise FolderNotWritable(detail) from error
 
 
 def print_models(models: Models, *, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""How the command line shows errors."""
+"""How the command line shows errors, and those that only it has."""
 
 from __future__ import annotations
 
@@ -19,6 +19,18 @@ HINTS = {  # the options that an error's remedy asks for, by the error's code
 }
 
 
+class FileUnreadable(CowError):
+    """A file of the command line cannot be read."""
+
+    code, status = "file-unreadable", 0  # never on the wire
+
+
+class FolderNotWritable(CowError):
+    """The results cannot be written."""
+
+    code, status = "folder-not-writable", 0
+
+
 class Commands(TyperGroup):
     """A group of commands whose errors are a few plain lines on standard error.
 
@@ -37,6 +49,9 @@ class Commands(TyperGroup):
             for field in (field for field in error.errors if field.detail not in error.detail):
                 typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
             raise typer.Exit(1) from error
+        except typer.BadParameter as error:
+            error.message = _own_words(error)
+            raise
         except Exception as error:
             from cow_service.settings import SettingsError  # noqa: PLC0415 - its import would slow down --help
 
@@ -44,6 +59,16 @@ class Commands(TyperGroup):
                 raise
             typer.secho(str(error), fg="red", err=True)
             raise typer.Exit(2) from error
+
+
+def _own_words(error: typer.BadParameter) -> str:
+    """What is wrong with an option, without what the validator of typer puts before it ("Value error, ")."""
+    from pydantic import ValidationError  # noqa: PLC0415 - its import would slow down --help
+
+    if not isinstance(error.__cause__, ValidationError):
+        return error.message
+    raised = error.__cause__.errors()[0].get("ctx", {}).get("error")
+    return str(raised) if isinstance(raised, ValueError) else error.message
 
 
 def printable(text: str) -> str:

@@ -12,8 +12,9 @@ from typing import Annotated, Any, Literal, cast
 
 import typer
 
+from cow_service.cli.errors import FileUnreadable
 from cow_service.cli.interventions import intervention_fields
-from cow_service.errors import CowError, InvalidRequest
+from cow_service.errors import InvalidRequest
 
 
 class Format(StrEnum):
@@ -152,11 +153,11 @@ def with_request_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def read_file(path: Path) -> bytes:
-    """The bytes of a file of the command line. Raises `CowError` where it cannot be read."""
+    """The bytes of a file of the command line. Raises `FileUnreadable`."""
     try:
         return path.read_bytes()
     except OSError as error:
-        raise CowError(f"'{path}' cannot be read: {error.strerror}.") from error
+        raise FileUnreadable(f"'{path}' cannot be read: {error.strerror}. Choose another file.") from error
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
