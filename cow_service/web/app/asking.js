@@ -8,6 +8,7 @@ import { call, callJson, newIdempotencyKey, persist, postJson } from "./server.j
 import { NOTHING_CORRECTED, get, set } from "./store.js";
 
 const MOST_UNDONE = 50;
+const LINE_SECONDS = 2; // between two looks at the place in the queue
 let running = null; // the AbortController of the job that the page waits for
 
 /** Shows whether the server is away. */
@@ -60,6 +61,14 @@ function outcomeOf(job) {
   return { answer, simulation, problem: problem && { ...problem, code: problem.type.split(":").pop(), errors: problem.errors ?? [] } };
 }
 
+/** Reads the place in the queue, of which the events tell nothing. */
+async function lookAtLine(id, signal) {
+  if (get().run?.job.status !== "queued") return;
+  const job = await callJson(`/jobs/${id}`, { signal }).catch(() => null); // the events tell what is wrong
+  const { run } = get();
+  if (job?.status === "queued" && run?.job.id === id) set({ run: { ...run, job } });
+}
+
 async function watch(job, settings, controller) {
   set({ run: { job, done: [] }, problem: null });
   const noted = (event, now) => {
@@ -67,7 +76,8 @@ async function watch(job, settings, controller) {
     if (run?.job.id !== job.id) return;
     set({ run: { job: now.id ? now : run.job, done: event === "stage" ? [...run.done, now.stage] : run.done } });
   };
-  const last = await ended(job.id, noted, controller.signal);
+  const line = setInterval(() => void lookAtLine(job.id, controller.signal), 1000 * LINE_SECONDS);
+  const last = await ended(job.id, noted, controller.signal).finally(() => clearInterval(line));
   const { answer, simulation, problem } = outcomeOf(last);
   const { picture } = get();
   const image = (simulation ?? answer)?.image;

@@ -41,14 +41,18 @@ export const arrowReach = ({ width, height }) => 0.14 * Math.max(width, height);
 
 export const tipOf = ([x, y], [dx, dy], size) => [x + dx * arrowReach(size), y + dy * arrowReach(size)];
 
-/** Frames at which a path has a handle: evenly over the part that moves and is seen. */
-export function waypointFrames(path, most = 5) {
-  let last = path.points.length - 1;
-  const [x, y] = path.points[last];
-  while (last > 0 && Math.hypot(path.points[last - 1][0] - x, path.points[last - 1][1] - y) < 0.5) last -= 1;
-  while (last > 0 && !path.visible[last]) last -= 1;
-  const count = Math.min(most, Math.floor(last / 4));
-  return Array.from({ length: count }, (_, place) => Math.round(((place + 1) * last) / count));
+const HANDLE_DISTANCE = 0.06; // of the image's longer side: between two handles of a path
+
+/** Frames at which a path has a handle: evenly along the part that is seen. */
+export function waypointFrames({ points, visible }, { width, height }, most = 5) {
+  const out = visible.indexOf(false);
+  const seen = out < 0 ? points.length : out;
+  const along = [0];
+  for (let i = 1; i < seen; i += 1) along.push(along[i - 1] + Math.hypot(points[i][0] - points[i - 1][0], points[i][1] - points[i - 1][1]));
+  const length = along.at(-1) ?? 0;
+  const count = Math.min(most, Math.floor(length / (HANDLE_DISTANCE * Math.max(width, height))));
+  const frames = Array.from({ length: count }, (_, place) => along.findIndex((value) => value >= ((place + 1) * length) / count - 1e-6));
+  return [...new Set(frames)].filter((frame) => frame > 0);
 }
 
 /** The points of a path of which one was moved: its neighbours follow, less and less up to the next handles. */

@@ -100,7 +100,7 @@ function Other({ other }) {
     <h3>${label}</h3>
     ${status === "running" && html`<p role="status">Running…</p><progress aria-label=${`Progress of ${label}`}></progress>`}
     ${answer && html`<p class="said" dir="auto">${answerWords(answer)}</p>${answer.reasoning && html`<p class="reasoning" dir="auto">${answer.reasoning}</p>`}`}
-    ${simulation && html`<${Outcome} trajectory=${simulation.trajectory} /><div class="filmstrip">${simulation.frames.map((frame) =>
+    ${simulation && html`<${Outcome} trajectory=${simulation.trajectory} said=${answer?.reasoning} /><div class="filmstrip">${simulation.frames.map((frame) =>
       html`<span class="shot" key=${frame.index}><${Shot} sha256=${frame.sha256} alt=${`Frame ${frame.index}`} /></span>`)}</div>`}
     ${(answer || simulation) && html`<${Cost} made=${answer ?? simulation} />`}
     ${problem && html`<p class="warning">${problem.detail}</p>`}

@@ -60,7 +60,7 @@ export function Scene({ state }) {
   const origin = corrections.grounding?.point ?? (draft?.mover || corrections.grounding?.bbox ? middleOf(moverBox) : simulation?.grounding.point ?? null);
   const direction = draft?.direction ?? (corrections.motion ? corrections.motion.direction : simulation?.motion.direction) ?? null;
   const path = simulation?.trajectory.paths[0] ?? null;
-  const frames = path && !corrections.motion?.steps?.length ? waypointFrames(path) : [];
+  const frames = path && !corrections.motion?.steps?.length ? waypointFrames(path, size) : [];
   const points = draft?.points ?? path?.points ?? [];
   const editing = !player.playing && tool === "select";
 
