@@ -18,7 +18,7 @@ from cow_service.service import Service
 from cow_service.settings import Settings
 
 MINIMAL = {"Prefer": "return=minimal"}
-LISTS = {"states", "scale", "rotation", "band", "tracks", "tracks_visible"}
+LISTS = {"states", "scale", "rotation", "band", "futures", "tracks", "tracks_visible"}
 REMOVES = "If the blue cube is removed and the red ball moves to the right, will it leave the image? (A) Yes (B) No"
 
 

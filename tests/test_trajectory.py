@@ -63,6 +63,8 @@ def is_sane(trajectory: Trajectory, frames: int = 49) -> None:
         assert len(path.rotation) in (0, frames)
         assert len(path.band) in (0, frames)
         assert all(x0 <= x1 and y0 <= y1 for x0, y0, x1, y1 in path.band)
+        assert {len(future) for future in path.futures} <= {frames}
+        assert len(path.futures) == (min(trajectory.ensemble, 8) if path.band and path.body == 0 else 0)
         assert min(path.scale) > 0
     for body in trajectory.bodies:
         assert min(body.size) > 0
@@ -110,8 +112,21 @@ class TestWhatHappens:
         is_sane(told)
         assert told.ensemble == 0
         assert [encounter.probability for encounter in told.encounters] == [None] * len(told.encounters)
-        assert told.path.band == ()
+        assert told.path.band == told.path.futures == ()
         assert (told.outcome.probability, told.outcome.sure) == (None, False)
+
+    def test_futures_are_worlds_of_the_ensemble(self) -> None:
+        """Where all of them are told, the band is made of them."""
+        told = simulated(scene(BESIDE), [BESIDE], ensemble=8)
+        is_sane(told)
+        futures = np.array(told.path.futures)
+        assert np.array_equal(futures, futures.round(1))
+        low, high = np.percentile(futures, [10, 90], axis=0)
+        assert np.hstack([low, high]) == pytest.approx(np.array(told.path.band), abs=0.5)
+        many = np.array(simulated(scene(BESIDE), [BESIDE], ensemble=100).path.futures)
+        assert many.shape == (8, 49, 2)
+        assert len(np.unique(many[:, -1, 0])) == 8
+        assert many[:, 0] == pytest.approx(np.array([told.path.points[0]] * 8), abs=3)
 
     def test_a_question_about_nothing_has_no_outcome(self) -> None:
         assert simulated(scene(BESIDE), [BESIDE], question="What a day!").outcome is None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-LEFT_OUT = ("states", "scale", "rotation", "band", "tracks", "tracks_visible")  # of `Path`, all per frame
+LEFT_OUT = ("states", "scale", "rotation", "band", "futures", "tracks", "tracks_visible")  # of `Path`, all per frame
 SEPARATORS = (",", ":")
 
 

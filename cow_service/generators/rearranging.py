@@ -113,6 +113,7 @@ def _with_frame_before(path: Path, state: tuple[float, float, float, float, floa
             "scale": (1.0, *path.scale),
             "rotation": (0.0, *path.rotation) if path.rotation else (),
             "band": (),
+            "futures": (),
             "tracks": (),
             "tracks_visible": None,
         }

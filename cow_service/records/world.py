@@ -85,6 +85,11 @@ class Path(Record):
         description="Per frame: [x0, y0, x1, y1], px, the 10th and 90th percentile of the point over the ensemble; "
         f"empty without one{_MINIMAL}.",
     )
+    futures: tuple[tuple[Point, ...], ...] = Field(
+        default=(),
+        description="Of the mover alone: the point in other worlds of the ensemble, at most 8 of them, each [x, y] per "
+        f"frame, px, to 0.1 px; empty where `band` is{_MINIMAL}.",
+    )
     moved_at: float | None = Field(default=None, ge=0, description="Seconds until it is set in motion; null: never.")
     tipped_at: float | None = Field(
         default=None, ge=0, description="Seconds until its upright axis leans by more than 45 degrees; null: never."

@@ -16,6 +16,7 @@ from cow_service.physics.projection import SeenPaths, rotation, rotation_where_p
 from cow_service.physics.world import Worlds
 from cow_service.records import Body, CameraDeviations, CameraEstimate, Contact, Path, Point
 from cow_service.records.world import BAND_PERCENTILES
+from cow_service.records import BBox, Body, CameraDeviations, CameraEstimate, Contact, Path, Point
 from cow_service.stages.shown import shown_body, was_put
 from cow_service.vision.types import Floats
 
@@ -23,6 +24,9 @@ MOVED = 0.5  # px: what moves less in the image stays where it is
 PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
 SETTLED = 0.25  # px per frame: what moves less is at rest
 LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
+LOW, HIGH = 10, 90  # percentiles of the band
+MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are told
+FUTURE_DECIMALS = 1  # px
 
 
 def camera_record(fit: CameraFit, worlds: Worlds, around: Worlds | None) -> CameraEstimate:
@@ -113,6 +117,7 @@ def _path(
     if worlds.seen is not None:
         seen = shown_body(seen, body, worlds)
         start, scale = points[0], scale / scale[0]
+    band, futures = _spread(around, body, points - path.points[0])
     visible = np.all((points >= 0) & (points < np.array(size)), axis=1) & ~path.passed[0]
     return Path(
         body=body,
@@ -121,7 +126,8 @@ def _path(
         visible=tuple(visible.tolist()),
         scale=tuple(scale.tolist()),
         rotation=tuple(turned.tolist()) if np.abs(turned).max() > 0.05 else (),
-        band=() if around is None else _band(around, body, points - path.points[0], len(points)),
+        band=band,
+        futures=futures,
         tracks=tuple(pairs(track) for track in tracks(seen, start, points, scale, turned)),
     )
 
@@ -146,6 +152,32 @@ def _band(around: Worlds, body: int, shift: Floats, num_frames: int) -> tuple[tu
     stamps = np.arange(points.shape[1])
     columns = [np.interp(frames, stamps, edge[:, axis]) + shift[:, axis] for edge in (low, high) for axis in (0, 1)]
     return tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in np.stack(columns, axis=1).tolist())
+def _spread(around: Worlds | None, body: int, shift: Floats) -> tuple[tuple[BBox, ...], tuple[tuple[Point, ...], ...]]:
+    """The band of a body's path, and of the mover its futures; nothing without an ensemble."""
+    if around is None:
+        return (), ()
+    worlds = seen_paths(around, body).points
+    band = _band(worlds, around.every, shift)
+    return band, _futures(worlds, around.every, shift) if body == 0 else ()
+
+
+def _band(worlds: Floats, every: int, shift: Floats) -> tuple[BBox, ...]:
+    """Per frame the 10th and 90th percentile over the worlds of the ensemble, as `_at_frames` takes them."""
+    low, high = np.percentile(worlds, [LOW, HIGH], axis=0)
+    edges = np.hstack([_at_frames(low, every, shift), _at_frames(high, every, shift)])
+    return tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in edges.tolist())
+
+
+def _futures(worlds: Floats, every: int, shift: Floats) -> tuple[tuple[Point, ...], ...]:
+    """Paths of some worlds, evenly from all of the ensemble, as `_at_frames` takes them."""
+    chosen = np.linspace(0, len(worlds) - 1, min(MAX_FUTURES, len(worlds))).round().astype(int)
+    return tuple(pairs(_at_frames(worlds[index], every, shift).round(FUTURE_DECIMALS)) for index in chosen)
+
+
+def _at_frames(points: Floats, every: int, shift: Floats) -> Floats:
+    """Points [F, 2] of each frame, of points that are recorded at every few of them, moved by `shift` [F, 2]."""
+    frames, stamps = np.arange(len(shift)) / every, np.arange(len(points))
+    return np.stack([np.interp(frames, stamps, points[:, axis]) for axis in (0, 1)], axis=1) + shift
 
 
 def contact_records(worlds: Worlds, camera: FloorCamera) -> tuple[Contact, ...]:
