@@ -14,9 +14,8 @@ from cow_service.physics.events import WorldEvents
 from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.projection import SeenPaths, rotation, rotation_where_put, seen_paths, states
 from cow_service.physics.world import Worlds
-from cow_service.records import Body, CameraDeviations, CameraEstimate, Contact, Path, Point
-from cow_service.records.world import BAND_PERCENTILES
 from cow_service.records import BBox, Body, CameraDeviations, CameraEstimate, Contact, Path, Point
+from cow_service.records.world import BAND_PERCENTILES
 from cow_service.stages.shown import shown_body, was_put
 from cow_service.vision.types import Floats
 
@@ -24,7 +23,6 @@ MOVED = 0.5  # px: what moves less in the image stays where it is
 PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
 SETTLED = 0.25  # px per frame: what moves less is at rest
 LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
-LOW, HIGH = 10, 90  # percentiles of the band
 MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are told
 FUTURE_DECIMALS = 1  # px
 
@@ -144,14 +142,6 @@ def tracks(seen: SeenBody, start: Floats, points: Floats, scale: Floats, turned:
     return found
 
 
-def _band(around: Worlds, body: int, shift: Floats, num_frames: int) -> tuple[tuple[float, float, float, float], ...]:
-    """Per frame the 10th and 90th percentile over the worlds of the ensemble."""
-    points = seen_paths(around, body).points
-    low, high = np.percentile(points, BAND_PERCENTILES, axis=0)
-    frames = np.arange(num_frames) / around.every
-    stamps = np.arange(points.shape[1])
-    columns = [np.interp(frames, stamps, edge[:, axis]) + shift[:, axis] for edge in (low, high) for axis in (0, 1)]
-    return tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in np.stack(columns, axis=1).tolist())
 def _spread(around: Worlds | None, body: int, shift: Floats) -> tuple[tuple[BBox, ...], tuple[tuple[Point, ...], ...]]:
     """The band of a body's path, and of the mover its futures; nothing without an ensemble."""
     if around is None:
@@ -163,7 +153,7 @@ def _spread(around: Worlds | None, body: int, shift: Floats) -> tuple[tuple[BBox
 
 def _band(worlds: Floats, every: int, shift: Floats) -> tuple[BBox, ...]:
     """Per frame the 10th and 90th percentile over the worlds of the ensemble, as `_at_frames` takes them."""
-    low, high = np.percentile(worlds, [LOW, HIGH], axis=0)
+    low, high = np.percentile(worlds, BAND_PERCENTILES, axis=0)
     edges = np.hstack([_at_frames(low, every, shift), _at_frames(high, every, shift)])
     return tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in edges.tolist())
 

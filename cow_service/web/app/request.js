@@ -73,6 +73,13 @@ export function groundingOf(grounding) {
   return { object: grounding.object, ...place };
 }
 
+/** The objects of a request whose mover is given: the reader, who knew what the question names, is not asked then. */
+export function objectsOf(grounding, own) {
+  const names = new Set(own.map((object) => object.object));
+  const others = grounding.others.filter((other) => !names.has(other.object));
+  return [...own, ...others.map(({ object, bbox, role }) => ({ object, bbox, role }))];
+}
+
 /** The role of an object that was drawn: the question asks about what it names. */
 export function roleOf(name, question) {
   return question.toLowerCase().includes(name.toLowerCase().trim()) ? "target" : "obstacle";

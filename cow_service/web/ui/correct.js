@@ -3,7 +3,7 @@
 import { html } from "../vendor/htm-preact.js";
 import { correct } from "../app/asking.js";
 import { boxBetween, isBox, rounded } from "../app/geometry.js";
-import { groundingOf, isDirected, motionOf } from "../app/request.js";
+import { groundingOf, isDirected, motionOf, objectsOf } from "../app/request.js";
 import { NOTHING_CORRECTED, set } from "../app/store.js";
 
 const KINDS = { linear: "is pushed", projectile: "is thrown", fall: "falls freely", static: "stays where it is", place: "is put somewhere" };
@@ -102,7 +102,7 @@ export function Correct({ state }) {
     ${corrections.trajectory && html`<p class="hint">The path is yours. <button class="plain" onClick=${() => correct({ trajectory: null })}>Compute it again</button></p>`}
     ${simulation && html`<fieldset><legend>What moves</legend><div class="row">
       <input aria-label="Name of what moves" dir="auto" maxlength="200" value=${simulation.grounding.object} onChange=${(event) => event.target.value.trim()
-        && correct({ grounding: { ...groundingOf(simulation.grounding), ...corrections.grounding, object: event.target.value.trim() } })} />
+        && correct({ objects: objectsOf(simulation.grounding, corrections.objects), grounding: { ...groundingOf(simulation.grounding), ...corrections.grounding, object: event.target.value.trim() } })} />
       <button onClick=${() => set({ tool: "mover" })}>Draw its box</button></div></fieldset>
       <${Motion} simulation=${simulation} corrections=${corrections} />`}
     <${Objects} simulation=${simulation} corrections=${corrections} found=${found} picture=${picture} />

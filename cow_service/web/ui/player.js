@@ -12,6 +12,7 @@ export function usePlayer(simulation) {
   const [frame, setFrame] = useState(0);
   const [playing, setPlaying] = useState(false);
   const element = useRef(null);
+  const moving = useRef(false); // a frame that was on its way when the film was stopped does not count
   const video = simulation?.video ?? null;
   const url = useArtifact(video?.sha256 ?? null);
   const count = simulation ? simulation.trajectory.paths[0].points.length : 0;
@@ -29,6 +30,7 @@ export function usePlayer(simulation) {
 
   useEffect(() => {
     if (!playing || !count) return undefined;
+    moving.current = true;
     const film = element.current;
     let handle = 0;
     let wanted = true;
@@ -37,7 +39,7 @@ export function usePlayer(simulation) {
     };
     if (film && url) {
       const shown = (_, meta) => {
-        if (!wanted) return;
+        if (!wanted || !moving.current) return;
         setFrame(clamp(Math.floor(meta.mediaTime * fps + 0.01), 0, count - 1));
         handle = film.requestVideoFrameCallback(shown);
       };
@@ -67,6 +69,7 @@ export function usePlayer(simulation) {
 
   const seek = (wanted) => {
     const next = clamp(wanted, 0, count - 1);
+    moving.current = false;
     setPlaying(false);
     setFrame(next);
     if (element.current) element.current.currentTime = (next + 0.5) / fps;

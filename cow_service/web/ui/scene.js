@@ -1,11 +1,11 @@
 // The picture with what was found in it: to look at, to play, and to correct.
 
-import { html, useCallback, useEffect, useRef, useState } from "../vendor/htm-preact.js";
+import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
 import { correct } from "../app/asking.js";
 import { boxBetween, directionBetween, isBox, lineOf, middleOf, movedBox, pulledPath, rounded, tipOf, waypointFrames } from "../app/geometry.js";
 import { useCutout } from "../app/pixels.js";
-import { groundingOf, isDirected, motionOf, roleOf } from "../app/request.js";
-import { get, set } from "../app/store.js";
+import { groundingOf, isDirected, motionOf, objectsOf, roleOf } from "../app/request.js";
+import { set } from "../app/store.js";
 import { BoxHandles, Handle, pointIn } from "./handles.js";
 import { Arrow, Labels, Moment, Rect, World, labelsOf } from "./marks.js";
 import { Transport, usePlayer } from "./player.js";
@@ -72,14 +72,15 @@ export function Scene({ state }) {
     ...world.filter((label) => !ownNames.has(label.text)),
   ];
 
-  const endOfBox = useCallback((box) => {
-    const { tool: chosen, result: shown, corrections: now } = get();
+  // Beside a mover that is given.
+  const known = () => (simulation ? { objects: objectsOf(simulation.grounding, corrections.objects) } : {});
+  const endOfBox = (box) => {
     if (!isBox(box)) return;
-    if (chosen === "mover") {
-      const name = now.grounding?.object ?? shown?.simulation?.grounding.object;
-      correct({ grounding: { ...(name ? { object: name } : {}), bbox: box }, trajectory: null });
+    if (tool === "mover") {
+      const name = corrections.grounding?.object ?? simulation?.grounding.object;
+      correct({ ...known(), grounding: { ...(name ? { object: name } : {}), bbox: box }, trajectory: null });
     } else setPending(box);
-  }, []);
+  };
 
   const drawing = {
     onPointerDown(event) {
@@ -116,7 +117,7 @@ export function Scene({ state }) {
       setDraft(null);
       if (Math.hypot(dx, dy) < 2 * unit) return;
       const box = movedBox(corrections.grounding?.bbox ?? simulation.grounding.bbox, handle, dx, dy, size);
-      correct({ grounding: { ...(moverName === "what moves" ? {} : { object: moverName }), bbox: box }, trajectory: null });
+      correct({ ...known(), grounding: { ...(moverName === "what moves" ? {} : { object: moverName }), bbox: box }, trajectory: null });
     },
   };
 
@@ -167,7 +168,7 @@ export function Scene({ state }) {
           onEnd=${(dx, dy) => {
             setDraft(null);
             if (Math.hypot(dx, dy) < 2 * unit) return;
-            correct({ trajectory: { points: pulled(place, dx, dy), fps: simulation.trajectory.fps }, grounding: corrections.grounding ?? groundingOf(simulation.grounding) });
+            correct({ ...known(), trajectory: { points: pulled(place, dx, dy), fps: simulation.trajectory.fps }, grounding: corrections.grounding ?? groundingOf(simulation.grounding) });
           }} />`)}
         ${editing && shownDirection && html`<${Handle} at=${tipOf(origin, shownDirection, size)} unit=${unit} kind="tip" label="Tip of the direction arrow."
           onMove=${(dx, dy) => setDraft({ direction: aimedAt(dx, dy) })}
