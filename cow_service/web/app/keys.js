@@ -1,6 +1,6 @@
-// The caller's API key: kept for this tab alone, and asked for when the server wants one.
+// The caller's API key: kept for this tab alone, for /docs too, and asked for when the server wants one.
 
-const NAME = "cow-api-key";
+const NAME = "cow-key";
 let asking = null; // the promise of a dialog that is open
 let open = null;
 
