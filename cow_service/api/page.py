@@ -42,8 +42,8 @@ class StaticFile:
 
     @property
     def etag(self) -> str:
-        """Of its bytes."""
-        return f'"{hashlib.sha256(self.body).hexdigest()[:32]}"'
+        """Of its bytes; weak, since it is the same for the compressed ones."""
+        return f'W/"{hashlib.sha256(self.body).hexdigest()[:32]}"'
 
     @property
     def compresses(self) -> bool:
@@ -88,6 +88,15 @@ def _files_in(folder: Traversable, prefix: str) -> list[tuple[str, StaticFile]]:
 @cache
 def _compressed(path: str) -> bytes:
     return gzip.compress(static_files()[path].body, mtime=0)
+
+
+def _takes_gzip(accepted: str) -> bool:
+    """Whether `Accept-Encoding` lists gzip, and not with a weight of nought (RFC 9110, section 12.5.3)."""
+    for item in accepted.lower().split(","):
+        name, _, weight = item.partition(";")
+        if name.strip() == "gzip":
+            return weight.replace(" ", "") not in ("q=0", "q=0.0", "q=0.00", "q=0.000")
+    return False
 
 
 def security_headers(artifacts_at: str | None = None) -> dict[str, str]:
@@ -148,8 +157,8 @@ def _respond(request: Request, path: str, headers: dict[str, str]) -> Response:
     found = static_files()[path]
     sent = headers | {"ETag": found.etag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
     known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
-    if found.etag in known or "*" in known:
+    if found.etag.removeprefix("W/") in known or "*" in known:
         return Response(status_code=304, headers=sent)
-    if found.compresses and "gzip" in request.headers.get("accept-encoding", ""):
+    if found.compresses and _takes_gzip(request.headers.get("accept-encoding", "")):
         return Response(_compressed(path), headers=sent | {"Content-Encoding": "gzip"}, media_type=found.media_type)
     return Response(found.body, headers=sent, media_type=found.media_type)

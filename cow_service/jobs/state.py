@@ -104,8 +104,18 @@ def page(owner: str | None, filters: JobFilters, active: ActiveJobs) -> JobPage:
         if not more or len(jobs) == filters.limit:
             break
         before, seen = _position(rest[:taken], seen, before)
-    jobs.sort(key=lambda job: job.created_at, reverse=True)
+    jobs = _with_problems(sorted(jobs, key=lambda job: job.created_at, reverse=True))
     return JobPage(jobs=tuple(jobs), next=_cursor(*_position(rest[:taken], seen, before)) if more else None)
+
+
+def _with_problems(jobs: list[Job]) -> list[Job]:
+    """The jobs with what the failed ones failed for: lists are read without outcomes, which can be long."""
+    failed = [job.id for job in jobs if job.status == "failed"]
+    if not failed:
+        return jobs
+    found = {one.workflow_id: _error(one) for one in workflows_of_jobs(workflow_ids=failed, load_output=True)}
+    problems = {job_id: Problem(**error.as_problem()) for job_id, error in found.items() if error is not None}
+    return [job.model_copy(update={"problem": problems.get(job.id, job.problem)}) for job in jobs]
 
 
 def _listed(owner: str | None, filters: JobFilters, before: datetime | None, limit: int) -> list[WorkflowStatus]:

@@ -1,15 +1,19 @@
-// What people do at the page: choose a picture, ask, correct, undo, cancel, open a job.
+// What people do at the page: choose a picture, ask, correct, undo, cancel, open a job, compare.
 
-import { artifactAddress } from "./artifacts.js";
+import { artifactAddress, forgetArtifacts } from "./artifacts.js";
 import { jobAddress, pageAddress } from "./address.js";
 import { follow } from "./events.js";
+import { forgetKey } from "./keys.js";
 import { requestOf, stateOf } from "./request.js";
-import { call, callJson, newIdempotencyKey, persist, postJson } from "./server.js";
+import { Problem, call, callJson, newIdempotencyKey, persist, postJson } from "./server.js";
 import { NOTHING_CORRECTED, get, set } from "./store.js";
 
 const MOST_UNDONE = 50;
 const LINE_SECONDS = 2; // between two looks at the place in the queue
-let running = null; // the AbortController of the job that the page waits for
+const JOB_ID = /^[A-Za-z0-9-]{1,64}$/;
+const NOTHING_ASKED = Object.freeze({ run: null, result: null, problem: null, compared: [], past: [], future: [], tool: "select" });
+
+let running = new AbortController(); // of what the page waits for
 
 /** Shows whether the server is away. */
 export const tellAway = (away) => {
@@ -24,19 +28,43 @@ export function shownProblem(error) {
   return { code: "page-error", title: "The page made a mistake.", detail: String(error?.message ?? error), errors: [] };
 }
 
-/** Sends a request and returns its job. The picture is sent where the server does not keep it. */
+/** Ends what the page waits for, its job too, and begins anew. */
+function begin() {
+  const { run } = get();
+  if (run?.job.id && run.cancels) void cancelJob(run.job.id);
+  running.abort();
+  running = new AbortController();
+  return running;
+}
+
+async function cancelJob(id) {
+  try {
+    await call(`/jobs/${id}/cancel`, { method: "POST" });
+  } catch (error) {
+    if (error.code !== "job-not-found") set({ problem: shownProblem(error) });
+  }
+}
+
+/** Sends a request and returns its job. The picture is sent where the server does not keep it.
+
+A request that is on its way is not broken off: whoever aborts meanwhile cancels its job. */
 async function submit(picture, kind, request, signal) {
   const headers = { Prefer: "respond-async", "Idempotency-Key": newIdempotencyKey() };
   const send = () => {
-    if (picture.sha256) return postJson(`/${kind}`, { ...request, image: { artifact: picture.sha256 } }, headers, signal);
+    if (picture.sha256) return postJson(`/${kind}`, { ...request, image: { artifact: picture.sha256 } }, headers);
     const { question, ...rest } = request;
     const body = new FormData();
     body.append("image", picture.blob, "image");
     body.append("question", question);
     body.append("request", JSON.stringify(rest));
-    return callJson(`/${kind}`, { method: "POST", body, headers, signal });
+    return callJson(`/${kind}`, { method: "POST", body, headers });
   };
-  const sent = () => persist(send, tellAway, signal);
+  const sent = async () => {
+    const job = await persist(send, tellAway, signal);
+    if (!signal?.aborted) return job;
+    await cancelJob(job.id);
+    throw signal.reason;
+  };
   try {
     return await sent();
   } catch (error) {
@@ -69,114 +97,139 @@ async function lookAtLine(id, signal) {
   if (job?.status === "queued" && run?.job.id === id) set({ run: { ...run, job } });
 }
 
-async function watch(job, settings, controller) {
-  set({ run: { job, done: [] }, problem: null });
+/** Shows a job until it has ended, then its result. `asked` is what it was asked: {question, settings, corrections}. */
+async function watch(job, asked, signal, cancels) {
+  set({ run: { job, done: [], settings: asked.settings, cancels }, problem: null });
   const noted = (event, now) => {
     const { run } = get();
-    if (run?.job.id !== job.id) return;
-    set({ run: { job: now.id ? now : run.job, done: event === "stage" ? [...run.done, now.stage] : run.done } });
+    if (signal.aborted || run?.job.id !== job.id) return;
+    set({ run: { ...run, job: now.id ? now : run.job, done: event === "stage" ? [...run.done, now.stage] : run.done } });
   };
-  const line = setInterval(() => void lookAtLine(job.id, controller.signal), 1000 * LINE_SECONDS);
-  const last = await ended(job.id, noted, controller.signal).finally(() => clearInterval(line));
+  const line = setInterval(() => void lookAtLine(job.id, signal), 1000 * LINE_SECONDS);
+  const last = await ended(job.id, noted, signal).finally(() => clearInterval(line));
+  if (signal.aborted) return;
   const { answer, simulation, problem } = outcomeOf(last);
   const { picture } = get();
-  const image = (simulation ?? answer)?.image;
-  if (picture && image) set({ picture: { ...picture, sha256: picture.sha256 ?? image.sha256 ?? null } });
+  const sha256 = picture?.sha256 ?? (simulation ?? answer)?.image.sha256 ?? null;
+  if (picture && !picture.sha256 && sha256) set({ picture: { ...picture, sha256 } });
   if (last.status === "succeeded") {
-    set({ result: { jobId: job.id, kind: last.kind, answer, simulation, settings }, run: null, problem, tool: "select" });
+    set({ result: { jobId: job.id, kind: last.kind, answer, simulation, settings: asked.settings, asked }, run: null, problem });
   } else {
     set({ run: null, problem: last.status === "canceled" ? null : problem });
   }
 }
 
-function begin() {
-  running?.abort();
-  running = new AbortController();
-  return running;
-}
-
-async function guarded(controller, work) {
+async function guarded(signal, work) {
   try {
     await work();
   } catch (error) {
-    if (controller.signal.aborted) return;
-    set({ run: null, problem: shownProblem(error) });
+    if (!signal.aborted) set({ run: null, problem: shownProblem(error) });
   }
 }
+
+const waiting = (status, settings) => ({ job: { id: null, status, progress: 0, stage: null }, done: [], settings, cancels: true });
 
 /** Asks what is on the screen. The job before, if it has not ended, is canceled. */
 export async function ask() {
-  const { picture, question, settings, run } = get();
+  const { picture, question, settings, corrections } = get();
   if (!picture || !question.trim()) return;
-  if (run?.job.id) void cancelJob(run.job.id);
-  const controller = begin();
-  set({ run: { job: { id: null, status: "sending", progress: 0, stage: null }, done: [] }, problem: null, compared: [] });
-  await guarded(controller, async () => {
-    const job = await submit(picture, settings.kind, requestOf(get()), controller.signal);
+  const { signal } = begin();
+  const asked = { question, settings, corrections };
+  set({ run: waiting("sending", settings), problem: null, compared: [] });
+  await guarded(signal, async () => {
+    const job = await submit(picture, settings.kind, requestOf(asked), signal);
+    forgetLook(); // the picture is kept for this job now
     history.pushState(null, "", jobAddress(job.id));
-    await watch(job, settings, controller);
+    await watch(job, asked, signal, true);
   });
-  if (!controller.signal.aborted) forgetLook();
-}
-
-async function cancelJob(id) {
-  try {
-    await call(`/jobs/${id}/cancel`, { method: "POST" });
-  } catch (error) {
-    set({ problem: shownProblem(error) });
-  }
 }
 
 /** Ends the job that the page waits for. */
-export async function cancel() {
+export function cancel() {
   const { run } = get();
-  if (!run) return;
-  if (run.job.id) await cancelJob(run.job.id);
-  running?.abort();
+  if (run?.job.id) void cancelJob(run.job.id);
   set({ run: null });
+  begin();
 }
 
 /** Changes corrections and asks again, if something was asked before. */
-export function correct(change, { again = true } = {}) {
-  const { corrections, past, result, problem } = get();
-  const next = { ...corrections, ...change };
-  set({ corrections: next, past: [...past, corrections].slice(-MOST_UNDONE), future: [], tool: "select" });
-  if (again && (result || problem)) void ask();
+export function correct(change) {
+  const { corrections, past } = get();
+  set({ corrections: { ...corrections, ...change }, past: [...past, corrections].slice(-MOST_UNDONE), future: [], tool: "select" });
+  askAgain();
+}
+
+function askAgain() {
+  const { result, problem, run } = get();
+  if (result || problem || run) void ask();
 }
 
 function step(from, to) {
   const state = get();
   if (!state[from].length) return;
-  const corrections = state[from].at(-1);
-  set({ corrections, [from]: state[from].slice(0, -1), [to]: [...state[to], state.corrections] });
-  if (state.result || state.problem) void ask();
+  set({ corrections: state[from].at(-1), [from]: state[from].slice(0, -1), [to]: [...state[to], state.corrections] });
+  askAgain();
 }
 
 export const undo = () => step("past", "future");
 export const redo = () => step("future", "past");
 
-export const changeSettings = (change) => set(({ settings }) => ({ settings: { ...settings, ...change } }));
+/** Changes settings. Options belong to one generator; answers that are written anew replace those of an opened job. */
+export function changeSettings(change) {
+  const { settings } = get();
+  const { options, ...rest } = settings.rest;
+  const also = "choices" in change ? { rest } : "generator" in change ? { generator_options: {} } : {};
+  set({ settings: { ...settings, ...change, ...also } });
+}
+
+function showPicture(picture, more) {
+  const { picture: before } = get();
+  if (before?.blob && before.url !== picture?.url) URL.revokeObjectURL(before.url);
+  set({ picture, found: [], view: "case", ...NOTHING_ASKED, ...more });
+}
+
+/** Back to the start. */
+export function restart() {
+  begin();
+  forgetLook();
+  showPicture(null, { question: "", corrections: NOTHING_CORRECTED });
+}
+
+/** Forgets the key, and what it was good for. */
+export function leave() {
+  forgetKey();
+  forgetArtifacts();
+  restart();
+}
+
+/** The size of a picture at an address. Throws where the browser cannot show it. */
+async function sizeOf(url) {
+  const image = new Image();
+  image.src = url;
+  await image.decode();
+  return { width: image.naturalWidth, height: image.naturalHeight };
+}
+
+let chosen = 0; // pictures so far: the latest counts
 
 /** Shows a picture that was dropped, pasted, chosen or photographed, and looks what is in it. */
 export async function choosePicture(blob, name, question = "") {
-  begin();
+  const number = (chosen += 1);
   const url = URL.createObjectURL(blob);
-  const image = new Image();
-  image.src = url;
+  let size = null;
   try {
-    await image.decode();
+    size = await sizeOf(url);
   } catch {
-    URL.revokeObjectURL(url);
     const detail = `“${name}” is no picture that the browser can show. Take a PNG, JPEG or WebP.`;
-    set({ problem: { code: "not-a-picture", title: "That is no picture.", detail, errors: [] } });
-    return;
+    if (number === chosen) set({ problem: { code: "not-a-picture", title: "That is no picture.", detail, errors: [] } });
   }
+  if (size === null || number !== chosen) return URL.revokeObjectURL(url);
+  begin();
   forgetLook();
-  const picture = { url, blob, sha256: null, width: image.naturalWidth, height: image.naturalHeight, name };
-  const fresh = { corrections: NOTHING_CORRECTED, past: [], future: [], run: null, result: null, problem: null, compared: [], found: [] };
-  set({ picture, question, tool: "select", view: "case", ...fresh });
+  const picture = { url, blob, sha256: null, ...size, name };
+  showPicture(picture, { question, corrections: NOTHING_CORRECTED });
   history.pushState(null, "", pageAddress());
-  await look(picture);
+  return look(picture);
 }
 
 let looked = null; // the job of `look`
@@ -190,71 +243,72 @@ async function look(picture) {
     motion: { kind: "static" },
     num_frames: 2, video: false, ensemble: 0, frames: { count: 1 }, generator: "cutout",
   };
+  const isShown = () => get().picture?.url === picture.url;
   try {
     const job = await submit(picture, "simulate", request, undefined);
     looked = job.id;
-    if (get().picture?.url !== picture.url || get().run || get().result) return forgetLook();
-    const last = await ended(job.id, () => {}, undefined);
-    const { simulation } = outcomeOf(last);
-    const current = get().picture;
-    if (!simulation || current?.url !== picture.url) return;
-    set({ found: simulation.trajectory.bodies.slice(1), picture: { ...current, sha256: simulation.image.sha256 } });
+    const { run, result } = get();
+    if (!isShown() || run?.job.id || result) return forgetLook();
+    await follow(job.id, () => {}, tellAway, undefined);
+    if (!isShown() || looked !== job.id) return undefined; // it was removed meanwhile
+    const { simulation, problem } = outcomeOf(await callJson(`/jobs/${job.id}`));
+    if (!isShown()) return undefined;
+    if (simulation) set({ found: simulation.trajectory.bodies.slice(1), picture: { ...get().picture, sha256: simulation.image.sha256 } });
+    else if (problem?.code.startsWith("image-")) set({ problem });
   } catch (error) {
-    if (error.code === "bad-image" || error.status === 413 || error.status === 415) set({ problem: error });
+    if (isShown() && (error.code?.startsWith("image-") || error.code === "body-too-large")) set({ problem: error });
     // Else there are no suggestions: what is wrong with the server is told when something is asked.
   }
+  return undefined;
 }
 
-/** Removes the job of `look`: the picture is kept by the jobs that came after it. */
-function forgetLook() {
+/** Removes the job of `look`, also where the page is closed meanwhile. */
+export function forgetLook() {
   if (looked === null) return;
   const id = looked;
   looked = null;
-  call(`/jobs/${id}`, { method: "DELETE" }).catch(() => {});
+  call(`/jobs/${id}`, { method: "DELETE", keepalive: true }).catch(() => {});
 }
 
 /** Shows a job as if it had been asked here. */
 export async function openJob(id) {
-  const controller = begin();
-  set({ view: "case", run: { job: { id: null, status: "opening", progress: 0, stage: null }, done: [] }, problem: null, compared: [] });
-  await guarded(controller, async () => {
-    const { signal } = controller;
-    const [job, accepted] = await persist(
-      () => Promise.all([callJson(`/jobs/${id}`, { signal }), callJson(`/jobs/${id}/request`, { signal })]), tellAway, signal);
-    const shown = stateOf(accepted.kind, accepted.request);
+  const { signal } = begin();
+  set({ view: "case", run: { ...waiting("opening", get().settings), cancels: false }, problem: null, compared: [] });
+  await guarded(signal, async () => {
+    if (!JOB_ID.test(id)) throw new Problem({ type: "urn:cow:problem:job-not-found", title: "There is no such job.", detail: "The link names none." }, 404);
+    const read = () => Promise.all([callJson(`/jobs/${id}`, { signal }), callJson(`/jobs/${id}/request`, { signal })]);
+    const [job, accepted] = await persist(read, tellAway, signal);
+    const asked = stateOf(accepted.kind, accepted.request);
     const sha256 = accepted.request.image.artifact;
     const url = await artifactAddress(sha256);
-    const image = new Image();
-    image.src = url;
-    await image.decode().catch(() => {});
-    const size = { width: image.naturalWidth || 640, height: image.naturalHeight || 480 };
-    const picture = { url, blob: null, sha256, ...size, name: "image" };
+    const size = await sizeOf(url).catch(() => ({ width: 640, height: 480 })); // it is gone: what was found is still shown
+    if (signal.aborted) return;
     const { answer, simulation, problem } = outcomeOf(job);
-    const result = job.status === "succeeded" ? { jobId: id, kind: job.kind, answer, simulation, settings: shown.settings } : null;
-    set({ ...shown, picture, result, past: [], future: [], found: [], tool: "select", run: null, problem });
-    if (job.status === "queued" || job.status === "running") await watch(job, shown.settings, controller);
+    const result = job.status === "succeeded" ? { jobId: id, kind: job.kind, answer, simulation, settings: asked.settings, asked } : null;
+    showPicture({ url, blob: null, sha256, ...size, name: "image" }, { ...asked, result, problem });
+    if (job.status === "queued" || job.status === "running") await watch(job, asked, signal, false);
   });
 }
 
-/** Asks the same of another reader or generator, beside what is shown. */
+/** Asks what the result on the screen was asked of another reader or generator, beside it. */
 export async function compareWith(change) {
-  const { picture, settings, result } = get();
+  const { picture, result } = get();
   const label = Object.values(change).join(", ");
-  const other = { ...settings, ...change };
-  const put = (entry) =>
-    set(({ compared }) => ({ compared: [...compared.filter((each) => each.label !== label), { label, ...entry }] }));
+  const options = "generator" in change ? { generator_options: {} } : {};
+  const settings = { ...result.asked.settings, ...change, ...options };
+  const put = (entry) => set(({ compared, result: shown }) =>
+    shown === result ? { compared: [...compared.filter((each) => each.label !== label), { label, ...entry }] } : {});
   put({ status: "running" });
-  const { signal } = running ?? begin();
   try {
-    const job = await submit(picture, other.kind, requestOf({ ...get(), settings: other }), signal);
-    const { answer, simulation, problem } = outcomeOf(await ended(job.id, () => {}, signal));
-    if (get().result === result) put({ status: answer || simulation ? "succeeded" : "failed", jobId: job.id, answer, simulation, problem });
+    const job = await submit(picture, settings.kind, requestOf({ ...result.asked, settings }), undefined);
+    const { answer, simulation, problem } = outcomeOf(await ended(job.id, () => {}, undefined));
+    put({ status: answer || simulation ? "succeeded" : "failed", jobId: job.id, answer, simulation, problem });
   } catch (error) {
-    if (!signal.aborted) put({ status: "failed", problem: shownProblem(error) });
+    put({ status: "failed", problem: shownProblem(error) });
   }
 }
 
-/** Reads what the server has; later questions do not wait for it. */
+/** Reads what the server has; questions do not wait for it. */
 export async function loadModels() {
   try {
     set({ models: await persist(() => callJson("/models"), tellAway) });

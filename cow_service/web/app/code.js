@@ -5,7 +5,11 @@ import { serverAddress } from "./address.js";
 const LONG = 100; // characters of a line
 const ARGUMENT = " ".repeat(8); // before an argument of the Python call
 
-export const jsonOf = (request) => JSON.stringify(request, null, 2);
+/** The body as JSON; `sha256` is the picture's, where the server keeps it. */
+export function jsonOf(request, sha256) {
+  const image = sha256 ? { artifact: sha256 } : "data:image/png;base64,...";
+  return JSON.stringify({ image, ...request }, null, 2);
+}
 
 const shellQuoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
 
@@ -13,7 +17,7 @@ const shellQuoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
 export function curlOf(kind, { question, ...rest }, image, withKey) {
   const lines = [`curl ${serverAddress()}/${kind}`];
   if (withKey) lines.push('-H "Authorization: Bearer $COW_API_KEY"');
-  lines.push(`-F ${shellQuoted(`image=@${image}`)}`, `--form-string ${shellQuoted(`question=${question}`)}`);
+  lines.push(`-F ${shellQuoted(`image=@"${image.replaceAll(/["\\]/g, "\\$&")}"`)}`, `--form-string ${shellQuoted(`question=${question}`)}`);
   if (Object.keys(rest).length) lines.push(`--form-string ${shellQuoted(`request=${JSON.stringify(rest)}`)}`);
   return lines.join(" \\\n  ");
 }

@@ -19,8 +19,8 @@ async function read(response, each) {
     for (const block of blocks) {
       const event = { event: "message", id: null, data: "" };
       for (const line of block.split(/\r?\n/)) {
-        const [, name, value] = /^(event|id|data): ?(.*)$/.exec(line) || [];
-        if (name) event[name] = value;
+        const [name, ...rest] = line.split(":"); // a value may hold any character but ends of lines
+        if (name in event) event[name] = rest.join(":").replace(/^ /, "");
       }
       if (event.data) each(event);
     }

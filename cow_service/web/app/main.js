@@ -2,7 +2,7 @@
 
 import { html, render } from "../vendor/htm-preact.js";
 import { Page, isTyping } from "../ui/page.js";
-import { choosePicture, loadModels, openJob, redo, undo } from "./asking.js";
+import { choosePicture, forgetLook, loadModels, openJob, redo, restart, undo } from "./asking.js";
 import { onKeyWanted } from "./keys.js";
 import { get, set } from "./store.js";
 
@@ -43,12 +43,14 @@ function openAddress() {
   if (query.get("view") === "jobs") set({ view: "jobs", problem: null });
   else if (job && get().result?.jobId === job) set({ view: "case", problem: null });
   else if (job) void openJob(job);
-  else set({ view: "case", picture: null, result: null, run: null, problem: null });
+  else restart();
 }
 
 addEventListener("popstate", () => {
   if (!location.hash) openAddress();
 });
+
+addEventListener("pagehide", forgetLook);
 
 render(html`<${Page} />`, document.getElementById("app"));
 if (location.search) openAddress();

@@ -1,18 +1,11 @@
 // Pictures made of masks in the browser: the outline of an object, and the object cut out.
 
 import { useEffect, useState } from "../vendor/htm-preact.js";
-import { artifactAddress } from "./artifacts.js";
+import { artifactBlob } from "./artifacts.js";
 
 const THRESHOLD = 128; // of a mask's grey levels
 const OUTLINE = [255, 196, 0]; // RGB, as in the server's overlay
 const MOST_SIDE = 1024; // px: outlines of larger pictures are made at this size
-
-async function loaded(url) {
-  const image = new Image();
-  image.src = url;
-  await image.decode();
-  return image;
-}
 
 function drawn(image, width, height) {
   const canvas = document.createElement("canvas");
@@ -42,8 +35,9 @@ function outlineIn(context, width, height, thickness) {
 }
 
 /** A picture of the outline of a mask, and the masked part of the image alone. */
-async function madeOf(imageUrl, maskSha256, bbox) {
-  const [image, mask] = await Promise.all([loaded(imageUrl), artifactAddress(maskSha256).then(loaded)]);
+async function madeOf(picture, maskSha256, bbox) {
+  const blobs = [picture.blob ?? artifactBlob(picture.sha256), artifactBlob(maskSha256)];
+  const [image, mask] = await Promise.all((await Promise.all(blobs)).map((blob) => createImageBitmap(blob)));
   const scale = Math.min(1, MOST_SIDE / Math.max(mask.width, mask.height));
   const [width, height] = [Math.round(mask.width * scale), Math.round(mask.height * scale)];
   const context = drawn(mask, width, height);
@@ -62,18 +56,18 @@ async function madeOf(imageUrl, maskSha256, bbox) {
 }
 
 /** {outline, cutout} of a mask as addresses; null until they are made, and where there is no mask. */
-export function useCutout(imageUrl, mask, bbox) {
+export function useCutout(picture, mask, bbox) {
   const [made, setMade] = useState({ of: null });
-  const of = mask && imageUrl ? `${mask.sha256} ${imageUrl}` : null;
+  const of = mask ? `${mask.sha256} ${picture.url}` : null;
   useEffect(() => {
     let wanted = true;
     let urls = null;
     if (of) {
-      madeOf(imageUrl, mask.sha256, bbox).then((found) => {
+      madeOf(picture, mask.sha256, bbox).then((found) => {
         urls = found;
         if (wanted) setMade({ of, ...found });
         else release(found);
-      }, () => {});
+      }, () => {}); // the box is drawn where there is no outline
     }
     return () => {
       wanted = false;

@@ -37,13 +37,13 @@ async function problemOf(response) {
 }
 
 /** A response that is not an error. Asks for a key where one is wanted. Throws `Problem` or `Unreachable`. */
-export async function call(path, { method = "GET", body, headers = {}, signal } = {}) {
+export async function call(path, { method = "GET", body, headers = {}, signal, keepalive } = {}) {
   for (;;) {
     const key = currentKey();
     const sent = { ...headers, ...(key === null ? {} : { Authorization: `Bearer ${key}` }) };
     let response;
     try {
-      response = await fetch(address(path), { method, body, headers: sent, signal });
+      response = await fetch(address(path), { method, body, headers: sent, signal, keepalive });
     } catch (error) {
       if (signal?.aborted) throw error;
       throw new Unreachable();

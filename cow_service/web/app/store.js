@@ -22,9 +22,11 @@ export const DEFAULT_SETTINGS = Object.freeze({
   num_frames: 81,
   fps: 16,
   frames: { policy: "events" },
+  video: true,
   ensemble: 50,
   seed: null,
   generator_options: {},
+  rest: {}, // fields of an opened job that the page has no control for
 });
 
 let state = {
@@ -38,8 +40,8 @@ let state = {
   past: [],
   future: [],
   tool: "select", // or "mover", "object", "direction"
-  run: null, // {job, done: [stages]} while a job is in the making
-  result: null, // {jobId, kind, answer, simulation, settings} of the last job that succeeded
+  run: null, // {job, done: [stages], settings} while a job is in the making
+  result: null, // {jobId, kind, answer, simulation, settings, asked} of the last job that succeeded
   compared: [], // the same question by other readers and generators
   problem: null,
   away: false,

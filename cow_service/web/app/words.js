@@ -52,7 +52,10 @@ export function when(time) {
   return today ? then.toLocaleTimeString() : then.toLocaleString();
 }
 
+const NAME_IT = "Draw a box around what moves: choose “What moves” above the picture, or name it as the picture shows it.";
+
 const REMEDIES = {
+  "object-not-found": NAME_IT,
   "cannot-ground": "Draw a box around what moves: choose “What moves” above the picture.",
   "cannot-read-direction": "Draw the direction: choose “Direction” above the picture, and drag from the object to where it goes.",
   "artifact-not-found": "The picture is no longer kept by the server. Choose it again.",

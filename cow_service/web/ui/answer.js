@@ -58,12 +58,13 @@ function Warnings({ warnings }) {
 }
 
 export function Result({ state }) {
-  const { result, compared, models, settings, run } = state;
+  const { result, compared, models, run } = state;
   const { answer, simulation } = result;
   // Why nothing was imagined is told as a problem, with what can be done.
   const told = answer?.simulation_problem ? [] : [...(answer?.warnings ?? []), ...(simulation?.warnings ?? [])];
   const warnings = [...new Set(told)];
   return html`<section class=${run ? "result old" : "result"} aria-label="Result" aria-busy=${Boolean(run)} data-job=${result.jobId}>
+    ${run && html`<p class="hint">Of the request before:</p>`}
     ${answer && html`<div class="verdicts">
       <${Verdict} title=${simulation ? "After looking" : "From the picture alone"} verdict=${answer} kind="looked" />
       ${answer.baseline && html`<${Verdict} title="Without imagination" verdict=${answer.baseline} kind="baseline" />`}
@@ -73,22 +74,22 @@ export function Result({ state }) {
     ${simulation?.trajectory.placement && html`<p>${`It ends ${simulation.trajectory.placement.result.replaceAll("-", " ")}.`}</p>`}
     <${Cost} made=${answer ?? simulation} />
     <${Warnings} warnings=${warnings} />
-    ${models && html`<${Others} models=${models} settings=${settings} compared=${compared} />`}
+    ${models && html`<${Others} models=${models} settings=${result.settings} busy=${Boolean(run)} compared=${compared} />`}
   </section>`;
 }
 
 const usable = (list, current) => list.filter((each) => each.ready !== false && !each.missing.length
   && each.name !== (current || list.find((one) => one.default)?.name));
 
-function Others({ models, settings, compared }) {
+function Others({ models, settings, busy, compared }) {
   const readers = usable(models.readers, settings.reader);
   const generators = usable(models.generators, settings.generator);
   if (!readers.length && !generators.length && !compared.length) return null;
   return html`<div class="others">
     <h3>Side by side</h3>
     <div class="row">
-      ${readers.map(({ name }) => html`<button key=${`reader ${name}`} onClick=${() => compareWith({ reader: name })}>Reader ${name}</button>`)}
-      ${generators.map(({ name }) => html`<button key=${`generator ${name}`} onClick=${() => compareWith({ generator: name })}>Generator ${name}</button>`)}
+      ${readers.map(({ name }) => html`<button key=${`reader ${name}`} disabled=${busy} onClick=${() => compareWith({ reader: name })}>Reader ${name}</button>`)}
+      ${generators.map(({ name }) => html`<button key=${`generator ${name}`} disabled=${busy} onClick=${() => compareWith({ generator: name })}>Generator ${name}</button>`)}
     </div>
     <div class="columns">${compared.map((other) => html`<${Other} key=${other.label} other=${other} />`)}</div>
   </div>`;

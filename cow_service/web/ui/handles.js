@@ -3,7 +3,7 @@
 import { html, useRef } from "../vendor/htm-preact.js";
 
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-const KEY_STEP = 2; // px of the image; ten times with Shift
+const KEY_STEP = 3; // CSS px; ten times with Shift
 const KEY_PAUSE = 700; // ms without a key before what was moved is taken
 
 /** A point of the screen in pixels of the image. */
@@ -12,8 +12,8 @@ export function pointIn(svg, event) {
   return [at.x, at.y];
 }
 
-/** Properties of an SVG element that is dragged. `onMove` and `onEnd` hear (dx, dy) in px since the drag began. */
-export function useDrag(onMove, onEnd) {
+/** Properties of an SVG element that is dragged. `unit` is the size of a CSS pixel in px of the image. `onMove` and `onEnd` hear (dx, dy) in px since the drag began. */
+export function useDrag(unit, onMove, onEnd) {
   const drag = useRef(null);
   const keys = useRef({ dx: 0, dy: 0, timer: 0 });
   const latest = useRef();
@@ -47,7 +47,7 @@ export function useDrag(onMove, onEnd) {
       event.preventDefault();
       event.stopPropagation();
       const moved = keys.current;
-      const size = event.shiftKey ? 10 * KEY_STEP : KEY_STEP;
+      const size = (event.shiftKey ? 10 * KEY_STEP : KEY_STEP) * unit;
       moved.dx += step[0] * size;
       moved.dy += step[1] * size;
       latest.current.onMove(moved.dx, moved.dy);
@@ -63,7 +63,7 @@ export function useDrag(onMove, onEnd) {
 
 /** A round handle. `unit` is the size of a CSS pixel in pixels of the image. */
 export function Handle({ at, unit, label, kind, onMove, onEnd }) {
-  const drag = useDrag(onMove, onEnd);
+  const drag = useDrag(unit, onMove, onEnd);
   return html`<g class=${`handle ${kind}`} tabindex="0" role="button" aria-label=${`${label} Arrow keys move it.`} aria-roledescription="handle" ...${drag}>
     <title>${label}</title>
     <circle class="reach" cx=${at[0]} cy=${at[1]} r=${(kind.startsWith("corner") ? 12 : 18) * unit} />
@@ -76,7 +76,7 @@ const CORNER_NAMES = { nw: "Upper left", ne: "Upper right", se: "Lower right", s
 
 /** A box that can be moved, and a handle at each corner. `onMove` and `onEnd` hear (handle, dx, dy). */
 export function BoxHandles({ box, unit, name, kind, onMove, onEnd }) {
-  const drag = useDrag((dx, dy) => onMove("all", dx, dy), (dx, dy) => onEnd("all", dx, dy));
+  const drag = useDrag(unit, (dx, dy) => onMove("all", dx, dy), (dx, dy) => onEnd("all", dx, dy));
   const [x0, y0, x1, y1] = box;
   return html`<g>
     <rect class=${`grip ${kind}`} x=${x0} y=${y0} width=${Math.max(0, x1 - x0)} height=${Math.max(0, y1 - y0)} tabindex="0" role="button"

@@ -10,6 +10,7 @@ import { Shot } from "./filmstrip.js";
 
 const STATUSES = ["", "queued", "running", "succeeded", "failed", "canceled"];
 const LIMIT = 30;
+const SURE_SECONDS = 4; // in which a second press deletes
 const REFRESH_SECONDS = 2; // while a job is in the making
 
 const isOpen = (job) => job.status === "queued" || job.status === "running";
@@ -23,18 +24,24 @@ async function read(filters, cursor, signal) {
 
 export function Jobs() {
   const [filters, setFilters] = useState({ status: "", kind: "" });
+  const [cursors, setCursors] = useState([null]); // of the pages up to this one
   const [page, setPage] = useState(null);
-  const [refreshed, refresh] = useState(0);
+  const [refreshed, setRefreshed] = useState(0);
+  const refresh = () => setRefreshed((times) => times + 1);
+  const choose = (change) => {
+    setFilters({ ...filters, ...change });
+    setCursors([null]);
+  };
 
   useEffect(() => {
     const controller = new AbortController();
     const { signal } = controller;
-    read(filters, null, signal).then((found) => !signal.aborted && setPage(found), (error) => !signal.aborted && set({ problem: shownProblem(error) }));
+    read(filters, cursors.at(-1), signal).then((found) => !signal.aborted && setPage(found), (error) => !signal.aborted && set({ problem: shownProblem(error) }));
     return () => controller.abort();
-  }, [filters, refreshed]);
+  }, [filters, cursors, refreshed]);
   useEffect(() => {
     if (!page?.jobs.some(isOpen)) return undefined;
-    const timer = setTimeout(() => refresh(refreshed + 1), 1000 * REFRESH_SECONDS);
+    const timer = setTimeout(refresh, 1000 * REFRESH_SECONDS);
     return () => clearTimeout(timer);
   }, [page]);
 
@@ -44,26 +51,35 @@ export function Jobs() {
     } catch (error) {
       set({ problem: shownProblem(error) });
     }
-    refresh(refreshed + 1);
-  };
-  const more = async () => {
-    const next = await read(filters, page.next);
-    setPage({ jobs: [...page.jobs, ...next.jobs], next: next.next });
+    refresh();
   };
   return html`<section class="jobs" aria-label="Jobs">
     <div class="row">
       <h1>Jobs</h1>
-      <label>Status<select onChange=${(event) => setFilters({ ...filters, status: event.target.value })}>
+      <label>Status<select onChange=${(event) => choose({ status: event.target.value })}>
         ${STATUSES.map((status) => html`<option key=${status} value=${status}>${status || "all"}</option>`)}</select></label>
-      <label>Kind<select onChange=${(event) => setFilters({ ...filters, kind: event.target.value })}>
+      <label>Kind<select onChange=${(event) => choose({ kind: event.target.value })}>
         <option value="">all</option><option value="answer">answer</option><option value="simulate">simulate</option></select></label>
-      <button onClick=${() => refresh(refreshed + 1)}>Refresh</button>
+      <button onClick=${refresh}>Refresh</button>
     </div>
     ${page === null && html`<p role="status">Reading the jobs…</p>`}
     ${page?.jobs.length === 0 && html`<p class="hint">${filters.status || filters.kind ? "No job is like that." : "There are no jobs yet. Ask something, and it is listed here."}</p>`}
     <ul class="joblist">${page?.jobs.map((job) => html`<${JobRow} key=${job.id} job=${job} act=${act} />`)}</ul>
-    ${page?.next && html`<button onClick=${more}>More</button>`}
+    <div class="row">
+      ${cursors.length > 1 && html`<button onClick=${() => setCursors(cursors.slice(0, -1))}>Newer</button>`}
+      ${page?.next && html`<button onClick=${() => setCursors([...cursors, page.next])}>Older</button>`}
+    </div>
   </section>`;
+}
+
+/** Deletes at the second press. */
+function Delete({ name, onDelete }) {
+  const [asked, setAsked] = useState(false);
+  useEffect(() => {
+    const timer = asked && setTimeout(() => setAsked(false), 1000 * SURE_SECONDS);
+    return () => clearTimeout(timer);
+  }, [asked]);
+  return html`<button onClick=${() => (asked ? onDelete() : setAsked(true))} aria-label=${`${asked ? "Really delete" : "Delete"}: ${name}`}>${asked ? "Really?" : "Delete"}</button>`;
 }
 
 function JobRow({ job, act }) {
@@ -84,7 +100,7 @@ function JobRow({ job, act }) {
     </div>
     <div class="actions">
       ${isOpen(job) && html`<button onClick=${() => act(`/jobs/${job.id}/cancel`, "POST")}>Cancel</button>`}
-      <button onClick=${() => act(`/jobs/${job.id}`, "DELETE")} aria-label=${`Delete: ${job.question ?? job.id}`}>Delete</button>
+      <${Delete} name=${job.question ?? job.id} onDelete=${() => act(`/jobs/${job.id}`, "DELETE")} />
     </div>
   </li>`;
 }

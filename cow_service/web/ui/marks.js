@@ -7,8 +7,8 @@ import { encounterWords, seconds } from "../app/words.js";
 
 /** Names of what is in the picture. */
 export function Labels({ labels, unit, size }) {
-  return html`<g class="names">${placed(labels, unit, size).map(({ text, kind, x, y, height }) =>
-    html`<text key=${`${kind} ${text}`} class=${`name ${kind}`} x=${x} y=${y + 0.78 * height} font-size=${13 * unit}>${text}</text>`)}</g>`;
+  return html`<g class="names">${placed(labels, unit, size).map(({ text, kind, x, y, height }, place) =>
+    html`<text key=${place} class=${`name ${kind}`} x=${x} y=${y + 0.78 * height} font-size=${13 * unit}>${text}</text>`)}</g>`;
 }
 
 /** The names of a world: {text, box, kind, below}. */

@@ -5,9 +5,9 @@ import { ask } from "../app/asking.js";
 import { get, set } from "../app/store.js";
 import { remedyOf } from "../app/words.js";
 
-const TOOLS = { "cannot-ground": ["mover", "Draw its box"], "cannot-read-direction": ["direction", "Draw the direction"] };
+const TOOLS = { "cannot-ground": ["mover", "Draw its box"], "object-not-found": ["mover", "Draw its box"], "cannot-read-direction": ["direction", "Draw the direction"] };
 const AGAIN = new Set(["queue-full", "rate-limited", "storage-unavailable", "not-ready", "worker-ended", "job-timeout", "mllm-unavailable",
-  "reader-unavailable", "generator-unavailable", "internal-error", "mllm-bad-reply", "unauthorized"]);
+  "reader-unavailable", "generator-unavailable", "generator-out-of-memory", "weights-unavailable", "internal-error", "mllm-bad-reply", "unauthorized"]);
 
 export function ProblemNotice({ problem }) {
   const tool = get().picture ? TOOLS[problem.code] : undefined;

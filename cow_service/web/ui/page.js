@@ -2,7 +2,8 @@
 
 import { html } from "../vendor/htm-preact.js";
 import { address, jobAddress, jobsAddress, pageAddress } from "../app/address.js";
-import { currentKey, forgetKey } from "../app/keys.js";
+import { leave, restart } from "../app/asking.js";
+import { currentKey } from "../app/keys.js";
 import { set, useStore } from "../app/store.js";
 import { answerWords } from "../app/words.js";
 import { Correct } from "./correct.js";
@@ -15,41 +16,37 @@ import { Stages } from "./stages.js";
 import { Choose, Start } from "./start.js";
 import { Take } from "./take.js";
 
-function go(event, href, change) {
+/** Does something and shows its address, unless a new tab is wanted. */
+function go(event, href, work) {
   if (event.ctrlKey || event.metaKey || event.shiftKey) return;
   event.preventDefault();
   history.pushState(null, "", href);
-  set({ problem: null, ...change });
+  work();
 }
-
-const RESTARTED = { view: "case", picture: null, question: "", result: null, run: null, found: [], compared: [] };
 
 function Header({ state }) {
   const { view, result } = state;
   const caseAddress = result ? jobAddress(result.jobId) : pageAddress();
   return html`<header>
-    <a class="brand" href=${pageAddress()} onClick=${(event) => go(event, pageAddress(), RESTARTED)}><b>COW</b> <span>Causal Object World model</span></a>
+    <a class="brand" href=${pageAddress()} onClick=${(event) => go(event, pageAddress(), restart)}><b>COW</b> <span>Causal Object World model</span></a>
     <nav aria-label="Page">
-      <a href=${caseAddress} aria-current=${view === "case" ? "page" : undefined} onClick=${(event) => go(event, caseAddress, { view: "case" })}>Try</a>
-      <a href=${jobsAddress()} aria-current=${view === "jobs" ? "page" : undefined} onClick=${(event) => go(event, jobsAddress(), { view: "jobs" })}>Jobs</a>
+      <a href=${caseAddress} aria-current=${view === "case" ? "page" : undefined} onClick=${(event) => go(event, caseAddress, () => set({ view: "case", problem: null }))}>Try</a>
+      <a href=${jobsAddress()} aria-current=${view === "jobs" ? "page" : undefined} onClick=${(event) => go(event, jobsAddress(), () => set({ view: "jobs", problem: null }))}>Jobs</a>
       <a href=${address("/docs")}>API</a>
-      ${currentKey() !== null && html`<button class="plain" onClick=${() => {
-        forgetKey();
-        set({});
-      }}>Forget the key</button>`}
+      ${currentKey() !== null && html`<button class="plain" onClick=${leave}>Forget the key</button>`}
     </nav>
   </header>`;
 }
 
 function Case({ state }) {
-  const { picture, run, result, problem, settings } = state;
+  const { picture, run, result, problem } = state;
   if (!picture) return html`<${Start} />`;
   return html`<div class="case">
     <div class="left"><${Scene} state=${state} /></div>
     <div class="right">
       <${Question} state=${state} />
       ${problem && html`<${ProblemNotice} problem=${problem} />`}
-      <${Stages} run=${run} result=${result} settings=${settings} />
+      <${Stages} run=${run} result=${result} />
       ${result && html`<${Result} state=${state} />`}
       <${Correct} state=${state} />
       ${state.question.trim() && html`<${Take} state=${state} />`}
@@ -79,4 +76,7 @@ export function Page() {
   </div>`;
 }
 
-export const isTyping = (target) => target instanceof Element && target.closest("input, textarea, select, [contenteditable]") !== null;
+const TEXT = "textarea, input:not([type]), input[type=text], input[type=number], input[type=password]";
+
+/** Whether keys belong to a text that somebody writes. */
+export const isTyping = (target) => target instanceof Element && target.closest(TEXT) !== null;

@@ -8,7 +8,7 @@ import { encounterWords, seconds } from "../app/words.js";
 const calm = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 /** The state of a player of a simulation: {frame, count, fps, playing, video, seek, toggle}. */
-export function usePlayer(simulation) {
+export function usePlayer(simulation, isBusy) {
   const [frame, setFrame] = useState(0);
   const [playing, setPlaying] = useState(false);
   const element = useRef(null);
@@ -23,9 +23,9 @@ export function usePlayer(simulation) {
     setPlaying(false);
   }, [simulation?.id]);
 
-  // The film starts by itself once it can, unless less motion is wanted.
+  // The film starts by itself once it can, unless less motion is wanted or somebody is at a handle.
   useEffect(() => {
-    if (simulation && !calm() && (url || !video)) setPlaying(true);
+    if (simulation && !calm() && !isBusy() && (url || !video)) setPlaying(true);
   }, [simulation?.id, url]);
 
   useEffect(() => {
@@ -107,7 +107,7 @@ export function Transport({ player, trajectory }) {
     <button class="round" onClick=${player.toggle} aria-label=${playing ? "Pause" : "Play"}>${playing ? "❚❚" : "▶"}</button>
     <div class="timeline">
       <div class="marks">
-        ${marks.map((mark) => html`<button key=${`${mark.frame} ${mark.text}`} class=${`mark ${mark.kind}`} style=${{ left: `${(100 * mark.frame) / last}%` }}
+        ${marks.map((mark, place) => html`<button key=${place} class=${`mark ${mark.kind}`} style=${{ left: `${(100 * mark.frame) / last}%` }}
           title=${`${seconds(mark.frame / fps)}: ${mark.text}`} aria-label=${`Go to ${seconds(mark.frame / fps)}: ${mark.text}`}
           onClick=${() => player.seek(mark.frame)}></button>`)}
       </div>

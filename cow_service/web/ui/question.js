@@ -1,8 +1,9 @@
 // The question, suggestions, and how it is to be answered.
 
 import { html, useEffect, useRef } from "../vendor/htm-preact.js";
-import { ask, cancel, changeSettings } from "../app/asking.js";
-import { set } from "../app/store.js";
+import { ask, cancel, changeSettings, correct } from "../app/asking.js";
+import { correctedWords } from "../app/corrections.js";
+import { NOTHING_CORRECTED, set } from "../app/store.js";
 import { suggestionsOf } from "../app/suggestions.js";
 
 const MOST_CHARACTERS = 4000;
@@ -23,6 +24,7 @@ export function Question({ state }) {
     current.style.height = "auto";
     current.style.height = `${Math.min(current.scrollHeight + 2, 260)}px`;
   }, [question]);
+  const corrected = correctedWords(state.corrections);
   const suggestions = result || question ? [] : suggestionsOf(found);
   return html`<form class="question" onSubmit=${send}>
     <label for="question">What if…</label>
@@ -35,6 +37,7 @@ export function Question({ state }) {
         void ask();
       }}>${text}</button></li>`)}
     </ul>`}
+    ${corrected && html`<p class="hint">Asked with your corrections: ${corrected}. <button type="button" class="plain" onClick=${() => correct(NOTHING_CORRECTED)}>Forget them</button></p>`}
     <div class="row">
       <button class="primary" disabled=${!picture || !question.trim()}>${settings.kind === "answer" ? "Ask" : "Imagine"}</button>
       ${run && html`<button type="button" onClick=${cancel}>Cancel</button>`}

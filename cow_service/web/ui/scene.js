@@ -4,7 +4,7 @@ import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
 import { correct } from "../app/asking.js";
 import { boxBetween, directionBetween, isBox, lineOf, middleOf, movedBox, pulledPath, rounded, tipOf, waypointFrames } from "../app/geometry.js";
 import { useCutout } from "../app/pixels.js";
-import { groundingOf, isDirected, motionOf, objectsOf, roleOf } from "../app/request.js";
+import { freeName, groundingOf, isDirected, knownBeside, motionTowards, moverWith, roleOf } from "../app/corrections.js";
 import { set } from "../app/store.js";
 import { BoxHandles, Handle, pointIn } from "./handles.js";
 import { Arrow, Labels, Moment, Rect, World, labelsOf } from "./marks.js";
@@ -30,14 +30,6 @@ function useUnit(element, width) {
   return unit;
 }
 
-/** The motion of a request in which the direction is another one. */
-export function directed(simulation, corrections, direction) {
-  const base = corrections.motion ?? (simulation ? motionOf(simulation.motion) : {});
-  if (!isDirected(base.kind)) return { ...(base.law ? { law: base.law } : {}), kind: "linear", direction };
-  const depth = Math.abs(base.depth ?? 0) > 0.95 ? 0 : base.depth;
-  return { ...base, direction, ...(depth === undefined ? {} : { depth }) };
-}
-
 export function Scene({ state }) {
   const { picture, result, corrections, tool, found, question } = state;
   const simulation = result?.simulation ?? null;
@@ -47,38 +39,43 @@ export function Scene({ state }) {
   const [layers, setLayers] = useState(LAYERS);
   const [draft, setDraft] = useState(null);
   const [pending, setPending] = useState(null); // the box of an object that has no name yet
-  const player = usePlayer(simulation);
-  const cutout = useCutout(picture.url, simulation?.grounding.mask ?? null, simulation?.grounding.bbox ?? null);
+  const busy = useRef(false); // somebody drags
+  busy.current = draft !== null;
+  const player = usePlayer(simulation, () => busy.current || frame.current.querySelector("svg").contains(document.activeElement));
+  const cutout = useCutout(picture, simulation?.grounding.mask ?? null, simulation?.grounding.bbox ?? null);
 
   useEffect(() => {
     setDraft(null);
-  }, [simulation?.id, corrections, state.problem]);
-  useEffect(() => setPending(null), [picture.url]);
+    setPending(null);
+  }, [picture.url]);
 
   const moverBox = draft?.mover ?? corrections.grounding?.bbox ?? simulation?.grounding.bbox ?? null;
   const moverName = corrections.grounding?.object ?? simulation?.grounding.object ?? "what moves";
   const origin = corrections.grounding?.point ?? (draft?.mover || corrections.grounding?.bbox ? middleOf(moverBox) : simulation?.grounding.point ?? null);
-  const direction = draft?.direction ?? (corrections.motion ? corrections.motion.direction : simulation?.motion.direction) ?? null;
+  const undirected = corrections.motion?.kind && !isDirected(corrections.motion.kind);
+  const known = undirected ? null : corrections.motion?.direction ?? simulation?.motion.direction ?? null;
+  const direction = draft?.direction ?? known;
   const path = simulation?.trajectory.paths[0] ?? null;
-  const frames = path && !corrections.motion?.steps?.length ? waypointFrames(path, size) : [];
-  const points = draft?.points ?? path?.points ?? [];
+  const frames = path ? waypointFrames(path, size) : [];
+  const given = corrections.trajectory?.points; // it may not be computed yet
+  const base = given && given.length === path?.points.length ? given : path?.points ?? [];
+  const points = draft?.points ?? base;
   const editing = !player.playing && tool === "select";
 
-  const ownNames = new Set(corrections.objects.map((object) => object.object));
+  const ownNames = new Set(corrections.objects.filter((object) => object.bbox).map((object) => object.object));
   const world = simulation ? labelsOf(simulation.trajectory) : found.map((body) => ({ text: body.object, box: body.bbox, kind: "body" }));
   const labels = [
     ...(moverBox ? [{ text: moverName, box: moverBox, kind: "mover" }] : []),
-    ...corrections.objects.filter((object) => object.bbox).map((object, place) => ({ text: object.object, box: draft?.object === place ? draft.box : object.bbox, kind: "own" })),
-    ...world.filter((label) => !ownNames.has(label.text)),
+    ...corrections.objects.map((object, place) => ({ text: object.object, box: draft?.object === place ? draft.box : object.bbox, kind: "own" })).filter((label) => label.box),
+    ...world.filter((label) => label.kind !== "body" || !ownNames.has(label.text)),
   ];
 
-  // Beside a mover that is given.
-  const known = () => (simulation ? { objects: objectsOf(simulation.grounding, corrections.objects) } : {});
   const endOfBox = (box) => {
     if (!isBox(box)) return;
     if (tool === "mover") {
       const name = corrections.grounding?.object ?? simulation?.grounding.object;
-      correct({ ...known(), grounding: { ...(name ? { object: name } : {}), bbox: box }, trajectory: null });
+      const fresh = { ...corrections, grounding: name ? { object: name } : {} }; // another thing may have another shape
+      correct(moverWith(simulation, fresh, { bbox: box }));
     } else setPending(box);
   };
 
@@ -104,8 +101,8 @@ export function Scene({ state }) {
         if (box) endOfBox(box);
         set({ tool: "select" });
       } else if (aimed) {
-        const place = origin ? {} : { grounding: { point: from } };
-        correct({ ...place, motion: directed(simulation, corrections, aimed), trajectory: null });
+        const place = origin ? {} : moverWith(simulation, corrections, { point: from });
+        correct({ ...place, motion: motionTowards(simulation, corrections, aimed), trajectory: null });
       }
     },
     onPointerCancel: () => setDraft(null),
@@ -117,17 +114,16 @@ export function Scene({ state }) {
       setDraft(null);
       if (Math.hypot(dx, dy) < 2 * unit) return;
       const box = movedBox(corrections.grounding?.bbox ?? simulation.grounding.bbox, handle, dx, dy, size);
-      correct({ ...known(), grounding: { ...(moverName === "what moves" ? {} : { object: moverName }), bbox: box }, trajectory: null });
+      correct(moverWith(simulation, corrections, { bbox: box }));
     },
   };
 
   const shownDirection = direction && origin ? direction : null;
   const aimedAt = (dx, dy) => {
-    const known = (corrections.motion ? corrections.motion.direction : simulation?.motion.direction) ?? [1, 0];
-    const [tx, ty] = tipOf(origin, known, size);
+    const [tx, ty] = tipOf(origin, known ?? [1, 0], size);
     return directionBetween(origin, [tx + dx, ty + dy]);
   };
-  const pulled = (place, dx, dy) => pulledPath(path.points, frames, place, [dx, dy]);
+  const pulled = (place, dx, dy) => pulledPath(base, frames, place, [dx, dy]);
   const ownObject = (place) => ({
     onMove: (handle, dx, dy) => setDraft({ object: place, box: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) }),
     onEnd: (handle, dx, dy) => {
@@ -146,7 +142,7 @@ export function Scene({ state }) {
         class=${player.frame > 0 || player.playing ? "" : "waiting"}></video>`}
       <svg viewBox=${`0 0 ${size.width} ${size.height}`} role="group" aria-label="What was found" ...${drawing}>
         ${!simulation && found.map((body, place) => html`<${Rect} key=${place} box=${body.bbox} kind="body" />`)}
-        ${simulation && html`<${World} simulation=${simulation} unit=${unit} size=${size} layers=${layers} line=${draft?.points ? lineOf({ points, visible: path.visible }) : null} />`}
+        ${simulation && html`<${World} simulation=${simulation} unit=${unit} size=${size} layers=${layers} line=${points !== path.points ? lineOf({ points, visible: path.visible }) : null} />`}
         ${cutout && !draft?.mover && !player.playing && html`<image class="outline" href=${cutout.outline} x="0" y="0" width=${size.width} height=${size.height} />`}
         ${moverBox && html`<${Rect} box=${moverBox} kind=${cutout && !draft?.mover ? "mover thin" : "mover"} />`}
         ${corrections.objects.map((object, place) => {
@@ -168,20 +164,24 @@ export function Scene({ state }) {
           onEnd=${(dx, dy) => {
             setDraft(null);
             if (Math.hypot(dx, dy) < 2 * unit) return;
-            correct({ ...known(), trajectory: { points: pulled(place, dx, dy), fps: simulation.trajectory.fps }, grounding: corrections.grounding ?? groundingOf(simulation.grounding) });
+            correct({
+              ...knownBeside(simulation, corrections),
+              grounding: corrections.grounding ?? groundingOf(simulation.grounding),
+              trajectory: { points: pulled(place, dx, dy), fps: simulation.trajectory.fps },
+            });
           }} />`)}
         ${editing && shownDirection && html`<${Handle} at=${tipOf(origin, shownDirection, size)} unit=${unit} kind="tip" label="Tip of the direction arrow."
           onMove=${(dx, dy) => setDraft({ direction: aimedAt(dx, dy) })}
           onEnd=${(dx, dy) => {
             const aimed = aimedAt(dx, dy);
-            if (aimed && Math.hypot(dx, dy) >= 2 * unit) correct({ motion: directed(simulation, corrections, aimed), trajectory: null });
-            else setDraft(null);
+            if (aimed && Math.hypot(dx, dy) >= 2 * unit) correct({ motion: motionTowards(simulation, corrections, aimed), trajectory: null });
+            setDraft(null);
           }} />`}
       </svg>
     </div>
     ${pending && html`<${NameForm} onName=${(name) => {
       setPending(null);
-      const object = { object: name, bbox: pending, role: roleOf(name, question) };
+      const object = { object: freeName(name, corrections.objects), bbox: pending, role: roleOf(name, question) };
       correct({ objects: [...corrections.objects, object] });
     }} onCancel=${() => setPending(null)} />`}
     ${simulation && html`<${Transport} player=${player} trajectory=${simulation.trajectory} />`}

@@ -3,8 +3,8 @@
 import { html } from "../vendor/htm-preact.js";
 import { STAGES, percent, plural, seconds, stagesOf } from "../app/words.js";
 
-function running(run, settings) {
-  const stages = stagesOf(settings);
+function running(run) {
+  const stages = stagesOf(run.settings);
   const at = stages.indexOf(run.job.stage);
   const done = run.done.length ? Math.max(...run.done.map((stage) => stages.indexOf(stage))) : -1;
   return stages.map((stage, place) => {
@@ -34,9 +34,9 @@ function waiting({ status, position, expected_wait: wait, progress }) {
   return `Running: ${percent(progress)}`;
 }
 
-export function Stages({ run, result, settings }) {
+export function Stages({ run, result }) {
   if (!run && !result) return null;
-  const stages = run ? running(run, settings) : ended(result);
+  const stages = run ? running(run) : ended(result);
   return html`<section class="stages" aria-label="Stages">
     <ol>${stages.map(({ stage, state, text }) => html`<li key=${stage} class=${state} data-stage=${stage} data-state=${state}><span class="dot" aria-hidden="true"></span>${STAGES[stage]}
       <small>${text || { now: "now", next: "", done: "done" }[state]}</small></li>`)}</ol>

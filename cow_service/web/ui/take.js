@@ -38,7 +38,7 @@ function Code({ state }) {
   const [told, setTold] = useState("");
   const request = requestOf(state);
   const file = state.picture.blob?.name ?? (/\.\w+$/.test(state.picture.name) ? state.picture.name : "photo.jpg");
-  const text = { curl: () => curlOf(state.settings.kind, request, file, currentKey() !== null), python: () => pythonOf(state.settings.kind, request, file), json: () => jsonOf(request) }[form]();
+  const text = { curl: () => curlOf(state.settings.kind, request, file, currentKey() !== null), python: () => pythonOf(state.settings.kind, request, file), json: () => jsonOf(request, state.picture.sha256) }[form]();
   return html`<div class="code">
     <div class="row"><div class="segments" role="group" aria-label="Form of the request">
       ${Object.entries(FORMS).map(([name, label]) => html`<button key=${name} aria-pressed=${form === name} onClick=${() => {
