@@ -193,6 +193,10 @@ def test_a_failed_job_keeps_its_problem(served: Served) -> None:
     Job.model_validate(job)
     assert (job["status"], job["result"]) == ("failed", None)
     assert job["problem"] == told
+    (listed,) = [
+        one for one in served.http.get("/jobs", params={"status": "failed"}).json()["jobs"] if one["id"] == job["id"]
+    ]
+    assert listed["problem"] == told
     key, replayed = new_key(), []
     for _ in range(2):
         again = served.http.post("/simulate", json=LOST, headers={"Idempotency-Key": key})
