@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import httpx
@@ -32,6 +32,10 @@ from numpy.typing import NDArray
 
 from cow_service.service import Service
 from cow_service.settings import Settings
+
+if TYPE_CHECKING:  # other tests do not need a browser
+    from browser import Windows
+    from playwright.sync_api import Browser
 
 # How much the crash, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
 SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
@@ -175,3 +179,21 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def http(server: Server) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=server.address, timeout=110) as client:
         yield client
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    """A browser for the tests of one file: while it runs, playwright's event loop is that of the main thread."""
+    from browser import launched
+
+    with launched() as browser:
+        yield browser
+
+
+@pytest.fixture
+def windows(chromium: Browser) -> Iterator[Windows]:
+    """Opens pages; errors in them fail the test."""
+    from browser import Windows
+
+    with Windows(chromium) as opened:
+        yield opened

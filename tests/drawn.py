@@ -20,6 +20,18 @@ def floor(width: int = 640, height: int = 400, grey: int = 150, seed: int = 0) -
     return np.repeat(value[..., None], 3, axis=2).astype(np.uint8)
 
 
+def clutter(width: int, height: int, seed: int = 0) -> Image:
+    """Coloured texture full of edges, as a photograph of a workshop has it: no object can be told from another."""
+    rng = np.random.default_rng(seed)
+    patches = cv2.resize(rng.integers(30, 220, (15, 20, 3), np.uint8), (width, height), interpolation=cv2.INTER_CUBIC)
+    image = np.clip(patches + rng.normal(0, 25, (height, width, 3)), 0, 255).astype(np.uint8)
+    for _ in range(60):
+        middle, axes = rng.integers(0, (width, height)).tolist(), rng.integers(5, 70, 2).tolist()
+        colour, thickness = rng.integers(0, 255, 3).tolist(), int(rng.choice([cv2.FILLED, 2, 3]))
+        cv2.ellipse(image, middle, axes, float(rng.uniform(0, 180)), 0, 360, colour, thickness)
+    return image
+
+
 def ball(image: Image, centre: tuple[float, float], radius: float, rgb: tuple[int, int, int]) -> Image:
     """A shaded ball."""
     ys, xs = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5

@@ -1,0 +1,138 @@
+"""A real browser for the tests of the page: Debian's chromium, driven by playwright."""
+
+from __future__ import annotations
+
+import base64
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, expect, sync_playwright
+
+REQUIRED = "COW_TEST_BROWSER"  # set where a missing browser is a fault and not a reason to skip
+HOW_TO_GET_IT = "chromium is not installed: apt-get install --no-install-recommends chromium"
+WIDE, NARROW = 1280, 390  # CSS px
+SIZES = {WIDE: {"width": WIDE, "height": 900}, NARROW: {"width": NARROW, "height": 844}}
+FAILED_REQUEST = "Failed to load resource"  # how chromium tells of a response that is an error, or of none
+# The policy's violations are told to the page as events; chromium's own words for them are not of one form.
+TELL_VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
+    console.error(`Content-Security-Policy: ${event.violatedDirective} ${event.blockedURI} ${event.sample}`));"""
+
+WAIT = 30_000  # ms for anything that must come about
+Point = tuple[float, float]
+
+
+@contextmanager
+def launched() -> Iterator[Browser]:
+    """A chromium, ended afterwards. Skips the test where there is none, and fails in CI."""
+    program = shutil.which("chromium")
+    if program is None:
+        if os.environ.get(REQUIRED) or os.environ.get("CI") == "true":
+            pytest.fail(HOW_TO_GET_IT)
+        pytest.skip(HOW_TO_GET_IT)
+    expect.set_options(timeout=WAIT)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+class Windows:
+    """Pages, each with storage and cache of its own; what goes wrong in them fails the test at the end of the `with` block."""
+
+    def __init__(self, browser: Browser) -> None:
+        self._browser = browser
+        self._contexts: list[BrowserContext] = []
+        self._faults: list[str] = []
+
+    def __enter__(self) -> Windows:
+        return self
+
+    def __exit__(self, failed: object, *_: object) -> None:
+        for context in self._contexts:
+            context.close()
+        if failed is None and self._faults:
+            pytest.fail("Errors in the browser:\n" + "\n".join(self._faults))
+
+    def open(self, address: str, width: int = WIDE, requests_fail: bool = False, **options: Any) -> Page:
+        """A page. `requests_fail`: the test has the server refuse something, which chromium logs as an error."""
+        context = self._browser.new_context(**{"viewport": SIZES[width], "reduced_motion": "reduce"} | options)
+        self._contexts.append(context)
+        context.set_default_timeout(WAIT)
+        context.add_init_script(TELL_VIOLATIONS)
+
+        def logged(message: ConsoleMessage) -> None:
+            if message.type == "error" and not (requests_fail and message.text.startswith(FAILED_REQUEST)):
+                self._faults.append(f"{message.text} ({message.location['url']})")
+
+        context.on("console", logged)
+        context.on("weberror", lambda error: self._faults.append(str(error.error)))
+        page = context.new_page()
+        page.goto(address)
+        return page
+
+
+def drop(page: Page, content: bytes, name: str = "picture.png", media_type: str = "image/png") -> None:
+    """Drops a file on the page."""
+    make = """([data, name, type]) => {
+        const transfer = new DataTransfer();
+        transfer.items.add(new File([Uint8Array.from(atob(data), (one) => one.charCodeAt(0))], name, { type }));
+        return transfer;
+    }"""
+    transfer = page.evaluate_handle(make, [base64.b64encode(content).decode(), name, media_type])
+    page.dispatch_event("main", "drop", {"dataTransfer": transfer})
+
+
+def ask(page: Page, question: str) -> None:
+    """Types a question and presses Enter."""
+    field = page.locator("#question")
+    field.fill(question)
+    field.press("Enter")
+
+
+def result(page: Page, before: str | None = None) -> str:
+    """The id of the job whose result is shown, once it is another one than `before`."""
+    shown = page.locator(".result[data-job]:not(.old)" + (f":not([data-job='{before}'])" if before else ""))
+    expect(shown).to_be_visible()
+    return shown.get_attribute("data-job") or ""
+
+
+def said(page: Page) -> str:
+    """The answer after looking."""
+    return page.locator(".verdict.looked .said").inner_text()
+
+
+def stage(page: Page, name: str) -> str:
+    """What became of a stage: done, kept, now or next."""
+    return page.locator(f"[data-stage={name}]").get_attribute("data-state") or ""
+
+
+def drag_in_picture(page: Page, start: Point, end: Point) -> None:
+    """Drags by the mouse between two points of the picture, px of the picture."""
+    svg = page.locator(".scene svg")
+    svg.scroll_into_view_if_needed()
+    to_window = "(svg, at) => at.map(([x, y]) => new DOMPoint(x, y).matrixTransform(svg.getScreenCTM())).map(({x, y}) => [x, y])"
+    from_window, to = svg.evaluate(to_window, [start, end])
+    page.mouse.move(*from_window)
+    page.mouse.down()
+    page.mouse.move(*to, steps=4)
+    page.mouse.up()
+
+
+def arrow_tip(page: Page) -> Point:
+    """Where the handle of the arrow's tip is, px of the picture."""
+    knob = page.locator(".handle.tip .knob")
+    return float(knob.get_attribute("cx") or 0), float(knob.get_attribute("cy") or 0)
+
+
+def path(page: Page) -> str:
+    """The path of what moves, as SVG."""
+    return page.locator("path.path").first.get_attribute("d") or ""
+
+
+def assert_fits(page: Page) -> None:
+    """The page is no wider than its window."""
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0

@@ -1,0 +1,145 @@
+"""The page in a real browser, on a real server: ask, see, correct by dragging and by keyboard, draw what was not found."""
+
+from __future__ import annotations
+
+import re
+
+import httpx
+import pytest
+from browser import (
+    NARROW,
+    WIDE,
+    Windows,
+    arrow_tip,
+    ask,
+    assert_fits,
+    drag_in_picture,
+    drop,
+    path,
+    result,
+    said,
+    stage,
+)
+from conftest import Server
+from drawn import clutter, png_bytes
+from playwright.sync_api import Page, Request, expect
+from servers import QUESTION, picture
+
+FIRST_VIEW_BYTES = 150_000
+FROM_MOTION_ON = ("motion", "trajectory", "generation", "answering")
+
+
+def answered(server: Server, windows: Windows, width: int, shift: int, **options: str) -> Page:
+    """A page on which the answer to a question about a picture of its own is shown."""
+    page = windows.open(server.address, width, **options)
+    drop(page, picture(shift))
+    ask(page, QUESTION)
+    result(page)
+    return page
+
+
+@pytest.mark.parametrize(("width", "shift"), [(WIDE, 1), (NARROW, 2)])
+def test_dragging_the_arrow_changes_path_and_answer(server: Server, windows: Windows, width: int, shift: int) -> None:
+    page = answered(server, windows, width, shift)
+    first, at_first = result(page), path(page)
+    assert said(page) == "Yes"
+    assert_fits(page)
+
+    drag_in_picture(page, arrow_tip(page), (60 + shift, 10))
+    dragged = result(page, before=first)
+    assert said(page) == "No"
+    assert path(page) != at_first
+    assert stage(page, "grounding") == "kept"
+    assert {name: stage(page, name) for name in FROM_MOTION_ON} == dict.fromkeys(FROM_MOTION_ON, "done")
+
+    page.get_by_role("button", name="Undo").click()
+    result(page, before=dragged)
+    assert said(page) == "Yes"
+    assert path(page) == at_first
+    assert {stage(page, name) for name in FROM_MOTION_ON} == {"kept"}
+    page.get_by_role("button", name="Redo").click()
+    expect(page.locator(".verdict.looked .said")).to_have_text("No")
+
+
+def test_what_was_not_found_is_drawn(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    drop(page, png_bytes(clutter(400, 300)), "photo.png")
+    ask(page, "If the toy car moves, will it hit the wooden crate?")
+    notice = page.locator(".notice.problem")
+    expect(notice).to_contain_text("toy car")
+    assert page.locator(".mark").count() == 0
+
+    notice.get_by_role("button", name="Draw its box").click()
+    drag_in_picture(page, (40, 120), (90, 170))
+    expect(notice).to_contain_text("direction")
+    page.get_by_role("button", name="Another object", exact=True).click()
+    drag_in_picture(page, (200, 100), (270, 180))
+    page.get_by_label("What is in the box?").fill("wooden crate")
+    page.keyboard.press("Enter")
+    expect(page.get_by_label("What wooden crate is")).to_have_value("target")
+    notice.get_by_role("button", name="Draw the direction").click()
+    drag_in_picture(page, (65, 145), (165, 145))
+
+    met = page.locator(".mark.touches")
+    expect(met).to_have_attribute("title", re.compile("hits wooden crate"))
+    expect(notice).to_have_count(0)
+    assert said(page) == "Yes"
+
+
+def test_the_film_plays_in_step_with_its_overlay(server: Server, windows: Windows) -> None:
+    page = answered(server, windows, WIDE, 3, reduced_motion="no-preference")
+    slider = page.get_by_label("Frame of the clip")
+    expect(slider).to_have_value(re.compile(r"^([5-9]|[1-6]\d)$"))
+    page.get_by_role("button", name="Pause").click()
+    expect(page.locator(".handle.tip")).to_be_visible()  # what can be corrected is shown while the film stands still
+    frame = int(slider.input_value())
+    trajectory = httpx.get(f"{server.address}/jobs/{result(page)}").json()["result"]["simulation"]["trajectory"]
+    now = page.locator("circle.now").first
+    shown = float(now.get_attribute("cx") or 0), float(now.get_attribute("cy") or 0)
+    assert shown == pytest.approx(trajectory["paths"][0]["points"][frame])
+    film = page.locator(".scene video")
+    assert abs(film.evaluate("film => film.currentTime") * trajectory["fps"] - frame) <= 1
+
+    page.locator(".mark.touches").first.click()
+    first_touch = min(met["first_frame"] for met in trajectory["encounters"])
+    expect(slider).to_have_value(str(first_touch))
+    assert int(film.evaluate("film => film.currentTime") * trajectory["fps"]) == first_touch
+
+
+def test_keyboard_alone(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    page.get_by_role("button", name=re.compile("yellow ball")).wait_for()
+    tab_to(page, ".examples button")
+    page.keyboard.press("Enter")
+    expect(page.locator("#question")).to_be_focused()
+    page.keyboard.press("Enter")
+    first = result(page)
+    aimed = arrow_tip(page)
+    tab_to(page, ".handle.tip")
+    for _ in range(3):
+        page.keyboard.press("Shift+ArrowUp")
+    result(page, before=first)
+    assert arrow_tip(page)[1] < aimed[1] - 20
+    assert (stage(page, "grounding"), stage(page, "trajectory")) == ("kept", "done")
+
+
+def tab_to(page: Page, selector: str) -> None:
+    """Presses Tab until an element of these has the focus."""
+    for _ in range(80):
+        page.keyboard.press("Tab")
+        if page.evaluate("selector => document.activeElement.matches(selector)", selector):
+            return
+    pytest.fail(f"The Tab key does not reach {selector}.")
+
+
+def test_the_first_view_is_light(server: Server, windows: Windows) -> None:
+    page = windows.open("about:blank")
+    requests: list[Request] = []
+    page.on("requestfinished", lambda request: requests.append(request))  # noqa: PLW0108 (it takes no builtin)
+    page.goto(server.address, wait_until="networkidle")
+    sizes = [request.sizes() for request in requests]
+    parts = ("requestHeadersSize", "requestBodySize", "responseHeadersSize", "responseBodySize")
+    sent = {request.url: sum(size[part] for part in parts) for request, size in zip(requests, sizes, strict=True)}
+    assert len([url for url in sent if url.startswith(server.address)]) > 10
+    assert sum(sent.values()) <= FIRST_VIEW_BYTES, sent
+    assert {url for url in sent if not url.startswith(server.address)} == set()
