@@ -92,6 +92,7 @@ def test_the_list_of_jobs(served: Served, windows: Windows) -> None:
     expect(rows.filter(has=page.locator(".badge.succeeded"))).to_have_count(0)
     expect(rows.filter(has=page.locator(".badge.failed"))).not_to_have_count(0)
     page.get_by_role("button", name=f"Delete: {UNREAD}").click()
+    page.get_by_role("button", name=f"Really delete: {UNREAD}").click()
     expect(rows.filter(has_text="unicorn")).to_have_count(0)
     assert served.http.get(f"/jobs/{bad['id']}").status_code == 404
 

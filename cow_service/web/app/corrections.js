@@ -9,7 +9,9 @@ const OF_LINEAR = [...OF_DIRECTED, "distance", "duration", "until", "steps"];
 export const isDirected = (kind) => DIRECTED.has(kind);
 
 const present = (record) => Object.fromEntries(Object.entries(record).filter(([, value]) => value !== null && value !== undefined));
-const only = (record, names) => present(Object.fromEntries(names.map((name) => [name, record[name]])));
+const DEFAULTS = { depth: 0, depth_deviation: 0 };
+const isDefault = (name, value) => (Array.isArray(value) && !value.length) || DEFAULTS[name] === value;
+const only = (record, names) => present(Object.fromEntries(names.filter((name) => !isDefault(name, record[name])).map((name) => [name, record[name]])));
 const plain = (words) => words.toLowerCase().trim();
 const sameBox = (a, b) => Boolean(a && b) && a.every((value, place) => Math.abs(value - b[place]) < 1);
 
