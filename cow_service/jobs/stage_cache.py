@@ -67,7 +67,10 @@ class StoredStep:
     def __call__(
         self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
     ) -> tuple[StageResult[Any], bool]:
-        """The stage's result, and whether another job had computed it."""
+        """The stage's result, and whether another job had computed it.
+
+        A job that computes one of `key.also` at this moment is not waited for: what it reads is more than is wanted here.
+        """
         digest, *also = (self._stored_as(each, key.shareable) for each in (key.digest, *key.also))
         with self.hold_key(digest, self.outages.check_canceled):
             found = self.outages.wait_through(lambda: self._find_any(stage, [digest, *also]))
