@@ -81,7 +81,10 @@ def test_cancel_ends_the_job(served: Served, windows: Windows) -> None:
 
 
 def test_the_list_of_jobs(served: Served, windows: Windows) -> None:
-    good, bad = asked(served), asked(served, "/simulate", image=UNREADABLE, question=UNREAD, grounding=None, motion=None)
+    good, bad = (
+        asked(served),
+        asked(served, "/simulate", image=UNREADABLE, question=UNREAD, grounding=None, motion=None),
+    )
     page = windows.open(address(served))
     page.get_by_role("link", name="Jobs").click()
     rows = page.locator(".job")
@@ -107,7 +110,9 @@ def shown_pictures(page: Page, selector: str) -> int:
     """How many pictures there are; all of them are decoded."""
     pictures = page.locator(selector)
     expect(pictures.first).to_be_visible()
-    widths = eventually(lambda: all(found := pictures.evaluate_all("all => all.map((img) => img.naturalWidth)")) and found)
+    widths = eventually(
+        lambda: all(found := pictures.evaluate_all("all => all.map((img) => img.naturalWidth)")) and found
+    )
     return len(widths)
 
 

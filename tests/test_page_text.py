@@ -127,7 +127,9 @@ def test_the_code_asks_the_same(server: Server, codes: dict[str, str], tmp_path:
     program = {"Python": [sys.executable, "-c"], "curl": ["bash", "-c"]}[form]
     if form == "curl" and shutil.which("curl") is None:
         pytest.skip("curl is not installed: apt-get install curl")
-    run = subprocess.run([*program, codes[form]], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    run = subprocess.run(
+        [*program, codes[form]], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
+    )
     assert run.returncode == 0, run.stderr
     asked, told = newest(server), json.loads(codes["JSON"])
     assert told.pop("image") == asked["image"]
