@@ -41,7 +41,7 @@ def launched() -> Iterator[Browser]:
 
 
 class Windows:
-    """Pages, each with storage and cache of its own; what goes wrong in them fails the test at the end of the `with` block."""
+    """Pages, each with storage and cache of its own. Errors in them fail the test at the end of the `with` block."""
 
     def __init__(self, browser: Browser) -> None:
         self._browser = browser
@@ -114,7 +114,8 @@ def drag_in_picture(page: Page, start: Point, end: Point) -> None:
     """Drags by the mouse between two points of the picture, px of the picture."""
     svg = page.locator(".scene svg")
     svg.scroll_into_view_if_needed()
-    to_window = "(svg, at) => at.map(([x, y]) => new DOMPoint(x, y).matrixTransform(svg.getScreenCTM())).map(({x, y}) => [x, y])"
+    to_window = """(svg, points) => points
+        .map(([x, y]) => new DOMPoint(x, y).matrixTransform(svg.getScreenCTM())).map(({ x, y }) => [x, y])"""
     from_window, to = svg.evaluate(to_window, [start, end])
     page.mouse.move(*from_window)
     page.mouse.down()

@@ -1,4 +1,4 @@
-"""The page in a real browser, on a real server: ask, see, correct by dragging and by keyboard, draw what was not found."""
+"""The page in a real browser: ask, see, correct by dragging and by keyboard, draw what was not found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page in a real browser: jobs from their link and from the list, canceled ones, and a server that is away or has keys."""
+"""The page in a real browser: jobs from links and from the list, canceled ones, a server that is away or has keys."""
 
 from __future__ import annotations
 
