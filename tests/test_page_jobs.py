@@ -116,6 +116,7 @@ def shown_pictures(page: Page, selector: str) -> int:
     return len(widths)
 
 
+@pytest.mark.slow
 def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, windows: Windows) -> None:
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
@@ -132,6 +133,7 @@ def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, windows: Windows
         assert result(page) == job["id"]
 
 
+@pytest.mark.slow
 def test_a_server_with_keys(tmp_path: Path, windows: Windows) -> None:
     key = new_key()
     with Served(tmp_path, COW_API_KEYS=json.dumps({"alice": hash_of(key)})) as served:
