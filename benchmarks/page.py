@@ -25,12 +25,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import Browser, Page, Request, sync_playwright
+from playwright.sync_api import Browser, Page, Request, ViewportSize, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGE = ROOT / "examples" / "ball-and-mug" / "image.jpg"
 QUESTION = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
-WINDOW = {"width": 1280, "height": 900}  # CSS px
+WINDOW = ViewportSize(width=1280, height=900)  # CSS px
 DRAG_SECONDS = 2.0
 DRAG_RADIUS = 60.0  # CSS px
 # Notes when an example is there, and when each frame is shown.
@@ -60,7 +60,7 @@ def start_server(data: Path) -> tuple[subprocess.Popen[str], str]:
 
 def first_view(browser: Browser, address: str) -> dict[str, float]:
     """Of one new context: milliseconds until it is painted and usable, bytes over the wire, requests."""
-    context = browser.new_context(viewport=WINDOW)  # pyright: ignore[reportArgumentType]
+    context = browser.new_context(viewport=WINDOW)
     page = context.new_page()
     page.add_init_script(WATCH)
     requests: list[Request] = []
@@ -68,7 +68,7 @@ def first_view(browser: Browser, address: str) -> dict[str, float]:
     page.goto(address, wait_until="networkidle")
     sizes = [request.sizes() for request in requests]
     parts = ("requestHeadersSize", "requestBodySize", "responseHeadersSize", "responseBodySize")
-    figures = {
+    figures: dict[str, float] = {
         "first_contentful_paint_ms": page.evaluate(PAINT),
         "usable_ms": page.evaluate("window.usableAt"),
         "bytes": sum(size[part] for size in sizes for part in parts),
@@ -87,7 +87,7 @@ def shown_result(page: Page, before: str | None = None) -> str:
 
 def dragging(browser: Browser, address: str, runs: int) -> tuple[dict[str, float], list[float]]:
     """Frames a second while the arrow is dragged, and the milliseconds from each release to the new answer."""
-    context = browser.new_context(viewport=WINDOW, reduced_motion="reduce")  # pyright: ignore[reportArgumentType]
+    context = browser.new_context(viewport=WINDOW, reduced_motion="reduce")
     page = context.new_page()
     page.add_init_script(WATCH)
     page.goto(address)
