@@ -38,9 +38,10 @@ export function usePlayer(simulation, isBusy) {
       if (wanted) setPlaying(false);
     };
     if (film && url) {
+      const show = (time) => setFrame(clamp(Math.floor(time * fps + 0.01), 0, count - 1));
       const shown = (_, meta) => {
         if (!wanted || !moving.current) return;
-        setFrame(clamp(Math.floor(meta.mediaTime * fps + 0.01), 0, count - 1));
+        show(meta.mediaTime);
         handle = film.requestVideoFrameCallback(shown);
       };
       handle = film.requestVideoFrameCallback(shown);
@@ -51,6 +52,7 @@ export function usePlayer(simulation, isBusy) {
         film.cancelVideoFrameCallback(handle);
         film.removeEventListener("ended", stop);
         film.pause();
+        show(film.currentTime); // it may have gone on since the last frame that was told
       };
     }
     const began = performance.now() - (1000 * frame) / fps;
