@@ -69,7 +69,7 @@ class StoredStep:
     ) -> tuple[StageResult[Any], bool]:
         """The stage's result, and whether another job had computed it.
 
-        A job that computes one of `key.also` at this moment is not waited for: what it reads is more than is wanted here.
+        A job that computes one of `key.also` at this moment is not waited for: it reads more than is wanted here.
         """
         digest, *also = (self._stored_as(each, key.shareable) for each in (key.digest, *key.also))
         with self.hold_key(digest, self.outages.check_canceled):
