@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from browser import NARROW, WIDE, Windows, arrow_tip, ask, assert_fits, drop, result, said
-from drawn import clutter, floor, png_bytes
+from drawn import ball, block, clutter, floor, png_bytes
 from playwright.sync_api import Page, expect
 from servers import BODY, QUESTION, Served, data_url, eventually, picture, slow
 
@@ -64,7 +64,8 @@ def test_a_link_to_no_job_says_so(served: Served, windows: Windows) -> None:
 
 def test_cancel_ends_the_job(served: Served, windows: Windows) -> None:
     page = windows.open(address(served))
-    drop(page, png_bytes(floor(1600, 1000)))
+    large = ball(floor(1600, 1000), (400, 500), 110, (210, 20, 20))
+    drop(page, png_bytes(block(large, (1100, 380, 1330, 620), (50, 80, 200))))
     page.get_by_text("How to answer").click()
     page.get_by_label("Length of the clip, frames").fill("481")
     page.get_by_label("Length of the clip, frames").press("Tab")
