@@ -17,7 +17,6 @@ import math
 import os
 import shutil
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -25,6 +24,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from latency import start_server
 from playwright.sync_api import Browser, Page, Request, ViewportSize, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,18 +44,6 @@ const look = () => {
 new MutationObserver(look).observe(document, { childList: true, subtree: true });
 """
 PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
-
-
-def start_server(data: Path) -> tuple[subprocess.Popen[str], str]:
-    """The server process and its address."""
-    command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", "0"]
-    environment = os.environ | {"COW_DATA_DIR": str(data)}
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    for line in process.stderr:
-        if "running on" in line:
-            return process, line.split("running on ")[1].split()[0]
-    raise RuntimeError("The server did not start.")
 
 
 def first_view(browser: Browser, address: str) -> dict[str, float]:
@@ -132,7 +120,7 @@ def rounded(figures: dict[str, float]) -> dict[str, float]:
 def measure(chromium: str, runs: int) -> dict[str, Any]:
     """All figures."""
     with tempfile.TemporaryDirectory() as data, sync_playwright() as playwright:
-        process, address = start_server(Path(data))
+        process, address, _ = start_server(Path(data))
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         try:
             first_view(browser, address)  # not counted

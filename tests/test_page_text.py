@@ -95,7 +95,6 @@ def codes(server: Server, chromium: object) -> dict[str, str]:
         drop(page, picture(5), "it's a photo.png")
         ask(page, QUESTION)
         result(page)
-        page.get_by_text("What was read, to correct")
         page.get_by_label("Law").select_option("ballistic")
         page.get_by_role("button", name="Ask").wait_for()
         page.locator("#question").fill(f"{QUESTION} {HARD_TO_QUOTE}")

@@ -5,7 +5,7 @@ import { jobAddress, pageAddress } from "./address.js";
 import { follow } from "./events.js";
 import { forgetKey } from "./keys.js";
 import { requestOf, stateOf } from "./request.js";
-import { Problem, call, callJson, newIdempotencyKey, persist, postJson } from "./server.js";
+import { Problem, call, callJson, codeOf, newIdempotencyKey, persist, postJson } from "./server.js";
 import { NOTHING_CORRECTED, get, set } from "./store.js";
 
 const MOST_UNDONE = 50;
@@ -86,7 +86,7 @@ function outcomeOf(job) {
   const answer = job.kind === "answer" ? job.result : null;
   const simulation = job.kind === "answer" ? answer?.simulation ?? null : job.result;
   const problem = job.problem ?? answer?.simulation_problem ?? null;
-  return { answer, simulation, problem: problem && { ...problem, code: problem.type.split(":").pop(), errors: problem.errors ?? [] } };
+  return { answer, simulation, problem: problem && { ...problem, code: codeOf(problem), errors: problem.errors ?? [] } };
 }
 
 /** Reads the place in the queue, of which the events tell nothing. */

@@ -1,5 +1,7 @@
 // Corrections as a request takes them, made of what a result says and of corrections that were made before.
 
+import { isSameBox } from "./geometry.js";
+
 const DIRECTED = new Set(["linear", "projectile"]);
 const SET_MOVING = new Set(["linear", "projectile", "fall"]); // kinds of motion that others may have
 const OF_ALL = ["kind", "law", "others", "metres_per_pixel"];
@@ -13,7 +15,6 @@ const DEFAULTS = { depth: 0, depth_deviation: 0 };
 const isDefault = (name, value) => (Array.isArray(value) && !value.length) || DEFAULTS[name] === value;
 const only = (record, names) => present(Object.fromEntries(names.filter((name) => !isDefault(name, record[name])).map((name) => [name, record[name]])));
 const plain = (words) => words.toLowerCase().trim();
-const sameBox = (a, b) => Boolean(a && b) && a.every((value, place) => Math.abs(value - b[place]) < 1);
 
 /** The motion that a result has, as a request gives it. */
 export function motionOf(motion) {
@@ -59,7 +60,7 @@ function objectsBeside({ grounding }, own) {
   const names = new Set([grounding.object, ...own.map((object) => object.object)].map(plain));
   const objects = [...own];
   for (const { object, bbox, role, prior } of [...grounding.others, ...changed]) {
-    if (names.has(plain(object)) || objects.some((known) => sameBox(known.bbox, bbox)) || sameBox(grounding.bbox, bbox)) continue;
+    if (names.has(plain(object)) || objects.some((known) => isSameBox(known.bbox, bbox)) || isSameBox(grounding.bbox, bbox)) continue;
     names.add(plain(object));
     objects.push({ object, bbox, role: role ?? "target", ...priorOf(prior) });
   }

@@ -28,6 +28,9 @@ export function movedBox(box, handle, dx, dy, size) {
   return [x0, y0, x1, y1].map((value) => rounded(value));
 }
 
+/** Whether two boxes are the same but for rounding; a box that is not there is like no other. */
+export const isSameBox = (a, b) => Boolean(a && b) && a.every((value, place) => Math.abs(value - b[place]) < 1);
+
 export const middleOf = ([x0, y0, x1, y1]) => [(x0 + x1) / 2, (y0 + y1) / 2];
 
 /** A unit vector from one point to another; null where they are too near. */

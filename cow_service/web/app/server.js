@@ -3,11 +3,14 @@
 import { address } from "./address.js";
 import { askForKey, currentKey, forgetKey } from "./keys.js";
 
+/** The code of a problem as the server tells it, such as `cannot-ground`; empty where it has none. */
+export const codeOf = (problem) => String(problem.type ?? "").split(":").pop();
+
 /** What the server answered instead of a result (RFC 9457). */
 export class Problem extends Error {
   constructor(body, status, retryAfter = null) {
     super(body.detail || body.title || `The server answered ${status}.`);
-    this.code = String(body.type || "").split(":").pop() || `http-${status}`;
+    this.code = codeOf(body) || `http-${status}`;
     this.title = body.title || "The request failed.";
     this.detail = this.message;
     this.errors = body.errors || [];

@@ -2,7 +2,7 @@
 
 import { html } from "../vendor/htm-preact.js";
 import { correct } from "../app/asking.js";
-import { boxBetween, isBox, rounded } from "../app/geometry.js";
+import { boxBetween, isBox, isSameBox, rounded } from "../app/geometry.js";
 import { correctedWords, freeName, isDirected, motionWith, moverWith } from "../app/corrections.js";
 import { set } from "../app/store.js";
 
@@ -44,8 +44,6 @@ function Motion({ simulation, corrections }) {
   </fieldset>`;
 }
 
-const sameBox = (a, b) => Boolean(a) && a.every((value, place) => Math.abs(value - b[place]) < 1);
-
 function Objects({ simulation, corrections, found, picture }) {
   const { objects: own, interventions } = corrections;
   const changed = (place, fields) => own.map((object, index) => (index === place ? { ...object, ...fields } : object));
@@ -58,7 +56,7 @@ function Objects({ simulation, corrections, found, picture }) {
     });
   };
   const bodies = simulation ? simulation.trajectory.bodies.slice(1) : found;
-  const others = bodies.filter((body) => !own.some((object) => sameBox(object.bbox, body.bbox)));
+  const others = bodies.filter((body) => !own.some((object) => isSameBox(object.bbox, body.bbox)));
   const removed = interventions.filter((each) => each.kind === "remove").map((each) => each.object);
   const remove = (body) => {
     const object = freeName(body.object, own);

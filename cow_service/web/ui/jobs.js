@@ -3,7 +3,7 @@
 import { html, useEffect, useState } from "../vendor/htm-preact.js";
 import { openJob, shownProblem, tellAway } from "../app/asking.js";
 import { jobAddress } from "../app/address.js";
-import { call, callJson, persist } from "../app/server.js";
+import { call, callJson, codeOf, persist } from "../app/server.js";
 import { set } from "../app/store.js";
 import { percent, remedyOf, when } from "../app/words.js";
 import { Shot } from "./filmstrip.js";
@@ -89,7 +89,7 @@ function JobRow({ job, act }) {
     history.pushState(null, "", jobAddress(job.id));
     void openJob(job.id);
   };
-  const problem = job.problem && { ...job.problem, code: job.problem.type.split(":").pop() };
+  const problem = job.problem && { ...job.problem, code: codeOf(job.problem) };
   return html`<li class=${`job ${job.status}`}>
     <div class="thumb">${job.image && html`<${Shot} sha256=${job.image} alt="" loading="lazy" />`}</div>
     <div class="about">

@@ -64,9 +64,11 @@ export function Scene({ state }) {
 
   const ownNames = new Set(corrections.objects.filter((object) => object.bbox).map((object) => object.object));
   const world = simulation ? labelsOf(simulation.trajectory) : found.map((body) => ({ text: body.object, box: body.bbox, kind: "body" }));
+  const removed = new Set(corrections.interventions.filter((each) => each.kind === "remove").map((each) => each.object));
+  const nameOf = (object) => (removed.has(object) ? `${object}, taken away` : object);
   const labels = [
     ...(moverBox ? [{ text: moverName, box: moverBox, kind: "mover" }] : []),
-    ...corrections.objects.map((object, place) => ({ text: object.object, box: draft?.object === place ? draft.box : object.bbox, kind: "own" })).filter((label) => label.box),
+    ...corrections.objects.map((object, place) => ({ text: nameOf(object.object), box: draft?.object === place ? draft.box : object.bbox, kind: "own" })).filter((label) => label.box),
     ...world.filter((label) => label.kind !== "body" || !ownNames.has(label.text)),
   ];
 
