@@ -1,0 +1,135 @@
+"""What a report says: rates, gains, calibration and cost of every arm of every run, computed once for all its forms."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+from pydantic import Field
+
+from cow_service.evals.items import TASKS, Task
+from cow_service.evals.observations import Observation
+from cow_service.evals.runs import Run
+from cow_service.evals.statistics import (
+    Calibration,
+    Cost,
+    Gain,
+    Rates,
+    calibration,
+    cost,
+    gain,
+    rates,
+    with_holm,
+)
+from cow_service.records import Record
+
+BASELINE = "never"
+
+
+class Cell(Record):
+    """The rates of one task, or one level of it."""
+
+    task: Task
+    level: str | None = Field(description="Null: all levels.")
+    rates: Rates
+
+
+class TaskGain(Record):
+    """The gain on one task."""
+
+    task: Task
+    gain: Gain
+
+
+class ArmSummary(Record):
+    """What one arm of one run came to."""
+
+    run: int = Field(description="Place of the run in the report, from 0.")
+    mllm: str
+    arm: str
+    name: str = Field(description="Unique in the report: the arm, and the multimodal LLM where there are several.")
+    rates: Rates
+    cells: tuple[Cell, ...]
+    gain: Gain | None = Field(default=None, description="Over the arm `never`; null for itself, or without one.")
+    gains: tuple[TaskGain, ...] = Field(default=(), description="The same per task, p values adjusted over them.")
+    calibration: Calibration | None = None
+    cost: Cost
+
+
+class Price(Record):
+    """Of a million tokens."""
+
+    input: float = Field(ge=0)
+    output: float = Field(ge=0)
+
+
+def summarize(runs: Sequence[Run], prices: Mapping[str, Price] | None = None) -> tuple[ArmSummary, ...]:
+    """Of every arm that has replies, in the order of the runs and of their arms."""
+    several = len({run.info.mllm for run in runs}) > 1 or len(runs) > 1
+    found: list[ArmSummary] = []
+    for place, run in enumerate(runs):
+        for arm in run.info.arms:
+            observations = run.of_arm(arm)
+            of_all = rates(observations)
+            if of_all is None:
+                continue
+            name = f"{run.info.mllm}, {arm}" if several else arm
+            known = {each.name for each in found}
+            baseline = [] if arm == BASELINE else _baseline(runs, run)
+            found.append(
+                ArmSummary(
+                    run=place,
+                    mllm=run.info.mllm,
+                    arm=arm,
+                    name=f"{name} ({place + 1})" if name in known else name,
+                    rates=of_all,
+                    cells=_cells(observations),
+                    gain=gain(observations, baseline),
+                    gains=_gains(observations, baseline),
+                    calibration=calibration(observations),
+                    cost=_cost(observations, (prices or {}).get(run.info.mllm)),
+                )
+            )
+    return tuple(found)
+
+
+def _baseline(runs: Sequence[Run], run: Run) -> list[Observation]:
+    """The replies without imagination: of the same run, else of the first that asked the same of the same model."""
+
+    def same(other: Run) -> bool:
+        pairs = ((run.info, other.info),)
+        return all((a.data_digest, a.mllm, a.ask, a.seed) == (b.data_digest, b.mllm, b.ask, b.seed) for a, b in pairs)
+
+    candidates = [run, *(other for other in runs if other is not run and same(other))]
+    return next((found for other in candidates if (found := other.of_arm(BASELINE))), [])
+
+
+def _cells(observations: Sequence[Observation]) -> tuple[Cell, ...]:
+    """Per task: all of it, then its levels where there are several."""
+    cells: list[Cell] = []
+    for task, of_task in _by_task(observations).items():
+        levels = sorted({each.level for each in of_task})
+        for level in (None, *levels):
+            of_level = rates([each for each in of_task if level in (None, each.level)])
+            if of_level is not None:
+                cells.append(Cell(task=task, level=level, rates=of_level))
+    return tuple(cells)
+
+
+def _gains(observations: Sequence[Observation], baseline: Sequence[Observation]) -> tuple[TaskGain, ...]:
+    there = _by_task(baseline)
+    found = [(task, gain(of_task, there.get(task, []))) for task, of_task in _by_task(observations).items()]
+    known = [(task, each) for task, each in found if each is not None]
+    adjusted = with_holm([each for _, each in known])
+    return tuple(TaskGain(task=task, gain=each) for (task, _), each in zip(known, adjusted, strict=True))
+
+
+def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation]]:
+    found: dict[Task, list[Observation]] = defaultdict(list)
+    for each in observations:
+        found[each.task].append(each)
+    return {task: found[task] for task in TASKS if task in found}
+
+
+def _cost(observations: Sequence[Observation], price: Price | None) -> Cost:
+    return cost(observations) if price is None else cost(observations, price.input, price.output)

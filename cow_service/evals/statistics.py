@@ -1,0 +1,258 @@
+"""Rates, and what is gained by an arm over another: paired by question and repeat, drawn by scene."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import zlib
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.stats import binomtest
+
+from cow_service.evals.observations import Observation
+from cow_service.records import Record
+
+RESAMPLES = 10_000
+CONFIDENCE = 0.95
+
+
+class Spread(Record):
+    """A share of questions: the mean over repeats, and their standard deviation (one repeat has none)."""
+
+    mean: float
+    sd: float | None
+
+
+class Rates(Record):
+    """What one arm came to on some questions."""
+
+    questions: int = Field(description="Different ones with a reply.")
+    replies: int
+    failed: int = Field(description="Questions asked without a reply, over all repeats; they count nowhere else.")
+    tpr: Spread = Field(description="Right of all; an unreadable reply is not right.")
+    nsr: Spread = Field(description="Abstained of all.")
+    tpr_as_paper: Spread = Field(description="Right of all as the paper's rules read the replies.")
+    unreadable: int
+    imagined: float = Field(description="Share of replies that rest on a simulation.")
+    refused: float = Field(description="Share of replies for which a simulation was wanted and refused.")
+
+
+class Gain(Record):
+    """What an arm gains over a baseline on the questions that both replied to, as shares of questions."""
+
+    questions: int
+    scenes: int
+    gain: float
+    low: float = Field(description="Lower end of the 95% interval: bootstrap over scenes.")
+    high: float
+    helped: int = Field(description="Pairs of replies, wrong in the baseline and right in the arm.")
+    hurt: int = Field(description="The other way round.")
+    discordant: tuple[int, int] = Field(
+        description="Questions right in most repeats of one of both alone: of the arm, of the baseline."
+    )
+    p: float = Field(description="Exact McNemar test on these questions, two-sided.")
+    p_holm: float | None = Field(default=None, description="The same, adjusted over the tasks that are compared.")
+
+
+class Bin(Record):
+    """Told probabilities between two bounds, and how often what they tell of happened."""
+
+    low: float
+    high: float
+    count: int
+    told: float = Field(description="Mean of the probabilities.")
+    happened: float = Field(description="Share that happened.")
+
+
+class Calibration(Record):
+    """How good the told probabilities are."""
+
+    count: int
+    brier: float
+    base_brier: float = Field(description="Of one who always tells the share that happened.")
+    bins: tuple[Bin, ...]
+
+
+class Cost(Record):
+    """What the replies of an arm cost; sums."""
+
+    replies: int
+    calls: int
+    input_tokens: int
+    output_tokens: int
+    seconds: float
+    imaginations: int
+    money: float | None = Field(default=None, description="In the currency of the price table; null without one.")
+
+
+def rates(observations: Sequence[Observation]) -> Rates | None:
+    """Of one arm; None where nothing was replied to."""
+    replied = [each for each in observations if each.failure is None]
+    if not replied:
+        return None
+    return Rates(
+        questions=len({each.item for each in replied}),
+        replies=len(replied),
+        failed=len(observations) - len(replied),
+        tpr=_spread(replied, lambda each: each.right),
+        nsr=_spread(replied, lambda each: each.abstained),
+        tpr_as_paper=_spread(replied, lambda each: each.read_as_paper == each.truth),
+        unreadable=sum(each.unreadable for each in replied),
+        imagined=statistics.fmean(each.imaginations > 0 for each in replied),
+        refused=statistics.fmean(each.refusal is not None for each in replied),
+    )
+
+
+def _spread(observations: Sequence[Observation], is_one: Callable[[Observation], bool]) -> Spread:
+    """Of the shares of the repeats."""
+    by_repeat: dict[int, list[bool]] = defaultdict(list)
+    for each in observations:
+        by_repeat[each.repeat].append(is_one(each))
+    shares = [statistics.fmean(values) for values in by_repeat.values()]
+    return Spread(mean=statistics.fmean(shares), sd=statistics.stdev(shares) if len(shares) > 1 else None)
+
+
+def gain(arm: Sequence[Observation], baseline: Sequence[Observation], resamples: int = RESAMPLES) -> Gain | None:
+    """Of an arm over a baseline; None where no question was replied to in both.
+
+    The interval is a bootstrap over scenes, studentized: with some forty scenes the plain percentiles are too narrow.
+    """
+    pairs = _pairs(arm, baseline)
+    if not pairs:
+        return None
+    sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
+    by_item: dict[str, list[tuple[bool, bool]]] = defaultdict(list)
+    for one, other in pairs:
+        sums[one.scene][0] += one.right - other.right
+        sums[one.scene][1] += 1
+        by_item[one.item].append((one.right, other.right))
+    table = np.array([sums[scene] for scene in sorted(sums)])
+    low, high = bootstrap_interval(table, resamples)
+    majority = [(_most(a for a, _ in values), _most(b for _, b in values)) for values in by_item.values()]
+    won = sum(a and not b for a, b in majority)
+    lost = sum(b and not a for a, b in majority)
+    return Gain(
+        questions=len(by_item),
+        scenes=len(table),
+        gain=float(table[:, 0].sum() / table[:, 1].sum()),
+        low=low,
+        high=high,
+        helped=sum(one.right and not other.right for one, other in pairs),
+        hurt=sum(other.right and not one.right for one, other in pairs),
+        discordant=(won, lost),
+        p=float(binomtest(won, won + lost).pvalue) if won + lost else 1.0,
+    )
+
+
+def _pairs(arm: Iterable[Observation], baseline: Iterable[Observation]) -> list[tuple[Observation, Observation]]:
+    """Replies to the same question in the same repeat."""
+    there = {(each.item, each.repeat): each for each in baseline if each.failure is None}
+    return [
+        (each, there[each.item, each.repeat])
+        for each in arm
+        if each.failure is None and (each.item, each.repeat) in there
+    ]
+
+
+def _most(values: Iterable[bool]) -> bool:
+    """Whether more than half are true."""
+    known = list(values)
+    return 2 * sum(known) > len(known)
+
+
+def bootstrap_interval(table: NDArray[np.float64], resamples: int = RESAMPLES) -> tuple[float, float]:
+    """The 95% interval of a ratio of sums, from a table (clusters, 2) of numerators and denominators.
+
+    A bootstrap-t over clusters with the linearized standard error (Efron and Tibshirani 1993, section 12.5), and no
+    wider than [-1, 1]. The random numbers are fixed by the table.
+    """
+    count = len(table)
+    total = table.sum(axis=0)
+    ratio = total[0] / total[1]
+    error = _standard_error(table, np.ones((1, count)), np.array([ratio]))[0]
+    if count < 2 or error == 0:
+        return float(ratio), float(ratio)
+    draws = np.random.default_rng(zlib.crc32(np.ascontiguousarray(table).tobytes()))
+    weights = draws.multinomial(count, np.full(count, 1 / count), size=resamples).astype(np.float64)
+    drawn = weights @ table
+    ratios = drawn[:, 0] / drawn[:, 1]
+    errors = _standard_error(table, weights, ratios)
+    usable = errors > 0
+    if not usable.any():
+        return float(ratio), float(ratio)
+    studentized = (ratios[usable] - ratio) / errors[usable]
+    edge = (1 - CONFIDENCE) / 2
+    low, high = np.quantile(studentized, [1 - edge, edge])
+    return max(-1.0, float(ratio - low * error)), min(1.0, float(ratio - high * error))
+
+
+def _standard_error(
+    table: NDArray[np.float64], weights: NDArray[np.float64], ratios: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Of ratios of weighted sums (draws,), linearized: the spread of what each cluster adds to its ratio."""
+    count = len(table)
+    added = table[None, :, 0] - ratios[:, None] * table[None, :, 1]
+    squares = (weights * added**2).sum(axis=1)
+    return np.sqrt(squares * count / max(count - 1, 1)) / (weights @ table[:, 1])
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """p values adjusted for their number (Holm 1979), in the given order."""
+    order = sorted(range(len(values)), key=values.__getitem__)
+    adjusted = [0.0] * len(values)
+    most = 0.0
+    for rank, place in enumerate(order):
+        most = max(most, min(1.0, (len(values) - rank) * values[place]))
+        adjusted[place] = most
+    return adjusted
+
+
+def with_holm(gains: Sequence[Gain]) -> list[Gain]:
+    """The same with adjusted p values."""
+    adjusted = holm([each.p for each in gains])
+    return [each.model_copy(update={"p_holm": p}) for each, p in zip(gains, adjusted, strict=True)]
+
+
+def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibration | None:
+    """Of the told probabilities, each item once; None where none was told."""
+    told = {
+        each.item: (each.probability, each.happens)
+        for each in observations
+        if each.probability is not None and each.happens is not None
+    }
+    if not told:
+        return None
+    table = np.array(list(told.values()), dtype=np.float64)
+    base = table[:, 1].mean()
+    places = np.minimum((table[:, 0] * bins).astype(int), bins - 1)
+    return Calibration(
+        count=len(table),
+        brier=float(np.mean((table[:, 0] - table[:, 1]) ** 2)),
+        base_brier=float(base * (1 - base)),
+        bins=tuple(_bin(table[places == place], place, bins) for place in range(bins) if (places == place).any()),
+    )
+
+
+def _bin(rows: NDArray[np.float64], place: int, bins: int) -> Bin:
+    told, happened = rows.mean(axis=0)
+    return Bin(low=place / bins, high=(place + 1) / bins, count=len(rows), told=float(told), happened=float(happened))
+
+
+def cost(observations: Sequence[Observation], input_price: float = math.nan, output_price: float = math.nan) -> Cost:
+    """Sums over the replies. Prices are per million tokens; without both there is no sum of money."""
+    replied = [each for each in observations if each.failure is None]
+    given, made = sum(each.input_tokens for each in replied), sum(each.output_tokens for each in replied)
+    money = (given * input_price + made * output_price) / 1e6
+    return Cost(
+        replies=len(replied),
+        calls=sum(each.calls for each in replied),
+        input_tokens=given,
+        output_tokens=made,
+        seconds=sum(each.seconds for each in replied),
+        imaginations=sum(each.imaginations for each in replied),
+        money=None if math.isnan(money) else money,
+    )
