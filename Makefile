@@ -20,7 +20,6 @@ test-fast: $(VENV)/.test ## the tests that take seconds
 	$(PYTEST) -m "not slow"
 
 soak: $(VENV)/.test ## all tests and all cases, those of crashes, fuzz and states ten times as long, and public harnesses
-	$(BIN)/python -m pip install --quiet --no-compile --editable ".[test,harnesses]" --constraint tests/constraints.txt
 	$(PYTEST) tests/test_inspect.py tests/test_docs.py
 	COW_TEST_SCALE=10 $(PYTEST)
 

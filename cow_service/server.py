@@ -6,11 +6,15 @@ import logging
 import signal
 import socket
 import threading
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
 
 import uvicorn
 
 from cow_service.api.app import create_app
 from cow_service.api.connections import Connection, allow_connections
+from cow_service.errors import StorageUnavailable
 from cow_service.jobs.computing import Elsewhere
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
@@ -20,6 +24,8 @@ from cow_service.workers.pool import WorkerPool
 
 EVERYWHERE = ("0.0.0.0", "::")  # addresses at which a server listens, and nobody asks
 LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
+LOAD_SECONDS = 3600.0  # longest that models may take to load where nothing is asked before
+START_POLL_SECONDS = 0.01
 CLOSE_SECONDS = 5.0  # for open connections, after the grace period of running jobs
 
 log = logging.getLogger("cow_service")
@@ -36,10 +42,13 @@ class Server(uvicorn.Server):
         """Listens, and says how to begin."""
         await super().startup(sockets)
         if self.started:
-            port = self.servers[0].sockets[0].getsockname()[1]
-            address = _address(self._engine.service.settings.host, port)
-            log.info("open %s/ in a browser", address)
-            log.info("or try: %s", _example_call(self._engine.service.settings, address))
+            log.info("open %s/ in a browser", self.address)
+            log.info("or try: %s", _example_call(self._engine.service.settings, self.address))
+
+    @property
+    def address(self) -> str:
+        """Where it listens, once it has started."""
+        return _address(self._engine.service.settings.host, self.servers[0].sockets[0].getsockname()[1])
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Accepts no more jobs, then closes connections, then lets the app end."""
@@ -108,6 +117,43 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
 
     Raises the `CowError` for which the default request cannot be served.
     """
+    server, engine, readiness = _server(service, pool)
+
+    def failed() -> None:
+        server.should_exit = True
+
+    readiness.start(failed)
+    readiness.wait(LOAD_WAIT_SECONDS)
+    engine.start()
+    server.run()
+    readiness.wait(0)
+
+
+@contextmanager
+def serving(service: Service) -> Generator[str]:
+    """A server in a thread of this process, at the address of the settings; yields that address.
+
+    Raises the `CowError` for which the default request cannot be served, and `StorageUnavailable`.
+    """
+    server, engine, readiness = _server(service, None)
+    readiness.start()
+    readiness.wait(LOAD_SECONDS)
+    engine.start()
+    thread = threading.Thread(target=server.run, name="cow-server", daemon=True)
+    thread.start()
+    try:
+        while not server.started:
+            if not thread.is_alive():
+                raise StorageUnavailable("The server in this process ended before it had begun; its log says why.")
+            time.sleep(START_POLL_SECONDS)
+        yield server.address
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngine, Readiness]:
+    """A server that does not run yet, with its parts."""
     settings = service.settings
     engine, readiness = _parts(service, pool)
     config = uvicorn.Config(
@@ -119,14 +165,5 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
         http=Connection,  # h11 whatever is installed: parsers differ on which headers they refuse, and on how long
         timeout_graceful_shutdown=int(settings.shutdown_grace + CLOSE_SECONDS),
     )
-    server = Server(config, engine)
-
-    def failed() -> None:
-        server.should_exit = True
-
     allow_connections()
-    readiness.start(failed)
-    readiness.wait(LOAD_WAIT_SECONDS)
-    engine.start()
-    server.run()
-    readiness.wait(0)
+    return Server(config, engine), engine, readiness

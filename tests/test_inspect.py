@@ -15,8 +15,7 @@ from conftest import SCALE
 from random_mllm import USAGE, RandomMllm, random_mllm
 from servers import QUESTION, Served, picture
 
-pytest.importorskip("inspect_ai", reason="public harnesses are tested by `make soak`")
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.soak_only, pytest.mark.slow, pytest.mark.timeout(300)]
 SAMPLES, EPOCHS, SEED = 4, 2 * SCALE, 3
 IMAGINING = ("openai-api/local/cow/qwen3-vl-8b", "openai/cow/qwen3-vl-8b")
 WITHOUT = "openai-api/local/cow/qwen3-vl-8b:no-imagination"

@@ -11,6 +11,7 @@ import typer
 
 from cow_service import __version__
 from cow_service.cli import batch as batch_cli
+from cow_service.cli import eval as eval_cli
 from cow_service.cli import keys as keys_cli
 from cow_service.cli import mcp as mcp_cli
 from cow_service.cli import models as models_cli
@@ -263,6 +264,7 @@ def _service(**overrides: Any) -> Service:
 app.command("batch")(batch_cli.batch)
 app.command("mcp")(mcp_cli.mcp)
 app.command("top")(top_cli.top)
+app.add_typer(eval_cli.app, name="eval")
 app.add_typer(keys_cli.app, name="keys")
 app.add_typer(models_cli.app, name="models")
 app.add_typer(tracks_cli.app, name="tracks")

@@ -17,6 +17,7 @@ from cow_service.evals.observations import Observation
 from cow_service.records import Record
 
 RESAMPLES = 10_000
+MIN_CLUSTERS = 4  # of fewer scenes nothing can be said: the interval is [-1, 1]
 CONFIDENCE = 0.95
 
 
@@ -174,20 +175,29 @@ def bootstrap_interval(table: NDArray[np.float64], resamples: int = RESAMPLES) -
     total = table.sum(axis=0)
     ratio = total[0] / total[1]
     error = _standard_error(table, np.ones((1, count)), np.array([ratio]))[0]
-    if count < 2 or error == 0:
-        return float(ratio), float(ratio)
+    if count < MIN_CLUSTERS:
+        return -1.0, 1.0
+    if error == 0:
+        return _unanimous_interval(float(ratio), count)
     draws = np.random.default_rng(zlib.crc32(np.ascontiguousarray(table).tobytes()))
     weights = draws.multinomial(count, np.full(count, 1 / count), size=resamples).astype(np.float64)
     drawn = weights @ table
     ratios = drawn[:, 0] / drawn[:, 1]
     errors = _standard_error(table, weights, ratios)
     usable = errors > 0
-    if not usable.any():
-        return float(ratio), float(ratio)
     studentized = (ratios[usable] - ratio) / errors[usable]
     edge = (1 - CONFIDENCE) / 2
     low, high = np.quantile(studentized, [1 - edge, edge])
     return max(-1.0, float(ratio - low * error)), min(1.0, float(ratio - high * error))
+
+
+def _unanimous_interval(ratio: float, count: int) -> tuple[float, float]:
+    """Of clusters that all have the same ratio: with 95% confidence fewer than 3 in `count` of all others differ.
+
+    These may be at -1 or 1 (the rule of three, Hanley and Lippman-Hand 1983).
+    """
+    others = min(1.0, 3 / count)
+    return ratio - (1 + ratio) * others, ratio + (1 - ratio) * others
 
 
 def _standard_error(

@@ -118,8 +118,10 @@ def _cells(observations: Sequence[Observation]) -> tuple[Cell, ...]:
 
 def _gains(observations: Sequence[Observation], baseline: Sequence[Observation]) -> tuple[TaskGain, ...]:
     there = _by_task(baseline)
-    found = [(task, gain(of_task, there.get(task, []))) for task, of_task in _by_task(observations).items()]
-    known = [(task, each) for task, each in found if each is not None]
+    found: list[tuple[Task, Gain | None]] = [
+        (task, gain(of_task, there.get(task, []))) for task, of_task in _by_task(observations).items()
+    ]
+    known: list[tuple[Task, Gain]] = [(task, each) for task, each in found if each is not None]
     adjusted = with_holm([each for _, each in known])
     return tuple(TaskGain(task=task, gain=each) for (task, _), each in zip(known, adjusted, strict=True))
 

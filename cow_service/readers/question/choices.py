@@ -42,9 +42,11 @@ def choices_source(question: str, given: Sequence[str | AnswerOption] | None) ->
 
 def question_without(question: str, options: Sequence[AnswerOption]) -> str:
     """The question for these options: without those that it lists itself where they are others."""
-    listed, rest, _ = split_options(question)
-    same = [(option.letter, plain(option.text)) for option in options] == [(a, plain(text)) for a, text in listed]
-    return question if same or not listed or not options else " ".join(rest.replace(" . ", " ").split())
+    listed = split_options(question)
+    same = [(one.letter, plain(one.text)) for one in options] == [(a, plain(text)) for a, text in listed.options]
+    if same or not listed.options or not options:
+        return question
+    return " ".join(listed.rest.replace(" . ", " ").split())
 
 
 def says_not_sure(text: str) -> bool:

@@ -15,6 +15,7 @@ class Listed(NamedTuple):
     options: Options
     rest: str
     lettered: bool = True  # the letters stand in the question
+    places: tuple[tuple[int, int], ...] = ()  # begin and end of the text of each option in the question
 
 
 MAX_LISTS = 12  # the last so many of a text are looked at
@@ -58,7 +59,8 @@ def split_options(question: str) -> Listed:
     if best is None:
         return _split_announced(question)
     chain, end, options = best
-    return Listed(options, question[: chain[0].start()] + " . " + question[end:])
+    places = _places(question, [marker.end() for marker in chain], options)
+    return Listed(options, question[: chain[0].start()] + " . " + question[end:], places=places)
 
 
 def _split_announced(question: str) -> Listed:
@@ -69,8 +71,19 @@ def _split_announced(question: str) -> Listed:
         short = all(text and len(text.split()) <= _LONGEST and not _FORM.search(text) for text in texts)
         if short and 1 < len({text.lower() for text in texts}) == len(texts) <= len(_LETTERS):
             options = tuple(zip(_LETTERS, texts, strict=False))
-            return Listed(options, question[: found.start()] + " . " + question[found.end() :], lettered=False)
+            parts = [found.start("list"), *(found.start("list") + part.end() for part in _PARTS.finditer(listed))]
+            rest = question[: found.start()] + " . " + question[found.end() :]
+            return Listed(options, rest, lettered=False, places=_places(question, parts, options))
     return Listed((), question)
+
+
+def _places(question: str, begins: Sequence[int], options: Options) -> tuple[tuple[int, int], ...]:
+    """Where the texts of the options stand, each after its own begin."""
+    found = [
+        re.compile(r"\s+".join(re.escape(word) for word in text.split())).search(question, begin)
+        for begin, (_, text) in zip(begins, options, strict=True)
+    ]
+    return tuple(each.span() for each in found if each is not None)
 
 
 def _chains(question: str) -> list[list[re.Match[str]]]:

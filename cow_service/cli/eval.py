@@ -1,0 +1,192 @@
+"""`cow eval`: does imagination help a multimodal LLM, by how much, and at what cost."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from typer.core import TyperGroup
+
+from cow_service.cli.errors import printable
+from cow_service.errors import CowError
+
+INSTALL = 'pip install "cow-service[evals]"'
+EXIT_SOME_FAILED = 3
+EXIT_INTERRUPTED = 130
+_OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair")
+MAX_FAULTS_SHOWN = 10
+
+
+class EvalsNotInstalled(CowError):
+    """The Python packages of the evaluation are not installed."""
+
+    code, status = "evals-not-installed", 0
+
+
+class _RunByDefault(TyperGroup):
+    """`cow eval DATA` is `cow eval run DATA`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Puts the name of the command in front where there is none."""
+        if args and args[0] not in self.commands and args[0] != "--help":
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=_RunByDefault,
+    rich_markup_mode=None,
+    no_args_is_help=True,
+    help="Measure whether imagination helps: cow eval DATA asks, cow eval report RUNS compares.",
+)
+
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; one in it is gone on with.")]
+Prices = Annotated[
+    Path | None,
+    typer.Option(help="YAML or JSON: {MODEL: {input: 1.25, output: 10}}, per million tokens.", show_default="none"),
+]
+
+
+@app.command()
+def run(
+    data: Annotated[
+        str,
+        typer.Argument(
+            help="A folder in CausalSpatial's layout, a folder of scenes, a file (JSONL, CSV, TSV, Parquet), or the "
+            "name of a data set of the Hugging Face hub, such as Mwxinnn/CausalSpatial."
+        ),
+    ],
+    out: Out,
+    mllm: Annotated[
+        str | None,
+        typer.Option(help="The multimodal LLM, as Inspect names it: openai/gpt-5.", show_default="the embedded reader"),
+    ] = None,
+    arm: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="never, always, auto, best-of-K, placebo-still, placebo-direction, encounters, frames-only, oracle; "
+            "may be repeated, or several with commas.",
+            show_default="never,always",
+        ),
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="How often each question is asked in each arm.")] = 1,
+    ask: Annotated[
+        Literal["prompt", "answer"] | None,
+        typer.Option(
+            help="prompt: the paper's prompt, with frames of /simulate; answer: the service's own /answer.",
+            show_default="prompt with --mllm, else answer",
+        ),
+    ] = None,
+    subset: Annotated[
+        list[str] | None, typer.Option(help="Of CausalSpatial's layout only these; may be repeated.")
+    ] = None,
+    limit: Annotated[
+        int | None, typer.Option(min=1, help="Only the first so many questions.", show_default="all")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the order in which options are shown.")] = 0,
+    reader: Annotated[
+        str | None, typer.Option(help="Who grounds and reads motion for the imagination.", show_default="the server's")
+    ] = None,
+    generator: Annotated[str | None, typer.Option(help="Who makes its frames.", show_default="the server's")] = None,
+    url: Annotated[
+        str | None, typer.Option(help="The COW server.", show_default="one is started in this process")
+    ] = None,
+    base_url: Annotated[
+        str | None, typer.Option(help="Where the multimodal LLM is served.", show_default="the provider's")
+    ] = None,
+    temperature: Annotated[float | None, typer.Option(help="Of its replies.", show_default="the provider's")] = None,
+    max_tokens: Annotated[int | None, typer.Option(min=1, help="Of a reply.", show_default="8192")] = None,
+    concurrency: Annotated[int, typer.Option(min=1, help="Questions at the same time, in each arm.")] = 8,
+    skip_faulty: Annotated[
+        bool, typer.Option("--skip-faulty", help="Leave out rows that cannot be asked, and columns that mean nothing.")
+    ] = False,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Ask those again that failed.")] = False,
+    log_images: Annotated[bool, typer.Option(help="Keep pictures in Inspect's logs, for inspect view.")] = True,
+    prices: Prices = None,
+) -> None:
+    """Ask every question in every arm, and report.
+
+    The same command resumes a run that was interrupted; no reply that has come is asked for again.
+
+    Exit code 0: all were asked; 3: some failed, with their reasons in the report; 1: the run could not begin or go on.
+    """
+    _check_installed()
+    from cow_service.evals.run import Plan, evaluate  # noqa: PLC0415
+
+    arms = [name.strip() for text in arm or ["never,always"] for name in text.split(",") if name.strip()]
+    plan = Plan(
+        data=data,
+        out=out,
+        mllm=mllm,
+        ask=ask or ("answer" if mllm is None else "prompt"),
+        arms=arms,
+        repeats=repeats,
+        subsets=tuple(subset or ()),
+        limit=limit,
+        seed=seed,
+        reader=reader,
+        generator=generator,
+        url=url,
+        base_url=base_url,
+        temperature=temperature,
+        max_tokens=max_tokens,
+        concurrency=concurrency,
+        skip_faulty=skip_faulty,
+        retry_failed=retry_failed,
+        log_images=log_images,
+    )
+    priced = _priced(prices)
+    try:
+        done = evaluate(plan)
+    except KeyboardInterrupt:
+        typer.echo("Interrupted. The same command goes on with it.", err=True)
+        sys.stderr.flush()
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    for told in (*done.info.notes, *done.info.faults[:MAX_FAULTS_SHOWN]):
+        typer.echo(printable(told), err=True)
+    _report([done], out / "report", priced)
+    failed = sum(each.failure is not None for each in done.observations)
+    if failed:
+        typer.echo(f"{failed} questions failed; the report says why. --retry-failed asks them again.", err=True)
+        raise typer.Exit(EXIT_SOME_FAILED)
+
+
+@app.command()
+def report(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUNS", help="Folders that `cow eval --out` wrote.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the report.", show_default="RUN/report")
+    ] = None,
+    prices: Prices = None,
+) -> None:
+    """Compare runs: tables, plots and a page that opens without a server."""
+    _check_installed()
+    from cow_service.evals.runs import read_run  # noqa: PLC0415
+
+    priced = _priced(prices)
+    _report([read_run(folder) for folder in runs], out or runs[0] / "report", priced)
+
+
+def _report(runs: list[Any], out: Path, prices: dict[str, Any]) -> None:
+    """Writes a report, and prints its table."""
+    from cow_service.evals.report.write import write_report  # noqa: PLC0415
+
+    typer.echo(printable(write_report(runs, out, prices)))
+    typer.echo(f"\nThe report, with every item: {out / 'index.html'}")
+
+
+def _priced(path: Path | None) -> dict[str, Any]:
+    from cow_service.evals.prices import read_prices  # noqa: PLC0415
+
+    return {} if path is None else read_prices(path)
+
+
+def _check_installed() -> None:
+    """Raises `EvalsNotInstalled`."""
+    from importlib.util import find_spec  # noqa: PLC0415
+
+    missing = [name for name in _OF_EXTRA if find_spec(name) is None]
+    if missing:
+        raise EvalsNotInstalled(f"`cow eval` needs {', '.join(missing)}: {INSTALL}")

@@ -1,0 +1,57 @@
+"""Reads data sets: CausalSpatial's layout, scenes with truth, JSON Lines, CSV, TSV and Parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from cow_service.errors import InvalidRequest
+from cow_service.evals.loaders.causalspatial import SUBSETS, load_causalspatial, subset_shards
+from cow_service.evals.loaders.collecting import Collected, collect, digest_of, refuse_faults
+from cow_service.evals.loaders.hub import CAUSALSPATIAL, download, is_hub_name
+from cow_service.evals.loaders.rows import RowFault
+from cow_service.evals.loaders.scenes import scene_folders, scene_rows
+from cow_service.evals.loaders.tables import READERS, table_rows
+from cow_service.evals.pictures import Pictures
+
+__all__ = ["CAUSALSPATIAL", "SUBSETS", "Collected", "RowFault", "digest_of", "load"]
+
+
+def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_faulty: bool = False) -> Collected:
+    """The items of a data set, each checked, and its pictures kept.
+
+    `data` is a folder or a file, or the name of a data set of the Hugging Face hub. Rows that cannot be asked raise
+    `InvalidRequest`, which names them; with `skip_faulty` they are left out, and so they are of data in CausalSpatial's
+    layout, whose published rows cannot be mended here.
+    """
+    unknown = [subset for subset in subsets if subset not in SUBSETS]
+    if unknown:
+        raise InvalidRequest(f"There is no subset '{unknown[0]}': CausalSpatial has {', '.join(SUBSETS)}.")
+    path = Path(data)
+    if not path.exists() and is_hub_name(data):
+        path = download(data)
+    found, published = _found(path, data, subsets or SUBSETS, pictures, skip_faulty)
+    if not skip_faulty and not published:
+        refuse_faults(found)
+    if not found.items:
+        reasons = "\n".join(found.faults[:5])
+        raise InvalidRequest(f"'{data}' holds no question that can be asked.{' ' if reasons else ''}{reasons}")
+    return found
+
+
+def _found(
+    path: Path, data: str, subsets: Sequence[str], pictures: Pictures, skip_faulty: bool
+) -> tuple[Collected, bool]:
+    """What a folder or file holds, and whether it is in CausalSpatial's layout."""
+    if path.is_file() and path.suffix.lower() in READERS:
+        return collect(table_rows(path, ignore_columns=skip_faulty), pictures), False
+    if path.is_dir() and subset_shards(path, subsets):
+        return load_causalspatial(path, subsets, pictures), True
+    if path.is_dir() and scene_folders(path):
+        return collect(scene_rows(path), pictures), False
+    what = "is not there" if not path.exists() else "holds none of these"
+    raise InvalidRequest(
+        f"'{data}' {what}: give a folder in CausalSpatial's layout (collision/*.parquet), a folder of scenes "
+        f"(*/meta.json with image.jpg), a file ({', '.join(READERS)}), or the name of a data set, such as "
+        f"{CAUSALSPATIAL}."
+    )

@@ -1,0 +1,112 @@
+"""A row of any data set, checked, and as an item."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cow_service.errors import CowError
+from cow_service.evals.items import TASKS, UNKNOWN_LEVEL, Item, Task
+from cow_service.evals.pictures import Pictures
+from cow_service.evals.wording import LETTERS, Wording, appended_wording, listed_wording
+from cow_service.readers.question.choices import not_sure_option, option_saying
+from cow_service.records import AnswerOption
+
+_LETTER = re.compile(r"^\s*[(\[]?\s*([A-Za-z])\s*[)\].:]?\s*$")
+_LETTER_AND_TEXT = re.compile(r"^\s*(?:[(\[]\s*([A-Za-z])\s*[)\]]|([A-Z])\s*[.:)])\s*(\S.*)$", re.DOTALL)
+_TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **{task: task for task in TASKS}}
+
+
+class RowFault(ValueError):
+    """Why a row cannot be asked; its text says what is wrong with which value."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a data set says of one question, before it is checked."""
+
+    place: str  # file and row, for people
+    id: str
+    source_id: str
+    image: bytes | None
+    question: str | None
+    answer: str | None
+    options: Sequence[str] | None = None  # beside the question; None: it lists them itself
+    task: str | None = None
+    level: str | None = None
+    scene: str | None = None
+    oracle: Sequence[bytes] = ()
+
+
+def item_of(row: Row, pictures: Pictures) -> Item:
+    """The item of a row; its pictures are kept. Raises `RowFault`."""
+    parts, options = _wording(row)
+    image = _picture(row.image, "image", pictures)
+    abstain = not_sure_option(options)
+    return Item(
+        id=row.id,
+        row=row.place,
+        source_id=row.source_id,
+        image=image,
+        question=parts,
+        options=options,
+        answer=_answer(row.answer, options),
+        abstain=None if abstain is None else abstain.letter,
+        task=task_of(row.task),
+        level=row.level or UNKNOWN_LEVEL,
+        scene=row.scene or image,
+        oracle=tuple(_picture(each, "oracle frame", pictures) for each in row.oracle),
+    )
+
+
+def task_of(name: str | None) -> Task:
+    """The task that a data set's name means; `other` where it is none of ours."""
+    words = re.findall(r"[a-z]+", (name or "").lower())
+    for word in words:
+        if word in _TASKS:
+            return _TASKS[word]
+    return "other"
+
+
+def _wording(row: Row) -> Wording:
+    """The question around its options. Raises `RowFault` where it has none, or they are no options."""
+    if not row.question or not row.question.strip():
+        raise RowFault("`question` is empty")
+    if row.options is None:
+        listed = listed_wording(row.question)
+        if listed is None:
+            raise RowFault("the question lists no options, such as (A) Yes, (B) No, and the row has none either")
+        return listed
+    texts = [str(text).strip() for text in row.options]
+    if len(texts) < 2 or not all(texts) or len({text.lower() for text in texts}) < len(texts):
+        raise RowFault(f"`options` must be two or more different texts, got {texts}")
+    if len(texts) > len(LETTERS):
+        raise RowFault(f"`options` are at most {len(LETTERS)}, got {len(texts)}")
+    return appended_wording(row.question.rstrip(), texts)
+
+
+def _answer(given: str | None, options: Sequence[AnswerOption]) -> str:
+    """The letter of the right option: given as a letter, as its text, or both."""
+    if given is None or not str(given).strip():
+        raise RowFault("`answer` is empty")
+    text = str(given)
+    by_letter = {option.letter: option for option in options}
+    letter = _LETTER.match(text)
+    if letter and letter[1].upper() in by_letter:
+        return letter[1].upper()
+    both = _LETTER_AND_TEXT.match(text)
+    said = option_saying(options, both[3] if both else text)
+    if said is None or (both and (both[1] or both[2]).upper() != said.letter):
+        shown = ", ".join(f"({option.letter}) {option.text}" for option in options)
+        raise RowFault(f"`answer` is none of the options: {text[:60]!r}; they are {shown[:200]}")
+    return said.letter
+
+
+def _picture(data: bytes | None, name: str, pictures: Pictures) -> str:
+    if not data:
+        raise RowFault(f"the {name} is missing")
+    try:
+        return pictures.add(data)
+    except CowError as error:
+        raise RowFault(f"the {name} cannot be used: {error.detail}") from error
