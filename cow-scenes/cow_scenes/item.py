@@ -1,0 +1,62 @@
+"""Makes one item: finds its world, draws it, and writes its truth folder in one rename."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from .accept import Accepted, find_world, still
+from .arrows import draw_arrow, draw_style, ends_of
+from .layout import TEMPORARY, truth_folder
+from .meta import FUTURE, box_of, direction_of, meta_of
+from .plan import ItemKey
+from .raster import depths, id_picture
+from .settings import Settings
+
+
+def ids_of(item: Accepted) -> Image.Image:
+    """Object ids at t = 0 as an 8-bit grey picture."""
+    things = item.draft.world.things
+    layers = depths(item.camera, things, {t.name: still(t) for t in things}, item.draft.world.table)
+    return Image.fromarray(id_picture(layers, {t.name: i + 1 for i, t in enumerate(things)}), "L")
+
+
+def question_picture(item: Accepted, clean: Image.Image, trail: Image.Image | None) -> tuple[Image.Image, dict]:
+    """The picture that is asked about, and the item's record."""
+    if not item.draft.arrow:
+        return trail or clean, meta_of(item, None)
+    arrow = draw_style(item.key.random("arrow"), item.draft.along)
+    mover = item.draft.world.thing(item.draft.world.mover)
+    left, top, right, bottom = box_of(item.camera, mover, *still(mover))
+    point = item.camera.project(np.array(mover.centre))
+    ends = ends_of(arrow, point, direction_of(item), float(min(right - left, bottom - top)) / 2, clean.width)
+    return draw_arrow(clean, arrow, ends), meta_of(item, arrow)
+
+
+def write_item(folder: Path, item: Accepted, settings: Settings, threads: int) -> None:
+    """Draw and write all files of an item into a folder."""
+    # Blender is loaded here only: all that needs no picture works without it.
+    from .studio import Studio  # noqa: PLC0415
+
+    studio = Studio(item, settings.samples, threads)
+    clean = studio.render(0)
+    trail = studio.render_trail() if item.draft.trail_times else None
+    picture, meta = question_picture(item, clean, trail)
+    pictures = {"image": picture, "clean": clean, **{f"future_{n}": studio.render(n) for n in FUTURE}}
+    for name, drawn in pictures.items():
+        drawn.save(folder / f"{name}.jpg", quality=settings.quality, optimize=True)
+    ids_of(item).save(folder / "ids.png", optimize=True)
+    (folder / "meta.json").write_text(json.dumps(meta, separators=(",", ":")) + "\n")
+
+
+def make_item(out: Path, key: ItemKey, settings: Settings, threads: int) -> None:
+    """Make an item under `out`; a folder with its final name is always complete."""
+    folder = truth_folder(out, key)
+    making = folder.parent / f"{TEMPORARY}{key.id}-{os.getpid()}"
+    shutil.rmtree(making, ignore_errors=True)
+    making.mkdir(parents=True)
+    write_item(making, find_world(key, settings.width, settings.height), settings, threads)
+    making.rename(folder)

@@ -1,0 +1,75 @@
+"""Which items a set holds: names, order and seeds. Nothing here is random."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import UsageError
+
+TASKS = ("collision", "trajectory", "compatibility", "occlusion")
+LEVELS = ("L1", "L2")
+SUBSET_OF = {t: ("physics" if t == "trajectory" else t) for t in TASKS}
+"""The dataset's configuration of each task; `physics` is the trajectory task."""
+
+FORMS: dict[tuple[str, str], tuple[str, ...]] = {
+    ("collision", "L1"): ("slide", "car", "remove"),
+    ("collision", "L2"): ("slide", "first", "car", "remove", "first"),
+    ("trajectory", "L1"): ("throw", "table", "trail", "billiards"),
+    ("trajectory", "L2"): ("throw", "table", "trail", "billiards"),
+    ("compatibility", "L1"): ("fall", "place"),
+    ("compatibility", "L2"): ("fall", "place"),
+    ("occlusion", "L1"): ("slide-occlude",),
+    ("occlusion", "L2"): ("slide-occlude",),
+}
+
+
+@dataclass(frozen=True)
+class ItemKey:
+    """One item's name: task, level and number within both; `seed` is the set's."""
+
+    seed: int
+    task: str
+    level: str
+    number: int
+
+    @property
+    def subset(self) -> str:
+        """The dataset configuration the item belongs to."""
+        return SUBSET_OF[self.task]
+
+    @property
+    def id(self) -> str:
+        """The item's id, e.g. `Physics_Level_2_13`."""
+        return f"{self.subset.capitalize()}_Level_{self.level[1]}_{self.number}"
+
+    @property
+    def form(self) -> str:
+        """The form is a function of the number, so that each form has its share."""
+        forms = FORMS[self.task, self.level]
+        return forms[self.number % len(forms)]
+
+    @property
+    def want(self) -> int:
+        """Wanted answer: 0 or 1 in turn per form (Yes, No), so that answers are balanced."""
+        count = len(FORMS[self.task, self.level])
+        return (self.number // count + self.number % count) % 2
+
+    def random(self, stream: str) -> np.random.Generator:
+        """A generator of this item's own; another `stream` gives independent numbers."""
+        text = f"{self.seed}/{self.task}/{self.level}/{self.number}/{stream}"
+        return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "big"))
+
+
+def plan_items(seed: int, tasks: tuple[str, ...], levels: tuple[str, ...], count: int) -> tuple[ItemKey, ...]:
+    """Spread `count` items evenly over tasks and levels; a larger count only adds items."""
+    if count < 1:
+        raise UsageError(f"count is {count}; ask for at least 1 item")
+    if seed < 0:
+        raise UsageError(f"seed is {seed}; give 0 or more")
+    for name, known in ((tasks, TASKS), (levels, LEVELS)):
+        for value in name:
+            if value not in known:
+                raise UsageError(f"{value!r} is not known; choose from {', '.join(known)}")
+    groups = [(t, lv) for lv in LEVELS if lv in levels for t in TASKS if t in tasks]
+    return tuple(ItemKey(seed, *groups[i % len(groups)], i // len(groups)) for i in range(count))
