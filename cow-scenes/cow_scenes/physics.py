@@ -13,7 +13,7 @@ from .pieces import pieces_of
 from .world import FPS, GONE, SAMPLES, SUBSTEPS, Contact, Run, Thing, World
 
 FRICTION, FLOOR_FRICTION, RESTITUTION, MASS = 0.5, 0.3, 0.5, 1.0
-CARRY_SECONDS, CARRY_HEIGHT = 0.6, 0.75
+CARRY_SECONDS, CARRY_HEIGHT = 0.6, 1.0
 GAP_REACH = 2.0
 """Metres within which the closest approach is measured."""
 
@@ -111,7 +111,7 @@ class ContactLog:
         self.names = names
         self.last: dict[tuple[str, str], int] = {}
         self.open: dict[tuple[str, str], dict] = {}
-        self.found: list[dict] = []
+        self.found: list[tuple[tuple[str, str], dict]] = []
 
     def step(self, client: int, step: int) -> None:
         """Note what touches after `step` steps."""
@@ -125,7 +125,7 @@ class ContactLog:
             if step - self.last.get(pair, -1000) > SUBSTEPS:
                 self.open[pair] = {"step": step, "point": np.mean([at for _, at in points], 0), "impulse": 0.0}
                 if step > 1 or not ({"floor", "table"} & set(pair)):
-                    self.found.append({"pair": pair, "record": self.open[pair]})
+                    self.found.append((pair, self.open[pair]))
             record = self.open[pair]
             if step - record["step"] < SUBSTEPS:
                 record["impulse"] += impulse
@@ -133,13 +133,13 @@ class ContactLog:
 
     def contacts(self) -> tuple[Contact, ...]:
         """All touches in the order of time."""
-        return tuple(
-            Contact(
-                *f["pair"], f["record"]["step"] / (FPS * SUBSTEPS), tuple(float(c) for c in f["record"]["point"]),
-                float(f["record"]["impulse"]), -(-f["record"]["step"] // SUBSTEPS),
-            )
-            for f in self.found
-        )  # fmt: skip
+        return tuple(self.contact(*pair, record) for pair, record in self.found)
+
+    def contact(self, a: str, b: str, record: dict) -> Contact:
+        """One touch as it is told."""
+        x, y, z = (float(c) for c in record["point"])
+        step = record["step"]
+        return Contact(a, b, step / (FPS * SUBSTEPS), (x, y, z), float(record["impulse"]), -(-step // SUBSTEPS))
 
 
 def carried(world: World, time: float) -> list[float] | None:
@@ -149,7 +149,8 @@ def carried(world: World, time: float) -> list[float] | None:
     s = time / CARRY_SECONDS
     s = s * s * (3 - 2 * s)
     start, end = np.array(world.thing(world.mover).centre), np.array(world.carry_to)
-    return [*(start + (end - start) * s)[:2], start[2] + (end[2] - start[2]) * s + CARRY_HEIGHT * 4 * s * (1 - s) / 3]
+    x, y, z = start + (end - start) * s
+    return [float(x), float(y), float(z + CARRY_HEIGHT * s * (1 - s))]
 
 
 def gaps_now(client: int, names: dict[int, str], mover: int) -> dict[str, float]:

@@ -13,15 +13,16 @@ SUBSET_OF = {t: ("physics" if t == "trajectory" else t) for t in TASKS}
 """The dataset's configuration of each task; `physics` is the trajectory task."""
 
 FORMS: dict[tuple[str, str], tuple[str, ...]] = {
-    ("collision", "L1"): ("slide", "car", "remove"),
-    ("collision", "L2"): ("slide", "first", "car", "remove", "first"),
-    ("trajectory", "L1"): ("throw", "table", "trail", "billiards"),
-    ("trajectory", "L2"): ("throw", "table", "trail", "billiards"),
+    ("collision", "L1"): ("slide", "remove", "car"),
+    ("collision", "L2"): ("first", "car", "slide", "remove", "first"),
+    ("trajectory", "L1"): ("throw", "trail", "table", "billiards"),
+    ("trajectory", "L2"): ("billiards", "table", "throw", "trail"),
     ("compatibility", "L1"): ("fall", "place"),
-    ("compatibility", "L2"): ("fall", "place"),
+    ("compatibility", "L2"): ("place", "fall"),
     ("occlusion", "L1"): ("slide-occlude",),
     ("occlusion", "L2"): ("slide-occlude",),
 }
+"""Forms in turn by item number."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,12 @@ class ItemKey:
 
     @property
     def want(self) -> int:
-        """Wanted answer: 0 or 1 in turn per form (Yes, No), so that answers are balanced."""
-        count = len(FORMS[self.task, self.level])
-        return (self.number // count + self.number % count) % 2
+        """Index of the wanted option, in turn per form, so that answers are balanced."""
+        forms = FORMS[self.task, self.level]
+        turn, place = divmod(self.number, len(forms))
+        if self.form == "first":
+            return (turn * forms.count("first") + forms[:place].count("first")) % 3
+        return (turn + place) % 2
 
     def random(self, stream: str) -> np.random.Generator:
         """A generator of this item's own; another `stream` gives independent numbers."""

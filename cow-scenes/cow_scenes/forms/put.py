@@ -6,8 +6,8 @@ from ..catalogue import BOWL_OPENING, RADIUS
 from ..world import Run, World
 from .base import CLEAR_GAP, Draft, Form, Palette, Random, add_others, pick, spot, stand, unit
 
-TOPS = {"cube": 0.15, "cylinder": 0.14, "mug": 0.12, "bowl": 0.25}
-"""Metres: half the width of what can be landed on."""
+TOPS = {"cube": 0.15, "cylinder": 0.14}
+"""Metres: half the width of what can be landed on; what falls into a mug or bowl does not clearly land on it."""
 
 
 def draw_fall(random: Random, level: str, want: int) -> Draft:

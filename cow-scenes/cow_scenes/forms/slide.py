@@ -69,7 +69,8 @@ def draw_first(random: Random, level: str, want: int) -> Draft:
         turn = 0.0 if k == 0 and random.uniform() < 0.5 else random.choice([-1, 1]) * random.uniform(0.5, 1.0)
         at = start + random.uniform(0.7, 1.9) * unit(heading + turn)
         things.append(stand(pick(random, STANDING), palette.next(), at, random.uniform(0, 2 * np.pi)))
-    named = [things[1 + i].name for i in random.permutation(3)]
+    named = [t.name for t in things[2:]]
+    named.insert(want, things[1].name)
     add_others(random, palette, things, level, least=1)
     mover, along = things[0].name, choose_along(random)
     world = World(tuple(things[:6]), mover, push(heading, speed), frictionless=frozenset({mover}))
@@ -78,11 +79,14 @@ def draw_first(random: Random, level: str, want: int) -> Draft:
 
 
 def judge_first(draft: Draft, run: Run) -> int | None:
-    """The option that the mover touches first; it has to be the target."""
+    """The option that the mover touches first; it has to be the target, and alone for two samples."""
     mover = draft.world.mover
     names = {t.name for t in draft.world.things}
-    touched = [({c.a, c.b} - {mover}).pop() for c in run.contacts if mover in {c.a, c.b} and {c.a, c.b} <= names]
-    return draft.options.index(touched[0]) if touched and touched[0] == draft.target else None
+    touches = [c for c in run.contacts if mover in {c.a, c.b} and {c.a, c.b} <= names]
+    if not touches or draft.target not in {touches[0].a, touches[0].b} or touches[0].time > 1.8:
+        return None
+    others = [c for c in touches if draft.target not in {c.a, c.b}]
+    return None if others and others[0].sample < touches[0].sample + 2 else draft.options.index(draft.target)
 
 
 def draw_remove(random: Random, level: str, want: int) -> Draft:
