@@ -113,6 +113,7 @@ def run(
     Exit code 0: all were asked; 3: some failed, with their reasons in the report; 1: the run could not begin or go on.
     """
     _check_installed()
+    from cow_service.evals.layout import REPORT  # noqa: PLC0415
     from cow_service.evals.run import Plan, evaluate  # noqa: PLC0415
 
     arms = [name.strip() for text in arm or ["never,always"] for name in text.split(",") if name.strip()]
@@ -146,7 +147,7 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED) from None
     for told in (*done.info.notes, *done.info.faults[:MAX_FAULTS_SHOWN]):
         typer.echo(printable(told), err=True)
-    _report([done], out / "report", priced)
+    _report([done], out / REPORT, priced)
     failed = sum(each.failure is not None for each in done.observations)
     if failed:
         typer.echo(f"{failed} questions failed; the report says why. --retry-failed asks them again.", err=True)
@@ -163,10 +164,11 @@ def report(
 ) -> None:
     """Compare runs: tables, plots and a page that opens without a server."""
     _check_installed()
+    from cow_service.evals.layout import REPORT  # noqa: PLC0415
     from cow_service.evals.runs import read_run  # noqa: PLC0415
 
     priced = _priced(prices)
-    _report([read_run(folder) for folder in runs], out or runs[0] / "report", priced)
+    _report([read_run(folder) for folder in runs], out or runs[0] / REPORT, priced)
 
 
 def _report(runs: list[Any], out: Path, prices: dict[str, Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -14,7 +13,6 @@ from cow_service.client.results import AsyncAnswer
 from cow_service.evals.asking import Asked, Case, Reply
 from cow_service.evals.imagination import REFUSALS, Look
 from cow_service.evals.pictures import Pictures
-from cow_service.records import Usage
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,6 @@ class ByAnswer:
     async def _ask(self, case: Case, imagine: Literal["always", "auto", "never"], trial: int) -> tuple[Reply, Look]:
         options: Any = {**self.options, **({"seed": trial} if trial else {})}
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))
-        begun = time.monotonic()
         answer = await self.client.answer(
             self.pictures.path(case.item.image),
             case.question,
@@ -48,9 +45,10 @@ class ByAnswer:
             imagine=imagine,
             **options,
         )
-        seconds = time.monotonic() - begun
-        # Usage is of everything together: it stands with the reply.
-        return Reply(_text(answer), answer.usage_total, seconds), await self._look(answer)
+        look = await self._look(answer)
+        # Usage and stages are of everything together: what is not of the simulation stands with the reply.
+        seconds = max(0.0, sum(answer.timings.values()) - look.seconds)
+        return Reply(_text(answer), answer.usage_total, seconds), look
 
     async def _look(self, answer: AsyncAnswer) -> Look:
         """What the answer rests on. Raises the fault for which nothing was imagined, where it is no refusal."""
@@ -69,7 +67,7 @@ class ByAnswer:
             frames=tuple(frame.sha256 for frame in simulation.frames),
             overlay=simulation.overlay.sha256,
             probability=None if outcome is None else outcome.probability,
-            usage=Usage(),
+            seconds=sum(simulation.timings.values()),
             simulated=True,
         )
 

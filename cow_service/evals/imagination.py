@@ -35,7 +35,7 @@ class Look:
     probability: float | None = None  # that what the question asks happens
     refusal: CowError | None = None  # why there is nothing
     usage: Usage = NO_USAGE
-    seconds: float = 0.0
+    seconds: float = 0.0  # of its stages, without waiting for a place
     simulated: bool = False
 
 
@@ -74,14 +74,14 @@ class Imagination:
         begun = time.monotonic()
         try:
             simulation = await self._simulate(item, trial, {})
-            usage = simulation.usage_total
+            usage, seconds = simulation.usage_total, sum(simulation.timings.values())
             if shown == "wrong-direction":
                 simulation = await self._simulate(item, trial, _opposite(simulation))
-                usage += simulation.usage_total
+                usage, seconds = usage + simulation.usage_total, seconds + sum(simulation.timings.values())
         except REFUSALS as refusal:
             usage = Usage.model_validate(refusal.usage or {})
             return Look(refusal=refusal, usage=usage, seconds=time.monotonic() - begun)
-        return await self._seen(simulation, shown, usage, time.monotonic() - begun)
+        return await self._seen(simulation, shown, usage, seconds)
 
     async def _simulate(self, item: Item, trial: int, changes: Mapping[str, Any]) -> AsyncSimulation:
         options: Any = {**self._options, **({"seed": trial} if trial else {}), **changes}

@@ -31,8 +31,11 @@ class Observation(Record):
     calls: int = Field(default=0, description="Of the multimodal LLM, those of the imagination included.")
     input_tokens: int = 0
     output_tokens: int = 0
-    seconds: float = Field(default=0.0, description="From the question to the reply.")
-    imagining_seconds: float = Field(default=0.0, description="Of those, for simulations that were not found again.")
+    seconds: float = Field(
+        default=0.0,
+        description="For simulations and replies, as if each were asked alone; what is found again takes less.",
+    )
+    imagining_seconds: float = Field(default=0.0, description="Of those, for simulations.")
     imaginations: int = Field(default=0, description="Simulations that the reply rests on.")
     refusal: str | None = Field(
         default=None, description="Code of the problem for which nothing was imagined where it should have been."

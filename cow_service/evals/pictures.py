@@ -8,8 +8,6 @@ from pathlib import Path
 from cow_service.media.artifacts import extension_of, media_type_of
 from cow_service.media.images import decode
 
-PICTURES = "pictures"
-
 
 class Pictures:
     """A folder of pictures. The same bytes are kept once."""

@@ -34,7 +34,6 @@ class Progress:
     counts: dict[str, Count]
     begun: float = field(default_factory=time.monotonic)
     done_here: int = 0
-    at_start: int = 0
 
     def add(self, arm: str, seen: Observation | None) -> None:
         """Counts a question that has just been asked; None: it failed."""
@@ -61,8 +60,12 @@ class Progress:
     @property
     def seconds_left(self) -> float | None:
         """At this rate; None before the first question was answered."""
-        left = sum(count.total - count.done for count in self.counts.values())
-        return left / self.rate if self.done_here else None
+        return self.left / self.rate if self.done_here else None
+
+    @property
+    def left(self) -> int:
+        """Questions that have not been asked."""
+        return sum(count.total - count.done for count in self.counts.values())
 
     def table(self) -> Table:
         """A row per arm, and the rate and time left below."""

@@ -5,19 +5,23 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import rich
+
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
 from cow_service.evals.arms import Arm, check_arms
 from cow_service.evals.items import Item
+from cow_service.evals.layout import CACHE, LOGS, PICTURES
 from cow_service.evals.loaders import digest_of, load
 from cow_service.evals.observations import Ask, RunInfo
-from cow_service.evals.pictures import PICTURES, Pictures
-from cow_service.evals.runs import CACHE, LOGS, Run, read_info, read_run, write_run
+from cow_service.evals.pictures import Pictures
+from cow_service.evals.runs import Run, read_info, read_run, write_run
 from cow_service.evals.versions import versions
 
 EMBEDDED = "cow/embedded"  # who answers where no multimodal LLM is named
@@ -138,10 +142,12 @@ def _ask(plan: Plan, info: RunInfo, items: Sequence[Item]) -> None:
         forget_failures(logs)
     progress = Progress({arm: Count(len(items) * info.repeats) for arm in info.arms})
     progress.add_earlier([each for each in read_observations(logs) if not (plan.retry_failed and each.failure)])
+    if not progress.left:
+        return
     key = hashlib.sha256(f"{info.created_at} {info.data_digest} {info.mllm}".encode()).hexdigest()
     with session(plan.out, plan.url, info.settings["requests"], key, **_server_settings(plan)) as shared:
         _check_server(shared.url)
-        with prepared(items), shown(progress):
+        with prepared(items), shown(progress), _quiet_inspect():
             eval_set(
                 tasks=[
                     causalspatial(data=info.data_digest, arm=arm, ask=plan.ask, seed=plan.seed) for arm in info.arms
@@ -163,6 +169,17 @@ def _ask(plan: Plan, info: RunInfo, items: Sequence[Item]) -> None:
                 score_display=False,
                 temperature=plan.temperature,
             )
+
+
+@contextmanager
+def _quiet_inspect() -> Generator[None]:
+    """Meanwhile Inspect says nothing of its own on standard output."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def _model(plan: Plan, get_model: Any) -> Any:

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from cow_service.errors import InvalidRequest
 from cow_service.evals.items import Item
+from cow_service.evals.layout import ITEMS, LOGS, RUN
 from cow_service.evals.observations import Observation, RunInfo
-
-RUN, ITEMS, LOGS, CACHE, SERVER, REPORT = "run.json", "items.jsonl", "logs", "cache", "server", "report"
 
 
 @dataclass(frozen=True)

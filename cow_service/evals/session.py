@@ -12,11 +12,13 @@ from typing import Any
 
 from cow_service.client import AsyncClient
 from cow_service.evals.imagination import Imagination
-from cow_service.evals.pictures import PICTURES, Pictures
-from cow_service.evals.runs import SERVER
+from cow_service.evals.layout import PICTURES, SERVER
+from cow_service.evals.pictures import Pictures
+from cow_service.observability import logging
 from cow_service.service import Service
 from cow_service.settings import load_settings
 
+LOG = "server.log"
 TIMEOUT = 600.0  # seconds that a server may say nothing: an MLLM of its own may think for long
 
 
@@ -75,8 +77,13 @@ def _server(folder: Path, url: str | None, settings: Mapping[str, Any]) -> Gener
         return
     from cow_service.server import serving  # noqa: PLC0415 - where a server is named, none is imported
 
-    with serving(Service(load_settings(data_dir=folder / SERVER, host="127.0.0.1", port=0, **settings))) as address:
-        yield address
+    known = load_settings(data_dir=folder / SERVER, host="127.0.0.1", port=0, **settings)
+    (folder / SERVER).mkdir(parents=True, exist_ok=True)
+    with (folder / SERVER / LOG).open("a", encoding="utf-8") as log:
+        logging.set_up(known, out=log, err=log)
+        with serving(Service(known)) as address:
+            yield address
+        logging.set_up(known)
 
 
 def own_folder() -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 from cow_service.evals.items import TASKS
@@ -25,6 +26,8 @@ def tables(summaries: Sequence[ArmSummary]) -> tuple[Table, ...]:
 def by_level(summaries: Sequence[ArmSummary]) -> Table:
     """As the paper prints it: right and abstained by task and level, with the paper's own figures below."""
     keys = {(cell.task, cell.level) for each in summaries for cell in each.cells}
+    levels = Counter(task for task, level in keys if level is not None)
+    keys = {(task, level) for task, level in keys if level is None or levels[task] > 1}
     columns = sorted(keys, key=lambda key: (TASKS.index(key[0]), key[1] is None, key[1] or ""))
     rows: list[tuple[str, ...]] = []
     for each in summaries:

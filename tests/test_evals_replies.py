@@ -1,0 +1,47 @@
+"""Which option a reply chooses, by our rules and by those of the paper's public script, each difference as it is."""
+
+from __future__ import annotations
+
+import pytest
+
+from cow_service.evals.replies import read_as_paper, read_reply
+from cow_service.records import AnswerOption
+
+OPTIONS = tuple(
+    AnswerOption(letter=letter, text=text) for letter, text in zip("ABC", ("Yes", "No", "Not sure"), strict=True)
+)
+SAME: dict[str, str | None] = {
+    "{'Reasoning': 'It rolls on.', 'Answer': 'A'}": "A",
+    "{'Reasoning': 'It rolls on.', 'Answer': '(B)'}": "B",
+    "{'Reasoning': 'It rolls on.', 'Answer': '(C) Not sure'}": "C",
+    "{'Reasoning': 'It rolls on.', 'Answer': 'B) No'}": "B",
+    '```json\n{"Reasoning": "It stops.", "Answer": "(A) Yes"}\n```': "A",
+    '{"Reasoning": "The cup is near.", "Answer": "B. No"}': "B",
+    '{"reasoning": "x", "answer": "a"}': "A",
+    "Answer: (B)": "B",
+    "Reasoning: it misses.\nAnswer: B": "B",
+    "": None,
+}
+# Reply: ours, the paper's.
+DIFFERENT: dict[str, tuple[str | None, str | None]] = {
+    "{'Reasoning': 'It rolls on.', 'Answer': 'Yes'}": ("A", "Y"),
+    "{'Reasoning': 'It rolls on.', 'Answer': 'No'}": ("B", "N"),
+    "{'Reasoning': 'Hidden.', 'Answer': 'Not sure.'}": ("C", "E"),
+    "{'Reasoning': 'Hidden.', 'Answer': 'Not sure'}": ("C", "N"),
+    "{'Reasoning': 'x', 'Answer': '(A)'}\n{'Reasoning': 'y', 'Answer': '(B)'}": (None, "B"),
+    "{'Reasoning': 'It rolls on.', 'Answer': '(D)'}": (None, "D"),
+    "B": ("B", None),
+    "(B) No": ("B", None),
+    "I cannot help with that.": (None, None),
+    "Error: timeout. Answer: none.": (None, "E"),
+}
+
+
+@pytest.mark.parametrize("reply", SAME)
+def test_replies_that_both_read_alike(reply: str) -> None:
+    assert (read_reply(reply, OPTIONS), read_as_paper(reply)) == (SAME[reply], SAME[reply])
+
+
+@pytest.mark.parametrize("reply", DIFFERENT)
+def test_replies_that_are_read_otherwise(reply: str) -> None:
+    assert (read_reply(reply, OPTIONS), read_as_paper(reply)) == DIFFERENT[reply]

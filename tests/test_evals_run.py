@@ -1,0 +1,295 @@
+"""`cow eval` as it is run: a real process, a real server in it, and an MLLM on loopback whose accuracy is known."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import EXAMPLES, ROOT, SCALE
+from truth_mllm import TruthMllm, truth_mllm
+
+from cow_service.evals.items import Item
+from cow_service.evals.loaders import load
+from cow_service.evals.pictures import Pictures
+from cow_service.evals.report.summary import ArmSummary, summarize
+from cow_service.evals.runs import Run, read_run
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(420)]
+SAMPLE = ROOT / "cow-scenes" / "sample"
+ALL_ARMS = (
+    *("never", "always", "auto", "best-of-2", "placebo-still"),
+    *("placebo-direction", "encounters", "frames-only", "oracle"),
+)
+PICTURES_SHOWN = {"never": 1, "always": 4, "placebo-still": 4, "encounters": 1, "frames-only": 3, "oracle": 3}
+REPEATS = 2
+MODEL = "openai-api/local/fake"
+
+
+@pytest.fixture(scope="module")
+def items(tmp_path_factory: pytest.TempPathFactory) -> list[Item]:
+    return load(str(SAMPLE), Pictures(tmp_path_factory.mktemp("pictures"))).items
+
+
+@pytest.fixture
+def mllm(items: list[Item]) -> Iterator[TruthMllm]:
+    with truth_mllm(items) as one:
+        yield one
+
+
+def command(data: Path, out: Path, *arguments: str, mllm: TruthMllm | None = None) -> list[str]:
+    own = ["--mllm", MODEL, "--base-url", mllm.address] if mllm else []
+    program = [sys.executable, "-m", "cow_service.cli.main", "eval"]
+    return [*program, str(data), "--out", str(out), *own, *arguments]
+
+
+def environment() -> dict[str, str]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("COW_", "INSPECT_"))}
+    return {**kept, "LOCAL_API_KEY": "none"}
+
+
+def evaluated(
+    data: Path, out: Path, *arguments: str, mllm: TruthMllm | None = None, code: int = 0
+) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        command(data, out, *arguments, mllm=mllm),
+        cwd=out.parent, env=environment(), capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == code, done.stdout[-2000:] + done.stderr[-4000:]
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@dataclass(frozen=True)
+class Done:
+    """A run of all arms, and what was asked in it."""
+
+    run: Run
+    arms: dict[str, ArmSummary]
+    mllm: TruthMllm
+    out: Path
+    told: str
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory, items: list[Item]) -> Iterator[Done]:
+    out = tmp_path_factory.mktemp("all") / "run"
+    with truth_mllm(items, without=0.3, with_frames=1.0) as mllm:
+        told = evaluated(SAMPLE, out, "--arm", ",".join(ALL_ARMS), "--repeats", str(REPEATS), mllm=mllm)
+        run = read_run(out)
+        yield Done(run, {each.arm: each for each in summarize([run])}, mllm, out, told.stdout)
+
+
+def test_every_question_is_asked_in_every_arm_and_repeat(done: Done, items: list[Item]) -> None:
+    asked = Counter((each.arm, each.item, each.repeat) for each in done.run.observations)
+    assert set(asked.values()) == {1}
+    assert set(asked) == {
+        (arm, item.id, repeat) for arm in ALL_ARMS for item in items for repeat in range(1, REPEATS + 1)
+    }
+    assert [each.failure for each in done.run.observations if each.failure] == []
+
+
+def test_all_arms_see_the_options_in_the_same_order(done: Done) -> None:
+    orders: dict[tuple[str, int], set[tuple[str, ...]]] = {}
+    for each in done.run.observations:
+        orders.setdefault((each.item, each.repeat), set()).add(each.options)
+    assert {len(shown) for shown in orders.values()} == {1}
+    assert len({next(iter(shown)) for shown in orders.values()}) > 3
+
+
+@pytest.mark.parametrize("arm", PICTURES_SHOWN)
+def test_an_arm_shows_what_it_is_named_for(done: Done, arm: str, items: list[Item]) -> None:
+    by_item = {item.id: item for item in items}
+    for each in done.run.of_arm(arm):
+        if each.refusal is None:
+            shown = len(each.frames) + (arm != "frames-only")
+            assert shown == (1 + len(by_item[each.item].oracle) if arm == "oracle" else PICTURES_SHOWN[arm])
+    still = {len(set(each.frames)) for each in done.run.of_arm("placebo-still")}
+    assert still == {1}
+    right, wrong = (
+        {each.item: each.frames for each in done.run.of_arm(f"{name}")} for name in ("always", "placebo-direction")
+    )
+    assert [item for item in right if right[item] == wrong[item] != ()] == []
+
+
+def test_what_frames_are_worth_is_what_the_mllm_makes_of_them(done: Done) -> None:
+    """It is always right where it sees frames, and no better for a placebo than without."""
+    looked = [each for each in done.run.of_arm("always") if each.refusal is None]
+    assert looked
+    assert all(each.right for each in looked)
+    assert all(each.right for each in done.run.of_arm("oracle"))
+    assert done.arms["placebo-still"].rates.tpr.mean < 0.8 > done.arms["never"].rates.tpr.mean
+    gained = done.arms["always"].gain
+    assert gained is not None
+    assert gained.low > 0
+    assert gained.helped > 10 > gained.hurt
+
+
+def test_the_gate_asks_thrice_before_and_imagines_where_answers_differ(done: Done) -> None:
+    for each in done.run.of_arm("auto"):
+        assert each.calls in (3, 4)
+        assert (each.calls == 4) == (bool(each.frames) or each.refusal is not None)
+    assert {each.calls for each in done.run.of_arm("best-of-2")} == {2}
+    assert {each.imaginations for each in done.run.of_arm("best-of-2") if each.refusal is None} == {2}
+
+
+def test_each_reply_was_one_request_and_counts_its_tokens(done: Done) -> None:
+    assert sum(each.calls for each in done.run.observations) == sum(done.mllm.asked.values())
+    cost = done.arms["never"].cost
+    assert (cost.input_tokens, cost.output_tokens) == (400 * cost.replies, 20 * cost.replies)
+
+
+def test_the_report_has_tables_plots_pictures_and_a_manifest(done: Done) -> None:
+    report = done.out / "report"
+    names = {path.relative_to(report).as_posix() for path in report.rglob("*") if path.is_file()}
+    tables = {f"tables/{name}.{form}" for name in ("levels", "arms", "gains", "cost") for form in ("md", "csv", "tex")}
+    assert {"index.html", "report.md", "manifest.json", "tables/pairs.csv", *tables} <= names
+    manifest = json.loads((report / "manifest.json").read_text())
+    assert manifest["runs"][0]["versions"]["prompts/eval-question"] == "1"
+    assert set(manifest["files"]) == names - {"manifest.json"}
+    assert "| always" in done.told
+    assert "GPT-5 (paper)" in (report / "report.md").read_text()
+
+
+def test_a_finished_run_asks_nothing_more_and_says_the_same(done: Done) -> None:
+    before = sum(done.mllm.asked.values())
+    again = evaluated(SAMPLE, done.out, "--arm", "never", "--repeats", "1", mllm=done.mllm)
+    assert sum(done.mllm.asked.values()) == before
+    assert again.stdout == done.told
+    other = evaluated(SAMPLE, done.out, "--arm", "never", "--seed", "7", mllm=done.mllm, code=1)
+    assert "another seed (0, not 7)" in other.stderr
+
+
+def test_killed_at_three_moments_no_reply_is_asked_for_twice(tmp_path: Path, items: list[Item]) -> None:
+    draws = random.Random(18)
+    arguments = ("--arm", "never,always", "--repeats", "3")
+    with truth_mllm(items) as whole:
+        evaluated(SAMPLE, tmp_path / "whole", *arguments, mllm=whole)
+    with truth_mllm(items, seconds=0.15) as mllm:
+        for _ in range(3):
+            before, begun = len(mllm.done), dict(mllm.asked)
+            process = subprocess.Popen(
+                command(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm),
+                cwd=tmp_path, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+            wanted = before + draws.randint(5, 18)
+            deadline = time.monotonic() + 60
+            while len(mllm.done) < wanted and time.monotonic() < deadline:
+                time.sleep(0.01)
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            killed = time.monotonic()
+            # What came a moment before the kill may not have been read by the process that was killed.
+            safe = {key for key, at in mllm.done.items() if at < killed - 0.25}
+            assert before < len(mllm.done) < len(whole.asked)
+            assert begun.keys() <= mllm.asked.keys()
+        asked_until_then = {key: mllm.asked[key] for key in safe}
+        evaluated(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm)
+        assert mllm.asked.keys() == whole.asked.keys()
+        assert {key: mllm.asked[key] for key in safe} == {key: asked_until_then[key] for key in safe}
+    for name in ("levels", "arms", "gains"):
+        tables = [(tmp_path / run / "report" / "tables" / f"{name}.md").read_text() for run in ("whole", "killed")]
+        assert tables[0] == tables[1]
+
+
+def test_failures_are_kept_with_their_reason_and_retried_on_request(
+    tmp_path: Path, items: list[Item], mllm: TruthMllm
+) -> None:
+    mllm.refuses = items[0].question[0][:40]
+    refused = [item.id for item in items if mllm.refuses in item.question[0]]
+    first = evaluated(SAMPLE, tmp_path / "run", "--arm", "never", mllm=mllm, code=3)
+    assert f"{len(refused)} questions failed" in first.stderr or f"{len(refused)} question failed" in first.stderr
+    failed = {each.item: each.failure for each in read_run(tmp_path / "run").observations if each.failure}
+    assert set(failed) == set(refused)
+    assert "The model is away." in str(failed[refused[0]])
+    mllm.refuses = ""
+    evaluated(SAMPLE, tmp_path / "run", "--arm", "never", mllm=mllm, code=3)
+    assert sum(mllm.asked.values()) == len(items) - len(refused), "failures are not asked again by themselves"
+    evaluated(SAMPLE, tmp_path / "run", "--arm", "never", "--retry-failed", mllm=mllm)
+    assert sum(mllm.asked.values()) == len(items)
+    assert [each.failure for each in read_run(tmp_path / "run").observations if each.failure] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--arm", "sometimes"), "There is no arm 'sometimes'"),
+        (("--arm", "oracle"), "needs pictures of what really happens"),
+        (("--subset", "physic"), "There is no subset 'physic'"),
+        (("--ask", "answer", "--arm", "placebo-still"), "has no arm 'placebo-still'"),
+        (("--url", "http://127.0.0.1:9"), "The server at http://127.0.0.1:9 cannot be asked"),
+        (("--prices", "nothing.yaml"), "The prices 'nothing.yaml' cannot be read"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_before_the_first_call(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, mllm: TruthMllm
+) -> None:
+    done = evaluated(EXAMPLES, tmp_path / "run", *arguments, mllm=mllm, code=1)
+    assert message in done.stderr
+    assert not mllm.asked
+
+
+def test_a_provider_that_is_not_there_is_named(tmp_path: Path) -> None:
+    done = evaluated(EXAMPLES, tmp_path / "run", "--mllm", "nobody/nothing", code=1)
+    assert "--mllm nobody/nothing cannot be used" in done.stderr
+
+
+def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path) -> None:
+    done = evaluated(EXAMPLES, tmp_path / "run")
+    run = read_run(tmp_path / "run")
+    known = {(each.arm, each.item): each for each in run.observations}
+    assert all(known["never", item].abstained for item in run.items), "it sees nothing in the image alone"
+    assert known["always", "collision_108"].right
+    assert {each.refusal for each in run.of_arm("always")} == {None, "cannot-read-direction"}
+    assert "| always" in done.stdout
+
+
+def test_inspects_own_command_runs_the_task(tmp_path: Path, mllm: TruthMllm, items: list[Item]) -> None:
+    given: dict[str, Any] = {"LOCAL_BASE_URL": mllm.address, "INSPECT_CACHE_DIR": str(tmp_path / "cache")}
+    options = ("-T", f"data={SAMPLE}", "-T", "arm=always", "--limit", "2", "--epochs", "2", "--display", "none")
+    done = subprocess.run(
+        [sys.executable, "-m", "inspect_ai", "eval", "cow_service/causalspatial", *options, "--model", MODEL],
+        cwd=tmp_path, env={**environment(), **given}, capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert sum(mllm.asked.values()) == 4 or len(mllm.asked) < 4
+    from inspect_ai.log import list_eval_logs, read_eval_log
+
+    (info,) = list_eval_logs(str(tmp_path / "logs"))
+    log = read_eval_log(info)
+    assert log.status == "success"
+    assert log.samples is not None
+    assert [len(sample.messages[0].content) for sample in log.samples] == [5] * 4, "image, three frames, question"
+    assert log.results is not None
+    assert {score.name for score in log.results.scores} == {"right", "abstained", "unreadable"}
+
+
+@pytest.mark.soak
+def test_the_true_gain_lies_in_the_interval_of_whole_runs(tmp_path: Path, items: list[Item]) -> None:
+    """Through the whole service: twenty seeded runs in `make soak`, two otherwise."""
+    runs, without, looking = 2 * SCALE, 0.4, 0.85
+    covered = nothing = 0
+    for seed in range(runs):
+        with truth_mllm(items, without=without, with_frames=looking, counted=True, seed=seed) as mllm:
+            out = tmp_path / f"run{seed}"
+            evaluated(SAMPLE, out, "--arm", "never,always,placebo-still", "--repeats", "5", mllm=mllm)
+        run = read_run(out)
+        arms = {each.arm: each for each in summarize([run])}
+        always, placebo = arms["always"].gain, arms["placebo-still"].gain
+        assert always is not None
+        assert placebo is not None
+        seeing = sum(each.refusal is None for each in run.of_arm("always")) / len(run.of_arm("always"))
+        covered += always.low <= seeing * (looking - without) <= always.high
+        nothing += placebo.low <= 0 <= placebo.high
+    assert covered >= 0.9 * runs - (SCALE == 1)
+    assert nothing >= 0.9 * runs - (SCALE == 1)
