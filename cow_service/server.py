@@ -14,7 +14,7 @@ import uvicorn
 
 from cow_service.api.app import create_app
 from cow_service.api.connections import Connection, allow_connections
-from cow_service.errors import StorageUnavailable
+from cow_service.errors import CowError, StorageUnavailable
 from cow_service.jobs.computing import Elsewhere
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
@@ -138,13 +138,22 @@ def serving(service: Service) -> Generator[str]:
     server, engine, readiness = _server(service, None)
     readiness.start()
     readiness.wait(LOAD_SECONDS)
-    engine.start()
-    thread = threading.Thread(target=server.run, name="cow-server", daemon=True)
+    failures: list[CowError] = []
+
+    def serve() -> None:
+        try:
+            engine.start()  # here and not in the caller's thread, whose event loop may be running
+            server.run()
+        except CowError as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=serve, name="cow-server", daemon=True)
     thread.start()
     try:
         while not server.started:
             if not thread.is_alive():
-                raise StorageUnavailable("The server in this process ended before it had begun; its log says why.")
+                told = "The server in this process ended before it had begun; its log says why."
+                raise failures[0] if failures else StorageUnavailable(told)
             time.sleep(START_POLL_SECONDS)
         yield server.address
     finally:

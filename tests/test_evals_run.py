@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import EXAMPLES, ROOT, SCALE
+from conftest import EXAMPLES, ROOT
 from truth_mllm import TruthMllm, truth_mllm
 
 from cow_service.evals.items import Item
@@ -172,7 +172,7 @@ def test_a_finished_run_asks_nothing_more_and_says_the_same(done: Done) -> None:
 
 def test_killed_at_three_moments_no_reply_is_asked_for_twice(tmp_path: Path, items: list[Item]) -> None:
     draws = random.Random(18)
-    arguments = ("--arm", "never,always", "--repeats", "3")
+    arguments = ("--arm", "never,always", "--repeats", "3", "--limit", "8")
     with truth_mllm(items) as whole:
         evaluated(SAMPLE, tmp_path / "whole", *arguments, mllm=whole)
     with truth_mllm(items, seconds=0.15) as mllm:
@@ -182,7 +182,7 @@ def test_killed_at_three_moments_no_reply_is_asked_for_twice(tmp_path: Path, ite
                 command(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm),
                 cwd=tmp_path, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip
-            wanted = before + draws.randint(5, 18)
+            wanted = before + draws.randint(3, 10)
             deadline = time.monotonic() + 60
             while len(mllm.done) < wanted and time.monotonic() < deadline:
                 time.sleep(0.01)
@@ -274,10 +274,11 @@ def test_inspects_own_command_runs_the_task(tmp_path: Path, mllm: TruthMllm, ite
     assert {score.name for score in log.results.scores} == {"right", "abstained", "unreadable"}
 
 
-@pytest.mark.soak
+@pytest.mark.soak_only
+@pytest.mark.timeout(1800)
 def test_the_true_gain_lies_in_the_interval_of_whole_runs(tmp_path: Path, items: list[Item]) -> None:
-    """Through the whole service: twenty seeded runs in `make soak`, two otherwise."""
-    runs, without, looking = 2 * SCALE, 0.4, 0.85
+    """Through the whole service, twenty seeded runs; the same with drawn rows is in test_evals_statistics.py."""
+    runs, without, looking = 20, 0.4, 0.85
     covered = nothing = 0
     for seed in range(runs):
         with truth_mllm(items, without=without, with_frames=looking, counted=True, seed=seed) as mllm:
@@ -291,5 +292,5 @@ def test_the_true_gain_lies_in_the_interval_of_whole_runs(tmp_path: Path, items:
         seeing = sum(each.refusal is None for each in run.of_arm("always")) / len(run.of_arm("always"))
         covered += always.low <= seeing * (looking - without) <= always.high
         nothing += placebo.low <= 0 <= placebo.high
-    assert covered >= 0.9 * runs - (SCALE == 1)
-    assert nothing >= 0.9 * runs - (SCALE == 1)
+    assert covered >= 18
+    assert nothing >= 18

@@ -66,7 +66,7 @@ class Asking(Protocol):
     """A way of asking."""
 
     async def __call__(self, case: Case) -> Asked:
-        """Asks. Raises the `CowError`, or the provider's own exception, for which there is no reply."""
+        """Asks. Raises the `CowError` for which there is no reply."""
         ...
 
 

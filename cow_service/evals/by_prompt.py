@@ -18,6 +18,7 @@ from inspect_ai.model import (
     ModelOutput,
 )
 
+from cow_service.errors import MllmUnavailable
 from cow_service.evals.asking import Asked, Case, Reply
 from cow_service.evals.imagination import Imagination, Look
 from cow_service.evals.pictures import Pictures
@@ -42,7 +43,7 @@ class ByPrompt:
     key: str  # of the run: replies of other runs are not taken
 
     async def __call__(self, case: Case) -> Asked:
-        """Imagines where the arm says so, and asks."""
+        """Imagines where the arm says so, and asks. Raises `MllmUnavailable`, and what a simulation failed with."""
         first = await self._first(case) if case.arm.gated else ()
         if first and not _wants_more(case, first):
             return Asked(first)
@@ -63,7 +64,12 @@ class ByPrompt:
     async def _ask(self, case: Case, messages: list[ChatMessage], purpose: str) -> Reply:
         # The repeat is part of the key by itself: it is Inspect's epoch.
         scopes = {"run": self.key, "arm": case.arm.name, "item": case.item.id, "purpose": purpose}
-        output = await self.model.generate(messages, cache=CachePolicy(expiry=None, scopes=scopes))
+        try:
+            output = await self.model.generate(messages, cache=CachePolicy(expiry=None, scopes=scopes))
+        except Exception as error:
+            # Providers raise what they like; Inspect has tried again where that may help.
+            told = getattr(error, "provider_message", None) or str(error)
+            raise MllmUnavailable(f"{self.model} gave no reply: {told}") from error
         return Reply(output.completion, _usage(output), output.time or 0.0)
 
     def _messages(self, case: Case, look: Look) -> list[ChatMessage]:

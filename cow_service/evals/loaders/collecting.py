@@ -60,9 +60,7 @@ def refuse_faults(found: Collected) -> None:
     more = f"\n... and {len(found.faults) - MAX_SHOWN} more" if len(found.faults) > MAX_SHOWN else ""
     raise InvalidRequest(
         f"{len(found.faults)} {'row' if len(found.faults) == 1 else 'rows'} cannot be asked; mend them, or leave them "
-        "out with --skip-faulty:\n"
-        + "\n".join(found.faults[:MAX_SHOWN])
-        + more
+        "out with --skip-faulty:\n" + "\n".join(found.faults[:MAX_SHOWN]) + more
     )
 
 
