@@ -9,8 +9,8 @@ from typing import Any, cast
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Annotation
-from matplotlib.ticker import FuncFormatter
+from matplotlib.text import Annotation, Text
+from matplotlib.ticker import FuncFormatter, NullFormatter
 from matplotlib.transforms import Bbox
 
 from cow_service.evals.report.plot_looks import DIM, Look, looks, percent_axis, short
@@ -104,8 +104,8 @@ def _draw(
     else:
         axes.set_xlim(0, 1.15 * max(values))
     # Tens and units as they are written: no powers, and no offset in the corner.
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.6g}"))
-    axes.xaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+    axes.xaxis.set_major_formatter(FuncFormatter(_number))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel(measure.axis)
     axes.set_title(f"Right answers against {measure.title}{_whiskers(found)}")
     tops = [100 * (each.rates.tpr.mean + (each.rates.tpr.sd or 0)) for each, _ in found]
@@ -113,6 +113,10 @@ def _draw(
     percent_axis(axes, max(-3, min(ends) - 12), min(103, max(tops) + 12))
     axes.grid()
     return labels
+
+
+def _number(value: float, _: int | None = None) -> str:
+    return f"{value:,.6g}"
 
 
 def _whiskers(found: Sequence[tuple[ArmSummary, float]]) -> str:
@@ -128,8 +132,7 @@ def _place(axes: Axes, labels: Sequence[Annotation], canvas: FigureCanvasAgg) ->
         best: tuple[int, tuple[float, float]] | None = None
         for place in PLACES:
             _move(label, place)
-            box = cast(Any, Annotation).get_window_extent(label, renderer)
-            text = _text_box(label, box, renderer)
+            text = _text_box(label, renderer)
             faults = sum(text.overlaps(other) for other in taken) + (not _inside(text, panel))
             if best is None or faults < best[0]:
                 best = (faults, place)
@@ -137,22 +140,22 @@ def _place(axes: Axes, labels: Sequence[Annotation], canvas: FigureCanvasAgg) ->
                 break
         assert best is not None
         _move(label, best[1])
-        taken.append(_text_box(label, label.get_window_extent(renderer), renderer))
+        taken.append(_text_box(label, renderer))
 
 
 def _move(label: Annotation, place: tuple[float, float]) -> None:
     across, down = place
     label.set_position(place)
-    label.set_ha("center" if across == 0 else "left" if across > 0 else "right")
-    label.set_va("center" if down == 0 else "bottom" if down > 0 else "top")
+    label.set(
+        ha="center" if across == 0 else "left" if across > 0 else "right",
+        va="center" if down == 0 else "bottom" if down > 0 else "top",
+    )
     if label.arrow_patch is not None:
         label.arrow_patch.set_visible(max(abs(across), abs(down)) > LEADER)
 
 
-def _text_box(label: Annotation, whole: Bbox, renderer: Any) -> Bbox:
+def _text_box(label: Annotation, renderer: Any) -> Bbox:
     """Of the text alone, without the line to the marker."""
-    from matplotlib.text import Text  # noqa: PLC0415
-
     label.update_positions(renderer)
     return Text.get_window_extent(label, renderer)
 

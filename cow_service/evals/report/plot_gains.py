@@ -39,7 +39,7 @@ def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
     axes.set_ylim(-len(rows) + 0.4, 0.7)
     edge = max(5.0, *(100 * abs(end) for row in rows if row.gain for end in (row.gain.low, row.gain.high)))
     axes.set_xlim(-1.08 * edge, 1.08 * edge)
-    axes.set_yticks([-place for place, row in enumerate(rows)], [row.text for row in rows])
+    axes.set_yticks([-place for place in range(len(rows))], [row.text for row in rows])
     for label, row in zip(axes.get_yticklabels(), rows, strict=True):
         label.set_fontweight("normal" if row.gain else "bold")
     axes.tick_params(axis="y", length=0)

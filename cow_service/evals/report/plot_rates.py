@@ -57,7 +57,7 @@ def draw_rates(summaries: Sequence[ArmSummary]) -> Figure | None:
 
 def _panels(summaries: Sequence[ArmSummary]) -> list[Panel]:
     """By task, then each task that has several levels."""
-    tasks = [task for task in TASKS if any(cell.task == task for each in summaries for cell in each.cells)]
+    tasks: list[Task] = [task for task in TASKS if any(cell.task == task for each in summaries for cell in each.cells)]
     by_task = [_group(summaries, task, None, task) for task in tasks]
     if len(tasks) > 1:
         by_task.insert(0, Group("all", {each.name: each.rates for each in summaries}))
