@@ -1,0 +1,182 @@
+"""The page of a report in a real browser, opened as a file: what it shows, finds, remembers and never runs."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from asked_runs import HOSTILE, picture, run
+from axe_playwright_python.sync_playwright import Axe
+from browser import NARROW, WIDE, Windows, assert_fits
+from playwright.sync_api import Page, expect
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("scipy")
+
+from cow_service.evals.report.page import write_page
+from cow_service.evals.report.page_data import script_json
+from cow_service.evals.report.plots import write_plots
+from cow_service.evals.report.summary import summarize
+from cow_service.evals.runs import Run
+
+ARMS = ("never", "always", "placebo-still")
+ODD = "trajectory-3"  # is refused, fails and replies with markup
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Six questions, each asked twice in three arms."""
+    folder = tmp_path_factory.mktemp("a run & more")
+    found = run(folder, 6, ARMS)
+    frames = (picture(folder, 77, "overlay"),)
+    changed = {
+        ("collision-0", "never"): {"read": "B", "reply": "The answer is B."},
+        ("collision-0", "always"): {
+            "read": "A",
+            "reply": "The answer is A.",
+            "probability": 0.83,
+            "overlay": frames[0],
+        },
+        (ODD, "never"): {"read": None, "reply": HOSTILE},
+        (ODD, "always"): {"refusal": "object-<b>not</b>-found", "frames": (), "imaginations": 0},
+        (ODD, "placebo-still"): {"read": None, "reply": None, "failure": "No answer within <i>120 s</i>."},
+    }
+    same = {"failure": None, "refusal": None}
+    observations = tuple(
+        each.model_copy(update={**same, "reply": each.reply or "A", **changed.get((each.item, each.arm), {})})
+        for each in found.observations
+    )
+    return replace(found, observations=observations)
+
+
+@pytest.fixture(scope="module")
+def report(asked: Run) -> Path:
+    folder, summaries = asked.folder / "report", summarize([asked])
+    return write_page(folder, [asked], summaries, write_plots(folder, summaries), [("By hand", "Said <b>plainly</b>.")])
+
+
+def shown(page: Page) -> list[str]:
+    return page.locator(".card h3").all_text_contents()
+
+
+def chosen(page: Page, **values: str) -> list[str]:
+    for name, value in values.items():
+        page.locator(f"[name={name}]").select_option(value)
+    return shown(page)
+
+
+def test_filters_narrow_what_is_shown_and_a_link_shows_it_again(report: Path, windows: Windows) -> None:
+    page = windows.open(report.as_uri())
+    assert len(shown(page)) == 6
+    assert chosen(page, task="collision") == ["collision-0", "collision-2", "collision-4"]
+    assert "collision-0" in chosen(page, arm="always", against="never", outcome="helped")
+    address = page.url
+    found = shown(page)
+    assert chosen(page, outcome="hurt") == [name for name in shown(page) if name != "collision-0"]
+    again = windows.open(address)
+    assert shown(again) == found
+    assert again.locator("[name=outcome]").input_value() == "helped"
+    assert again.locator("[name=task]").input_value() == "collision"
+    expect(again.locator("#count")).to_have_text(f"{len(found)} of 6 questions")
+    again.get_by_role("button", name="Clear").click()
+    assert len(shown(again)) == 6
+    assert chosen(again, outcome="refused") == [ODD]
+    assert chosen(again, arm="placebo-still", outcome="failed") == [ODD]
+    assert ODD in chosen(again, arm="never", outcome="unreadable")
+
+
+def test_the_search_reads_questions_and_where_asked_replies(report: Path, windows: Windows) -> None:
+    page = windows.open(report.as_uri())
+    page.get_by_label("Search").fill("ball number 3")
+    expect(page.locator(".card")).to_have_count(1)
+    page.get_by_label("Search").fill("onerror")
+    expect(page.locator(".card")).to_have_count(0)
+    page.get_by_label("in the replies, too").check()
+    expect(page.locator(".card")).to_have_count(1)
+    assert "q=onerror" in page.url
+    page.locator(".card h3 a").click()
+    expect(page.locator("#count")).to_have_text(f"1 of 6 questions, only {ODD}")
+    page.go_back()
+    expect(page.get_by_label("Search")).to_have_value("onerror")
+
+
+def test_the_table_links_to_the_questions_it_counts(report: Path, windows: Windows) -> None:
+    page = windows.open(report.as_uri())
+    row = page.get_by_role("row", name=re.compile("^always")).first
+    row.get_by_role("link").nth(2).click()
+    assert "collision-0" in shown(page)
+    assert page.locator("[name=outcome]").input_value() == "helped-any"
+    expect(page.locator("#items-heading")).to_be_focused()
+
+
+def test_pictures_load_and_plots_stand_in_the_page(report: Path, windows: Windows) -> None:
+    page = windows.open(f"{report.as_uri()}#item=collision-0")
+    images = page.locator(".card img")
+    assert images.count() == 1 + 4 + 1
+    page.wait_for_function("[...document.images].every((each) => each.complete && each.naturalWidth > 0)")
+    assert page.locator(".plot svg[role=img]").count() == 4
+    # Colours come from the page's own style: what matplotlib wrote as a style would be refused by the policy.
+    assert page.locator(".plot svg [style]").count() == 0
+    expect(page.locator(".card")).to_contain_text("Told probability: 83%; it happens.")
+
+
+def test_what_others_wrote_is_text(report: Path, windows: Windows) -> None:
+    page = windows.open(f"{report.as_uri()}#item={ODD}")
+    for details in page.locator(".card details").all():
+        details.locator("summary").click()
+    assert page.locator(".reply pre").first.text_content() == HOSTILE
+    expect(page.locator(".card")).to_contain_text("Simulation refused: object-<b>not</b>-found")
+    expect(page.locator(".card")).to_contain_text("No reply: No answer within <i>120 s</i>.")
+    expect(page.locator(".mark.unreadable").nth(1)).to_contain_text("unreadable")
+    assert page.locator("#cards :is(b, i, script, img[src=x])").count() == 0
+    assert page.title().startswith("COW evaluation")
+    expect(page.get_by_text("Said <b>plainly</b>.")).to_be_visible()
+
+
+def test_a_report_elsewhere_finds_its_pictures(asked: Run, tmp_path: Path, windows: Windows) -> None:
+    for copied in (False, True):
+        folder = tmp_path / f"copied {copied}"
+        path = write_page(folder, [asked], summarize([asked]), copy_pictures=copied)
+        assert (folder / "pictures").exists() == copied
+        page = windows.open(f"{path.as_uri()}#item=collision-0")
+        page.wait_for_function(
+            "document.images.length === 6 && [...document.images].every((each) => each.naturalWidth)"
+        )
+
+
+def test_two_runs_of_the_same_questions_share_cards(asked: Run, tmp_path: Path, windows: Windows) -> None:
+    other = replace(asked, info=asked.info.model_copy(update={"mllm": "other/model"}))
+    page = windows.open(write_page(tmp_path, [asked, other], summarize([asked, other])).as_uri())
+    expect(page.locator(".card")).to_have_count(6)
+    expect(page.locator(".card").first.locator(".arm")).to_have_count(6)
+
+
+def test_a_run_without_replies_and_pictures_has_a_page(asked: Run, tmp_path: Path, windows: Windows) -> None:
+    nothing = replace(asked, folder=tmp_path / "lost", observations=())
+    page = windows.open(write_page(tmp_path, [nothing], ()).as_uri())
+    expect(page.locator(".card")).to_have_count(6)
+    expect(page.get_by_text("the file is missing").first).to_be_visible()
+
+
+def test_data_cannot_end_its_element() -> None:
+    said = script_json([HOSTILE, "<!--", "\u2029"])
+    assert not set("<>&\u2028\u2029") & set(said)
+    assert json.loads(said) == [HOSTILE, "<!--", "\u2029"]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_serious(report: Path, windows: Windows, scheme: str) -> None:
+    width = {"light": WIDE, "dark": NARROW}[scheme]
+    # The script of axe is put into the page, which its policy forbids.
+    page = windows.open(report.as_uri(), width, bypass_csp=True, color_scheme=scheme)
+    assert_fits(page)
+    page.locator("details").evaluate_all("all => all.forEach((details) => { details.open = true; })")
+    expect(page.locator(".reply").first).to_be_attached()
+    assert_fits(page)
+    page.add_style_tag(content=".card { content-visibility: visible !important; }")  # else axe leaves out what is below
+    violations = Axe().run(page).response["violations"]
+    serious = [each for each in violations if each["impact"] in ("serious", "critical")]
+    assert [(each["id"], [node["html"][:200] for node in each["nodes"]]) for each in serious] == []
