@@ -10,7 +10,9 @@ from typing import Any
 
 from cow_service.errors import InvalidRequest, StorageUnavailable
 from cow_service.evals.report.contents import gains, overview, pairs, tables
+from cow_service.evals.report.page import write_page
 from cow_service.evals.report.paper import differences
+from cow_service.evals.report.plots import write_plots
 from cow_service.evals.report.summary import ArmSummary, Price, summarize
 from cow_service.evals.report.tables import csv_text, latex, markdown
 from cow_service.evals.runs import Run
@@ -43,6 +45,9 @@ def _write(runs: Sequence[Run], summaries: Sequence[ArmSummary], out: Path) -> N
         for extension, text in FORMATS.items():
             if table.name != "pairs" or extension == "csv":
                 (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
+    plots = write_plots(out / "plots", summaries)
+    sections = [(f"Differences from the paper: {about.lower()}", "\n".join(told)) for about, told in differences()]
+    write_page(out, runs, summaries, plots, sections)
     parts = [f"## {table.title}\n\n{markdown(table)}" for table in known]
     (out / "report.md").write_text("\n\n".join(["# Evaluation", _asked(runs), *parts, _differences()]) + "\n", "utf-8")
     _write_manifest(runs, out)
