@@ -56,11 +56,12 @@ def make(
     """Make a set of items, or go on with one that was cut off."""
     tasks, levels = chosen(task or [], TASKS, "--task"), chosen(level or [], LEVELS, "--level")
     settings = Settings(seed, count, tasks, levels, width, height, samples, quality, shard_rows)
+    events = make_set(out, settings, processes)
     total = len(settings.plan())
     columns = (TextColumn("items"), BarColumn(), MofNCompleteColumn(), Rate(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
         bar = progress.add_task("items", total=total, completed=total - len(missing(out, settings)))
-        for event in make_set(out, settings, processes):
+        for event in events:
             if isinstance(event, Failed):
                 progress.console.print(f"{event.key.id}: {event.reason}", markup=False)
             progress.advance(bar)

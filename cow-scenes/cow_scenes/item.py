@@ -55,8 +55,16 @@ def write_item(folder: Path, item: Accepted, settings: Settings, threads: int) -
 def make_item(out: Path, key: ItemKey, settings: Settings, threads: int) -> None:
     """Make an item under `out`; a folder with its final name is always complete."""
     folder = truth_folder(out, key)
+    if folder.exists():
+        return
     making = folder.parent / f"{TEMPORARY}{key.id}-{os.getpid()}"
     shutil.rmtree(making, ignore_errors=True)
     making.mkdir(parents=True)
     write_item(making, find_world(key, settings.width, settings.height), settings, threads)
-    making.rename(folder)
+    try:
+        making.rename(folder)
+    except OSError:
+        # A process of a run that was killed may have finished the same item, with the same bytes, just now.
+        if not folder.exists():
+            raise
+        shutil.rmtree(making)

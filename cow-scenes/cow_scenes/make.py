@@ -42,7 +42,7 @@ def missing(out: Path, settings: Settings) -> tuple[ItemKey, ...]:
 
 
 def make_set(out: Path, settings: Settings, processes: int) -> Iterator[Made | Failed]:
-    """Make what is missing, yield each item's end, then write shards, card and manifest.
+    """Check the arguments and the folder at once; what is returned makes the set as it is read.
 
     Raises:
         UsageError: if the folder belongs to something else.
@@ -51,6 +51,11 @@ def make_set(out: Path, settings: Settings, processes: int) -> Iterator[Made | F
     if processes < 1:
         raise UsageError(f"--processes is {processes}; give 1 or more")
     open_folder(out, settings)
+    return make_missing(out, settings, processes)
+
+
+def make_missing(out: Path, settings: Settings, processes: int) -> Iterator[Made | Failed]:
+    """Make what is missing, yield each item's end, then write shards, card and manifest."""
     failed = []
     todo = missing(out, settings)
     for event in make_all(todo, out, settings, processes) if todo else ():

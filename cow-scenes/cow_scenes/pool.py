@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import threading
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -39,12 +40,21 @@ class Worker:
     key: ItemKey | None = None
 
 
+def leave_with_parent() -> None:
+    """End this process when the one that started it is gone, so that a killed run leaves nothing behind."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
 def serve(pipe: Connection, out: Path, settings: Settings, threads: int) -> None:
     """Make the items that come through the pipe, until it closes."""
     # Blender writes a line per picture to standard output, below Python.
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
+    threading.Thread(target=leave_with_parent, daemon=True).start()
     from .item import make_item  # noqa: PLC0415
 
     while True:
