@@ -60,7 +60,7 @@ def draw_place(random: Random, level: str, want: int) -> Draft:
 
 
 def judge_place(draft: Draft, run: Run) -> int | None:
-    """Yes if it rests within the bowl's opening with most of its depth below the rim, No if it rests on the rim."""
+    """Yes if it rests in the opening with half of its height or more below the rim, No if it rests on the rim."""
     mover, bowl = draft.world.thing(draft.world.mover), draft.world.thing(draft.target)
     end, rest = run.centres[mover.name][-1], run.centres[bowl.name][-1]
     if any(not {c.a, c.b} <= {mover.name, bowl.name, "floor"} for c in run.contacts):
@@ -69,7 +69,7 @@ def judge_place(draft: Draft, run: Run) -> int | None:
     depth = rest[2] + bowl.height / 2 - (end[2] - mover.height / 2)
     inner = BOWL_OPENING * bowl.scale
     if mover.radius < 0.75 * inner:
-        return 0 if aside < inner - mover.radius * 0.7 and depth > 0.5 * min(mover.height, bowl.height) else None
+        return 0 if aside < inner - mover.radius * 0.7 and depth > 0.5 * mover.height else None
     return 1 if depth < 0.75 * bowl.height and end[2] > rest[2] + bowl.height / 2 else None
 
 
