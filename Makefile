@@ -22,6 +22,7 @@ test-fast: $(VENV)/.test ## the tests that take seconds
 soak: $(VENV)/.test ## all tests and all cases, those of crashes, fuzz and states ten times as long, and public harnesses
 	$(PYTEST) tests/test_inspect.py tests/test_docs.py
 	COW_TEST_SCALE=10 $(PYTEST)
+	$(MAKE) -C cow-scenes test
 
 lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/ruff check .

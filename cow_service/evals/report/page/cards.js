@@ -111,7 +111,8 @@ function armBlock(item, place) {
 }
 
 function card(item) {
-  const facts = [item.task, item.level, item.scene, item.source, ...(core.data.length > 1 ? [item.data] : [])];
+  const named = item.scene === item.source ? [item.scene] : [item.scene, item.source];
+  const facts = [item.task, item.level, ...named, ...(core.data.length > 1 ? [item.data] : [])];
   return make("article", { class: "card" },
     make("header", { class: "about" },
       make("h3", {}, make("a", { href: `#${new URLSearchParams({ item: item.id })}` }, item.id)),
