@@ -155,7 +155,7 @@ def test_the_report_has_tables_plots_pictures_and_a_manifest(done: Done) -> None
     tables = {f"tables/{name}.{form}" for name in ("levels", "arms", "gains", "cost") for form in ("md", "csv", "tex")}
     assert {"index.html", "report.md", "manifest.json", "tables/pairs.csv", *tables} <= names
     manifest = json.loads((report / "manifest.json").read_text())
-    assert manifest["runs"][0]["versions"]["prompts/eval-question"] == "1"
+    assert manifest["runs"][0]["versions"]["prompts/eval-question"].startswith("1 (sha256 ")
     assert set(manifest["files"]) == names - {"manifest.json"}
     assert "| always" in done.told
     assert "GPT-5 (paper)" in (report / "report.md").read_text()

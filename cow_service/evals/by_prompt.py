@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from inspect_ai.model import (
-    CachePolicy,
-    ChatMessage,
-    ChatMessageUser,
-    Content,
-    ContentImage,
-    ContentText,
-    Model,
-    ModelOutput,
-)
+from inspect_ai.model import CachePolicy, ChatMessage, Model, ModelOutput
 
 from cow_service.errors import MllmUnavailable
 from cow_service.evals.asking import Asked, Case, Reply
+from cow_service.evals.conversation import message
 from cow_service.evals.imagination import Imagination, Look
 from cow_service.evals.pictures import Pictures
-from cow_service.media.artifacts import media_type_of
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Usage, Verdict
 from cow_service.stages.gating import gate_of
@@ -80,12 +70,7 @@ class ByPrompt:
             shown = "image-and-frames" if with_image else "frames"
         text = load_prompt(PROMPT).render(question=case.question, shown=shown, facts=look.facts)
         digests = (*((case.item.image,) if with_image else ()), *look.frames)
-        content: list[Content] = [*(self._picture(digest) for digest in digests), ContentText(text=text)]
-        return [ChatMessageUser(content=content)]
-
-    def _picture(self, digest: str) -> ContentImage:
-        data = self.pictures.read(digest)
-        return ContentImage(image=f"data:{media_type_of(data)};base64,{base64.b64encode(data).decode()}")
+        return [message(digests, text, self.pictures)]
 
 
 def _wants_more(case: Case, first: Sequence[Reply]) -> bool:

@@ -10,20 +10,21 @@ from typing import Any
 
 from inspect_ai import Epochs, Task, task
 from inspect_ai.dataset import MemoryDataset, Sample
-from inspect_ai.model import ChatMessage, ChatMessageAssistant, ChatMessageUser, GenerateConfig, ModelOutput, get_model
+from inspect_ai.model import GenerateConfig, ModelOutput, get_model
 from inspect_ai.scorer import Score, Scorer, Target, mean, scorer, std
 from inspect_ai.solver import Generate, Solver, TaskState, solver
 
 from cow_service.evals.arms import Arm, check_arms
-from cow_service.evals.asking import Asked, Asking, Case, observed
+from cow_service.evals.asking import Asking, Case, observed
 from cow_service.evals.by_answer import ByAnswer
 from cow_service.evals.by_prompt import ByPrompt
+from cow_service.evals.conversation import conversation
 from cow_service.evals.items import Item, question_text
 from cow_service.evals.loaders import CAUSALSPATIAL, load
 from cow_service.evals.observations import Ask, Observation
 from cow_service.evals.progress import count
 from cow_service.evals.replies import order_of
-from cow_service.evals.session import active_session, own_folder, session
+from cow_service.evals.session import Session, active_session, own_folder, session
 from cow_service.readers.prompts import load_prompt
 
 ITEM, OBSERVATION = "item", "observation"  # where a sample holds them
@@ -124,7 +125,7 @@ def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
         seen = observed(case, asked)
         count(arm, seen)
         state.store.set(OBSERVATION, seen.model_dump(mode="json"))
-        state.messages = _conversation(case, asked)
+        state.messages = conversation(case, asked, seen.overlay, _shared().pictures)
         state.output = ModelOutput.from_content(str(state.model), asked.replies[-1].text)
         state.completed = True
         return state
@@ -132,19 +133,18 @@ def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
     return solve
 
 
-def _asking(ask: Ask) -> Asking:
+def _shared() -> Session:
     shared = active_session()
     if shared is None:
         raise RuntimeError("The solver runs in tasks of `causalspatial` alone.")
+    return shared
+
+
+def _asking(ask: Ask) -> Asking:
+    shared = _shared()
     if ask == "answer":
         return ByAnswer(shared.client(), shared.pictures, shared.options, shared.key)
     return ByPrompt(get_model(), shared.imagination(), shared.pictures, shared.key)
-
-
-def _conversation(case: Case, asked: Asked) -> list[ChatMessage]:
-    """What a viewer shows: what was asked last, and every reply."""
-    replies = [ChatMessageAssistant(content=reply.text) for reply in asked.replies]
-    return [*(asked.messages or (ChatMessageUser(content=case.question),)), *replies]
 
 
 @scorer(metrics={"right": [mean(), std()], "abstained": [mean()], "unreadable": [mean()]})

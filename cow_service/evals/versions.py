@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
@@ -20,4 +21,8 @@ def versions() -> dict[str, str]:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found | {f"prompts/{name}": str(load_prompt(name).version) for name in PROMPTS}
+    for name in PROMPTS:
+        prompt = load_prompt(name)
+        digest = hashlib.sha256(prompt.body.encode()).hexdigest()
+        found[f"prompts/{name}"] = f"{prompt.version} (sha256 {digest})"
+    return found
