@@ -30,7 +30,7 @@ class _RunByDefault(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Puts the name of the command in front where there is none."""
-        if args and args[0] not in self.commands and args[0] != "--help":
+        if args and args[0] not in self.commands:
             args = ["run", *args]
         return super().parse_args(ctx, args)
 
@@ -106,7 +106,7 @@ def run(
     log_images: Annotated[bool, typer.Option(help="Keep pictures in Inspect's logs, for inspect view.")] = True,
     prices: Prices = None,
 ) -> None:
-    """Ask every question in every arm, and report.
+    """Ask every question in every arm, and report. `cow eval report RUNS` compares runs.
 
     The same command resumes a run that was interrupted; no reply that has come is asked for again.
 

@@ -25,6 +25,7 @@ from cow_service.evals.tasks import ITEM, OBSERVATION
 
 # What a log holds beside: pictures and every step of the way.
 _NOT_READ = {"messages", "events", "attachments", "output", "store", "timelines"}
+_CANCELED = "CancelledError("  # how Inspect writes down what an interrupt cut off
 MAX_FAILURE = 500  # characters
 
 
@@ -53,7 +54,7 @@ def _observation(log: EvalLog, sample: EvalSample) -> Observation | None:
     for score in (sample.scores or {}).values():
         if score.metadata and OBSERVATION in score.metadata:
             return Observation.model_validate(score.metadata[OBSERVATION])
-    if sample.error is None:
+    if sample.error is None or (log.status == "cancelled" and sample.error.message.startswith(_CANCELED)):
         return None
     arguments: dict[str, Any] = log.plan.steps[0].params
     item = Item.model_validate(sample.metadata[ITEM])

@@ -148,7 +148,7 @@ def _ask(plan: Plan, info: RunInfo, items: Sequence[Item]) -> None:
     with session(plan.out, plan.url, info.settings["requests"], key, **_server_settings(plan)) as shared:
         _check_server(shared.url)
         with prepared(items), shown(progress), _quiet_inspect():
-            eval_set(
+            _, ended = eval_set(
                 tasks=[
                     causalspatial(data=info.data_digest, arm=arm, ask=plan.ask, seed=plan.seed) for arm in info.arms
                 ],
@@ -169,6 +169,8 @@ def _ask(plan: Plan, info: RunInfo, items: Sequence[Item]) -> None:
                 score_display=False,
                 temperature=plan.temperature,
             )
+    if any(log.status == "cancelled" for log in ended):
+        raise KeyboardInterrupt
 
 
 @contextmanager

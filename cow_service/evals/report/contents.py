@@ -15,6 +15,8 @@ from cow_service.evals.statistics import Gain, Rates, Spread
 
 ALL = "all"
 NONE = ""  # a cell of which nothing is known
+_IN_SHORT = ("arm", "replies", "failed", "TPR, %", "NSR, %", "unreadable", "imagined", "refused")
+_GAINS_IN_SHORT = ("arm", "task", "questions", "gain, points", "95% interval", "helped", "hurt", "McNemar p")
 
 
 def tables(summaries: Sequence[ArmSummary]) -> tuple[Table, ...]:
@@ -90,6 +92,22 @@ def gains(summaries: Sequence[ArmSummary]) -> Table:
     return Table(
         "gains", "Gain over the arm `never`, paired by question and repeat, drawn by scene", header, tuple(rows)
     )
+
+
+def in_short(summaries: Sequence[ArmSummary]) -> Table:
+    """What each arm came to, for a terminal."""
+    whole = overview(summaries)
+    kept = tuple(whole.header.index(name) for name in _IN_SHORT)
+    rows = tuple(tuple(row[place] for place in kept) for row in whole.rows)
+    return Table("arms-in-short", whole.title, _IN_SHORT, rows)
+
+
+def gains_in_short(summaries: Sequence[ArmSummary]) -> Table:
+    """The gains over all tasks, and those on each, for a terminal."""
+    whole = gains(summaries)
+    kept = tuple(whole.header.index(name) for name in _GAINS_IN_SHORT)
+    rows = tuple(tuple(row[place] for place in kept) for row in whole.rows if row[-1] or row[1] == ALL)
+    return Table("gains-in-short", whole.title, _GAINS_IN_SHORT, rows)
 
 
 def calibration(summaries: Sequence[ArmSummary]) -> Table:

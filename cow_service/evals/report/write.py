@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cow_service.errors import InvalidRequest, StorageUnavailable
-from cow_service.evals.report.contents import gains, overview, pairs, tables
+from cow_service.evals.report.contents import gains_in_short, in_short, pairs, tables
 from cow_service.evals.report.page import write_page
 from cow_service.evals.report.paper import differences
 from cow_service.evals.report.plots import write_plots
@@ -34,7 +34,7 @@ def write_report(runs: Sequence[Run], out: Path, prices: Mapping[str, Price]) ->
         _write(runs, summaries, out)
     except OSError as error:
         raise StorageUnavailable(f"'{out}' cannot be written: {error.strerror or error}.") from error
-    shown = [table for table in (overview(summaries), gains(summaries)) if table.rows]
+    shown = [table for table in (in_short(summaries), gains_in_short(summaries)) if table.rows]
     return "\n\n".join(markdown(table) for table in shown)
 
 
