@@ -99,9 +99,9 @@ class Handler(BaseHTTPRequestHandler):
         for part, (status, code) in self.hub.refused.items():
             if part in address:
                 return self.send(status, {"X-Error-Code": code, "X-Error-Message": f"{code} it is"})
-        if match := re.fullmatch(r"/api/models/([^/]+/[^/]+)(?:/revision/(.+))?", address):
+        if match := re.fullmatch(r"/api/(?:models|datasets)/([^/]+/[^/]+)(?:/revision/(.+))?", address):
             return self.list(match[1], match[2] or "main")
-        if match := re.fullmatch(r"/([^/]+/[^/]+)/resolve/([^/]+)/(.+)", address):
+        if match := re.fullmatch(r"/(?:datasets/)?([^/]+/[^/]+)/resolve/([^/]+)/(.+)", address):
             return self.resolve(match[1], match[2], match[3], body=body)
         if match := re.fullmatch(r"/storage/([^/]+/[^/]+)/([^/]+)/(.+)", address):
             return self.bytes(self.hub.commits[match[1]][match[2]][match[3]], match[3], {}, body=body)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import os
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import EXAMPLES, ROOT
 from drawn import png_bytes
+from hub import Blob, running
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -234,6 +238,27 @@ def test_files_that_were_not_written_to_their_end_are_named(tmp_path: Path, pict
     (scene / "meta.json").write_text('{"question": "Wil')
     with pytest.raises(InvalidRequest, match=r"one/meta.json: no whole JSON"):
         load(str(scene.parent), pictures)
+
+
+def test_a_data_set_of_the_hub_is_downloaded_and_read(tmp_path: Path) -> None:
+    pq.write_table(pa.Table.from_pylist([row_of("occlusion", 60, 1)]), file_in(tmp_path / "occlusion"))
+    shard = (tmp_path / "occlusion" / "train.parquet").read_bytes()
+    program = (
+        "import sys; from pathlib import Path; from cow_service.evals.loaders import load;"
+        "from cow_service.evals.pictures import Pictures;"
+        "print([item.id for item in load(sys.argv[1], Pictures(Path('pictures'))).items])"
+    )
+    with running() as one:
+        one.commit("someone/questions", {"occlusion/train.parquet": Blob(shard), "weights.bin": Blob(b"large")})
+        known = {**os.environ, "HF_ENDPOINT": one.address, "HF_HOME": str(tmp_path / "home"), "HF_HUB_DISABLE_XET": "1"}
+        command = [sys.executable, "-c", program]
+        done, unknown = (
+            subprocess.run([*command, name], cwd=tmp_path, env=known, capture_output=True, text=True, check=False)
+            for name in ("someone/questions", "someone/nothing")
+        )
+        assert done.stdout == "['occlusion/0/0']\n", done.stderr
+        assert one.downloads() == ["occlusion/train.parquet"], "only what is read"
+    assert "The data set 'someone/nothing' is no folder here, and could not be had from the hub" in unknown.stderr
 
 
 @pytest.mark.parametrize("data", ["nothing/here/at-all", "README.md"])

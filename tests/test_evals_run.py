@@ -202,6 +202,26 @@ def test_killed_at_three_moments_no_reply_is_asked_for_twice(tmp_path: Path, ite
         assert tables[0] == tables[1]
 
 
+def test_an_interrupted_run_ends_in_peace_and_is_gone_on_with(tmp_path: Path, mllm: TruthMllm) -> None:
+    mllm.seconds = 0.2
+    arguments = ("--arm", "never,always", "--limit", "6")
+    process = subprocess.Popen(
+        command(SAMPLE, tmp_path / "run", *arguments, mllm=mllm),
+        cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while len(mllm.done) < 3 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Interrupted. The same command goes on with it." in told
+    assert "Traceback" not in told
+    evaluated(SAMPLE, tmp_path / "run", *arguments, mllm=mllm)
+    run = read_run(tmp_path / "run")
+    assert [each.failure for each in run.observations] == [None] * 12
+
+
 def test_failures_are_kept_with_their_reason_and_retried_on_request(
     tmp_path: Path, items: list[Item], mllm: TruthMllm
 ) -> None:

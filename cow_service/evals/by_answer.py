@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -11,6 +10,7 @@ from cow_service.client import AsyncClient
 from cow_service.client.errors import error_from
 from cow_service.client.results import AsyncAnswer
 from cow_service.evals.asking import Asked, Case, Reply
+from cow_service.evals.idempotency import asked_once
 from cow_service.evals.imagination import REFUSALS, Look
 from cow_service.evals.pictures import Pictures
 
@@ -37,14 +37,13 @@ class ByAnswer:
 
     async def _ask(self, case: Case, imagine: Literal["always", "auto", "never"], trial: int) -> tuple[Reply, Look]:
         options: Any = {**self.options, **({"seed": trial} if trial else {})}
+        image = self.pictures.path(case.item.image)
+
+        async def ask(key: str) -> AsyncAnswer:
+            return await self.client.answer(image, case.question, idempotency_key=key, imagine=imagine, **options)
+
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))
-        answer = await self.client.answer(
-            self.pictures.path(case.item.image),
-            case.question,
-            idempotency_key=hashlib.sha256("\n".join(parts).encode()).hexdigest(),
-            imagine=imagine,
-            **options,
-        )
+        answer = await asked_once(ask, *parts)
         look = await self._look(answer)
         # Usage and stages are of everything together: what is not of the simulation stands with the reply.
         seconds = max(0.0, sum(answer.timings.values()) - look.seconds)

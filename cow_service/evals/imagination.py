@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from cow_service.client import AsyncClient
 from cow_service.client.results import AsyncSimulation
 from cow_service.errors import CannotGround, CannotReadDirection, CowError, MllmBadReply
 from cow_service.evals.arms import Shown
+from cow_service.evals.idempotency import asked_once
 from cow_service.evals.items import Item, question_text
 from cow_service.evals.pictures import Pictures
 from cow_service.media.images import decode, encode_png, fit_within
@@ -85,11 +85,12 @@ class Imagination:
 
     async def _simulate(self, item: Item, trial: int, changes: Mapping[str, Any]) -> AsyncSimulation:
         options: Any = {**self._options, **({"seed": trial} if trial else {}), **changes}
-        parts = (self._key, item.id, item.image, str(sorted(options.items())))
-        key = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-        return await self._client.simulate(
-            self._pictures.path(item.image), question_text(item), idempotency_key=key, video=False, **options
-        )
+        image, question = self._pictures.path(item.image), question_text(item)
+
+        async def ask(key: str) -> AsyncSimulation:
+            return await self._client.simulate(image, question, idempotency_key=key, video=False, **options)
+
+        return await asked_once(ask, self._key, item.id, item.image, str(sorted(options.items())))
 
     async def _seen(self, simulation: AsyncSimulation, shown: Shown, usage: Usage, seconds: float) -> Look:
         """The look of a simulation; its pictures are kept."""

@@ -80,4 +80,5 @@ class RunInfo(Record):
     seed: int
     settings: dict[str, Any] = Field(description="Frames, reader, generator, generation settings.")
     versions: dict[str, str] = Field(description="Of the packages and prompts.")
+    rounds: int = Field(default=0, description="How often what had failed was asked again.")
     created_at: str = Field(description="RFC 3339, UTC.")

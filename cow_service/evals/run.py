@@ -62,7 +62,7 @@ def evaluate(plan: Plan) -> Run:
     found, items = _items(plan)
     arms = check_arms(plan.arms, plan.ask, items)
     info = _info(plan, items, tuple(found.faults), tuple(found.notes), arms)
-    info = _merged(read_info(plan.out), info)
+    info = _merged(read_info(plan.out), info, again=plan.retry_failed)
     _prepare_inspect(plan.out)
     write_run(plan.out, info, items)
     _ask(plan, info, items)
@@ -104,7 +104,7 @@ def _info(
     )
 
 
-def _merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
+def _merged(before: RunInfo | None, wanted: RunInfo, *, again: bool) -> RunInfo:
     """A run that goes on, with more arms or repeats perhaps. Raises `InvalidRequest` where the rest is not the same."""
     if before is None:
         return wanted
@@ -116,7 +116,10 @@ def _merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
                 "another folder, or the same arguments as before."
             )
     arms = (*before.arms, *(arm for arm in wanted.arms if arm not in before.arms))
-    merged = {"arms": arms, "repeats": max(before.repeats, wanted.repeats), "versions": wanted.versions}
+    # Under the key of an earlier round a failed job would only be found again.
+    rounds = before.rounds + again
+    repeats = max(before.repeats, wanted.repeats)
+    merged = {"arms": arms, "repeats": repeats, "versions": wanted.versions, "rounds": rounds}
     return before.model_copy(update=merged)
 
 
@@ -144,7 +147,7 @@ def _ask(plan: Plan, info: RunInfo, items: Sequence[Item]) -> None:
     progress.add_earlier([each for each in read_observations(logs) if not (plan.retry_failed and each.failure)])
     if not progress.left:
         return
-    key = hashlib.sha256(f"{info.created_at} {info.data_digest} {info.mllm}".encode()).hexdigest()
+    key = hashlib.sha256(f"{info.created_at} {info.data_digest} {info.mllm} {info.rounds}".encode()).hexdigest()
     with session(plan.out, plan.url, info.settings["requests"], key, **_server_settings(plan)) as shared:
         _check_server(shared.url)
         with prepared(items), shown(progress), _quiet_inspect():
@@ -169,7 +172,7 @@ def _ask(plan: Plan, info: RunInfo, items: Sequence[Item]) -> None:
                 score_display=False,
                 temperature=plan.temperature,
             )
-    if any(log.status == "cancelled" for log in ended):
+    if len(ended) < len(info.arms):  # Inspect takes an interrupt for an end
         raise KeyboardInterrupt
 
 
@@ -212,7 +215,7 @@ def _check_server(url: str) -> None:
     from cow_service.client import Client  # noqa: PLC0415
 
     try:
-        with Client(url) as client:
+        with Client(url, retries=0) as client:
             client.models()
     except CowError as error:
         error.detail = f"The server at {url} cannot be asked. {error.detail}"

@@ -1,0 +1,90 @@
+"""The tables of a report, as they are: Markdown, CSV and LaTeX of a run that is always the same."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+from asked_runs import HOSTILE, run
+from conftest import ROOT
+
+from cow_service.evals.prices import read_prices
+from cow_service.evals.report.contents import pairs, tables
+from cow_service.evals.report.summary import ArmSummary, summarize
+from cow_service.evals.report.tables import Table, csv_text, latex, markdown
+from cow_service.evals.report.write import write_report
+from cow_service.evals.runs import Run
+
+GOLDEN = ROOT / "tests" / "data" / "evals"
+FORMS = {"md": markdown, "csv": csv_text, "tex": latex}
+TASKS = ("collision", "trajectory", "compatibility", "occlusion")
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return run(tmp_path_factory.mktemp("run"), count=24, repeats=3, tasks=TASKS)
+
+
+@pytest.fixture(scope="module")
+def summaries(asked: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[ArmSummary, ...]:
+    prices = tmp_path_factory.mktemp("prices") / "prices.yaml"
+    prices.write_text("openai/small: {input: 2, output: 10}\n")
+    return summarize([asked], read_prices(prices))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_tables_are_as_they_were(form: str, summaries: tuple[ArmSummary, ...]) -> None:
+    """A change that is wanted: write what is told here into tests/data/evals."""
+    told = "\n".join(f"{table.title}\n{FORMS[form](table)}" for table in tables(summaries))
+    assert told == (GOLDEN / f"tables.{form}").read_text(encoding="utf-8")
+
+
+def test_the_figures_of_a_table_are_those_of_the_replies(asked: Run, summaries: tuple[ArmSummary, ...]) -> None:
+    by_name = {table.name: table for table in tables(summaries)}
+    rows = {(row[0], row[1]): dict(zip(by_name["levels"].header, row, strict=True)) for row in by_name["levels"].rows}
+    for arm in asked.info.arms:
+        replies = [each for each in asked.of_arm(arm) if each.failure is None]
+        shares = [
+            sum(each.right for each in of_repeat) / len(of_repeat)
+            for repeat in (1, 2, 3)
+            if (of_repeat := [each for each in replies if each.repeat == repeat])
+        ]
+        assert rows[arm, "TPR"]["all"].startswith(f"{100 * sum(shares) / 3:.2f} ± ")
+    assert rows["GPT-5 (paper)", "TPR"]["all"] == "54.17"
+
+
+def test_every_question_and_repeat_has_a_row_of_its_own(asked: Run, summaries: tuple[ArmSummary, ...]) -> None:
+    rows = list(csv.DictReader(io.StringIO(csv_text(pairs([asked], summaries)))))
+    assert len(rows) == 24 * 3
+    for row in rows[:20]:
+        for arm in asked.info.arms:
+            (seen,) = (
+                each for each in asked.of_arm(arm) if (each.item, str(each.repeat)) == (row["item"], row["repeat"])
+            )
+            expected = ("", "") if seen.failure else (seen.read or "", str(int(seen.right)))
+            assert (row[f"{arm}: chosen"], row[f"{arm}: right"]) == expected
+
+
+def test_text_that_means_something_to_a_format_is_text_in_it() -> None:
+    table = Table("x", "100% of \\ & _", ("a|b", "c"), ((HOSTILE.replace("\u2028", " "), "50% & 3_4"),))
+    assert markdown(table).splitlines()[0].count("|") == 4
+    assert list(csv.reader(io.StringIO(csv_text(table))))[1][1] == "50% & 3_4"
+    text = latex(table)
+    assert r"50\% \& 3\_4 \\" in text
+    assert r"\caption{100\% of \textbackslash{} \& \_}" in text
+
+
+def test_runs_of_two_models_are_compared_each_with_its_own_baseline(tmp_path: Path) -> None:
+    large = run(tmp_path / "large", mllm="openai/large", arms=("never",), repeats=2)
+    more = run(tmp_path / "more", mllm="openai/large", arms=("always",), repeats=2)
+    small = run(tmp_path / "small", arms=("never", "always"), repeats=2)
+    found = {each.name: each for each in summarize([large, more, small])}
+    assert set(found) == {"openai/large, never", "openai/large, always", "openai/small, never", "openai/small, always"}
+    assert found["openai/large, always"].gain is not None, "its baseline is in another folder"
+    write_report([large, more, small], tmp_path / "report", {})
+    manifest = json.loads((tmp_path / "report" / "manifest.json").read_text())
+    assert [each["mllm"] for each in manifest["runs"]] == ["openai/large", "openai/large", "openai/small"]
+    assert (tmp_path / "report" / "index.html").is_file()
