@@ -101,6 +101,8 @@ class Handler(BaseHTTPRequestHandler):
                 return self.send(status, {"X-Error-Code": code, "X-Error-Message": f"{code} it is"})
         if match := re.fullmatch(r"/api/(?:models|datasets)/([^/]+/[^/]+)(?:/revision/(.+))?", address):
             return self.list(match[1], match[2] or "main")
+        if match := re.fullmatch(r"/api/datasets/([^/]+/[^/]+)/tree/(.+)", address):
+            return self.tree(match[1], match[2])
         if match := re.fullmatch(r"/(?:datasets/)?([^/]+/[^/]+)/resolve/([^/]+)/(.+)", address):
             return self.resolve(match[1], match[2], match[3], body=body)
         if match := re.fullmatch(r"/storage/([^/]+/[^/]+)/([^/]+)/(.+)", address):
@@ -117,6 +119,13 @@ class Handler(BaseHTTPRequestHandler):
         files = [blob.listed(path) for path, blob in self.hub.commits[repository][commit].items()]
         document = json.dumps({"id": repository, "sha": commit, "siblings": files}).encode()
         return self.send(200, {"Content-Type": "application/json"}, document)
+
+    def tree(self, repository: str, commit: str) -> None:
+        files = self.hub.commits[repository][commit]
+        listed = [
+            {"type": "file", "path": path, "size": len(blob.data), "oid": blob.sha1} for path, blob in files.items()
+        ]
+        return self.send(200, {"Content-Type": "application/json"}, json.dumps(listed).encode())
 
     def resolve(self, repository: str, commit: str, path: str, *, body: bool) -> None:
         blob = self.hub.commits[repository].get(commit, {}).get(path)
