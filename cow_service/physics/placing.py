@@ -13,6 +13,7 @@ import numpy as np
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera_fit import CameraFit
 from cow_service.physics.draws import COLUMN
+from cow_service.physics.hanging import hung_over, is_above
 from cow_service.physics.lift import FARTHEST, NEAREST, Cameras, Placed, above, in_the_air
 from cow_service.records import FALLING_KINDS, Cue, Motion
 from cow_service.vision.types import Floats
@@ -93,6 +94,10 @@ def place(
             return _going(placed, supports, motion, cameras, parameters, draws, asked, others)
     ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
     height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
+    if motion.kind == "fall" and asked is not None and is_above(mover.bbox, bodies[asked].bbox):
+        below = _stand(bodies, supports, asked, cameras.at_height(np.ones(len(draws))), draws)
+        if below is not None and not bodies[asked].is_flying:
+            height = hung_over(ball, height, below.centre[:, 2], fit, draws)
     cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
     placed = in_the_air(cameras, mover.bbox, mover.shape, depth)
     all_placed = _with_others(bodies, supports, motion, cameras, draws, placed)
