@@ -24,6 +24,8 @@ from cow_service.evals.pictures import Pictures
 from cow_service.evals.runs import Run, read_info, read_run, write_run
 from cow_service.evals.versions import versions
 
+# Providers that Inspect and the server in this process both know, and where both look for the key.
+KEYS = {"openai": "OPENAI_API_KEY", "anthropic": "ANTHROPIC_API_KEY", "google": "GOOGLE_API_KEY"}
 EMBEDDED = "cow/embedded"  # who answers where no multimodal LLM is named
 _SAME = ("data_digest", "mllm", "ask", "seed", "settings")  # what a run that goes on has in common with its begin
 
@@ -203,11 +205,13 @@ def _server_settings(plan: Plan) -> dict[str, Any]:
     if plan.url is not None or plan.ask == "prompt" or plan.mllm is None:
         return {}
     provider, _, name = plan.mllm.partition("/")
-    if provider not in ("openai", "anthropic", "google"):
+    if provider not in KEYS:
         raise InvalidRequest(
             f"The server in this process cannot ask '{plan.mllm}': start `cow serve` with COW_MLLM, and give its --url."
         )
-    return {"mllm": f"{provider}:{name}", "mllm_base_url": plan.base_url, "reader": plan.reader or "mllm"}
+    key = os.environ.get("COW_MLLM_API_KEY") or os.environ.get(KEYS[provider])
+    named = {"mllm": f"{provider}:{name}", "mllm_base_url": plan.base_url, "mllm_api_key": key}
+    return {**named, "reader": plan.reader or "mllm"}
 
 
 def _check_server(url: str) -> None:
