@@ -34,6 +34,7 @@ ALL_ARMS = (
 PICTURES_SHOWN = {"never": 1, "always": 4, "placebo-still": 4, "encounters": 1, "frames-only": 3, "oracle": 3}
 REPEATS = 2
 MODEL = "openai-api/local/fake"
+CONCURRENCY = 8  # of an arm, by default
 
 
 @pytest.fixture(scope="module")
@@ -175,9 +176,10 @@ def test_killed_at_three_moments_no_reply_is_asked_for_twice(tmp_path: Path, ite
     arguments = ("--arm", "never,always", "--repeats", "3", "--limit", "8")
     with truth_mllm(items) as whole:
         evaluated(SAMPLE, tmp_path / "whole", *arguments, mllm=whole)
+    kills: list[float] = []
     with truth_mllm(items, seconds=0.15) as mllm:
         for _ in range(3):
-            before, begun = len(mllm.done), dict(mllm.asked)
+            before = len(mllm.done)
             process = subprocess.Popen(
                 command(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm),
                 cwd=tmp_path, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -188,15 +190,14 @@ def test_killed_at_three_moments_no_reply_is_asked_for_twice(tmp_path: Path, ite
                 time.sleep(0.01)
             process.send_signal(signal.SIGKILL)
             process.wait()
-            killed = time.monotonic()
-            # What came a moment before the kill may not have been read by the process that was killed.
-            safe = {key for key, at in mllm.done.items() if at < killed - 0.25}
-            assert before < len(mllm.done) < len(whole.asked)
-            assert begun.keys() <= mllm.asked.keys()
-        asked_until_then = {key: mllm.asked[key] for key in safe}
+            kills.append(time.monotonic())
+            assert before < len(mllm.done) < sum(whole.asked.values())
         evaluated(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm)
         assert mllm.asked.keys() == whole.asked.keys()
-        assert {key: mllm.asked[key] for key in safe} == {key: asked_until_then[key] for key in safe}
+        # Replies under way at a kill were lost; what came a moment before it may not have been read any more.
+        lost = Counter(key for key, begun, sent in mllm.done if any(begun < at < sent + 0.25 for at in kills))
+        assert sum(lost.values()) <= 3 * 2 * CONCURRENCY
+        assert mllm.asked - lost <= whole.asked, "what had come was not asked for again"
     for name in ("levels", "arms", "gains"):
         tables = [(tmp_path / run / "report" / "tables" / f"{name}.md").read_text() for run in ("whole", "killed")]
         assert tables[0] == tables[1]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "cow_service"
-MAX_ROOT_FILES, MAX_ROOMS = 12, 29
+MAX_ROOT_FILES, MAX_ROOMS = 12, 30
 MAX_LINES, MAX_PIPELINE_LINES, MAX_PIPELINE_FUNCTION_LINES = 400, 150, 40
 
 HEAVY = ("torch", "transformers", "diffusers", "accelerate")

@@ -253,6 +253,25 @@ class TestPlacedScene:
             assert np.isfinite(placed.centre).all()
 
 
+@given(cameras, feet, st.floats(0.3, 0.7), st.floats(0.35, 0.7))
+def test_a_bowl_is_as_high_as_it_is_though_its_foot_is_narrower_than_its_rim(camera, foot, bottom, height) -> None:
+    there = camera.on_floor(foot)
+    assume(there is not None and 18 < camera.pitch < 45)
+    half = 0.05 * camera.away(there)
+    turns = np.linspace(0, 2 * np.pi, 90)
+    circle = np.stack([np.cos(turns), np.zeros(90), np.sin(turns)], axis=1) * half
+    middle = np.array([there[0], 0.0, there[1]])
+    tall = height * half
+    seen = camera.seen(np.concatenate([middle + circle + (0, 2 * tall, 0), middle + bottom * circle]))
+    bbox = (*seen.min(axis=0), *seen.max(axis=0))
+    assume(seen[90:, 1].max() > seen[:90, 1].max())  # its lowest point is its foot and not its near rim
+    right, wrong = (above(exactly(camera), bbox, "cylinder", likeliest(), np.zeros(1), taper=t) for t in (bottom, 1.0))
+    assert right is not None
+    assert wrong is not None
+    assert right.half_height[0] == pytest.approx(tall, rel=0.25)
+    assert abs(right.half_height[0] - tall) < abs(wrong.half_height[0] - tall)
+
+
 class TestSupports:
     def table(self, top: int = 200, bottom: int = 330) -> SeenBody:
         return body((200, top, 440, bottom), "box", "table")

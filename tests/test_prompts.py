@@ -59,6 +59,7 @@ SAMPLES: dict[str, object] = {
     "law": "contact",
     "changed": "With the vase removed",
     "as_it_is": "As it is",
+    "shown": "image-and-facts",
     "facts": ("The ball touches the vase after 0.5 s.",),
     "encounters_known": True,
     "encounters": ("touches the vase, 0.5 s in",),
@@ -74,7 +75,7 @@ def test_every_shipped_prompt_renders_its_inputs_and_no_others(name: str) -> Non
     assert "{%" not in text
     assert not any(line.endswith(" ") for line in text.splitlines())
     for each in ("question", "object", "sentence"):
-        if each in inputs and name != "motion-sentence":
+        if each in inputs and name not in ("motion-sentence", "eval-question"):
             assert all(f"> {line}" in text.splitlines() for line in str(inputs[each]).splitlines()), each
     with pytest.raises(TypeError, match="not declared: extra"):
         prompt.render(**inputs, extra="x")
@@ -94,7 +95,12 @@ SCHEMAS = {
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in PROMPTS.names() if name not in {"looking", "motion-sentence", "imagined-frames"}]
+    "name",
+    [
+        name
+        for name in PROMPTS.names()
+        if name not in {"looking", "motion-sentence", "imagined-frames", "eval-question"}
+    ],
 )
 def test_a_prompt_shows_the_fields_of_its_schema(name: str) -> None:
     prompt = load_prompt(name)

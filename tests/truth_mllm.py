@@ -36,7 +36,7 @@ class TruthMllm:
     counted: bool = False
     address: str = ""
     asked: Counter[str] = field(default_factory=Counter)
-    done: dict[str, float] = field(default_factory=dict)  # when a reply was sent, by what was asked
+    done: list[tuple[str, float, float]] = field(default_factory=list)  # what was asked, when, and when it was sent
     texts: list[str] = field(default_factory=list)
     images: list[int] = field(default_factory=list)
     refuses: str = ""  # questions with this in them
@@ -77,13 +77,14 @@ class _Handler(BaseHTTPRequestHandler):
         if self.mllm.refuses and self.mllm.refuses in json.dumps(body):
             self.send(400, {"error": {"message": "The model is away.", "type": "invalid_request_error"}})
             return
+        begun = time.monotonic()
         key, text = self.mllm.reply(body)
         time.sleep(self.mllm.seconds)
         choice = {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": text}}
         head = {"id": "x", "object": "chat.completion", "created": 0, "model": body["model"]}
         with suppress(OSError):
             self.send(200, {**head, "choices": [choice], "usage": TOKENS})
-            self.mllm.done[key] = time.monotonic()
+            self.mllm.done.append((key, begun, time.monotonic()))
 
     def send(self, status: int, body: object) -> None:
         data = json.dumps(body).encode()

@@ -31,6 +31,7 @@ class SeenBody:
     prior: ObjectPrior | None = None
     elongated: bool = False  # a vehicle: longer along its heading than across
     equal_sided: bool = False  # a cube: as wide as high
+    taper: float = 1.0  # its width at its lower end, of that at its upper end
 
     @property
     def foot(self) -> tuple[float, float]:

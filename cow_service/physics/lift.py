@@ -105,12 +105,18 @@ class Placed:
 
 
 def above(
-    cameras: Cameras, bbox: BBox, shape: Shape, draws: Floats, plane: Floats, depth_share: float = 1.0
+    cameras: Cameras,
+    bbox: BBox,
+    shape: Shape,
+    draws: Floats,
+    plane: Floats,
+    depth_share: float = 1.0,
+    taper: float = 1.0,
 ) -> Placed | None:
     """A body that stands on a horizontal plane at a height [K] (m); None where its foot lies at or above the horizon.
 
-    The foot is the middle of the box's lower edge; the body's middle lies half its depth further away. A sphere's depth
-    follows from its radius and its middle.
+    The foot is the middle of the box's lower edge; the body's middle lies half its depth there further away, which is
+    `taper` of that at its top. A sphere's depth follows from its radius and its middle.
     """
     height = cameras.height - plane
     stretch = np.exp(SIZE_SIGMA * draws[:, COLUMN["size"]])
@@ -133,13 +139,13 @@ def above(
     half, tall, centre = np.zeros(len(foot)), np.zeros(len(foot)), np.zeros((len(foot), 3))
     wide = (x1 - x0) / (2 * cameras.focal)
     for _ in range(5):
-        middle = near + way * (half * depth_share)[:, None]
+        middle = near + way * (half * depth_share * taper)[:, None]
         # What is seen from above is widest at its top, which is nearer; a cone is at its foot.
         widest = plane + (0.0 if shape == "cone" else 2 * tall)
         depth = cameras.depth(np.stack([middle[:, 0], widest, middle[:, 1]], axis=1))
         half = wide / np.sqrt(1 + wide**2) * np.maximum(depth, 1e-3 * height)
         deep = half * depth_share
-        tall = _half_height(cameras, bbox, shape, distance + deep, deep, plane)
+        tall = _half_height(cameras, bbox, shape, distance + deep * taper, deep, plane)
         centre = np.stack([middle[:, 0], plane + tall, middle[:, 1]], axis=1)
     return Placed(shape, centre, half * stretch, tall, True, depth_share)
 

@@ -182,7 +182,7 @@ def _stand(
         support = above(cameras, bodies[on].bbox, bodies[on].shape, draws, plane)
         if support is not None:
             plane = np.minimum(support.top, 0.95 * cameras.height)
-    return above(cameras, body.bbox, body.shape, draws, plane, depth_share)
+    return above(cameras, body.bbox, body.shape, draws, plane, depth_share, body.taper)
 
 
 def _depth_share(

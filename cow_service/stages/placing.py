@@ -93,6 +93,16 @@ def placed_before(grounding: Grounding, motion: Motion) -> tuple[Intervention, .
     return tuple(each for each in grounding.interventions if each.kind == "place" and each is not carried)
 
 
+def tapered(bodies: Sequence[SeenBody], put: Put | None, before: Sequence[Put]) -> tuple[SeenBody, ...]:
+    """The bodies; of those that something is put into, as wide at their lower end as their opening was measured."""
+    bottoms = {
+        each.targets[0]: each.opening.bottom
+        for each in (*before, *([] if put is None else [put]))
+        if each.opening is not None and not each.opening.foot_hidden
+    }
+    return tuple(replace(body, taper=bottoms.get(index, body.taper)) for index, body in enumerate(bodies))
+
+
 def _put(scene: Scene, placed: Intervention, body: int, bodies: Sequence[SeenBody]) -> Put:
     if placed.relation is None or not placed.targets:
         raise _nowhere(placed.object.object)

@@ -36,7 +36,15 @@ from cow_service.stages.paths import (
     tracks,
     with_times,
 )
-from cow_service.stages.placing import placed_before, placed_mover, placed_records, placement_of, put_before, put_of
+from cow_service.stages.placing import (
+    placed_before,
+    placed_mover,
+    placed_records,
+    placement_of,
+    put_before,
+    put_of,
+    tapered,
+)
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.shown import shown_bodies, was_put
@@ -76,7 +84,7 @@ def trajectory_of(
     before = put_before(scene, grounding, motion, bodies[:kept], led=free is not None)
     # People aim at what they ask about; where that is put elsewhere, not at its place in the image.
     asked_about = None if world.asked in [each.body for each in before] else world.asked
-    world = replace(world, put=put, put_before=before, asked=asked_about)
+    world = replace(world, bodies=tapered(world.bodies, put, before), put=put, put_before=before, asked=asked_about)
     tellable = query if known and query is not None and can_tell(query, kept, put is not None) else None
     if put is not None and asked is None:  # what is shown is what most worlds do
         tellable = Query(Asked(relation="inside"), put.targets[0])
