@@ -130,12 +130,13 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
 
 
 @contextmanager
-def serving(service: Service) -> Generator[str]:
-    """A server in a thread of this process, at the address of the settings; yields that address.
+def serving(service: Service, pool: WorkerPool | None = None) -> Generator[str]:
+    """A server in a thread of this process, at the address of the settings; yields that address. Jobs are computed by
+    the pool, where there is one.
 
     Raises the `CowError` for which the default request cannot be served, and `StorageUnavailable`.
     """
-    server, engine, readiness = _server(service, None)
+    server, engine, readiness = _server(service, pool)
     readiness.start()
     readiness.wait(LOAD_SECONDS)
     failures: list[CowError] = []

@@ -34,7 +34,7 @@ ALL_ARMS = (
 PICTURES_SHOWN = {"never": 1, "always": 4, "placebo-still": 4, "encounters": 1, "frames-only": 3, "oracle": 3}
 REPEATS = 2
 MODEL = "openai-api/local/fake"
-CONCURRENCY = 8  # of an arm, by default
+READ_WITHIN = 1.5  # seconds after a reply was sent: the first one loads what reads it
 
 
 @pytest.fixture(scope="module")
@@ -179,25 +179,25 @@ def test_killed_at_three_moments_no_reply_is_asked_for_twice(tmp_path: Path, ite
     kills: list[float] = []
     with truth_mllm(items, seconds=0.15) as mllm:
         for _ in range(3):
-            before = len(mllm.done)
+            wanted = len(mllm.done) + draws.randint(9, 14)
             process = subprocess.Popen(
                 command(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm),
                 cwd=tmp_path, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip
-            wanted = before + draws.randint(3, 10)
             deadline = time.monotonic() + 60
             while len(mllm.done) < wanted and time.monotonic() < deadline:
                 time.sleep(0.01)
             process.send_signal(signal.SIGKILL)
             process.wait()
             kills.append(time.monotonic())
-            assert before < len(mllm.done) < sum(whole.asked.values())
+            assert process.returncode == -signal.SIGKILL
+            assert len(mllm.done) >= wanted
         evaluated(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm)
         assert mllm.asked.keys() == whole.asked.keys()
         # Replies under way at a kill were lost; what came a moment before it may not have been read any more.
-        lost = Counter(key for key, begun, sent in mllm.done if any(begun < at < sent + 0.25 for at in kills))
-        assert sum(lost.values()) <= 3 * 2 * CONCURRENCY
-        assert mllm.asked - lost <= whole.asked, "what had come was not asked for again"
+        lost = Counter(key for key, begun, sent in mllm.done if any(begun < at < sent + READ_WITHIN for at in kills))
+        twice = mllm.asked - lost - whole.asked
+        assert not twice, [(kills, [each for each in mllm.done if each[0] == key]) for key in twice]
     for name in ("levels", "arms", "gains"):
         tables = [(tmp_path / run / "report" / "tables" / f"{name}.md").read_text() for run in ("whole", "killed")]
         assert tables[0] == tables[1]

@@ -26,6 +26,7 @@ from cow_service.evals.versions import versions
 
 # Providers that Inspect and the server in this process both know, and where both look for the key.
 KEYS = {"openai": "OPENAI_API_KEY", "anthropic": "ANTHROPIC_API_KEY", "google": "GOOGLE_API_KEY"}
+MAX_RETRIES = 6  # of a call of the multimodal LLM, about three minutes: then the question has failed
 EMBEDDED = "cow/embedded"  # who answers where no multimodal LLM is named
 _SAME = ("data_digest", "mllm", "ask", "seed", "settings")  # what a run that goes on has in common with its begin
 
@@ -167,6 +168,7 @@ def _ask(plan: Plan, info: RunInfo, items: Sequence[Item]) -> None:
                 max_connections=plan.concurrency,
                 max_tasks=len(info.arms),
                 max_tokens=plan.max_tokens,
+                max_retries=MAX_RETRIES,
                 display="none",
                 log_images=plan.log_images,
                 log_dir_allow_dirty=True,

@@ -76,12 +76,17 @@ def _server(folder: Path, url: str | None, settings: Mapping[str, Any]) -> Gener
         yield url
         return
     from cow_service.server import serving  # noqa: PLC0415 - where a server is named, none is imported
+    from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
     known = load_settings(data_dir=folder / SERVER, host="127.0.0.1", port=0, **settings)
     (folder / SERVER).mkdir(parents=True, exist_ok=True)
     with (folder / SERVER / LOG).open("a", encoding="utf-8") as log:
         logging.set_up(known, out=log, err=log)
-        with serving(Service(known)) as address:
+        service = Service(known)
+        pool = WorkerPool(known, service.metrics) if known.workers else None
+        if pool is not None:
+            pool.start()  # it computes in processes of its own: replies are read, and kept, as they come
+        with serving(service, pool) as address:
             yield address
         logging.set_up(known)
 
