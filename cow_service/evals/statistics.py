@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.stats import binomtest
+from scipy.stats import t as student_t
 
 from cow_service.evals.observations import Observation
 from cow_service.records import Record
 
 RESAMPLES = 10_000
-MIN_CLUSTERS = 4  # of fewer scenes nothing can be said: the interval is [-1, 1]
 CONFIDENCE = 0.95
 
 
@@ -120,7 +120,7 @@ def _spread(observations: Sequence[Observation], is_one: Callable[[Observation],
 def gain(arm: Sequence[Observation], baseline: Sequence[Observation], resamples: int = RESAMPLES) -> Gain | None:
     """Of an arm over a baseline; None where no question was replied to in both.
 
-    The interval is a bootstrap over scenes, studentized: with some forty scenes the plain percentiles are too narrow.
+    The interval is a bootstrap over scenes, studentized, and never narrower than few scenes allow.
     """
     pairs = _pairs(arm, baseline)
     if not pairs:
@@ -168,36 +168,41 @@ def _most(values: Iterable[bool]) -> bool:
 def bootstrap_interval(table: NDArray[np.float64], resamples: int = RESAMPLES) -> tuple[float, float]:
     """The 95% interval of a ratio of sums, from a table (clusters, 2) of numerators and denominators.
 
-    A bootstrap-t over clusters with the linearized standard error (Efron and Tibshirani 1993, section 12.5), and no
-    wider than [-1, 1]. The random numbers are fixed by the table.
+    A bootstrap-t over clusters with the linearized standard error (Efron and Tibshirani 1993, section 12.5), and at
+    least as wide as `_plus_two_interval`: of few clusters, or of nearly equal ones, a bootstrap sees too little. The
+    random numbers are fixed by the table.
     """
     count = len(table)
+    low, high = _plus_two_interval(table)
     total = table.sum(axis=0)
     ratio = total[0] / total[1]
     error = _standard_error(table, np.ones((1, count)), np.array([ratio]))[0]
-    if count < MIN_CLUSTERS:
-        return -1.0, 1.0
-    if error == 0:
-        return _unanimous_interval(float(ratio), count)
-    draws = np.random.default_rng(zlib.crc32(np.ascontiguousarray(table).tobytes()))
-    weights = draws.multinomial(count, np.full(count, 1 / count), size=resamples).astype(np.float64)
-    drawn = weights @ table
-    ratios = drawn[:, 0] / drawn[:, 1]
-    errors = _standard_error(table, weights, ratios)
-    usable = errors > 0
-    studentized = (ratios[usable] - ratio) / errors[usable]
-    edge = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(studentized, [1 - edge, edge])
-    return max(-1.0, float(ratio - low * error)), min(1.0, float(ratio - high * error))
+    if error > 0:
+        draws = np.random.default_rng(zlib.crc32(np.ascontiguousarray(table).tobytes()))
+        weights = draws.multinomial(count, np.full(count, 1 / count), size=resamples).astype(np.float64)
+        drawn = weights @ table
+        ratios = drawn[:, 0] / drawn[:, 1]
+        errors = _standard_error(table, weights, ratios)
+        usable = errors > 0
+        edge = (1 - CONFIDENCE) / 2
+        below, above = np.quantile((ratios[usable] - ratio) / errors[usable], [1 - edge, edge])
+        low, high = min(low, float(ratio - below * error)), max(high, float(ratio - above * error))
+    return max(-1.0, low), min(1.0, high)
 
 
-def _unanimous_interval(ratio: float, count: int) -> tuple[float, float]:
-    """Of clusters that all have the same ratio: with 95% confidence fewer than 3 in `count` of all others differ.
+def _plus_two_interval(table: NDArray[np.float64]) -> tuple[float, float]:
+    """A t interval after one cluster of mean size at -1 and one at 1 were added.
 
-    These may be at -1 or 1 (the rule of three, Hanley and Lippman-Hand 1983).
+    The same idea as for single shares (Agresti and Coull 1998). One cluster alone says nothing: [-1, 1].
     """
-    others = min(1.0, 3 / count)
-    return ratio - (1 + ratio) * others, ratio + (1 - ratio) * others
+    count, size = len(table), table[:, 1].mean()
+    if count < 2:
+        return -1.0, 1.0
+    more = np.vstack([table, [[size, size], [-size, size]]])
+    ratio = more[:, 0].sum() / more[:, 1].sum()
+    error = _standard_error(more, np.ones((1, count + 2)), np.array([ratio]))[0]
+    reach = float(student_t.ppf((1 + CONFIDENCE) / 2, count - 1)) * error
+    return float(ratio - reach), float(ratio + reach)
 
 
 def _standard_error(
