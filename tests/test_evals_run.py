@@ -249,6 +249,8 @@ def test_failures_are_kept_with_their_reason_and_retried_on_request(
         (("--subset", "physic"), "There is no subset 'physic'"),
         (("--ask", "answer", "--arm", "placebo-still"), "has no arm 'placebo-still'"),
         (("--url", "http://127.0.0.1:9"), "The server at http://127.0.0.1:9 cannot be asked"),
+        (("--reader", "embeded"), "--reader embeded: the server has only"),
+        (("--ask", "answer", "--temperature", "1"), "are for --ask prompt"),
         (("--prices", "nothing.yaml"), "The prices 'nothing.yaml' cannot be read"),
     ],
 )
@@ -260,9 +262,12 @@ def test_what_cannot_be_asked_is_refused_before_the_first_call(
     assert not mllm.asked
 
 
-def test_a_provider_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_provider_that_is_not_there_is_named_and_the_folder_stays_free(tmp_path: Path) -> None:
     done = evaluated(EXAMPLES, tmp_path / "run", "--mllm", "nobody/nothing", code=1)
     assert "--mllm nobody/nothing cannot be used" in done.stderr
+    assert not (tmp_path / "run" / "run.json").exists()
+    done = evaluated(EXAMPLES, tmp_path / "run", "--ask", "prompt", code=1)
+    assert "--ask prompt asks a multimodal LLM: name it with --mllm" in done.stderr
 
 
 def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path) -> None:

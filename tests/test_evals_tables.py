@@ -47,12 +47,8 @@ def test_the_figures_of_a_table_are_those_of_the_replies(asked: Run, summaries: 
     rows = {(row[0], row[1]): dict(zip(by_name["levels"].header, row, strict=True)) for row in by_name["levels"].rows}
     for arm in asked.info.arms:
         replies = [each for each in asked.of_arm(arm) if each.failure is None]
-        shares = [
-            sum(each.right for each in of_repeat) / len(of_repeat)
-            for repeat in (1, 2, 3)
-            if (of_repeat := [each for each in replies if each.repeat == repeat])
-        ]
-        assert rows[arm, "TPR"]["all"].startswith(f"{100 * sum(shares) / 3:.2f} ± ")
+        share = sum(each.right for each in replies) / len(replies)
+        assert rows[arm, "TPR"]["all"].startswith(f"{100 * share:.2f} ± ")
     assert rows["GPT-5 (paper)", "TPR"]["all"] == "54.17"
 
 

@@ -16,7 +16,6 @@ INSTALL = 'pip install "cow-service[evals]"'
 EXIT_SOME_FAILED = 3
 EXIT_INTERRUPTED = 130
 _OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair")
-MAX_FAULTS_SHOWN = 10
 
 
 class EvalsNotInstalled(CowError):
@@ -114,7 +113,8 @@ def run(
     """
     _check_installed()
     from cow_service.evals.layout import REPORT  # noqa: PLC0415
-    from cow_service.evals.run import Plan, evaluate  # noqa: PLC0415
+    from cow_service.evals.plan import Plan  # noqa: PLC0415
+    from cow_service.evals.run import evaluate  # noqa: PLC0415
 
     arms = [name.strip() for text in arm or ["never,always"] for name in text.split(",") if name.strip()]
     plan = Plan(
@@ -140,17 +140,19 @@ def run(
     )
     priced = _priced(prices)
     try:
-        done = evaluate(plan)
+        done = evaluate(plan, lambda told: typer.echo(printable(told), err=True))
     except KeyboardInterrupt:
         typer.echo("Interrupted. The same command goes on with it.", err=True)
         sys.stderr.flush()
         raise typer.Exit(EXIT_INTERRUPTED) from None
-    for told in (*done.info.notes, *done.info.faults[:MAX_FAULTS_SHOWN]):
-        typer.echo(printable(told), err=True)
     _report([done], out / REPORT, priced)
     failed = sum(each.failure is not None for each in done.observations)
     if failed:
         typer.echo(f"{failed} questions failed; the report says why. --retry-failed asks them again.", err=True)
+        raise typer.Exit(EXIT_SOME_FAILED)
+    unasked = len(done.items) * len(done.info.arms) * done.info.repeats - len(done.observations)
+    if unasked:
+        typer.echo(f"{unasked} questions were not asked. The same command goes on with it.", err=True)
         raise typer.Exit(EXIT_SOME_FAILED)
 
 

@@ -22,6 +22,8 @@ from cow_service.records import DIRECTED_KINDS, Motion, Simulation, Usage
 
 NO_USAGE = Usage()
 # What an image and a question may come to: nothing is imagined, and the question is asked without. All else is a fault.
+STEEP = 0.05  # of a unit vector
+_ENDS = ("distance", "duration", "until")
 REFUSALS = (CannotGround, CannotReadDirection, MllmBadReply)
 
 
@@ -117,7 +119,9 @@ def _facts(simulation: Simulation) -> tuple[str, ...]:
     """What a simulation found, in the words in which `/answer` tells it."""
     told: Any = hypothesis(Imagined(simulation, ()))
     found = tuple(told["facts"]) + tuple(told["encounters"])
-    return found or (("The moving object meets nothing.",) if told["encounters_known"] else ())
+    return found or (
+        "The moving object meets nothing." if told["encounters_known"] else "It is not known what it meets.",
+    )
 
 
 def _opposite(simulation: Simulation) -> dict[str, Any]:
@@ -130,8 +134,11 @@ def _opposite(simulation: Simulation) -> dict[str, Any]:
         wrong: dict[str, Any] = {"kind": "linear", "direction": (1.0, 0.0)}
     elif motion.kind in DIRECTED_KINDS and motion.direction is not None:
         right, down = motion.direction
+        if motion.kind == "projectile" and abs(right) < STEEP and abs(motion.depth) < STEEP:
+            raise CannotReadDirection("What is thrown straight up or down has no opposite direction.")
         wrong = {"kind": motion.kind, "direction": (-right, down if motion.kind == "projectile" else -down)}
-        wrong["depth"] = -motion.depth
+        wrong |= {"depth": -motion.depth, "speed": motion.speed}
+        wrong |= {name: value for name in _ENDS if (value := getattr(motion, name)) is not None}
     else:
         raise CannotReadDirection(f"A {motion.kind} motion has no direction, so there is no wrong one.")
     return {"motion": wrong}

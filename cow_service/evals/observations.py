@@ -81,4 +81,11 @@ class RunInfo(Record):
     settings: dict[str, Any] = Field(description="Frames, reader, generator, generation settings.")
     versions: dict[str, str] = Field(description="Of the packages and prompts.")
     rounds: int = Field(default=0, description="How often what had failed was asked again.")
+    token: str = Field(default="", description="Random: names the requests and replies of the run.")
     created_at: str = Field(description="RFC 3339, UTC.")
+
+    @property
+    def baseline_key(self) -> tuple[Any, ...]:
+        """What two runs have in common whose replies may be compared."""
+        generation: Any = self.settings.get("generation")
+        return self.data_digest, self.mllm, self.ask, self.seed, generation

@@ -7,6 +7,7 @@ import hashlib
 import random
 import re
 from collections.abc import Sequence
+from itertools import permutations
 
 from cow_service.evals.items import Item
 from cow_service.readers.mllm.answer import read_answer
@@ -24,15 +25,26 @@ DIFFERENCES = (
 )
 # What stands behind the word "answer" and a colon, up to the next quotation mark.
 _ANNOUNCED = re.compile(r"""["']?[Aa]nswer["']?\s*:\s*["']?([^"']+)""")
+MOST_LISTED = 5  # options, of which all orders are listed
 _PAPER_FORMS = tuple(map(re.compile, (r"\(([a-j])\)", r"^([a-j])$", r"([a-j])\.", r"^([a-j])\)")))
 
 
 def order_of(item: Item, seed: int, repeat: int) -> tuple[int, ...]:
-    """The order in which the options are shown: the same in every arm, another one in another repeat."""
-    digest = hashlib.sha256(f"{seed}\n{item.id}\n{repeat}".encode()).digest()
-    places = list(range(len(item.options)))
-    random.Random(int.from_bytes(digest, "big")).shuffle(places)
-    return tuple(places)
+    """The order in which the options are shown: the same in every arm, and another one in every repeat.
+
+    Up to five options go through all their orders before one comes again.
+    """
+    places = range(len(item.options))
+    if len(places) > MOST_LISTED:
+        return tuple(_draws(seed, item.id, str(repeat)).sample(places, len(places)))
+    orders = list(permutations(places))
+    _draws(seed, item.id).shuffle(orders)
+    return orders[(repeat - 1) % len(orders)]
+
+
+def _draws(*parts: object) -> random.Random:
+    digest = hashlib.sha256("\n".join(map(str, parts)).encode()).digest()
+    return random.Random(int.from_bytes(digest, "big"))
 
 
 def shown_options(item: Item, order: Sequence[int]) -> tuple[AnswerOption, ...]:

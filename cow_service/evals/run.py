@@ -2,128 +2,62 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import rich
 
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
-from cow_service.evals.arms import Arm, check_arms
+from cow_service.evals.arms import check_arms
 from cow_service.evals.items import Item
 from cow_service.evals.layout import CACHE, LOGS, PICTURES
-from cow_service.evals.loaders import digest_of, load
-from cow_service.evals.observations import Ask, RunInfo
+from cow_service.evals.loaders import load
+from cow_service.evals.observations import RunInfo
 from cow_service.evals.pictures import Pictures
+from cow_service.evals.plan import Plan, check_plan, info_of, merged, server_settings
 from cow_service.evals.runs import Run, read_info, read_run, write_run
-from cow_service.evals.versions import versions
 
-# Providers that Inspect and the server in this process both know, and where both look for the key.
-KEYS = {"openai": "OPENAI_API_KEY", "anthropic": "ANTHROPIC_API_KEY", "google": "GOOGLE_API_KEY"}
 MAX_RETRIES = 6  # of a call of the multimodal LLM, about three minutes: then the question has failed
-EMBEDDED = "cow/embedded"  # who answers where no multimodal LLM is named
-_SAME = ("data_digest", "mllm", "ask", "seed", "settings")  # what a run that goes on has in common with its begin
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What the caller wants."""
-
-    data: str
-    out: Path
-    mllm: str | None = None  # as Inspect names models; None: the service's own reader answers
-    ask: Ask = "prompt"
-    arms: Sequence[str] = ("never", "always")
-    repeats: int = 1
-    subsets: Sequence[str] = ()
-    limit: int | None = None
-    seed: int = 0
-    reader: str | None = None
-    generator: str | None = None
-    url: str | None = None
-    base_url: str | None = None  # of the multimodal LLM
-    temperature: float | None = None
-    max_tokens: int | None = None
-    concurrency: int = 8
-    skip_faulty: bool = False
-    retry_failed: bool = False
-    log_images: bool = True
-
-
-def evaluate(plan: Plan) -> Run:
+def evaluate(plan: Plan, tell: Callable[[str], None]) -> Run:
     """Asks everything that the folder has no reply to yet; returns all of it.
 
-    All is checked before the first question is asked. Raises `InvalidRequest` for data, arms and settings that cannot
-    be asked, and the `CowError` for which no server can be used.
+    All is checked before the first question is asked; `tell` is told what was found in the data. Raises
+    `InvalidRequest` for data, arms and settings that cannot be asked, `StorageUnavailable` for a folder that cannot be
+    written, and the `CowError` for which no server can be used.
     """
-    found, items = _items(plan)
+    check_plan(plan)
+    pictures = _pictures(plan.out)
+    found = load(plan.data, pictures, subsets=plan.subsets, skip_faulty=plan.skip_faulty)
+    items = found.items[: plan.limit]
     arms = check_arms(plan.arms, plan.ask, items)
-    info = _info(plan, items, tuple(found.faults), tuple(found.notes), arms)
-    info = _merged(read_info(plan.out), info, again=plan.retry_failed)
+    for told in (*found.notes, *found.faults):
+        tell(told)
+    settings, model = server_settings(plan), _model(plan)
+    wanted = info_of(plan, items, found, arms)
     _prepare_inspect(plan.out)
+    again = plan.retry_failed and _forget_failures(plan.out / LOGS) > 0
+    info = merged(read_info(plan.out), wanted, again=again)
     write_run(plan.out, info, items)
-    _ask(plan, info, items)
+    _ask(plan, info, items, model, settings)
     return read_run(plan.out)
 
 
-def _items(plan: Plan) -> tuple[Any, list[Item]]:
+def _pictures(out: Path) -> Pictures:
     try:
-        pictures = Pictures(plan.out / PICTURES)
-        found = load(plan.data, pictures, subsets=plan.subsets, skip_faulty=plan.skip_faulty)
+        return Pictures(out / PICTURES)
     except OSError as error:
-        raise StorageUnavailable(f"'{plan.out}' cannot be written: {error.strerror or error}.") from error
-    return found, found.items[: plan.limit]
+        raise StorageUnavailable(f"'{out}' cannot be written: {error.strerror or error}.") from error
 
 
-def _info(
-    plan: Plan, items: Sequence[Item], faults: tuple[str, ...], notes: tuple[str, ...], arms: Sequence[Arm]
-) -> RunInfo:
-    from cow_service.evals.tasks import MAX_TOKENS, request_options  # noqa: PLC0415 - Inspect takes a second to import
+def _forget_failures(logs: Path) -> int:
+    from cow_service.evals.logs import forget_failures  # noqa: PLC0415 - Inspect takes a second to import
 
-    counts = Counter(f"{item.task} {item.level}" for item in items)
-    settings: dict[str, Any] = {"requests": request_options(plan.reader, plan.generator)}
-    if plan.mllm is not None:
-        settings["generation"] = {"temperature": plan.temperature, "max_tokens": plan.max_tokens or MAX_TOKENS}
-    return RunInfo(
-        data=plan.data,
-        data_digest=digest_of(items),
-        counts=dict(sorted(counts.items())),
-        faults=faults,
-        notes=notes,
-        mllm=plan.mllm or EMBEDDED,
-        ask=plan.ask,
-        arms=tuple(arm.name for arm in arms),
-        repeats=plan.repeats,
-        seed=plan.seed,
-        settings=settings,
-        versions=versions(),
-        created_at=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
-
-
-def _merged(before: RunInfo | None, wanted: RunInfo, *, again: bool) -> RunInfo:
-    """A run that goes on, with more arms or repeats perhaps. Raises `InvalidRequest` where the rest is not the same."""
-    if before is None:
-        return wanted
-    for name in _SAME:
-        was, is_now = getattr(before, name), getattr(wanted, name)
-        if was != is_now:
-            raise InvalidRequest(
-                f"The folder holds a run with another {name.replace('_', ' ')} ({was}, not {is_now}): give --out "
-                "another folder, or the same arguments as before."
-            )
-    arms = (*before.arms, *(arm for arm in wanted.arms if arm not in before.arms))
-    # Under the key of an earlier round a failed job would only be found again.
-    rounds = before.rounds + again
-    repeats = max(before.repeats, wanted.repeats)
-    merged = {"arms": arms, "repeats": repeats, "versions": wanted.versions, "rounds": rounds}
-    return before.model_copy(update=merged)
+    return forget_failures(logs) if logs.is_dir() else 0
 
 
 def _prepare_inspect(out: Path) -> None:
@@ -131,28 +65,24 @@ def _prepare_inspect(out: Path) -> None:
     os.environ["INSPECT_CACHE_DIR"] = str((out / CACHE).resolve())
 
 
-def _ask(plan: Plan, info: RunInfo, items: Sequence[Item]) -> None:
+def _ask(plan: Plan, info: RunInfo, items: Sequence[Item], model: Any, settings: dict[str, Any]) -> None:
     """Asks what there is no reply to yet. Raises the `CowError` for which that cannot begin."""
     from inspect_ai import Epochs, eval_set  # noqa: PLC0415
-    from inspect_ai.model import get_model  # noqa: PLC0415
 
-    from cow_service.evals.logs import forget_failures, read_observations  # noqa: PLC0415
+    from cow_service.evals.logs import read_observations  # noqa: PLC0415
     from cow_service.evals.progress import Count, Progress, shown  # noqa: PLC0415
     from cow_service.evals.session import session  # noqa: PLC0415
     from cow_service.evals.tasks import causalspatial, prepared  # noqa: PLC0415
 
     logs = plan.out / LOGS
     logs.mkdir(exist_ok=True)
-    model = _model(plan, get_model)
-    if plan.retry_failed:
-        forget_failures(logs)
     progress = Progress({arm: Count(len(items) * info.repeats) for arm in info.arms})
     progress.add_earlier([each for each in read_observations(logs) if not (plan.retry_failed and each.failure)])
     if not progress.left:
         return
-    key = hashlib.sha256(f"{info.created_at} {info.data_digest} {info.mllm} {info.rounds}".encode()).hexdigest()
-    with session(plan.out, plan.url, info.settings["requests"], key, **_server_settings(plan)) as shared:
-        _check_server(shared.url)
+    keys = f"{info.token} {info.rounds}", info.token
+    with session(plan.out, plan.url, info.settings["requests"], *keys, **settings) as shared:
+        _check_server(shared.url, plan)
         with prepared(items), shown(progress), _quiet_inspect():
             _, ended = eval_set(
                 tasks=[
@@ -191,8 +121,10 @@ def _quiet_inspect() -> Generator[None]:
         console.quiet = before
 
 
-def _model(plan: Plan, get_model: Any) -> Any:
+def _model(plan: Plan) -> Any:
     """The model of Inspect that answers. Raises `InvalidRequest` where its provider cannot be used."""
+    from inspect_ai.model import get_model  # noqa: PLC0415
+
     if plan.ask == "answer":
         return get_model("none/none")
     try:
@@ -202,27 +134,22 @@ def _model(plan: Plan, get_model: Any) -> Any:
         raise InvalidRequest(f"--mllm {plan.mllm} cannot be used: {error}") from error
 
 
-def _server_settings(plan: Plan) -> dict[str, Any]:
-    """Settings of the server in this process: its readers ask the same multimodal LLM, where that can be."""
-    if plan.url is not None or plan.ask == "prompt" or plan.mllm is None:
-        return {}
-    provider, _, name = plan.mllm.partition("/")
-    if provider not in KEYS:
-        raise InvalidRequest(
-            f"The server in this process cannot ask '{plan.mllm}': start `cow serve` with COW_MLLM, and give its --url."
-        )
-    key = os.environ.get("COW_MLLM_API_KEY") or os.environ.get(KEYS[provider])
-    named = {"mllm": f"{provider}:{name}", "mllm_base_url": plan.base_url, "mllm_api_key": key}
-    return {**named, "reader": plan.reader or "mllm"}
-
-
-def _check_server(url: str) -> None:
-    """Raises the `CowError` for which the server cannot be asked."""
+def _check_server(url: str, plan: Plan) -> None:
+    """Raises the `CowError` for which the server cannot be asked, or not so."""
     from cow_service.client import Client  # noqa: PLC0415
 
     try:
         with Client(url, retries=0) as client:
-            client.models()
+            models = client.models()
     except CowError as error:
         error.detail = f"The server at {url} cannot be asked. {error.detail}"
         raise
+    for option, name, known in (
+        ("reader", plan.reader, models.readers),
+        ("generator", plan.generator, models.generators),
+    ):
+        backend = next((each for each in known if each.name == name), None)
+        if name is not None and backend is None:
+            raise InvalidRequest(f"--{option} {name}: the server has only {', '.join(each.name for each in known)}.")
+        if backend is not None and backend.missing:
+            raise InvalidRequest(f"--{option} {name} is not ready: the server lacks {', '.join(backend.missing)}.")

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from cow_service.errors import InvalidRequest
 from cow_service.evals.items import Item
 from cow_service.evals.layout import ITEMS, LOGS, RUN
@@ -36,9 +38,12 @@ def write_run(folder: Path, info: RunInfo, items: Iterable[Item]) -> None:
 
 
 def read_info(folder: Path) -> RunInfo | None:
-    """What a folder was asked; None where no run was begun in it."""
+    """What a folder was asked; None where no run was begun in it. Raises `InvalidRequest` for one that is damaged."""
     path = folder / RUN
-    return RunInfo.model_validate_json(path.read_bytes()) if path.is_file() else None
+    try:
+        return RunInfo.model_validate_json(path.read_bytes()) if path.is_file() else None
+    except (ValidationError, OSError) as error:
+        raise _unreadable(folder, RUN, error) from error
 
 
 def read_run(folder: Path) -> Run:
@@ -46,8 +51,16 @@ def read_run(folder: Path) -> Run:
     info = read_info(folder)
     if info is None:
         raise InvalidRequest(f"'{folder}' holds no {RUN}: name the folder that `cow eval --out` wrote.")
-    lines = (folder / ITEMS).read_bytes().splitlines()
-    items = {item.id: item for item in map(Item.model_validate_json, lines)}
+    try:
+        lines = (folder / ITEMS).read_bytes().splitlines()
+        items = {item.id: item for item in map(Item.model_validate_json, lines)}
+    except (ValidationError, OSError) as error:
+        raise _unreadable(folder, ITEMS, error) from error
     from cow_service.evals.logs import read_observations  # noqa: PLC0415 - Inspect takes a second to import
 
     return Run(folder, info, items, tuple(read_observations(folder / LOGS)))
+
+
+def _unreadable(folder: Path, name: str, error: Exception) -> InvalidRequest:
+    reason = str(error).splitlines()[0]
+    return InvalidRequest(f"'{folder}' holds no whole run: {name} cannot be read ({reason}). Run `cow eval` again.")

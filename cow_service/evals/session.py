@@ -28,7 +28,8 @@ class Session:
 
     url: str
     pictures: Pictures
-    key: str  # of the run
+    key: str  # of the run and its round: names its requests
+    reply_key: str  # of the run: names its replies
     options: Mapping[str, Any]  # fields of the requests for simulations and answers
     _clients: dict[int, tuple[AsyncClient, Imagination]] = field(default_factory=dict)
 
@@ -52,13 +53,15 @@ _active: list[Session] = []
 
 
 @contextmanager
-def session(folder: Path, url: str | None, options: Mapping[str, Any], key: str, **settings: Any) -> Generator[Session]:
+def session(
+    folder: Path, url: str | None, options: Mapping[str, Any], key: str, reply_key: str, **settings: Any
+) -> Generator[Session]:
     """The session of all tasks that run meanwhile. Without an address, a server runs in this process meanwhile.
 
     Raises the `CowError` for which that server cannot be started.
     """
     with _server(folder, url, settings) as address:
-        _active.append(Session(address, Pictures(folder / PICTURES), key, options))
+        _active.append(Session(address, Pictures(folder / PICTURES), key, reply_key, options))
         try:
             yield _active[-1]
         finally:
@@ -84,11 +87,15 @@ def _server(folder: Path, url: str | None, settings: Mapping[str, Any]) -> Gener
         logging.set_up(known, out=log, err=log)
         service = Service(known)
         pool = WorkerPool(known, service.metrics) if known.workers else None
-        if pool is not None:
-            pool.start()  # it computes in processes of its own: replies are read, and kept, as they come
-        with serving(service, pool) as address:
-            yield address
-        logging.set_up(known)
+        try:
+            if pool is not None:
+                pool.start()  # it computes in processes of its own: replies are read, and kept, as they come
+            with serving(service, pool) as address:
+                yield address
+        finally:
+            if pool is not None:
+                pool.close()
+            logging.set_up(known)
 
 
 def own_folder() -> Path:

@@ -22,7 +22,7 @@ CONFIDENCE = 0.95
 
 
 class Spread(Record):
-    """A share of questions: the mean over repeats, and their standard deviation (one repeat has none)."""
+    """A share of replies, and the standard deviation of those of the repeats (one repeat has none)."""
 
     mean: float
     sd: float | None
@@ -109,12 +109,14 @@ def rates(observations: Sequence[Observation]) -> Rates | None:
 
 
 def _spread(observations: Sequence[Observation], is_one: Callable[[Observation], bool]) -> Spread:
-    """Of the shares of the repeats."""
+    """The share of all replies, and the deviation of the shares of the repeats."""
     by_repeat: dict[int, list[bool]] = defaultdict(list)
     for each in observations:
         by_repeat[each.repeat].append(is_one(each))
     shares = [statistics.fmean(values) for values in by_repeat.values()]
-    return Spread(mean=statistics.fmean(shares), sd=statistics.stdev(shares) if len(shares) > 1 else None)
+    return Spread(
+        mean=statistics.fmean(map(is_one, observations)), sd=statistics.stdev(shares) if len(shares) > 1 else None
+    )
 
 
 def gain(arm: Sequence[Observation], baseline: Sequence[Observation], resamples: int = RESAMPLES) -> Gain | None:

@@ -6,7 +6,6 @@ import atexit
 import secrets
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any
 
 from inspect_ai import Epochs, Task, task
 from inspect_ai.dataset import MemoryDataset, Sample
@@ -22,21 +21,20 @@ from cow_service.evals.conversation import conversation
 from cow_service.evals.items import Item, question_text
 from cow_service.evals.loaders import CAUSALSPATIAL, load
 from cow_service.evals.observations import Ask, Observation
+from cow_service.evals.plan import MAX_TOKENS, request_options
 from cow_service.evals.progress import count
 from cow_service.evals.replies import order_of
 from cow_service.evals.session import Session, active_session, own_folder, session
 from cow_service.readers.prompts import load_prompt
 
 ITEM, OBSERVATION = "item", "observation"  # where a sample holds them
-MAX_TOKENS = 8192  # of a reply, as in the paper
-FRAMES = {"policy": "initial", "count": 3, "max_side": 512}  # frames 1, 3, 5, as in the paper
 
 
 @task
 def causalspatial(
     data: str = CAUSALSPATIAL,
     arm: str = "always",
-    subsets: str = "",
+    subsets: str | list[str] = "",
     ask: Ask = "prompt",
     repeats: int = 1,
     seed: int = 0,
@@ -68,7 +66,7 @@ def prepared(items: Sequence[Item]) -> Generator[None]:
 
 
 def _loaded(
-    data: str, subsets: str, limit: int | None, url: str | None, reader: str | None, generator: str | None
+    data: str, subsets: str | list[str], limit: int | None, url: str | None, reader: str | None, generator: str | None
 ) -> Sequence[Item]:
     """The items of a data set, with the session of the first task of the process."""
     shared = active_session()
@@ -76,14 +74,9 @@ def _loaded(
         stack = ExitStack()
         atexit.register(stack.close)
         options = request_options(reader, generator)
-        shared = stack.enter_context(session(own_folder(), url, options, secrets.token_hex(8)))
-    return load(data, shared.pictures, subsets=[part for part in subsets.split(",") if part]).items[:limit]
-
-
-def request_options(reader: str | None, generator: str | None) -> dict[str, Any]:
-    """The fields of requests for simulations."""
-    named = {"reader": reader, "generator": generator}
-    return {"frames": dict(FRAMES), **{name: value for name, value in named.items() if value is not None}}
+        shared = stack.enter_context(session(own_folder(), url, options, *[secrets.token_hex(8)] * 2))
+    named = subsets.split(",") if isinstance(subsets, str) else subsets
+    return load(data, shared.pictures, subsets=[part.strip() for part in named if part.strip()]).items[:limit]
 
 
 def arm_task(items: Sequence[Item], arm: Arm, ask: Ask, repeats: int, seed: int) -> Task:
@@ -144,7 +137,7 @@ def _asking(ask: Ask) -> Asking:
     shared = _shared()
     if ask == "answer":
         return ByAnswer(shared.client(), shared.pictures, shared.options, shared.key)
-    return ByPrompt(get_model(), shared.imagination(), shared.pictures, shared.key)
+    return ByPrompt(get_model(), shared.imagination(), shared.pictures, shared.reply_key)
 
 
 @scorer(metrics={"right": [mean(), std()], "abstained": [mean()], "unreadable": [mean()]})

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cow_service.errors import InvalidRequest
 from cow_service.evals.loaders.causalspatial import SUBSETS, load_causalspatial, subset_shards
-from cow_service.evals.loaders.collecting import Collected, collect, digest_of, refuse_faults
+from cow_service.evals.loaders.collecting import Collected, collect, digest_of, refuse_broken, refuse_faults
 from cow_service.evals.loaders.hub import CAUSALSPATIAL, download, is_hub_name
 from cow_service.evals.loaders.rows import RowFault
 from cow_service.evals.loaders.scenes import scene_folders, scene_rows
@@ -22,7 +22,7 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
 
     `data` is a folder or a file, or the name of a data set of the Hugging Face hub. Rows that cannot be asked raise
     `InvalidRequest`, which names them; with `skip_faulty` they are left out, and so they are of data in CausalSpatial's
-    layout, whose published rows cannot be mended here.
+    layout, whose published rows cannot be mended here. A file that was cut off is refused always.
     """
     unknown = [subset for subset in subsets if subset not in SUBSETS]
     if unknown:
@@ -31,6 +31,10 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
     if not path.exists() and is_hub_name(data):
         path = download(data)
     found, published = _found(path, data, subsets or SUBSETS, pictures, skip_faulty)
+    refuse_broken(found)
+    absent = [subset for subset in subsets if published and not subset_shards(path, [subset])]
+    if absent:
+        raise InvalidRequest(f"'{data}' has no subset '{absent[0]}': a folder of that name with Parquet files.")
     if not skip_faulty and not published:
         refuse_faults(found)
     if not found.items:

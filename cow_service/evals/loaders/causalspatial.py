@@ -15,7 +15,7 @@ from typing import Any, Literal
 from cow_service.evals.items import REAL, Item
 from cow_service.evals.loaders.collecting import Collected, collect
 from cow_service.evals.loaders.parquet import parquet_rows
-from cow_service.evals.loaders.rows import Row, RowFault
+from cow_service.evals.loaders.rows import FileFault, Row, RowFault
 from cow_service.evals.loaders.scenes import oracle_frames
 from cow_service.evals.pictures import Pictures
 
@@ -50,8 +50,8 @@ def _rows(folder: Path, subsets: Sequence[str], abstaining: dict[str, str]) -> I
                     if isinstance(row, Row) and fields.get("not_sure"):
                         abstaining[row.id] = str(fields["not_sure"]).strip("() .").upper()[:1]
                     yield row
-            except RowFault as fault:
-                yield RowFault(f"{subset}/{fault}")
+            except FileFault as fault:
+                yield FileFault(f"{subset}/{fault}")
 
 
 def _row(folder: Path, subset: str, unique: str, place: str, fields: dict[str, Any]) -> Row | RowFault:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from cow_service.errors import InvalidRequest
 from cow_service.evals.items import Item, question_text
-from cow_service.evals.loaders.rows import Row, RowFault, item_of
+from cow_service.evals.loaders.rows import FileFault, Row, RowFault, item_of
 from cow_service.evals.pictures import Pictures
 
 MAX_SHOWN = 20
@@ -20,6 +20,7 @@ class Collected:
 
     items: list[Item] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)  # a row each, with its place: what is left out
+    broken: list[str] = field(default_factory=list)  # files that cannot be read to their end
     notes: list[str] = field(default_factory=list)  # what was found and worked around
 
 
@@ -29,6 +30,9 @@ def collect(rows: Iterable[Row | RowFault], pictures: Pictures, *, repeated_rows
     asked: dict[tuple[str, str], Item] = {}
     by_id: dict[str, Item] = {}
     for row in rows:
+        if isinstance(row, FileFault):
+            found.broken.append(str(row))
+            continue
         if isinstance(row, RowFault):
             found.faults.append(str(row))
             continue
@@ -51,6 +55,12 @@ def collect(rows: Iterable[Row | RowFault], pictures: Pictures, *, repeated_rows
     if repeated_rows and len(asked) < len(found.items):
         found.notes.append(f"{len(found.items) - len(asked)} rows ask the same of the same picture as another row.")
     return found
+
+
+def refuse_broken(found: Collected) -> None:
+    """Raises `InvalidRequest` that names every file that cannot be read to its end: rows are missing."""
+    if found.broken:
+        raise InvalidRequest("\n".join(found.broken[:MAX_SHOWN]) + ".")
 
 
 def refuse_faults(found: Collected) -> None:

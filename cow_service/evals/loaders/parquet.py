@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from cow_service.evals.loaders.rows import RowFault
+from cow_service.evals.loaders.rows import FileFault
 
 _AT_ONCE = 64  # rows: a row may hold a picture of a megabyte
 
 
 def parquet_rows(path: Path) -> Iterator[dict[str, Any]]:
-    """The rows of a file. Raises `RowFault` for a file that is none, or is not whole."""
+    """The rows of a file. Raises `FileFault` for a file that is none, or is not whole."""
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
@@ -21,4 +21,4 @@ def parquet_rows(path: Path) -> Iterator[dict[str, Any]]:
             for batch in file.iter_batches(batch_size=_AT_ONCE):
                 yield from batch.to_pylist()
     except (pa.ArrowException, OSError) as error:
-        raise RowFault(f"{path.name}: no whole Parquet file ({str(error).splitlines()[0]}); get it again") from error
+        raise FileFault(f"{path.name}: no whole Parquet file ({str(error).splitlines()[0]}); get it again") from error

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
 
 from cow_service.errors import CowError
 from cow_service.evals.items import TASKS, UNKNOWN_LEVEL, Item, Task
@@ -20,6 +23,10 @@ _TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **
 
 class RowFault(ValueError):
     """Why a row cannot be asked; its text says what is wrong with which value."""
+
+
+class FileFault(RowFault):
+    """Why a file cannot be read to its end: rows are missing, and nobody knows how many."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +51,7 @@ def item_of(row: Row, pictures: Pictures) -> Item:
     parts, options = _wording(row)
     image = _picture(row.image, "image", pictures)
     abstain = not_sure_option(options)
-    return Item(
+    return _checked(
         id=row.id,
         row=row.place,
         source_id=row.source_id,
@@ -58,6 +65,14 @@ def item_of(row: Row, pictures: Pictures) -> Item:
         scene=row.scene or image,
         oracle=tuple(_picture(each, "oracle frame", pictures) for each in row.oracle),
     )
+
+
+def _checked(**fields: Any) -> Item:
+    try:
+        return Item(**fields)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise RowFault(f"`{'.'.join(map(str, first['loc']))}` cannot be used: {first['msg']}") from error
 
 
 def task_of(name: str | None) -> Task:

@@ -35,9 +35,9 @@ def scene_rows(folder: Path) -> Iterator[Row | RowFault]:
             source_id=str(meta.get("id") or scene.name),
             image=image.read_bytes() if image.is_file() else None,
             question=meta["question"],
-            answer=meta.get("answer"),
-            task=meta.get("task"),
-            level=meta.get("level"),
+            answer=str(meta.get("answer") or ""),
+            task=str(meta.get("task") or ""),
+            level=str(meta["level"]) if meta.get("level") is not None else None,
             scene=scene.name,
             oracle=oracle_frames(scene),
         )

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cow_service.evals.loaders.parquet import parquet_rows
-from cow_service.evals.loaders.rows import Row, RowFault
+from cow_service.evals.loaders.rows import FileFault, Row, RowFault
 from cow_service.evals.wording import LETTERS
 
 # What a column means, by its names; those of VLMEvalKit are among them.
@@ -33,14 +33,18 @@ _URL = ("http://", "https://")
 _NAMES = {name: column for column, names in COLUMNS.items() for name in names}
 _LONGEST_PATH = 1024  # characters; what is longer is base64
 
-Numbered = tuple[str, dict[str, Any]]  # where a row stands, and its fields
+Numbered = tuple[str, dict[str, Any]] | RowFault  # where a row stands, and its fields; or why it has none
 
 
 def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Row | RowFault]:
     """The rows of a file. Columns that mean nothing are faults, unless they are ignored."""
     told: set[str] = set()
     try:
-        for place, fields in READERS[path.suffix.lower()](path):
+        for numbered in READERS[path.suffix.lower()](path):
+            if isinstance(numbered, RowFault):
+                yield numbered
+                continue
+            place, fields = numbered
             unknown = [name for name in fields if not _is_known(name)]
             if unknown and not ignore_columns:
                 for name in (name for name in unknown if name not in told):
@@ -81,7 +85,7 @@ def _row(path: Path, place: str, fields: dict[str, Any]) -> Row | RowFault:
         question=str(values["question"]),
         answer=str(values["answer"]),
         options=options,
-        task=values.get("task"),
+        task=None if values.get("task") is None else str(values["task"]),
         level=None if values.get("level") is None else str(values["level"]),
         scene=None if values.get("scene") is None else str(values["scene"]),
     )
@@ -98,8 +102,10 @@ def _options(given: Any, fields: dict[str, Any]) -> list[str] | None:
         if not isinstance(given, list):
             raise RowFault(f"`options` must be a list, got {type(given).__name__}")
         return [str(text) for text in given]
-    lettered = [str(fields[letter]) for letter in LETTERS if fields.get(letter) not in (None, "")]
-    return lettered or None
+    filled = [letter for letter in LETTERS if fields.get(letter) not in (None, "")]
+    if "".join(filled) != LETTERS[: len(filled)]:
+        raise RowFault(f"the options {', '.join(filled)} leave a letter out")
+    return [str(fields[letter]) for letter in filled] or None
 
 
 def _image(given: Any, folder: Path) -> bytes:
@@ -133,10 +139,12 @@ def _json_lines(path: Path) -> Iterator[Numbered]:
         try:
             fields = json.loads(line)
         except ValueError as error:
-            raise RowFault(f"{place}: no JSON ({error}); was the file written to its end?") from error
-        if not isinstance(fields, dict):
-            raise RowFault(f"{place}: must be an object, got {type(fields).__name__}")
-        yield place, fields
+            yield RowFault(f"{place}: no JSON ({error}); was the file written to its end?")
+            continue
+        if isinstance(fields, dict):
+            yield place, fields
+        else:
+            yield RowFault(f"{place}: must be an object, got {type(fields).__name__}")
 
 
 def _separated(delimiter: str) -> Callable[[Path], Iterator[Numbered]]:
@@ -158,14 +166,14 @@ def _numbered(path: Path, reader: Iterable[list[str]]) -> Iterator[Numbered]:
                 names = [name.strip() for name in cells]
                 continue
             if cells and len(cells) != len(names):
-                raise RowFault(
+                yield RowFault(
                     f"{path.name}, row {number}: has {len(cells)} cells for {len(names)} columns; was the file written "
                     "to its end?"
                 )
-            if cells:
+            elif cells:
                 yield f"{path.name}, row {number}", dict(zip(names, cells, strict=True))
     except (csv.Error, UnicodeDecodeError) as error:
-        raise RowFault(f"{path.name}, row {number + 1}: {error}; was the file written to its end?") from error
+        raise FileFault(f"{path.name}, row {number + 1}: {error}; was the file written to its end?") from error
 
 
 def _parquet(path: Path) -> Iterator[Numbered]:

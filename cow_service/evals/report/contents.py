@@ -144,23 +144,34 @@ def costs(summaries: Sequence[ArmSummary]) -> Table:
 
 def pairs(runs: Sequence[Run], summaries: Sequence[ArmSummary]) -> Table:
     """Every question and repeat, with what each arm chose; for further analysis."""
-    chosen = {(run, each.arm, each.item, each.repeat): each for run, of in enumerate(runs) for each in of.observations}
-    places = {
-        (each.item, each.repeat): each for of in runs for each in sorted(of.observations, key=lambda one: one.repeat)
+    chosen = {
+        (run, each.arm, of.info.data_digest, each.item, each.repeat): each
+        for run, of in enumerate(runs)
+        for each in of.observations
     }
+    places = {(of.info.data_digest, each.item, each.repeat): each for of in runs for each in of.observations}
     rows: list[tuple[str, ...]] = []
-    for (item, repeat), each in sorted(places.items()):
-        found = [chosen.get((one.run, one.arm, item, repeat)) for one in summaries]
+    for (data, item, repeat), each in sorted(places.items(), key=lambda place: place[0]):
+        found = [chosen.get((one.run, one.arm, data, item, repeat)) for one in summaries]
         told = [(NONE, NONE) if one is None else (one.read or NONE, str(int(one.right))) for one in found]
         told = [
             (NONE, NONE) if one is not None and one.failure is not None else shown
             for one, shown in zip(found, told, strict=True)
         ]
         rows.append(
-            (item, each.task, each.level, each.scene, str(repeat), each.truth, *(t for two in told for t in two))
+            (
+                data[:12],
+                item,
+                each.task,
+                each.level,
+                each.scene,
+                str(repeat),
+                each.truth,
+                *(t for two in told for t in two),
+            )
         )
     columns = tuple(f"{each.name}: {what}" for each in summaries for what in ("chosen", "right"))
-    header = ("item", "task", "level", "scene", "repeat", "truth", *columns)
+    header = ("data", "item", "task", "level", "scene", "repeat", "truth", *columns)
     return Table("pairs", "Every question and repeat", header, tuple(rows))
 
 

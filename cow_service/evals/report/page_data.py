@@ -63,16 +63,19 @@ def page_arms(runs: Sequence[Run], summaries: Sequence[ArmSummary]) -> tuple[Arm
     return tuple(Arm(each.name, each.run, each.arm, _baseline(each, found, runs)) for each in found)
 
 
+def _is_baseline(arm: Arm, runs: Sequence[Run]) -> bool:
+    return arm.arm == BASELINE and bool(runs[arm.run].of_arm(BASELINE))
+
+
 def _baseline(arm: Arm, arms: Sequence[Arm], runs: Sequence[Run]) -> int | None:
     """As the summaries choose it: of the same run, else of the first that asked the same of the same model."""
 
     def asked(place: int) -> tuple[Any, ...]:
-        info = runs[place].info
-        return info.data_digest, info.mllm, info.ask, info.seed
+        return runs[place].info.baseline_key
 
     if arm.arm == BASELINE:
         return None
-    same = [(each.run != arm.run, place) for place, each in enumerate(arms) if each.arm == BASELINE]
+    same = [(each.run != arm.run, place) for place, each in enumerate(arms) if _is_baseline(each, runs)]
     return min(((far, place) for far, place in same if asked(arms[place].run) == asked(arm.run)), default=(0, None))[1]
 
 

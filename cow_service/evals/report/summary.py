@@ -97,8 +97,7 @@ def _baseline(runs: Sequence[Run], run: Run) -> list[Observation]:
     """The replies without imagination: of the same run, else of the first that asked the same of the same model."""
 
     def same(other: Run) -> bool:
-        pairs = ((run.info, other.info),)
-        return all((a.data_digest, a.mllm, a.ask, a.seed) == (b.data_digest, b.mllm, b.ask, b.seed) for a, b in pairs)
+        return run.info.baseline_key == other.info.baseline_key
 
     candidates = [run, *(other for other in runs if other is not run and same(other))]
     return next((found for other in candidates if (found := other.of_arm(BASELINE))), [])
