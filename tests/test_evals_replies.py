@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import pytest
+from conftest import ROOT
 
 from cow_service.evals.replies import read_as_paper, read_reply
 from cow_service.records import AnswerOption
@@ -45,3 +48,8 @@ def test_replies_that_both_read_alike(reply: str) -> None:
 @pytest.mark.parametrize("reply", DIFFERENT)
 def test_replies_that_are_read_otherwise(reply: str) -> None:
     assert (read_reply(reply, OPTIONS), read_as_paper(reply)) == DIFFERENT[reply]
+
+
+def test_the_extra_has_the_packages_of_the_reader_that_reads_replies() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert "cow-service[providers]" in extras["evals"]

@@ -15,7 +15,7 @@ from cow_service.errors import CowError
 INSTALL = 'pip install "cow-service[evals]"'
 EXIT_SOME_FAILED = 3
 EXIT_INTERRUPTED = 130
-_OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair")
+_OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair", "pydantic_ai", "tenacity")
 
 
 class EvalsNotInstalled(CowError):
