@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
+import httpx
 import pytest
+from engines import app_for, running_engine
+from servers import BODY, events_of
 
 from cow_service.errors import StorageUnavailable
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.watches import Watches
+from cow_service.service import Service
 
 LAST, FOLLOWERS = 5, 40
 
@@ -71,3 +76,27 @@ def test_reading_ends_with_the_last_follower(leaving: int) -> None:
         return followed_still
 
     assert asyncio.run(leave()) == ([] if leaving == FOLLOWERS else ["job"])
+
+
+def test_a_job_that_is_deleted_while_someone_begins_to_follow_it(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app, engine = app_for(service), running_engine()
+    find = engine.find
+
+    async def follow() -> httpx.Response:
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow") as client:
+            job = (await client.post("/simulate", json=BODY, headers={"Prefer": "respond-async"})).json()["id"]
+
+            def find_and_delete(*arguments: Any, **more: Any) -> Any:
+                monkeypatch.setattr(engine, "find", find)
+                found = find(*arguments, **more)
+                engine.delete(job, None)
+                return found
+
+            monkeypatch.setattr(engine, "find", find_and_delete)
+            return await client.get(f"/jobs/{job}/events")
+
+    response = asyncio.run(follow())
+    assert (response.status_code, [event["event"] for event in events_of(response)]) == (200, ["deleted"])

@@ -10,8 +10,6 @@ from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 from functools import cached_property
 
-from anyio import to_thread
-
 from cow_service.errors import JobNotFound
 from cow_service.jobs.active import share_done
 from cow_service.jobs.engine import JobEngine
@@ -54,9 +52,11 @@ class _News:
 _watches: Watches[_News] = Watches(POLL_SECONDS)
 
 
-async def follow(engine: JobEngine, job_id: str, owner: str | None, after: int) -> AsyncGenerator[JobEvent]:
-    """The events of a job after a number, until its end. Raises `JobNotFound` where there is none to begin with."""
-    await to_thread.run_sync(lambda: engine.find(job_id, owner, full=False))
+async def follow(engine: JobEngine, job_id: str, after: int) -> AsyncGenerator[JobEvent]:
+    """The events of a job after a number, until its end; `deleted` where there is none, or none any more.
+
+    Whether the caller may hear of it was found out before: here is no way left to refuse it.
+    """
     sent, reported, number = after, (None, 0.0), 0
 
     def read() -> _News:

@@ -149,7 +149,7 @@ async def follow_job(submitter: Submitter, submission: Submission, created_at: s
 async def _listen(engine: JobEngine, submission: Submission, updates: asyncio.Queue[Job | None]) -> None:
     """Puts progress into the queue, until the end of the job."""
     with suppress(CowError):
-        async with aclosing(follow(engine, submission.job_id, submission.owner, QUEUED)) as events:
+        async with aclosing(follow(engine, submission.job_id, QUEUED)) as events:
             async for event in events:
                 if event.job is not None and event.job.status not in TERMINAL:
                     updates.put_nowait(event.job)

@@ -140,7 +140,7 @@ def job_routes(engine: JobEngine) -> APIRouter:
             return Response(status_code=204)
 
         async def stream() -> AsyncGenerator[ServerSentEvent]:
-            async for event in follow(engine, id, owner, after):
+            async for event in follow(engine, id, after):
                 number = None if event.number is None else str(event.number)
                 yield ServerSentEvent(event.data, event=event.name, id=number, sep="\n")
 

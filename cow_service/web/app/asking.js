@@ -232,7 +232,7 @@ export async function choosePicture(blob, name, question = "") {
   return look(picture);
 }
 
-let looked = null; // the job of `look`
+let looked = null; // the job of `look`: its id, and what ends the wait for it
 
 /** Looks what is in a picture, for suggestions. Its job is removed once another one keeps the picture. */
 async function look(picture) {
@@ -244,18 +244,18 @@ async function look(picture) {
     num_frames: 2, video: false, ensemble: 0, frames: { count: 1 }, generator: "cutout",
   };
   const isShown = () => get().picture?.url === picture.url;
+  const waits = new AbortController();
   try {
     const job = await submit(picture, "simulate", request, undefined);
-    looked = job.id;
+    looked = { id: job.id, waits };
     const { run, result } = get();
     if (!isShown() || run?.job.id || result) return forgetLook();
-    await follow(job.id, () => {}, tellAway, undefined);
-    if (!isShown() || looked !== job.id) return undefined; // it was removed meanwhile
-    const { simulation, problem } = outcomeOf(await callJson(`/jobs/${job.id}`));
-    if (!isShown()) return undefined;
+    const { simulation, problem } = outcomeOf(await ended(job.id, () => {}, waits.signal));
+    if (!isShown() || waits.signal.aborted) return undefined; // it was removed meanwhile
     if (simulation) set({ found: simulation.trajectory.bodies.slice(1), picture: { ...get().picture, sha256: simulation.image.sha256 } });
     else if (problem?.code.startsWith("image-")) set({ problem });
   } catch (error) {
+    if (waits.signal.aborted) return undefined; // it was removed meanwhile
     if (isShown() && (error.code?.startsWith("image-") || error.code === "body-too-large")) set({ problem: error });
     // Else there are no suggestions: what is wrong with the server is told when something is asked.
   }
@@ -265,8 +265,9 @@ async function look(picture) {
 /** Removes the job of `look`, also where the page is closed meanwhile. */
 export function forgetLook() {
   if (looked === null) return;
-  const id = looked;
+  const { id, waits } = looked;
   looked = null;
+  waits.abort(); // first: whoever follows a job that is gone is told of an error
   call(`/jobs/${id}`, { method: "DELETE", keepalive: true }).catch(() => {});
 }
 
