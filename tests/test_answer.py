@@ -636,7 +636,7 @@ def test_the_folder_of_an_answer(tmp_path: Path) -> None:
     assert "(A) Yes" in said.stdout
     assert "votes" not in said.stdout
     assert Answer.model_validate_json((tmp_path / "out" / "answer.json").read_text()).answer == "A"
-    assert (tmp_path / "out" / "overlay.png").exists()
+    assert (tmp_path / "out" / "overlay.jpg").exists()
     said = cow(tmp_path, "answer", image, question, "--no-imagine", "--baseline", "--votes", "2", "--json")
     told = Answer.model_validate_json(said.stdout)
     assert (told.simulation, told.not_sure, told.votes) == (None, True, {"not sure": 2})

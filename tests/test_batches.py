@@ -287,7 +287,7 @@ def test_a_second_call_finds_everything(server: Server, http: httpx.Client, tmp_
     assert len(first) == 6
     assert {entry["meta"]["truth"] for entry in lines_of(out)} == {"Yes"}
     assert sorted(path.name for path in (out / "items").iterdir()) == [f"q{n}" for n in range(6)]
-    assert (out / "items" / "q0" / "overlay.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "items" / "q0" / "overlay.jpg").read_bytes().startswith(b"\xff\xd8")
 
 
 @pytest.mark.soak_only

@@ -49,7 +49,7 @@ def test_simulate_writes_frames_video_overlay_and_record(tmp_path: Path, picture
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     out = tmp_path / "out"
-    names = {"frame_000.png", "frame_020.png", "frame_040.png", "overlay.png", "simulation.json", "video.mp4"}
+    names = {"frame_000.png", "frame_020.png", "frame_040.png", "overlay.jpg", "simulation.json", "video.mp4"}
     assert {path.name for path in out.iterdir()} == names | {"clip.gif", "clip.webp", "sheet.png"}
     simulation = Simulation.model_validate_json((out / "simulation.json").read_text())
     assert simulation.grounding.object == "red ball"

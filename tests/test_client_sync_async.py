@@ -241,7 +241,7 @@ def test_both_save_the_same(both: dict[str, Any], tmp_path: Path) -> None:
     assert names == [
         "answer.json",
         *(f"frame_{n:03d}.png" for n in (1, 3, 5)),
-        "overlay.png",
+        "overlay.jpg",
         "simulation.json",
         "video.mp4",
     ]

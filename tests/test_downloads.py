@@ -53,7 +53,7 @@ def test_a_zip_holds_what_the_sdk_saves_and_what_was_asked(served: Served, answe
     with Client(str(served.http.base_url)) as client:
         folder = client.job(answered).wait(60).save(tmp_path / "saved")
     assert held == {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert {"answer.json", "simulation.json", "overlay.png", "video.mp4", "frame_001.png", "factual_001.png"} <= set(
+    assert {"answer.json", "simulation.json", "overlay.jpg", "video.mp4", "frame_001.png", "factual_001.png"} <= set(
         held
     )
     # Nothing is left of it on the server.
@@ -99,6 +99,6 @@ def test_where_there_is_no_such_file_the_problem_says_what_to_send(served: Serve
 def test_an_artifact_that_is_gone_is_a_problem_and_no_broken_zip(served: Served) -> None:
     job = served.ended(served.submit({**BODY, "seed": 7, "fps": 9})["id"])
     sha256 = job["result"]["overlay"]["sha256"]
-    (path,) = served.data.rglob(f"{sha256}.png")
+    (path,) = served.data.rglob(f"{sha256}.jpg")
     path.unlink()
     problem(served.http.get(f"/jobs/{job['id']}/download"), 404, "artifact-not-found")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from cow_service.errors import CowError, ImageTooLarge, ImageTypeUnsupported, ImageUnreadable
-from cow_service.media.images import MIN_SIDE, DecodedImage, decode, encode_png, fit_within
+from cow_service.media.images import MIN_SIDE, DecodedImage, decode, decode_own, encode_png, fit_within
 
 WHITE = [255, 255, 255]
 BLACK = [0, 0, 0]
@@ -402,8 +402,9 @@ def test_encode_png_of_a_mask():
     mask = np.zeros((9, 10), bool)
     mask[2:4, 3:7] = True
     image = Image.open(io.BytesIO(encode_png(mask)))
-    assert image.mode == "L"
-    np.testing.assert_array_equal(np.asarray(image), np.where(mask, 255, 0))
+    assert image.mode == "1", "one bit per pixel"
+    np.testing.assert_array_equal(np.asarray(image), mask)
+    np.testing.assert_array_equal(decode_own(encode_png(mask)), np.where(mask, 255, 0)[..., None].repeat(3, axis=2))
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 4, 4), (0, 4, 3)])

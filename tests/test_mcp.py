@@ -46,6 +46,7 @@ from cow_service.mcp.inputs import AnswerInput, SimulateInput, parsed
 from cow_service.mcp.pictures import MAX_BYTES, fitted
 from cow_service.mcp.server import Caller
 from cow_service.mcp.transport import protection, with_own_keys
+from cow_service.media.images import encode_jpeg
 from cow_service.requests import ImageArtifact
 from cow_service.settings import Settings, SettingsError
 
@@ -234,12 +235,13 @@ def data(session: Session, tool: str, result: CallToolResult) -> dict[str, Any]:
 def sizes(result: CallToolResult) -> list[tuple[int, int]]:
     """Sizes of the pictures, in order."""
     found = []
-    for block in result.content[1:]:
+    for place, block in enumerate(result.content[1:]):
         assert block.type == "image"
-        assert block.mime_type == "image/png"
+        kind = "PNG" if place else "JPEG"  # the overlay comes first
+        assert block.mime_type == f"image/{kind.lower()}"
         with Image.open(io.BytesIO(base64.b64decode(block.data))) as picture:
             picture.load()
-            assert picture.format == "PNG"
+            assert picture.format == kind
             found.append(picture.size)
     return found
 
@@ -625,11 +627,11 @@ def test_arguments_become_a_request() -> None:
 def test_large_pictures_are_made_fit_for_a_model() -> None:
     buffer = io.BytesIO()
     Image.new("RGB", (3000, 1500), "red").save(buffer, "PNG")
-    media_type, (shown,) = fitted([buffer.getvalue()])
+    ((media_type, shown),) = fitted([buffer.getvalue()])
     assert media_type == "image/png"
     with Image.open(io.BytesIO(shown)) as small:
         assert small.size == (1024, 512)
-    assert fitted([shown]) == ("image/png", [shown])
+    assert fitted([shown]) == [("image/png", shown)]
 
 
 def test_remedies_are_for_errors_that_there_are() -> None:
@@ -680,16 +682,17 @@ def test_pictures_of_photographs_fit_into_a_message(count: int) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (600, 1400, 3), np.uint8)
     buffer = io.BytesIO()
     Image.fromarray(noise).save(buffer, "PNG")
-    media_type, shown = fitted([buffer.getvalue()] * count)
+    shown = fitted([buffer.getvalue()] * count)
     assert len(shown) == count
-    assert sum(map(len, shown)) <= MAX_BYTES
-    sizes = {Image.open(io.BytesIO(data)).size for data in shown}
+    assert sum(len(data) for _, data in shown) <= MAX_BYTES
+    sizes = {Image.open(io.BytesIO(data)).size for _, data in shown}
     assert len(sizes) == 1
     assert max(sizes.pop()) <= 1024
-    assert media_type == "image/jpeg"
+    assert {media_type for media_type, _ in shown} == {"image/jpeg"}
 
 
 def test_small_pictures_stay_as_they_are() -> None:
     buffer = io.BytesIO()
     Image.new("RGB", (300, 200), "red").save(buffer, "PNG")
-    assert fitted([buffer.getvalue()]) == ("image/png", [buffer.getvalue()])
+    overlay = encode_jpeg(np.zeros((200, 300, 3), np.uint8))
+    assert fitted([overlay, buffer.getvalue()]) == [("image/jpeg", overlay), ("image/png", buffer.getvalue())]

@@ -10,9 +10,12 @@ import av
 import numpy as np
 import pytest
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cow_service.errors import InternalError, StorageUnavailable
 from cow_service.media.video import write_mp4
+from cow_service.media.yuv import YuvFrames
 
 
 def scene(index: int, width: int = 96, height: int = 64) -> np.ndarray:
@@ -231,3 +234,20 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
         write_mp4(frames, tmp_path / "a.mp4", fps=16, width=160, height=96)
         digests.add((tmp_path / "a.mp4").read_bytes())
     assert len(digests) == 1
+
+
+def parts(length: int) -> st.SearchStrategy[slice]:
+    """Slices of something so long; some are empty."""
+    return st.tuples(st.integers(0, length), st.integers(0, length)).map(lambda ends: slice(min(ends), max(ends)))
+
+
+@given(st.lists(st.tuples(parts(12), parts(20)), max_size=6), st.integers(0, 2**32 - 1))
+def test_what_has_changed_is_converted_as_the_whole_frame_would_be(changes, seed) -> None:
+    generator = np.random.default_rng(seed)
+    frame = generator.integers(0, 256, (12, 20, 3), np.uint8)
+    frames = YuvFrames(12, 20)
+    frames.converted(frame)
+    for rows, columns in changes:
+        frame = frame.copy()
+        frame[rows, columns] = generator.integers(0, 256, 3)
+        np.testing.assert_array_equal(frames.converted(frame), YuvFrames(12, 20).converted(frame))

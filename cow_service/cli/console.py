@@ -42,7 +42,7 @@ def run_simulation(
     formats: Sequence[str] = (),
     *,
     as_json: bool,
-) -> None:
+) -> Simulation:
     """Simulates with progress of each stage, writes the results into a folder, and prints a summary.
 
     `formats` are names of `animations.FORMATS`. Raises `InvalidRequest` where one is wanted and no video.
@@ -57,10 +57,11 @@ def run_simulation(
     written = [*save(service, simulation, out), *_save_formats(out, formats)]
     if as_json:
         print(simulation.model_dump_json(indent=2))
-        return
+        return simulation
     print_stages(console, simulation)
     print_warnings(console, simulation.warnings)
     console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
+    return simulation
 
 
 def run_answer(service: Service, image: Path, body: dict[str, Any], out: Path | None, *, as_json: bool) -> None:

@@ -79,9 +79,9 @@ def simulate(
     body = {**request, "question": question, "video": video}
     out = out or Path(f"{image.stem}-cow")
     with _service() as service:
-        run_simulation(service, image, body, out, tuple(formats or ()), as_json=as_json)
+        simulation = run_simulation(service, image, body, out, tuple(formats or ()), as_json=as_json)
     if open_it:
-        typer.launch(str(out / ("video.mp4" if video else "overlay.png")))
+        typer.launch(str(out / ("video.mp4" if video else simulation.overlay_name)))
 
 
 @app.command()

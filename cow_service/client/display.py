@@ -143,7 +143,8 @@ def _row(figures: Sequence[str]) -> str:
 def _picture(data: bytes | None, ratio: float, height: int, caption: str) -> str:
     if data is None:
         return _figure(_placeholder("not downloaded", ratio, height), ratio, height, caption)
-    source = f"data:image/png;base64,{base64.b64encode(data).decode()}"
+    media_type = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
+    source = f"data:{media_type};base64,{base64.b64encode(data).decode()}"
     style = f"max-height:{height}px;{_PICTURE}"
     return _figure(f'<img src="{source}" alt="{escape(caption)}" style="{style}">', ratio, height, caption)
 

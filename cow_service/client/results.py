@@ -189,7 +189,7 @@ class Simulation(_Simulation):
         return _run(self, self._load())
 
     def save(self, folder: str | Path) -> Path:
-        """Writes frame_*.png, overlay.png, video.mp4 and simulation.json into a folder, which is made if missing."""
+        """Writes frame_*.png, overlay.jpg, video.mp4 and simulation.json into a folder, which is made if missing."""
         return _run(self, self.save_steps(folder))
 
     def _picture(self, sha256: str) -> bytes | None:
@@ -226,7 +226,7 @@ class AsyncSimulation(_Simulation):
         return await _async_run(self, self._load())
 
     async def save(self, folder: str | Path) -> Path:
-        """Writes frame_*.png, overlay.png, video.mp4 and simulation.json into a folder, which is made if missing."""
+        """Writes frame_*.png, overlay.jpg, video.mp4 and simulation.json into a folder, which is made if missing."""
         return await _async_run(self, self.save_steps(folder))
 
 

@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 from av.container import OutputContainer
 from av.error import FFmpegError
-from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
+from av.video.reformatter import ColorRange, Colorspace
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from cow_service.errors import CowError, InternalError, StorageUnavailable
+from cow_service.media.yuv import YuvFrames
 
 CRF_DEFAULT = 18  # x264's constant rate factor, 0 (lossless) to 51; 18 looks lossless
 _PRESET = "veryfast"
@@ -96,13 +97,13 @@ def _add_stream(container: OutputContainer, rate: Fraction, width: int, height: 
 def _encode(
     frames: Iterable[NDArray[np.uint8]], container: OutputContainer, stream: VideoStream, shape: tuple[int, int, int]
 ) -> int:
-    # One for all frames: to prepare it takes longer than to convert a frame.
-    reformatter = VideoReformatter()
+    height, width = shape[0] + shape[0] % 2, shape[1] + shape[1] % 2
+    planes = YuvFrames(height, width)
     count = 0
     for pixels in frames:
         if pixels.shape != shape or pixels.dtype != np.uint8:
             raise ValueError(f"Frame {count} is {pixels.shape} of {pixels.dtype}: it must be {shape} of uint8.")
-        frame = _to_yuv(pixels, reformatter)
+        frame = _to_frame(planes.converted(_even(pixels)))
         frame.pts, frame.time_base = count, stream.codec_context.time_base
         container.mux(stream.encode(frame))
         count += 1
@@ -111,16 +112,18 @@ def _encode(
     return count
 
 
-def _to_yuv(pixels: NDArray[np.uint8], reformatter: VideoReformatter) -> av.VideoFrame:
+def _even(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Contiguous, with even sides."""
     height, width = pixels.shape[:2]
-    even = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge") if height % 2 or width % 2 else pixels
-    return reformatter.reformat(
-        av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24"),
-        format="yuv420p",
-        dst_colorspace=Colorspace.ITU709,
-        dst_color_range=ColorRange.MPEG,
-        interpolation=Interpolation.AREA,
-    )
+    if height % 2 or width % 2:
+        pixels = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    return np.ascontiguousarray(pixels)
+
+
+def _to_frame(planes: NDArray[np.uint8]) -> av.VideoFrame:
+    frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
+    frame.colorspace, frame.color_range = Colorspace.ITU709, ColorRange.MPEG
+    return frame
 
 
 def _translated(error: FFmpegError) -> CowError:

@@ -106,7 +106,9 @@ class Simulation(Record):
         default=(), description="The same frames of the scene as it is, where something is taken away or put elsewhere."
     )
     video: Video | None = Field(description="Null where the request said `video: false`.")
-    overlay: Artifact = Field(description="The input with box, point, arrow and path drawn.")
+    overlay: Artifact = Field(
+        description="JPEG of the input with box, point, arrow and path drawn, 1280 px at most on the longer side."
+    )
     generator: GeneratorInfo
     reader: ReaderInfo
     usage: Usage = Field(default=Usage(), description="What this request cost: not of stages that are `reused`.")
@@ -121,11 +123,16 @@ class Simulation(Record):
     warnings: tuple[str, ...] = ()
 
     @property
+    def overlay_name(self) -> str:
+        """The overlay's file name. Earlier versions wrote PNGs."""
+        return "overlay.png" if self.overlay.media_type == "image/png" else "overlay.jpg"
+
+    @property
     def pictures(self) -> dict[str, Sha256]:
         """The digests of its pictures by the names of files: frames, those of the scene as it is, the overlay."""
         frames = {f"frame_{frame.index:03d}.png": frame.sha256 for frame in self.frames}
         factual = {f"factual_{frame.index:03d}.png": frame.sha256 for frame in self.factual_frames}
-        return frames | factual | {"overlay.png": self.overlay.sha256}
+        return frames | factual | {self.overlay_name: self.overlay.sha256}
 
     @property
     def encounters_known(self) -> bool:

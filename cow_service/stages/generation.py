@@ -13,7 +13,7 @@ from cow_service.generators.base import Generator, GeneratorInput
 from cow_service.generators.rearranging import with_put
 from cow_service.generators.removal import without_removed
 from cow_service.media.artifacts import ArtifactWriter
-from cow_service.media.images import encode_png, fit_within
+from cow_service.media.images import encode_jpeg, encode_png, fit_within
 from cow_service.media.overlay import Replaced, draw_overlay
 from cow_service.media.video import write_mp4
 from cow_service.records import BBox, Clip, Frame, Grounding, Motion, PlacedBefore, Trajectory, Video
@@ -23,6 +23,7 @@ from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.vision.types import Mask
 
+OVERLAY_SIDE = 1280  # px, at most
 MIN_GAP = 0.2  # s between a contact and another chosen frame: closer ones show the same
 
 Image = NDArray[np.uint8]
@@ -101,7 +102,7 @@ def _clip(
         removed = [(each.name, each.bbox, each.mask.full()) for each in gone]
         placed = [_replaced(given, factual_given, each) for each in trajectory.placed]
         drawn = draw_overlay(scene.image, given.grounding, motion, trajectory, mover, removed, placed)
-        overlay = artifacts.put(encode_png(drawn), "image/png")
+        overlay = artifacts.put(encode_jpeg(fit_within(drawn, OVERLAY_SIDE)), "image/jpeg")
     return Clip(
         frames=frames,
         factual_frames=factual,

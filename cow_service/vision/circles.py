@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision.masks import scaled
-from cow_service.vision.types import Floats, Floats32, Image
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
 EDGE = 1.0, 2.2  # Lab units per px, and times the median gradient; the larger counts
@@ -23,6 +24,9 @@ LEAST_RADIUS, MOST_RADIUS = 5.0, 80.0  # px at the working size
 RADIUS_STEP = 1.08  # between the radii that are voted for
 CELL = 2  # px: side of a cell that votes are gathered in
 LEAST_VOTES = 0.2  # of the circumference
+LEAST_ON = 8  # edges: fewer tell no circle
+FIRST_REACH, SECOND_REACH = 0.12, 0.06  # of the radius: edges this close to a circle are fitted
+LINE = 1e-9  # 1 - r^2 of points on a line, through which no circle goes
 LEAST_ARC = 0.1  # of the circumference that lies on edges
 MAX_CIRCLES = 32
 NEAR = 0.035, 1.0  # of the radius, px: edges this close to a circle lie on it
@@ -58,7 +62,7 @@ class Circle:
 class Edges:
     """The edges of an image at the working size, one point per pixel along them."""
 
-    points: Floats  # [N, 2] px
+    points: Floats  # [N, 2] px, from the top down
     normals: Floats  # [N, 2] unit vectors across the edge
     shape: tuple[int, int]  # height and width, px
     stretch: tuple[float, float]  # back to the image's size: x and y
@@ -95,6 +99,14 @@ class Edges:
         fitted = self._fitted(x / fx - 0.5, y / fy - 0.5, 2 * radius / (fx + fy))
         return None if fitted is None else self._enlarged(*fitted)
 
+    def may_fit(self, places: Floats, radius: float) -> Mask:
+        """Which of circles of the image around `places` [K, 2] (px) have enough edges near them for `fit`."""
+        fx, fy = self.stretch
+        x, y, radius = places[:, :1] / fx - 0.5, places[:, 1:] / fy - 0.5, 2 * radius / (fx + fy)
+        near = self._near(x.min(), y.min(), x.max(), y.max(), radius)
+        on, _, _ = _on_circle(self.points[near], self.normals[near], x, y, radius, _first_reach(radius))
+        return np.count_nonzero(on, axis=1) >= LEAST_ON
+
     def notch(self, a: Circle, b: Circle) -> float | None:
         """How deep the outline is notched where two circles overlap: 1 as theirs is, 0 as straight as a bottle's side.
 
@@ -122,10 +134,15 @@ class Edges:
         return step / max(float(depth[between].mean() - depth[beside].mean()), 1e-6)
 
     def _fitted(self, x: float, y: float, radius: float) -> tuple[float, float, float, frozenset[int]] | None:
-        reach = 1.6 * radius
-        columns, rows = self.points[:, 0], self.points[:, 1]
-        near = (columns > x - reach) & (columns < x + reach) & (rows > y - reach) & (rows < y + reach)
+        near = self._near(x, y, x, y, radius)
         return _fitted(self.points[near], self.normals[near], x, y, radius)
+
+    def _near(self, left: float, top: float, right: float, bottom: float, radius: float) -> NDArray[np.intp]:
+        """Indices of the edges that circles around the places of a box may lie on."""
+        reach = 1.6 * radius
+        first, last = np.searchsorted(self.points[:, 1], (top - reach, bottom + reach))
+        columns = self.points[first:last, 0]
+        return first + np.nonzero((columns > left - reach) & (columns < right + reach))[0]
 
     def _enlarged(self, x: float, y: float, radius: float, on: frozenset[int]) -> Circle:
         fx, fy = self.stretch
@@ -154,7 +171,9 @@ def _edges(small: Image) -> tuple[Floats, Floats]:
     here, ahead, behind, points, normals = (values[peak] for values in (here, ahead, behind, points, normals))
     bend = np.maximum(2 * here - ahead - behind, 1e-6)
     shift = np.clip(0.5 * (ahead - behind) / bend, -0.5, 0.5)  # the vertex of a parabola
-    return points + shift[:, None] * normals, normals
+    points += shift[:, None] * normals
+    down = np.argsort(points[:, 1], kind="stable")
+    return points[down], normals[down]
 
 
 def _at(values: Floats32, points: Floats) -> Floats:
@@ -199,31 +218,51 @@ def _voted(points: Floats, normals: Floats, shape: tuple[int, int]) -> list[tupl
     return found
 
 
+def _first_reach(radius: float) -> float:
+    return max(2.0, FIRST_REACH * radius)
+
+
 def _fitted(
     points: Floats, normals: Floats, x: float, y: float, radius: float
 ) -> tuple[float, float, float, frozenset[int]] | None:
     """The circle by least squares over the edges near one, twice; None where too few lie on it."""
-    for reach in (0.12, 0.06):
-        on, _ = _on_circle(points, normals, x, y, radius, max(2.0, reach * radius))
-        if np.count_nonzero(on) < 8:
+    for reach in (_first_reach(radius), None):
+        on, across, down = _on_circle(points, normals, x, y, radius, reach or max(2.0, SECOND_REACH * radius))
+        if np.count_nonzero(on) < LEAST_ON:
             return None
-        chosen = points[on] - np.array([x, y])
-        terms = np.column_stack([2 * chosen, np.ones(len(chosen))])  # x^2 + y^2 = 2ax + 2by + c, least squares
-        a, b, c = np.linalg.lstsq(terms, (chosen**2).sum(axis=1), rcond=None)[0]
-        fitted = float(np.sqrt(max(c + a * a + b * b, 0.0)))
-        if not 0.7 * radius < fitted < 1.4 * radius or np.hypot(a, b) > 0.4 * radius:
+        a, b, fitted = _least_squares(across[on], down[on])
+        if not 0.7 * radius < fitted < 1.4 * radius or math.hypot(a, b) > 0.4 * radius:
             return None
-        x, y, radius = float(x + a), float(y + b), fitted
-    on, angles = _on_circle(points, normals, x, y, radius, max(NEAR[1], NEAR[0] * radius))
-    bins = frozenset(int(v) % BINS for v in np.floor(angles[on] / (2 * np.pi) * BINS))
+        x, y, radius = x + a, y + b, fitted
+    on, across, down = _on_circle(points, normals, x, y, radius, max(NEAR[1], NEAR[0] * radius))
+    turns = np.arctan2(down[on], across[on]) / (2 * np.pi)
+    bins = frozenset((np.floor(turns * BINS).astype(int) % BINS).tolist())
     return (x, y, radius, bins) if len(bins) >= LEAST_ARC * BINS else None
 
 
+def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:
+    """Centre and radius of the circle x^2 + y^2 = 2ax + 2by + c through points [N], by its normal equations."""
+    count = len(across)
+    squares = across * across + down * down
+    terms = np.stack([across, down, squares, np.ones(count)])
+    (xx, xy, xz, x), (_, yy, yz, y), (_, _, _, z), _ = (terms @ terms.T).tolist()
+    xx, xy, yy = xx - x * x / count, xy - x * y / count, yy - y * y / count
+    xz, yz = xz - x * z / count, yz - y * z / count
+    determinant = xx * yy - xy * xy
+    if determinant < LINE * xx * yy:
+        return math.inf, math.inf, math.inf
+    a, b = (xz * yy - yz * xy) / determinant / 2, (yz * xx - xz * xy) / determinant / 2
+    return a, b, math.sqrt(max((z - 2 * a * x - 2 * b * y) / count + a * a + b * b, 0.0))
+
+
 def _on_circle(
-    points: Floats, normals: Floats, x: float, y: float, radius: float, reach: float
-) -> tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], Floats]:
-    """Which edges [N] lie within `reach` px of a circle and face it, and the angles [N] of all of them (radians)."""
-    away = points - np.array([x, y])
-    distance = np.hypot(away[:, 0], away[:, 1])
-    facing = np.abs((away * normals).sum(axis=1)) > FACING * distance
-    return (np.abs(distance - radius) < reach) & facing, np.arctan2(away[:, 1], away[:, 0])
+    points: Floats, normals: Floats, x: Floats | float, y: Floats | float, radius: float, reach: float
+) -> tuple[Mask, Floats, Floats]:
+    """Which edges [N] lie within `reach` px of a circle and face it, and how far right and below its centre all are.
+
+    Of several circles of one radius, `x` and `y` are [K, 1], and what is found [K, N].
+    """
+    across, down = points[:, 0] - x, points[:, 1] - y
+    distance = np.sqrt(across * across + down * down)
+    facing = np.abs(across * normals[:, 0] + down * normals[:, 1]) > FACING * distance
+    return (np.abs(distance - radius) < reach) & facing, across, down

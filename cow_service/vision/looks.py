@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cow_service.vision.circles import BINS, Circle
-from cow_service.vision.types import Floats, Floats32, Mask
+from cow_service.vision.types import Floats, Image, Mask
 
 LOOKS, LEAST_CONTRAST = 0.3, 12.0  # difference of the looks over the contrast, at most; grey levels of that contrast
 LEAST_OPACITY = 0.08
@@ -21,9 +21,9 @@ OFFSETS = np.array([(r * math.cos(t), r * math.sin(t)) for r in (0.25, 0.5, 0.7,
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """How circles of an image [H, W, 3] look inside and about them, in grey levels."""
+    """How circles of an RGB image [H, W, 3] look inside and about them, in grey levels."""
 
-    image: Floats32
+    image: Image
 
     def contrast(self, circle: Circle) -> float:
         """Lower quartile of the steps from inside to outside over the edges on a circle."""

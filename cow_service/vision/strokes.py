@@ -6,8 +6,9 @@ their shape.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -32,6 +33,9 @@ LEAST_INSIDE = 0.12  # of a hollow drawing's area that its rim encloses
 BIN = 16  # grey levels: colours this close are tried as one
 MAX_COLOURS = 36  # flat colours tried per thin structure
 
+Box = tuple[int, int, int, int]  # x, y, width, height, px
+Colour = tuple[int, int, int]  # RGB
+
 _SQUARE = np.ones((3, 3), np.uint8)
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
@@ -43,7 +47,7 @@ class Stroke:
     x: int
     y: int
     patch: Mask  # [h, w], its top left corner at (x, y)
-    colour: tuple[int, int, int]  # RGB; of a rim where the stroke has one
+    colour: Colour  # RGB; of a rim where the stroke has one
     hollow: bool = False  # a rim and the one flat colour that it encloses, both in the patch
 
 
@@ -63,24 +67,29 @@ def working_image(image: Image) -> WorkingImage:
 
 def find_strokes(image: Image) -> Iterator[Stroke]:
     """Candidates in an RGB image [h, w, 3] of working size. A drawing can be found twice, with slight differences."""
-    for (bx, by, bw, bh), thin in _patches(_thin_structures(image), most=1.0):
+    for (bx, by, bw, bh), thin in ((patch.box, patch.mask) for patch in _patches(_thin_structures(image), most=1.0)):
         window = image[by : by + bh, bx : bx + bw]
         allowed = thin.astype(np.uint8) * np.uint8(255)
-        known: dict[tuple[int, int, int, int], int] = {}
+        known: dict[Box, int] = {}
         for colour in _flat_colours(window[thin]):
             for tolerance in TOLERANCES:
-                low, high = np.clip(colour - tolerance, 0, 255), np.clip(colour + tolerance, 0, 255)
-                same = np.asarray(cv2.bitwise_and(cv2.inRange(window, low, high), allowed), np.uint8)
-                for box, patch in _patches(same, most=0.30):
-                    if _is_known(known, box, int(np.count_nonzero(patch))):
+                same = np.asarray(cv2.bitwise_and(_alike(window, colour, tolerance), allowed), np.uint8)
+                for patch in _patches(same, most=0.30, flat=partial(_alike, window, colour, FLAT)):
+                    if _is_known(known, patch.box, patch.area) or 2 * patch.flat < patch.area:
                         continue
-                    stroke = Stroke(bx + box[0], by + box[1], patch, (int(colour[0]), int(colour[1]), int(colour[2])))
+                    stroke = Stroke(bx + patch.box[0], by + patch.box[1], patch.mask, colour)
                     if _is_drawn(image, stroke):
                         yield stroke
                         yield from _hollow(image, stroke)
 
 
-def _is_known(known: dict[tuple[int, int, int, int], int], box: tuple[int, int, int, int], area: int) -> bool:
+def _alike(image: Image, colour: Colour, tolerance: int) -> NDArray[np.uint8]:
+    """255 where an image [h, w, 3] has a colour, within so many grey levels."""
+    low, high = tuple(max(0, v - tolerance) for v in colour), tuple(min(255, v + tolerance) for v in colour)
+    return np.asarray(cv2.inRange(image, low, high), np.uint8)
+
+
+def _is_known(known: dict[Box, int], box: Box, area: int) -> bool:
     """Whether a patch of this box and nearly this area was seen before; records it if not."""
     before = known.get(box)
     if before is not None and abs(area - before) <= ALIKE * before:
@@ -135,12 +144,8 @@ def _thin_structures(image: Image) -> NDArray[np.uint8]:
 
 
 def _is_drawn(image: Image, stroke: Stroke) -> bool:
-    """Whether the patch has one colour and a sharp edge all around, unlike shading."""
+    """Whether a patch of one colour has a sharp edge all around, unlike shading."""
     x, y, (h, w) = stroke.x, stroke.y, stroke.patch.shape
-    inner = image[y : y + h, x : x + w][stroke.patch].astype(np.int16)
-    flat = (np.abs(inner - np.array(stroke.colour, np.int16)) <= FLAT).all(axis=1)
-    if 2 * np.count_nonzero(flat) < len(inner):
-        return False
     pad = 4
     x0, y0 = max(0, x - pad), max(0, y - pad)
     x1, y1 = min(image.shape[1], x + w + pad), min(image.shape[0], y + h + pad)
@@ -158,8 +163,7 @@ def _is_gap(image: Image, stroke: Stroke) -> bool:
     x, y, (h, w) = stroke.x, stroke.y, stroke.patch.shape
     reach = max(h, w)
     near = image[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
-    low, high = (np.clip(np.array(stroke.colour) + step, 0, 255) for step in (-FLAT, FLAT))
-    alike = np.count_nonzero(cv2.inRange(near, low, high)) - np.count_nonzero(stroke.patch)
+    alike = np.count_nonzero(_alike(near, stroke.colour, FLAT)) - np.count_nonzero(stroke.patch)
     return alike > GAP_SHARE * near.shape[0] * near.shape[1]
 
 
@@ -208,8 +212,8 @@ def _outlined(patch: Mask) -> Mask:
     return whole > 0
 
 
-def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
-    """Colours [3] that many of the pixels [N, 3] share: a drawing has one, a shaded object spreads over many."""
+def _flat_colours(pixels: NDArray[np.uint8]) -> list[Colour]:
+    """Colours that many of the pixels [N, 3] share: a drawing has one, a shaded object spreads over many."""
     if len(pixels) < 40:
         return []
     binned = np.ascontiguousarray((pixels // BIN + 1).T).astype(np.int16)  # [3, N]; a margin of one bin all around
@@ -218,7 +222,7 @@ def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
     smooth = np.bincount(flat, minlength=side**3).reshape(side, side, side).astype(np.float32)
     for axis in range(3):
         smooth = smooth + 0.5 * (np.roll(smooth, 1, axis) + np.roll(smooth, -1, axis))
-    colours: list[NDArray[np.int64]] = []
+    colours: list[Colour] = []
     for _ in range(MAX_COLOURS):
         peak = np.unravel_index(int(smooth.argmax()), smooth.shape)
         if smooth[peak] < 30:
@@ -227,20 +231,51 @@ def _flat_colours(pixels: NDArray[np.uint8]) -> list[NDArray[np.int64]]:
         near = pixels[close[0] & close[1] & close[2]]
         colour = np.median(near, axis=0).astype(np.int64)
         if (np.abs(near - colour).max(axis=1) <= FLAT).sum() >= 24:
-            colours.append(colour)
+            colours.append((int(colour[0]), int(colour[1]), int(colour[2])))
         r, g, b = (slice(max(0, int(p) - 1), int(p) + 2) for p in peak)
         smooth[r, g, b] = 0
     return colours
 
 
-def _patches(same: Image, most: float) -> list[tuple[tuple[int, int, int, int], Mask]]:
-    """Connected patches (box [x, y, w, h], mask [h, w]) long enough for an arrow; `most` bounds area / diagonal^2."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(same, connectivity=8)
-    patches: list[tuple[tuple[int, int, int, int], Mask]] = []
-    squared = (stats[:, 2:4].astype(np.int64) ** 2).sum(axis=1)
+@dataclass(frozen=True)
+class _Patch:
+    """A connected patch of a mask."""
+
+    box: Box
+    area: int  # px
+    flat: int  # of them, those that have the patch's colour itself
+    labels: NDArray[np.int32]  # [h, w] of the box
+    label: int
+
+    @property
+    def mask(self) -> Mask:
+        """[h, w] of the box."""
+        return self.labels == self.label
+
+
+def _patches(same: NDArray[np.uint8], most: float, flat: Callable[[], NDArray[np.uint8]] | None = None) -> list[_Patch]:
+    """Connected patches that are long enough for an arrow; `most` bounds area / diagonal^2.
+
+    `flat` tells where [h, w] pixels have the patches' colour itself.
+    """
+    left, top, width, height = cv2.boundingRect(same)
+    if not width:
+        return []
+    window = slice(top, top + height), slice(left, left + width)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(same[window], connectivity=8)
+    squared = stats[:, 2].astype(np.int64) ** 2 + stats[:, 3].astype(np.int64) ** 2
     fitting = (stats[:, 4] >= 40) & (squared >= MIN_LENGTH**2) & (stats[:, 4] <= most * squared)
     fitting[0] = False  # the background
-    for i in np.nonzero(fitting)[0]:
-        x, y, w, h = (int(v) for v in stats[i][:4])
-        patches.append(((x, y, w, h), labels[y : y + h, x : x + w] == i))
+    chosen = np.nonzero(fitting)[0].tolist()
+    flats = np.zeros(len(stats), np.int64)
+    if flat is not None and chosen:
+        flats = np.bincount(labels[flat()[window] > 0], minlength=len(stats))
+    patches: list[_Patch] = []
+    for i in chosen:
+        x, y, w, h, area = stats[i].tolist()
+        patches.append(
+            _Patch(
+                (left + x, top + y, w, h), area, int(flats[i]), np.asarray(labels[y : y + h, x : x + w], np.int32), i
+            )
+        )
     return patches

@@ -34,6 +34,7 @@ MOST_SAG = 0.3  # of the distance of two positions: how far those between may li
 MAX_POSITIONS = 12
 MAX_PAIRS = 6  # circles that look alike, between and beyond which others are sought
 SAME_POSITION_IOU = 0.4
+AROUND = np.array([(0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25)])  # radii: where a circle is sought
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     edges = Edges.of(image)
     if edges is None:
         return ()
-    looks = Looks(image.astype(np.float32))
+    looks = Looks(image)
     ends = [circle for circle in edges.circles() if circle.support >= END_SUPPORT]
     ends = [circle for circle in ends if looks.contrast(circle) >= LEAST_CONTRAST]
     trails: list[Trail] = []
@@ -242,8 +243,9 @@ def _beyond(edges: Edges, looks: Looks, chain: tuple[Circle, ...]) -> tuple[Circ
 def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
     """The circle with most edges on it within half a radius of a place."""
     near: list[Circle] = []
-    for dx, dy in ((0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25)):
-        circle = edges.fit(x + dx * radius, y + dy * radius, radius)
+    places = np.array([x, y]) + radius * AROUND
+    for place in places[edges.may_fit(places, radius)].tolist():
+        circle = edges.fit(place[0], place[1], radius)
         close = circle is not None and math.dist((circle.x, circle.y), (x, y)) < 0.6 * radius
         if circle is not None and close and 1 / SIZES < circle.radius / radius < SIZES:
             near.append(circle)

@@ -63,7 +63,7 @@ export function Take({ state }) {
       ${Object.entries(FILES).filter(([format]) => format === "zip" || simulation?.video).map(([format, label]) => html`<button key=${format}
         onClick=${() => download(`/jobs/${jobId}/download?format=${format}`, `cow-${jobId}.${ENDINGS[format]}`)}>${label}</button>`)}
       ${simulation?.video && html`<button onClick=${() => download(`/artifacts/${simulation.video.sha256}`, `cow-${jobId}.mp4`)}>Video</button>`}
-      ${simulation && html`<button onClick=${() => download(`/artifacts/${simulation.overlay.sha256}`, `cow-${jobId}-overlay.png`)}>Overlay</button>`}
+      ${simulation && html`<button onClick=${() => download(`/artifacts/${simulation.overlay.sha256}`, `cow-${jobId}-overlay.${simulation.overlay.media_type === "image/png" ? "png" : "jpg"}`)}>Overlay</button>`}
       ${simulation?.frames.map((frame) => html`<button key=${frame.index} onClick=${() => download(`/artifacts/${frame.sha256}`, `cow-${jobId}-frame_${String(frame.index).padStart(3, "0")}.png`)}>Frame ${frame.index}</button>`)}
     </div>
     <div class="row link"><a href=${link}>Link to this view</a><button onClick=${() => copy(link, setTold)}>Copy the link</button><span role="status">${told}</span></div>`}
