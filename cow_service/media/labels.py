@@ -13,6 +13,7 @@ LETTERS = 0.42  # size of the letters, in OpenCV's unit, for a picture whose uni
 STEPS = 12  # places tried above each other, in heights of a label, before covering another one is accepted
 
 Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
 Plate = tuple[int, int, int, int]  # left, top, right and bottom, px
 
@@ -37,10 +38,11 @@ def draw_labels(
     height, width = canvas.shape[:2]
     weight, pad, size = max(1, round(unit)), round(3 * unit), LETTERS * unit
     placed: list[Plate] = []
+    spots = np.array(points, np.float64).reshape(-1, 2)
     for label in labels:
         text = _fitted(label.text.encode("ascii", "replace").decode(), size, weight, width - 2 * pad)
         (across, up), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, weight)
-        plate = _free_place(label, across + 2 * pad, up + base + 2 * pad, pad, (width, height), placed, points)
+        plate = _free_place(label, across + 2 * pad, up + base + 2 * pad, pad, (width, height), placed, spots)
         placed.append(plate)
         cv2.rectangle(canvas, plate[:2], (plate[2] - 1, plate[3] - 1), dark, -1)
         origin = plate[0] + pad, plate[1] + pad + up
@@ -64,7 +66,7 @@ def _free_place(
     gap: int,
     size: tuple[int, int],
     placed: Sequence[Plate],
-    points: Sequence[tuple[float, float]],
+    points: Floats,
 ) -> Plate:
     """Where a label of a width and height (px) covers least of the others; then fewest points; then next to its box."""
     x0, y0, x1, y1 = (float(np.clip(v, -20_000, 20_000)) for v in label.bbox)
@@ -78,8 +80,9 @@ def _free_place(
     return min(tried, key=lambda plate: (sum(_shared(plate, other) for other in placed), _count_in(plate, points)))
 
 
-def _count_in(plate: Plate, points: Sequence[tuple[float, float]]) -> int:
-    return sum(plate[0] <= x < plate[2] and plate[1] <= y < plate[3] for x, y in points)
+def _count_in(plate: Plate, points: Floats) -> int:
+    inside = (points >= plate[:2]) & (points < plate[2:])
+    return int(np.count_nonzero(inside[:, 0] & inside[:, 1]))
 
 
 def _inside(x: float, y: float, width: int, height: int, size: tuple[int, int]) -> Plate:

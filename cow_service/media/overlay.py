@@ -208,5 +208,5 @@ def _rectangle(canvas: Image, bbox: BBox, colour: Colour, width: int) -> None:
 
 def _fixed(point: Sequence[float] | NDArray[np.float64]) -> tuple[int, int]:
     """Fixed-point pixel centres, bounded so that far points stay drawable."""
-    x, y = (float(np.clip(v, -FARTHEST, FARTHEST)) for v in point[:2])
+    x, y = (min(max(float(v), -FARTHEST), FARTHEST) for v in point[:2])
     return round((x - 0.5) * 2**SUBPIXEL), round((y - 0.5) * 2**SUBPIXEL)

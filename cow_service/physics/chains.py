@@ -47,11 +47,12 @@ def times_tipped(worlds: Worlds) -> Floats:
     """
     count, frames = len(worlds.shapes[0]), worlds.runs[0].positions.shape[1]
     leans = np.zeros((len(worlds.runs), count, frames), bool)
-    for k, (shapes, run) in enumerate(zip(worlds.shapes, worlds.runs, strict=True)):
-        for body in run.moved:
-            if shapes[body].shape != "sphere":
-                upright = turned(run.turns[body], np.array([0.0, 1.0, 0.0]))[:, 1]
-                leans[k, body] = upright < math.cos(TIPPED)
+    draws = zip(worlds.shapes, worlds.runs, strict=True)
+    which = [(k, i) for k, (shapes, run) in enumerate(draws) for i in run.moved if shapes[i].shape != "sphere"]
+    if which:
+        turns = np.concatenate([worlds.runs[k].turns[i] for k, i in which])
+        upright = turned(turns, np.array([0.0, 1.0, 0.0]))[:, 1].reshape(len(which), frames)
+        leans[tuple(np.array(which).T)] = upright < math.cos(TIPPED)
     return _first(leans, worlds)
 
 

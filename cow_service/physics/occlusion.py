@@ -29,15 +29,25 @@ def shares(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path
     """By the silhouettes of the image; what is nearer covers what is farther."""
     covers, covered = np.zeros(path.depth.shape), np.zeros(path.depth.shape)
     seen = ~path.passed & ~other_path.passed
-    draws, frames = np.nonzero(_boxes_meet(subject, path, other, other_path) & seen)
-    of_other, of_subject = _sample(other), _sample(subject)
+    meet = _boxes_meet(subject, path, other, other_path) & seen
+    nearer = path.depth < other_path.depth
+    _fill(covers, meet & nearer, subject, path, other, other_path)
+    _fill(covered, meet & ~nearer, other, other_path, subject, path)
+    return Shares(covers, covered)
+
+
+def _fill(
+    found: Floats, where: Mask, front: CroppedMask, front_path: SeenPaths, back: CroppedMask, back_path: SeenPaths
+) -> None:
+    """Writes the share of the body at the back that the one in front covers, in some draws and frames [K, F]."""
+    draws, frames = np.nonzero(where)
+    if not len(draws):
+        return
+    points = _sample(back)
     for start in range(0, len(draws), CHUNK):
         k, f = draws[start : start + CHUNK], frames[start : start + CHUNK]
-        nearer = path.depth[k, f] < other_path.depth[k, f]
-        there, here = _moved(of_other, other_path, k, f), _moved(of_subject, path, k, f)
-        covers[k, f] = np.where(nearer, _inside(subject, _moved_back(there, path, k, f)), 0.0)
-        covered[k, f] = np.where(nearer, 0.0, _inside(other, _moved_back(here, other_path, k, f)))
-    return Shares(covers, covered)
+        there = _moved(points, back_path, k, f)
+        found[k, f] = _inside(front, _moved_back(there, front_path, k, f))
 
 
 def _moved(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.generators.base import Generator, GeneratorInput
+from cow_service.generators.base import GeneratorInput
 from cow_service.generators.rearranging import with_put
 from cow_service.generators.removal import without_removed
 from cow_service.media.artifacts import ArtifactWriter
-from cow_service.media.images import encode_jpeg, encode_png, fit_within
+from cow_service.media.images import encode_jpeg, fit_within
 from cow_service.media.overlay import Replaced, draw_overlay
 from cow_service.media.video import write_mp4
-from cow_service.records import BBox, Clip, Frame, Grounding, Motion, PlacedBefore, Trajectory, Video
+from cow_service.records import BBox, Clip, Grounding, Motion, PlacedBefore, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.bodies import obstacles_of
+from cow_service.stages.frames import EncodedFrame, stored
 from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.vision.types import Mask
@@ -89,27 +91,33 @@ def generate(
 def _clip(
     run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory, artifacts: ArtifactWriter
 ) -> Clip:
-    request, scene = run.request, run.scene
     with run.cpu():
         given, as_it_is = _inputs(run, grounding, motion, trajectory)
-    with run.device():
-        frames, video = _render(given, run.generator, request, artifacts, run.report_share)
-        factual = _factual_frames(as_it_is, frames, run.generator, request, artifacts, run.report_share)
-    with run.cpu():
-        seen = scene if given.before is None else given.scene
-        mover, factual_given = seen.silhouette(given.grounding.bbox), as_it_is or given
-        gone = factual_given.obstacles[len(given.obstacles) :]
-        removed = [(each.name, each.bbox, each.mask.full()) for each in gone]
-        placed = [_replaced(given, factual_given, each) for each in trajectory.placed]
-        drawn = draw_overlay(scene.image, given.grounding, motion, trajectory, mover, removed, placed)
-        overlay = artifacts.put(encode_jpeg(fit_within(drawn, OVERLAY_SIDE)), "image/jpeg")
-    return Clip(
-        frames=frames,
-        factual_frames=factual,
-        video=video,
-        overlay=overlay,
-        generator=run.generator.describe(given),
-    )
+    with ThreadPoolExecutor(1) as encoder:
+        with run.device():
+            frames, video = _render(run, given, artifacts, encoder)
+            factual = _factual_frames(run, as_it_is, [frame.index for frame in frames], encoder)
+        with run.cpu():
+            overlay = _overlay(run.scene.image, given, as_it_is or given, motion, trajectory)
+        return Clip(
+            frames=stored(frames, artifacts),
+            factual_frames=stored(factual, artifacts),
+            video=video,
+            overlay=artifacts.put(overlay, "image/jpeg"),
+            generator=run.generator.describe(given),
+        )
+
+
+def _overlay(
+    image: Image, given: GeneratorInput, as_it_is: GeneratorInput, motion: Motion, trajectory: Trajectory
+) -> bytes:
+    """The overlay over the input image [H, W, 3], as JPEG."""
+    mover = (as_it_is if given.before is None else given).scene.silhouette(given.grounding.bbox)
+    gone = as_it_is.obstacles[len(given.obstacles) :]
+    removed = [(each.name, each.bbox, each.mask.full()) for each in gone]
+    placed = [_replaced(given, as_it_is, each) for each in trajectory.placed]
+    drawn = draw_overlay(image, given.grounding, motion, trajectory, mover, removed, placed)
+    return encode_jpeg(fit_within(drawn, OVERLAY_SIDE))
 
 
 def _inputs(
@@ -141,57 +149,40 @@ def _seen_in(given: GeneratorInput, body: int) -> tuple[BBox, Mask]:
 
 
 def _factual_frames(
-    given: GeneratorInput | None,
-    frames: Sequence[Frame],
-    generator: Generator,
-    request: SimulateRequest,
-    artifacts: ArtifactWriter,
-    progress: Callable[[float], None],
-) -> tuple[Frame, ...]:
+    run: Run[SimulateRequest], given: GeneratorInput | None, indices: Sequence[int], encoder: Executor
+) -> list[EncodedFrame]:
     """The chosen frames of the scene as it is; a generator on a device of its own makes them only where they are
     asked for, because they cost as much as the clip."""
-    wanted = request.frames.factual
-    if given is None or not (generator.concurrency is None if wanted is None else wanted):
-        return ()
-    indices = [frame.index for frame in frames]
-    return tuple(
-        _store_frame(pixels, index, given.trajectory.fps, request.frames.max_side, artifacts)
-        for index, pixels in zip(indices, generator.render(given, indices, progress), strict=True)
-    )
+    wanted = run.request.frames
+    if given is None or not (run.generator.concurrency is None if wanted.factual is None else wanted.factual):
+        return []
+    return [
+        EncodedFrame.of(pixels, index, given.trajectory.fps, wanted.max_side, encoder)
+        for index, pixels in zip(indices, run.generator.render(given, indices, run.report_share), strict=True)
+    ]
 
 
 def _render(
-    given: GeneratorInput,
-    generator: Generator,
-    request: SimulateRequest,
-    artifacts: ArtifactWriter,
-    progress: Callable[[float], None],
-) -> tuple[tuple[Frame, ...], Video | None]:
+    run: Run[SimulateRequest], given: GeneratorInput, artifacts: ArtifactWriter, encoder: Executor
+) -> tuple[list[EncodedFrame], Video | None]:
     """The chosen frames, and the video of all of them. Only those that are needed are rendered."""
-    trajectory, wanted = given.trajectory, request.frames
-    chosen = choose_frames(wanted, trajectory)
+    generator, request, trajectory = run.generator, run.request, given.trajectory
+    chosen = choose_frames(request.frames, trajectory)
     size = generator.size(given.scene.width, given.scene.height)
     indices = tuple(range(trajectory.num_frames)) if request.video else chosen
-    frames: list[Frame] = []
+    frames: list[EncodedFrame] = []
 
     def rendered() -> Iterator[Image]:
-        for index, pixels in zip(indices, generator.render(given, indices, progress), strict=True):
+        for index, pixels in zip(indices, generator.render(given, indices, run.report_share), strict=True):
             if index in chosen:
-                frames.append(_store_frame(pixels, index, trajectory.fps, wanted.max_side, artifacts))
+                frames.append(EncodedFrame.of(pixels, index, trajectory.fps, request.frames.max_side, encoder))
             yield pixels
 
     video = _store_video(rendered(), trajectory.fps, size, artifacts) if request.video else None
     if video is None:
         for _ in rendered():
             pass
-    return tuple(frames), video
-
-
-def _store_frame(pixels: Image, index: int, fps: float, max_side: int | None, artifacts: ArtifactWriter) -> Frame:
-    picture = fit_within(pixels, max_side)
-    artifact = artifacts.put(encode_png(picture), "image/png")
-    height, width = picture.shape[:2]
-    return Frame(index=index, time=index / fps, url=artifact.url, sha256=artifact.sha256, width=width, height=height)
+    return frames, video
 
 
 def _store_video(frames: Iterator[Image], fps: float, size: tuple[int, int], artifacts: ArtifactWriter) -> Video:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,15 +48,19 @@ def imagine(world: WorldInput, query: Query | None, size: int) -> tuple[Imagined
     it, the likeliest world of those that agree is shown.
     """
     given = (world, world.as_it_is()) if world.is_changed else (world,)
-    shown = [_run(each, likeliest()) for each in given]
     queries = [query if len(given) == 1 else _as_it_is(query, place) for place in range(len(given))]
     if size == 0:
+        shown = [_run(each, likeliest()) for each in given]
         return tuple(
             Imagined(each, ran.worlds, ran.events, None, None, asked, None)
             for each, ran, asked in zip(given, shown, queries, strict=True)
         )
     rows = ensemble(size)
-    around = [_run(each, rows, EVERY) for each in given]
+    # Side by side: the engine's steps, half of the time, are not held up by the interpreter's lock.
+    with ThreadPoolExecutor(1) as beside:
+        likely = beside.submit(lambda: [_run(each, likeliest()) for each in given])
+        around = [_run(each, rows, EVERY) for each in given]
+        shown = likely.result()
     decided = _decided(queries, around, rows)
     if query is not None and any(each is not None and each.sure for each in decided):
         shown = _agreeing(given, query, decided, rows, around, shown)
