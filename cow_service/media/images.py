@@ -119,7 +119,8 @@ class OverfullError(ValueError):
 class DecodedImage:
     """The input image as pixels, upright, and the record that names it.
 
-    `pixels` is [H, W, 3] RGB, C-contiguous, W and H as in `info`; `media_type` is that of the bytes as sent.
+    `pixels` is [H, W, 3] RGB, C-contiguous and not to be written to, W and H as in `info`; `media_type` is that of the
+    bytes as sent.
     """
 
     pixels: NDArray[np.uint8]
@@ -251,8 +252,8 @@ def _decode_as(kind: str, data: bytes, max_megapixels: float) -> NDArray[np.uint
         rgb = _to_rgb(image)
         if kind == "WebP":
             orientation = _exif_orientation(image.info.get("exif", b""))
-    turn = _TRANSPOSE_TO_UPRIGHT.get(orientation)
-    return np.array(rgb if turn is None else rgb.transpose(turn), dtype=np.uint8)
+        turn = _TRANSPOSE_TO_UPRIGHT.get(orientation)
+        return np.asarray(rgb if turn is None else rgb.transpose(turn), np.uint8)
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:
@@ -294,7 +295,10 @@ def _to_rgb(image: Image.Image) -> Image.Image:
     if image.has_transparency_data:
         white = Image.new("RGBA", image.size, "white")
         return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
-    return image.convert("RGB")
+    if image.mode != "RGB":
+        return image.convert("RGB")
+    image.load()
+    return image
 
 
 def _grey16_to_8(image: Image.Image) -> NDArray[np.uint8]:

@@ -36,12 +36,12 @@ def resized_mask(mask: Mask, size: tuple[int, int]) -> Mask:
 
 def window_of(mask: Mask, margin: int = 0) -> tuple[slice, slice] | None:
     """Rows and columns that a mask [H, W] spans, with a margin (px) inside the image; None for an empty mask."""
-    lines = [np.nonzero(mask.any(axis=axis))[0] for axis in (1, 0)]
-    if not len(lines[0]):
+    left, top, across, down = cv2.boundingRect(mask.view(np.uint8))
+    if not across:
         return None
     rows, columns = (
-        slice(max(0, int(line[0]) - margin), min(length, int(line[-1]) + 1 + margin))
-        for line, length in zip(lines, mask.shape, strict=True)
+        slice(max(0, start - margin), min(length, start + size + margin))
+        for start, size, length in ((top, down, mask.shape[0]), (left, across, mask.shape[1]))
     )
     return rows, columns
 

@@ -36,6 +36,7 @@ def find_obstacles(
     taken, unless a mask was given.
     """
     body = silhouette(mover)
+    body_area = np.count_nonzero(body)
     near = cv2.dilate(body.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     obstacles: list[Obstacle] = []
     for other in named:
@@ -49,7 +50,7 @@ def find_obstacles(
         area = region.mask.area
         if iou(region.bbox, mover) >= SAME_OBJECT_IOU or region.mask.shared_with(body) > 0.5 * area:
             continue
-        if area < OWN_SHARE * body.sum() and region.mask.shared_with(near):
+        if area < OWN_SHARE * body_area and region.mask.shared_with(near):
             continue
         if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU or _is_part(region, other) for other in obstacles):
             continue

@@ -13,6 +13,7 @@ from cow_service.vision.masks import bbox_of, outline_of, scaled
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
+POINT_SIDE = 1280  # px: an object is looked for around a point in an image of at most this size
 POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
 ITERATIONS = 2
 GROW, SHRINK = 0.05, 0.04  # of its size: how far a guess may be from the object, outwards and inwards
@@ -53,7 +54,7 @@ def cut_quality(image: Image, mask: Mask) -> CutQuality:
     largest = max(contours, key=cv2.contourArea, default=None)
     hull = 0.0 if largest is None else cv2.contourArea(cv2.convexHull(largest))
     return CutQuality(
-        area=float(mask.sum()) / min(height, width) ** 2,
+        area=np.count_nonzero(mask) / min(height, width) ** 2,
         on_edge=float(np.mean(apart >= LEAST_CONTRAST)) if apart.size else 0.0,
         solidity=cv2.contourArea(largest) / hull if largest is not None and hull > 0 else 0.0,
     )
@@ -95,28 +96,42 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
     soft = cv2.GaussianBlur(_tidy(cut, box).astype(np.float32), (0, 0), 0.7)
     mask = np.zeros((height, width), bool)
     mask[rows, columns] = cv2.resize(soft, (crop.shape[1], crop.shape[0]), interpolation=cv2.INTER_LINEAR) > 0.5
-    share = mask.sum() / max(1.0, (x1 - x0) * (y1 - y0))
+    share = np.count_nonzero(mask) / max(1.0, (x1 - x0) * (y1 - y0))
     if not 0.12 < share < 1.3:
         mask = guess.copy() if guess is not None else _ellipse(height, width, (x0, y0, x1, y1))
     return mask
 
 
 def mask_from_point(image: Image, point: tuple[float, float]) -> Mask:
-    """Mask [H, W] of the object at a point [x, y]: of several sizes, the one whose outline lies best on edges."""
+    """Mask [H, W] of the object at a point [x, y]: of several sizes, the one whose outline lies best on edges.
+
+    The sizes are tried in an image of at most `POINT_SIDE`; the one that is taken is cut again in the image itself.
+    """
     height, width = image.shape[:2]
-    best: tuple[float, Mask] | None = None
-    tries = [_cut_around(image, point, reach * min(height, width)) for reach in POINT_REACHES]
-    for (score, mask), (_, larger) in zip(tries, [*tries[1:], (0.0, None)], strict=True):
-        if mask is None:
-            continue
-        stability = 0.0 if larger is None else float((mask & larger).sum() / (mask | larger).sum())
-        if best is None or score + STABILITY_WEIGHT * stability > best[0] + 0.02:
-            best = score + STABILITY_WEIGHT * stability, mask
-    if best is None:
+    small = scaled(image, POINT_SIDE / max(height, width))
+    factor = small.shape[1] / width, small.shape[0] / height
+    guess = _best_around(small, (point[0] * factor[0], point[1] * factor[1]))
+    if guess is None:
         half = POINT_REACHES[0] * min(height, width)
         box = (point[0] - half, point[1] - half, point[0] + half, point[1] + half)
         return _ellipse(height, width, _inside(box, width, height))
-    return mask_from_bbox(image, bbox_of(best[1]), best[1])
+    if small is not image:
+        enlarged = cv2.resize(guess.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+        guess = np.asarray(enlarged > 0.5)
+    return mask_from_bbox(image, bbox_of(guess), guess)
+
+
+def _best_around(image: Image, point: tuple[float, float]) -> Mask | None:
+    """Of several cuts around a point, the one [H, W] whose outline lies best on edges."""
+    best: tuple[float, Mask] | None = None
+    tries = [_cut_around(image, point, reach * min(image.shape[:2])) for reach in POINT_REACHES]
+    for (score, mask), (_, larger) in zip(tries, [*tries[1:], (0.0, None)], strict=True):
+        if mask is None:
+            continue
+        stability = 0.0 if larger is None else np.count_nonzero(mask & larger) / np.count_nonzero(mask | larger)
+        if best is None or score + STABILITY_WEIGHT * stability > best[0] + 0.02:
+            best = score + STABILITY_WEIGHT * stability, mask
+    return None if best is None else best[1]
 
 
 def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[float, Mask | None]:
