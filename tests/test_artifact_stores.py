@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import object_store
 import pytest
 
@@ -250,9 +251,10 @@ def _is_there(store: ArtifactStore, sha256: str) -> bool:
 def test_the_file_of_the_database_gives_room_back(tmp_path: Path):
     database = Database(Settings(data_dir=tmp_path))
     database.create_tables()
-    jobs = [f"job-{number}" for number in range(40)]
+    jobs, noise = [f"job-{number}" for number in range(40)], np.random.default_rng(0)
     for job in jobs:
-        database.store_result(hashlib.sha256(job.encode()).hexdigest(), job, "motion", "x" * 500_000, [])
+        digits = noise.integers(0, 10**9, 60_000).tobytes().hex()  # what is stored deflated stays large
+        database.store_result(hashlib.sha256(job.encode()).hexdigest(), job, "motion", digits, [])
     database.give_room_back(lambda: False)
     file = tmp_path / "jobs.sqlite3"
     full = file.stat().st_size

@@ -20,6 +20,7 @@ from sqlalchemy import event
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
+from cow_service.jobs.packing import packed, unpacked
 from cow_service.jobs.tables import METADATA, REFERENCES, RESULTS, STAGES
 from cow_service.settings import Settings, SettingsError
 
@@ -154,13 +155,13 @@ class Database:
         with self._cursor() as cursor:
             cursor.execute(self._plain(_FIND), (key,))
             row = cursor.fetchone()
-        return None if row is None else (row[0], row[1])
+        return None if row is None else (row[0], unpacked(row[1]))
 
     def store_result(self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str]) -> None:
         """Adds references to a stage's artifacts, then saves its result: in this order, each is valid alone."""
         with self._cursor() as cursor:
             self._add_references(cursor, job, artifacts)
-            cursor.execute(self._plain(_SAVE), (key, job, stage, result, time.time()))
+            cursor.execute(self._plain(_SAVE), (key, job, stage, packed(result), time.time()))
             cursor.execute(self._plain(_DONE), (job, stage))
 
     def reuse_result(self, job: str, stage: str, artifacts: Iterable[str]) -> None:
@@ -207,10 +208,6 @@ class Database:
     def jobs_with(self, sha256: str) -> list[str]:
         """The jobs that need an artifact."""
         return list(self._column(sa.select(REFERENCES.c.job_id).where(REFERENCES.c.sha256 == sha256)))
-
-    def job_ids(self) -> list[str]:
-        """The jobs that have results or references."""
-        return list(self._column(sa.union(sa.select(REFERENCES.c.job_id), sa.select(RESULTS.c.job_id))))
 
     def _column(self, query: Any) -> set[str]:
         with database_errors(), self._reading.connect() as connection:

@@ -14,6 +14,7 @@ from cow_service.jobs.queues import WEBHOOKS
 from cow_service.jobs.retries import let_callers_not_wait
 from cow_service.jobs.running_limit import bound_running_jobs
 from cow_service.jobs.serializer import JsonSerializer
+from cow_service.jobs.workflow_table import create_indexes
 from cow_service.settings import Settings
 
 
@@ -46,6 +47,8 @@ def launch(database: Database, settings: Settings, artifacts: str, executor_id: 
         DBOS.destroy()
         remedy = "see COW_DATABASE_URL" if settings.migrate else "run `cow migrate` first, and see COW_DATABASE_URL"
         raise StorageUnavailable(f"The job database cannot be used ({type(error).__name__}): {remedy}.") from error
+    if settings.migrate:
+        create_indexes(database.engine)
     let_callers_not_wait()
     if settings.running_limit_per_key is not None:
         bound_running_jobs(settings.running_limit_per_key)

@@ -20,6 +20,7 @@ from cow_service.jobs.news import JobNews, News
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.queues import PREFIX
 from cow_service.jobs.recovery import recover
+from cow_service.jobs.tidying import takes_turn, without_job
 
 OUTCOME_POLL_SECONDS = 0.005  # while the database has not got the outcome of finished work
 OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own polling
@@ -73,15 +74,13 @@ class Maintenance:
         before = datetime.now(UTC) - timedelta(hours=open_jobs.service.settings.job_retention_hours)
         while not self._stop.is_set() and (jobs := state.ended_before(before, MAX_REMOVED_JOBS)):
             open_jobs.remove(jobs, before.timestamp())
-        known = open_jobs.database.job_ids()
-        for start in range(0, len(known), MAX_REMOVED_JOBS):  # what jobs left that were deleted while they ran
-            if self._stop.is_set():
-                return
-            chunk = known[start : start + MAX_REMOVED_JOBS]
-            missing = set(chunk) - state.existing(chunk)
-            # A job that is being submitted refers to its image a moment before it is in the database.
-            if missing and not self._stop.wait(SUBMIT_SECONDS):
-                open_jobs.database.remove_jobs(sorted(missing - state.existing(sorted(missing))))
+        # What jobs left that were deleted while they ran. One that is being submitted refers to its image a moment
+        # before it is in the database: it is looked for twice.
+        missing = without_job(open_jobs.database)
+        if missing and not self._stop.wait(SUBMIT_SECONDS):
+            open_jobs.database.remove_jobs(sorted(set(missing) & set(without_job(open_jobs.database))))
+        if self._stop.is_set():
+            return
         collect_artifacts(open_jobs.service, open_jobs.database, self._stop.is_set)
         open_jobs.database.give_room_back(self._stop.is_set)
 
@@ -117,8 +116,12 @@ class Maintenance:
                 self._logged(self._open_jobs.recount)
             if now - collected > GARBAGE_SECONDS:
                 collected = now
-                self._logged(self.collect_garbage)
+                self._logged(self._tidy)
             self._stop.wait(CANCEL_POLL_SECONDS)
+
+    def _tidy(self) -> None:
+        if takes_turn(self._open_jobs.database, GARBAGE_SECONDS / 2):
+            self.collect_garbage()
 
     def _poll_cancellations(self) -> None:
         """Another process may have canceled or deleted a job that runs here, or taken it while this one was frozen."""

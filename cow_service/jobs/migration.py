@@ -8,7 +8,7 @@ from dbos import error as dbos_error
 from cow_service.errors import StorageUnavailable
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.serializer import JsonSerializer
-from cow_service.jobs.workflow_table import SCHEMA
+from cow_service.jobs.workflow_table import SCHEMA, create_indexes
 from cow_service.settings import Settings
 
 USE_LISTEN_NOTIFY = False  # DBOS asks its tables instead: what processes tell each other is ours
@@ -29,6 +29,7 @@ def migrate(settings: Settings) -> None:
                 executor_id=None,
                 use_listen_notify=USE_LISTEN_NOTIFY,
             ).run_migrations()
+        create_indexes(database.engine)
     except dbos_error.DBOSException as error:
         raise StorageUnavailable(
             f"The tables of the job database could not be updated ({type(error).__name__}): see COW_DATABASE_URL."

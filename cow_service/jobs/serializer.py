@@ -1,4 +1,4 @@
-"""Values in the job database are JSON, never pickles: reading it runs no code."""
+"""Values in the job database are JSON, long ones deflated, never pickles: reading it runs no code."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 from dbos import Serializer
 
 from cow_service.errors import CowError, InternalError
+from cow_service.jobs.packing import packed, unpacked
 from cow_service.jobs.stored_errors import error_as_json, error_from_json
 
 _ERROR = "cow_error"
@@ -25,11 +26,11 @@ class JsonSerializer(Serializer):
         if isinstance(data, BaseException):
             error = data if isinstance(data, CowError) else InternalError("The job met an error that nobody foresaw.")
             data = {_ERROR: error_as_json(error)}
-        return json.dumps(data, separators=(",", ":"))
+        return packed(json.dumps(data, separators=(",", ":")))
 
     def deserialize(self, serialized_data: str) -> Any:
         """The value of a JSON text, errors as exceptions."""
-        value = json.loads(serialized_data)
+        value = json.loads(unpacked(serialized_data))
         if not isinstance(value, dict) or set(value) != {_ERROR}:
             return value
         return error_from_json(value[_ERROR])

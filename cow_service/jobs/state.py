@@ -124,7 +124,7 @@ def _listed(owner: str | None, filters: JobFilters, before: datetime | None, lim
     wanted = [name for name, status in STATUS.items() if status in filters.status]
     if "queued" in filters.status:
         wanted = sorted({*wanted, "PENDING"})  # of those taken from the queue, some still wait
-    return workflows_of_jobs(
+    found = workflows_of_jobs(
         name=[filters.kind] if filters.kind else list(KINDS),
         status=wanted or None,
         user=owner,
@@ -133,6 +133,8 @@ def _listed(owner: str | None, filters: JobFilters, before: datetime | None, lim
         sort_desc=True,
         limit=limit,
     )
+    # Those of one time are in the order in which they came, but not where several statuses were looked up one by one.
+    return sorted(found, key=lambda one: (one.created_at, _attribute(one, ATTRIBUTE_CREATED_AT)), reverse=True)
 
 
 def _listed_job(job: Job) -> Job:
@@ -143,9 +145,12 @@ def _listed_job(job: Job) -> Job:
 
 def workflows_of_jobs(**filters: Any) -> list[WorkflowStatus]:
     """The workflows of jobs that match filters of `DBOS.list_workflows`; without results unless `load_output`."""
-    defaults: dict[str, Any] = {"name": list(KINDS), "load_input": False, "load_output": False}
+    defaults: dict[str, Any] = {"load_input": False, "load_output": False}
+    # Of ids that are known the kinds are looked at here: SQLite would look at all jobs of a kind for their ids.
+    if "workflow_ids" not in filters:
+        defaults["name"] = list(KINDS)
     with database_errors():
-        return DBOS.list_workflows(**(defaults | filters))
+        return [one for one in DBOS.list_workflows(**(defaults | filters)) if one.name in KINDS]
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,13 @@ STORES = sa.Table(
     sa.Column("id", sa.Integer, primary_key=True),  # always 1
     sa.Column("address", sa.Text, nullable=False),
 )
+# When a process last began to tidy: one row. It is not every process's work.
+TIDYING = sa.Table(
+    "cow_tidying",
+    METADATA,
+    sa.Column("id", sa.Integer, primary_key=True),  # always 1
+    sa.Column("begun", sa.Float, nullable=False),  # Unix time, s
+)
 # One row for each process that runs an engine.
 PROCESSES = sa.Table(
     "cow_processes",

@@ -134,11 +134,14 @@ class DiskArtifacts:
     def listed(self) -> Iterator[ListedArtifact]:
         """All files that are named by a digest."""
         with _storage_errors():
-            for path in self._folder.glob("[0-9a-f][0-9a-f]/*.*"):
-                with suppress(FileNotFoundError):  # deleted meanwhile
-                    if is_digest(path.stem):
-                        status = path.stat()
-                        yield ListedArtifact(path.stem, status.st_size, status.st_mtime)
+            for folder in self._folder.glob("[0-9a-f][0-9a-f]"):
+                with suppress(NotADirectoryError), os.scandir(folder) as entries:
+                    for entry in entries:
+                        sha256, _, extension = entry.name.partition(".")
+                        with suppress(FileNotFoundError):  # deleted meanwhile
+                            if extension and is_digest(sha256):
+                                status = entry.stat()
+                                yield ListedArtifact(sha256, status.st_size, status.st_mtime)
 
     @contextmanager
     def scratch(self) -> Generator[Path]:

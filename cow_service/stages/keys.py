@@ -20,7 +20,7 @@ from cow_service.requests import SimulateRequest, Stage
 from cow_service.stages.results import digest_of
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 8  # of stored results; raised where what a stage means or stores changes
+FORMAT = 9  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)

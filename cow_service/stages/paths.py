@@ -24,7 +24,8 @@ PUSHED = 2.0  # px: what something is put into or onto stays where it is if it m
 SETTLED = 0.25  # px per frame: what moves less is at rest
 LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
 MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are told
-FUTURE_DECIMALS = 1  # px
+FUTURE_DECIMALS, BAND_DECIMALS, POINT_DECIMALS = 1, 2, 3  # px: more digits say nothing and are half of a result
+STATE_DECIMALS, SCALE_DECIMALS, ROTATION_DECIMALS = 5, 6, 3  # m and m/s; of the size at first; degrees
 
 
 def camera_record(fit: CameraFit, worlds: Worlds, around: Worlds | None) -> CameraEstimate:
@@ -116,17 +117,19 @@ def _path(
         seen = shown_body(seen, body, worlds)
         start, scale = points[0], scale / scale[0]
     band, futures = _spread(around, body, points - path.points[0])
+    points, scale = np.round(points, POINT_DECIMALS), np.round(scale, SCALE_DECIMALS)
+    turned = np.round(turned, ROTATION_DECIMALS)
     visible = np.all((points >= 0) & (points < np.array(size)), axis=1) & ~path.passed[0]
     return Path(
         body=body,
-        states=tuple(tuple(state) for state in states(worlds, body).tolist()),
+        states=tuple(tuple(state) for state in np.round(states(worlds, body), STATE_DECIMALS).tolist()),
         points=pairs(points),
         visible=tuple(visible.tolist()),
         scale=tuple(scale.tolist()),
         rotation=tuple(turned.tolist()) if np.abs(turned).max() > 0.05 else (),
         band=band,
         futures=futures,
-        tracks=tuple(pairs(track) for track in tracks(seen, start, points, scale, turned)),
+        tracks=tuple(pairs(np.round(track, POINT_DECIMALS)) for track in tracks(seen, start, points, scale, turned)),
     )
 
 
@@ -154,7 +157,7 @@ def _spread(around: Worlds | None, body: int, shift: Floats) -> tuple[tuple[BBox
 def _band(worlds: Floats, every: int, shift: Floats) -> tuple[BBox, ...]:
     """Per frame the 10th and 90th percentile over the worlds of the ensemble, as `_at_frames` takes them."""
     low, high = np.percentile(worlds, BAND_PERCENTILES, axis=0)
-    edges = np.hstack([_at_frames(low, every, shift), _at_frames(high, every, shift)])
+    edges = np.round(np.hstack([_at_frames(low, every, shift), _at_frames(high, every, shift)]), BAND_DECIMALS)
     return tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in edges.tolist())
 
 

@@ -1,0 +1,157 @@
+"""What the jobs that are kept cost: lists of them, and tidying, by how many there are.
+
+    python benchmarks/jobs.py [--jobs 0,1000,10000,100000] [--database postgresql://...] [--json FILE]
+
+The rows of one real job that succeeded and of one that failed are copied: of a hundred jobs one has failed.
+Milliseconds are medians of `GET /jobs` in this process, without HTTP. Tidying is CPU seconds of one round that finds
+nothing to remove, as one server makes every ten minutes. The files of artifacts are not copied: all copies refer to the
+same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+
+from cow_service.jobs.engine import JobEngine, new_job_id
+from cow_service.jobs.spec import JobSpec
+from cow_service.jobs.state import JobFilters
+from cow_service.jobs.workflow_table import SCHEMA
+from cow_service.media.images import DecodedImage, encode_png
+from cow_service.service import Service
+from cow_service.settings import Settings
+from cow_service.stages.run import now
+
+FAILED_EVERY = 100
+DBOS_TABLES = ("workflow_status", "workflow_input", "workflow_output")
+OUR_TABLES = {"cow_stage_results": "key", "cow_holds": None, "cow_job_stages": None}
+GIVEN: dict[str, Any] = {"grounding": {"bbox": [10, 20, 30, 40]}, "num_frames": 9, "video": False}
+
+
+def run_job(engine: JobEngine, image: DecodedImage, motion: dict[str, Any]) -> str:
+    """One job to its end; its id."""
+    asked = {
+        "image": {"artifact": image.info.sha256},
+        "question": "If it moves, what happens?",
+        "motion": motion,
+        **GIVEN,
+    }
+    job_id = new_job_id(None, None)
+    spec = JobSpec(kind="simulate", request=asked, reader="embedded", generator="cutout", created_at=now())
+
+    async def ended() -> None:
+        with engine.active.waiting(job_id) as waiter:
+            await asyncio.to_thread(engine.submit, job_id, spec, None, None, image)
+            await waiter.ended.wait()
+
+    asyncio.run(ended())
+    return job_id
+
+
+def copies(engine: sa.Engine, job: str, first: int, count: int, step_ms: int) -> None:
+    """Copies all rows of a job, each a little older than the one before."""
+    schema = f"{SCHEMA}." if engine.dialect.name == "postgresql" else ""
+    series = (
+        f"SELECT generate_series({first}, {first + count - 1}) AS n"
+        if schema
+        else f"SELECT {first} AS n UNION ALL SELECT n + 1 FROM numbers WHERE n < {first + count - 1}"
+    )
+    inspector = sa.inspect(engine)
+    with engine.begin() as connection:
+        for table in (*(schema + name for name in DBOS_TABLES), *OUR_TABLES):
+            name, key = table.rpartition(".")[2], OUR_TABLES.get(table)
+            columns = [c["name"] for c in inspector.get_columns(name, schema=SCHEMA if "." in table else None)]
+            told: list[str] = []
+            for column in columns:
+                if column in ("workflow_uuid", "job_id", key):
+                    told.append(f"t.{column} || '-' || numbers.n")
+                elif name == "workflow_status" and column in ("created_at", "updated_at", "completed_at"):
+                    told.append(f"t.{column} - {step_ms} * numbers.n")
+                else:
+                    told.append(f"t.{column}")
+            whose = "workflow_uuid" if name in DBOS_TABLES else "job_id"
+            connection.execute(
+                sa.text(
+                    f"WITH RECURSIVE numbers AS ({series}) INSERT INTO {table} ({', '.join(columns)}) "
+                    f"SELECT {', '.join(told)} FROM {table} t, numbers WHERE t.{whose} = :job"
+                ),
+                {"job": job},
+            )
+
+
+def timed(work: Callable[[], object], runs: int = 7) -> float:
+    """Median milliseconds after one call that is not counted."""
+    work()
+    times: list[float] = []
+    for _ in range(runs):
+        started = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - started)
+    return round(1000 * statistics.median(times), 2)
+
+
+def measure(engine: JobEngine, counts: list[int]) -> list[dict[str, Any]]:
+    """A row for each number of jobs."""
+    pixels = np.full((64, 96, 3), 200, np.uint8)
+    pixels[20:40, 10:30] = (200, 30, 30)
+    _, image = engine.service.keep_image(encode_png(pixels))
+    good = run_job(engine, image, {"direction": [1, 0]})
+    bad = run_job(engine, image, {})  # the question tells no direction
+    rows: list[dict[str, Any]] = []
+    made = 2
+    for count in counts:
+        more = max(0, count - made)
+        if more:
+            failed = max(1, more // FAILED_EVERY)
+            copies(engine.database.engine, bad, made, failed, 20 * FAILED_EVERY)
+            copies(engine.database.engine, good, made + failed, more - failed, 20)
+            made += more
+        rows.append(
+            {
+                "jobs": made,
+                "page_ms": timed(lambda: engine.page(None, JobFilters())),
+                "failed_ms": timed(lambda: engine.page(None, JobFilters(status=("failed",)))),
+                "succeeded_ms": timed(lambda: engine.page(None, JobFilters(status=("succeeded",)))),
+                "running_ms": timed(lambda: engine.page(None, JobFilters(status=("running",)))),
+                "answers_ms": timed(lambda: engine.page(None, JobFilters(kind="answer"))),
+                "one_ms": timed(lambda: engine.find(good, None)),
+            }
+        )
+        tidy = engine._maintenance.collect_garbage  # pyright: ignore[reportPrivateUsage]
+        tidy()  # the first round after such a change of the tables is not typical
+        started = time.process_time()
+        tidy()
+        rows[-1]["tidying_cpu_s"] = round(time.process_time() - started, 3)
+        print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--jobs", default="0,1000,10000,100000")
+    parser.add_argument("--database", help="postgresql://...; by default SQLite")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    url: dict[str, Any] = {"database_url": given.database} if given.database else {}
+    with tempfile.TemporaryDirectory() as folder:
+        engine = JobEngine(Service(Settings(data_dir=Path(folder), **url)))
+        engine.start()
+        rows = measure(engine, [int(count) for count in given.jobs.split(",")])
+        engine.close()
+    if given.json:
+        given.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""What the job database is asked for while a process tidies: whose turn it is, and what belongs to no job."""
+
+from __future__ import annotations
+
+import time
+
+import sqlalchemy as sa
+
+from cow_service.jobs.database import Database, database_errors
+from cow_service.jobs.tables import REFERENCES, RESULTS, TIDYING
+from cow_service.jobs.workflow_table import workflow_table
+
+
+def takes_turn(database: Database, seconds: float) -> bool:
+    """Whether no process has begun to tidy for so long: it is then the caller's turn, and nobody else's."""
+    now = time.time()
+    first = "INSERT INTO cow_tidying (id, begun) VALUES (1, 0) ON CONFLICT DO NOTHING"
+    taken = sa.update(TIDYING).where(TIDYING.c.begun <= now - seconds).values(begun=now)
+    with database_errors(), database.engine.begin() as connection:
+        connection.execute(sa.text(first))
+        return connection.execute(taken).rowcount > 0
+
+
+def without_job(database: Database) -> list[str]:
+    """The ids under which there are results or references, and no job: it was deleted while it ran."""
+    table = workflow_table(database.engine)
+    with database_errors(), database.engine.connect() as connection:
+        found: set[str] = set()
+        for ours in (RESULTS, REFERENCES):
+            known = sa.select(table.c.workflow_uuid).where(table.c.workflow_uuid == ours.c.job_id).exists()
+            found |= set(connection.execute(sa.select(ours.c.job_id).distinct().where(~known)).scalars())
+    return sorted(found)
