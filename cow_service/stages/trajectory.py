@@ -26,9 +26,6 @@ from cow_service.stages.camera import camera_of
 from cow_service.stages.imagining import Imagined, imagine
 from cow_service.stages.outcomes import can_tell, with_outcomes
 from cow_service.stages.paths import (
-    POINT_DECIMALS,
-    SCALE_DECIMALS,
-    STATE_DECIMALS,
     body_records,
     camera_record,
     contact_records,
@@ -203,11 +200,11 @@ def _free_record(mover: SeenBody, grounding: Grounding, request: SimulateRequest
     else:
         found = tracks(mover, np.array(grounding.point), free.points, free.scale, np.zeros(len(times)))
     return Path(
-        states=tuple(tuple(state) for state in np.round(free.states, STATE_DECIMALS).tolist()),
-        points=pairs(np.round(free.points, POINT_DECIMALS)),
+        states=tuple(tuple(state) for state in free.states.tolist()),
+        points=pairs(free.points),
         visible=tuple(free.visible.tolist()),
-        scale=tuple(np.round(free.scale, SCALE_DECIMALS).tolist()),
-        tracks=tuple(pairs(np.round(track, POINT_DECIMALS)) for track in found),
+        scale=tuple(free.scale.tolist()),
+        tracks=tuple(pairs(track) for track in found),
         tracks_visible=_seen(given, times),
     )
 
