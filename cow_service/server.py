@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
+from functools import partial
 
 import uvicorn
 
@@ -20,6 +21,7 @@ from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
+from cow_service.warm_up import warm_up
 from cow_service.workers.pool import WorkerPool
 
 EVERYWHERE = ("0.0.0.0", "::")  # addresses at which a server listens, and nobody asks
@@ -74,7 +76,8 @@ def _parts(service: Service, pool: WorkerPool | None) -> tuple[JobEngine, Readin
     if service.settings.role == "api":
         return JobEngine(service, Elsewhere()), Readiness(service, lambda: None)
     if pool is None:
-        return JobEngine(service), Readiness(service)
+        warm = partial(warm_up, service.settings) if service.settings.warmup else lambda: None
+        return JobEngine(service), Readiness(service, warm_up=warm)
     return JobEngine(service, pool), Readiness(service, pool.check)
 
 
@@ -172,6 +175,7 @@ def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngin
         port=settings.port,
         log_config=None,
         access_log=False,
+        ws="none",
         http=Connection,  # h11 whatever is installed: parsers differ on which headers they refuse, and on how long
         timeout_graceful_shutdown=int(settings.shutdown_grace + CLOSE_SECONDS),
     )

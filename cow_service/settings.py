@@ -146,6 +146,11 @@ class Settings(BaseSettings):
     worker_jobs: int = Field(
         default=1000, ge=1, description="Jobs after which a worker process is replaced by a new one."
     )
+    warmup: bool = Field(
+        default=True,
+        description="Compute something small before /readyz says ready; else the first request takes several times as "
+        "long.",
+    )
     job_timeout: float = Field(
         default=3600,
         gt=0,

@@ -162,7 +162,7 @@ class Server:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A real `cow serve` in its own process."""
     data = tmp_path_factory.mktemp("server")
-    environment = os.environ | {"COW_DATA_DIR": str(data), "COW_MAX_BODY_MB": "3"}
+    environment = os.environ | {"COW_DATA_DIR": str(data), "COW_MAX_BODY_MB": "3", "COW_WARMUP": "false"}
     command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", "0"]
     log = (data / "log").open("w")
     with subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.PIPE, text=True) as process:

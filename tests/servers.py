@@ -72,6 +72,7 @@ class Served:
             "SLOW_JOURNAL": str(self.journal),
             # Where who computes does not matter: processes that are started for each server take most of a test's time.
             "COW_WORKERS": "false",
+            "COW_WARMUP": "false",
         }
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
         self._environment |= own | settings

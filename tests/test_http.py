@@ -48,7 +48,7 @@ def test_json_in_simulation_out(http: httpx.Client) -> None:
     for sha256, media_type in (
         (simulation.image.sha256, "image/png"),
         (simulation.frames[0].sha256, "image/png"),
-        (simulation.overlay.sha256, "image/png"),
+        (simulation.overlay.sha256, "image/jpeg"),
         (simulation.video.sha256, "video/mp4"),
     ):
         artifact = http.get(f"/artifacts/{sha256}")

@@ -311,11 +311,27 @@ class TestKeys:
     """What decides a stage's key, and what does not."""
 
     def key(
-        self, scene: Scene, stage="generation", inputs=(), identity=lambda role: {"name": role}, repeats=True, **request
+        self,
+        scene: Scene,
+        stage="generation",
+        inputs=(),
+        identity=lambda role: {"name": role},
+        repeats=True,
+        heeds_seed=True,
+        **request,
     ):
         one = run(scene, **request)
         one.request = AnswerRequest.model_validate(one.request.model_dump())
-        return key_of(stage, one.image.info.sha256, one.request, inputs, identity, lambda votes: repeats)
+        decides = identity, lambda votes: repeats, lambda: heeds_seed
+        return key_of(stage, one.image.info.sha256, one.request, inputs, *decides)
+
+    @pytest.mark.parametrize("stage", ["gating", "grounding", "motion", "answering"])
+    def test_the_seed_decides_where_the_reader_heeds_it(self, scene: Scene, stage: str) -> None:
+        one, other = (self.key(scene, stage, seed=seed) for seed in (1, 2))
+        assert one != other
+        rules, same = (self.key(scene, stage, seed=seed, heeds_seed=False) for seed in (1, 2))
+        assert rules == same
+        assert rules != self.key(scene, stage, seed=1, heeds_seed=False, question="another")
 
     def test_another_wording_renders_no_clip_again(self, scene: Scene) -> None:
         assert self.key(scene, question="a") == self.key(scene, question="b")

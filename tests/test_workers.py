@@ -36,7 +36,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 def workers_of(served: Served) -> list[psutil.Process]:
     assert served.process is not None
     alive = [one for one in psutil.Process(served.process.pid).children() if one.status() != psutil.STATUS_ZOMBIE]
-    return [one for one in alive if "cow_service.workers.child" in one.cmdline()]
+    return [one for one in alive if "cow_service.workers" in one.cmdline()]
 
 
 def test_a_crash_harms_the_job_that_caused_it_and_no_other(served: Served) -> None:

@@ -20,6 +20,7 @@ from cow_service.cli import top as top_cli
 from cow_service.cli import tracks as tracks_cli
 from cow_service.cli.errors import Commands
 from cow_service.cli.options import with_request_options
+from cow_service.cli.starting import quick_imports
 
 # Log levels of libraries that print notes when they are imported, such as on optional packages.
 QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
@@ -163,18 +164,19 @@ def serve(
     ] = None,
 ) -> None:
     """Start the server."""
-    service = _served(host=host, port=port, role=role)
-    from cow_service.cli.ports import check_port  # noqa: PLC0415
+    with quick_imports():
+        service = _served(host=host, port=port, role=role)
+        from cow_service.cli.ports import check_port  # noqa: PLC0415
 
-    check_port(service.settings)
-    from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
+        check_port(service.settings)
+        from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
-    settings = service.settings
-    pool = WorkerPool(settings, service.metrics) if settings.workers and settings.role == "all" else None
-    if pool is not None:
-        pool.start()  # its processes start while the server is imported
-    from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
-    from cow_service.server import run_server  # noqa: PLC0415
+        settings = service.settings
+        pool = WorkerPool(settings, service.metrics) if settings.workers and settings.role == "all" else None
+        if pool is not None:
+            pool.start()  # its processes start while the server is imported
+        from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
+        from cow_service.server import run_server  # noqa: PLC0415
 
     warn_if_open(settings)
     run_server(service, pool)
@@ -189,19 +191,20 @@ def worker(
 ) -> None:
     """Compute the jobs of servers on the same job database."""
     named = None if queues is None else tuple(name.strip() for name in queues.split(",") if name.strip())
-    service = _served(queues=named)
-    from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
+    with quick_imports():
+        service = _served(queues=named)
+        from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
-    pool = WorkerPool(service.settings, service.metrics)
-    pool.start()
-    from cow_service.server import run_worker  # noqa: PLC0415
+        pool = WorkerPool(service.settings, service.metrics)
+        pool.start()
+        from cow_service.server import run_worker  # noqa: PLC0415
 
     run_worker(service, pool)
 
 
 def _served(**overrides: Any) -> Service:
     """The service of a process that goes on, with its logs and traces."""
-    service = _service(**overrides)
+    service = _service(ahead=True, **overrides)
     from cow_service.jobs.queues import check_queues  # noqa: PLC0415
     from cow_service.observability import logging as logs  # noqa: PLC0415
     from cow_service.observability import tracing  # noqa: PLC0415
@@ -252,13 +255,20 @@ def openapi() -> None:
     typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
 
 
-def _service(**overrides: Any) -> Service:
-    from cow_service.service import Service  # noqa: PLC0415
+def _service(*, ahead: bool = False, **overrides: Any) -> Service:
+    """`ahead`: its first worker process, where there will be one, is started before all that it needs is imported."""
     from cow_service.settings import load_settings  # noqa: PLC0415
 
     for name, level in QUIET.items():
         os.environ.setdefault(name, level)
-    return Service(load_settings(**overrides))
+    settings = load_settings(**overrides)
+    if ahead and settings.workers and settings.role == "all":
+        from cow_service.workers.spawning import spawn_ahead  # noqa: PLC0415
+
+        spawn_ahead()
+    from cow_service.service import Service  # noqa: PLC0415
+
+    return Service(settings)
 
 
 app.command("batch")(batch_cli.batch)

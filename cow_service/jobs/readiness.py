@@ -15,10 +15,14 @@ MIN_FREE_BYTES = 200_000_000  # on the disk of the data folder
 class Readiness:
     """Waits once until the default backends are loaded, in a thread of its own."""
 
-    def __init__(self, service: Service, load: Callable[[], None] | None = None) -> None:
-        """`load` returns once they are loaded, and raises the `CowError` for which they cannot be."""
+    def __init__(
+        self, service: Service, load: Callable[[], None] | None = None, warm_up: Callable[[], None] = lambda: None
+    ) -> None:
+        """`load` returns once they are loaded, and raises the `CowError` for which they cannot be. `warm_up` is called
+        once, then."""
         self._service = service
         self._load_backends = load or service.check
+        self._warm_up = warm_up
         self._done = threading.Event()
         self._started = False
         self.error: CowError | None = None
@@ -50,6 +54,7 @@ class Readiness:
     def _load(self, failed: Callable[[], None]) -> None:
         try:
             self._load_backends()
+            self._warm_up()
         except CowError as error:
             self.error = error
             failed()

@@ -192,6 +192,9 @@ class Reader(Protocol):
     fingerprint: str
     """All that decides what it reads, besides what it is given: model, revision, prompts, options."""
 
+    heeds_seed: bool
+    """Whether the seed of a request changes anything. Of a reader without this attribute it is taken to."""
+
     def repeats_answers(self, votes: int) -> bool:
         """Whether `answer` with so many votes gives the same ones each time that it is asked the same.
 

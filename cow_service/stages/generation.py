@@ -16,7 +16,6 @@ from cow_service.generators.removal import without_removed
 from cow_service.media.artifacts import ArtifactWriter
 from cow_service.media.images import encode_jpeg, fit_within
 from cow_service.media.overlay import Replaced, draw_overlay
-from cow_service.media.video import write_mp4
 from cow_service.records import BBox, Clip, Grounding, Motion, PlacedBefore, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.bodies import obstacles_of
@@ -186,6 +185,8 @@ def _render(
 
 
 def _store_video(frames: Iterator[Image], fps: float, size: tuple[int, int], artifacts: ArtifactWriter) -> Video:
+    from cow_service.media.video import write_mp4  # noqa: PLC0415 # FFmpeg's bindings take long to import
+
     with artifacts.scratch() as path:
         count = write_mp4(frames, path, fps=fps, width=size[0], height=size[1])
         artifact = artifacts.put_file(path, "video/mp4")

@@ -79,11 +79,13 @@ def key_of(
     inputs: tuple[Record | None, ...],
     identity_of: Callable[[BackendRole], Mapping[str, Any] | None],
     repeats_answers: Callable[[int], bool],
+    heeds_seed: Callable[[], bool] = lambda: True,
 ) -> StageKey:
     """The key of a stage's result. `inputs` are the results of stages before it.
 
     `identity_of` a backend is all that decides its work, as JSON values, or None where it does not say; it is asked
-    only where the table names a backend. `repeats_answers` is that of the reader, asked where answers are drawn.
+    only where the table names a backend. `repeats_answers` is that of the reader, asked where answers are drawn;
+    `heeds_seed` where it reads: of rules, a request with another seed finds the same.
     """
     decided = KEY_FIELDS[stage]
     parts: dict[str, Any] = {
@@ -102,6 +104,8 @@ def key_of(
     if decided.backend is None:
         return StageKey(digest_of(parts))
     identity = identity_of(decided.backend)
+    if decided.backend == "reader" and not heeds_seed():
+        del parts["request"]["seed"]
     sampled = decided.votes is not None and not repeats_answers(getattr(request, decided.votes))
     parts["backend"] = identity
     return StageKey(digest_of(parts), identity is not None and not sampled, _read_with_more(parts, decided.read_with))

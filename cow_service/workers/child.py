@@ -1,4 +1,4 @@
-"""The main program of a worker process: `python -m cow_service.workers.child FD`, on one end of a pipe.
+"""The main program of a worker process, on one end of a pipe.
 
 It ends as soon as the pipe does, whatever it is doing: the process that started it is gone then, and another one takes
 its jobs.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -29,10 +28,10 @@ from cow_service.jobs.stored_errors import error_as_json
 from cow_service.observability import context, tracing
 from cow_service.observability import logging as logs
 from cow_service.observability.gpus import gpu_memory
-from cow_service.readers.question.sentences import parse
 from cow_service.requests import Stage
 from cow_service.service import Service
 from cow_service.settings import Settings
+from cow_service.warm_up import warm_up
 from cow_service.workers.messages import (
     Cancel,
     Configure,
@@ -114,6 +113,8 @@ class WorkerProcess:
     def _load(self) -> None:
         try:
             self._service.check()
+            if self._service.settings.warmup:
+                warm_up(self._service.settings)
         except CowError as error:
             self._send(Loaded(error_as_json(error)))
         except Exception:
@@ -121,7 +122,6 @@ class WorkerProcess:
             self._send(Loaded(error_as_json(unforeseen())))
         else:
             self._send(Loaded(None))
-            parse("")  # it builds the grammar, for which the first job would have to wait
 
     def _work(self, start: Start) -> None:
         spec = start.spec
@@ -194,7 +194,3 @@ def main(descriptor: int) -> None:
         pass
     tracing.stop()
     os._exit(0)  # threads may be at work; nobody wants what they do
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]))

@@ -5,13 +5,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
 from typing import Literal
 
@@ -25,7 +22,6 @@ from cow_service.workers.messages import (
     Cancel,
     Configure,
     Failed,
-    FromWorker,
     Heartbeat,
     HoldKey,
     KeyHeld,
@@ -39,6 +35,7 @@ from cow_service.workers.messages import (
     Succeeded,
     ToWorker,
 )
+from cow_service.workers.spawning import spawn
 
 POLL_SECONDS = 0.1  # how often a job at work is checked: whether it was canceled, whether its time is over
 CANCEL_SECONDS = 5.0  # that a canceled job is given to end; then its process is ended
@@ -67,14 +64,14 @@ class Worker:
 
     def __init__(self, name: str, settings: Settings, on_end: Callable[[EndReason], None]) -> None:
         """`on_end` is called once, when the process has ended."""
-        ours, theirs = Pipe()
+        spawned = spawn()
         self.name = name
         self.jobs_done = 0
         self.memory_bytes = 0
         self.gpus: tuple[GpuMemory, ...] = ()
         self.heard = time.monotonic()  # when it last sent a heartbeat
         self._job_timeout = settings.job_timeout
-        self._pipe: Connection[ToWorker, FromWorker] = ours
+        self._process, self._pipe = spawned.process, spawned.pipe
         self._sending = threading.Lock()
         self._inboxes: dict[str, SimpleQueue[OfJob | None]] = {}
         self._loaded = threading.Event()
@@ -83,10 +80,6 @@ class Worker:
         self._reason, self._is_final, self._stopped = "crashed", False, False
         self._end_reason: EndReason = "crashed"
         self._on_end = on_end
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "cow_service.workers.child", str(theirs.fileno())], pass_fds=[theirs.fileno()]
-            )
         threading.Thread(target=self._listen, name=f"cow-{name}", daemon=True).start()
         self._send(Configure(settings))
 

@@ -50,6 +50,8 @@ class EmbeddedReader:
     info = ReaderInfo(name="embedded", revision=__version__)  # rules change with the version alone
     fingerprint = f"embedded {__version__}"
 
+    heeds_seed = False
+
     def repeats_answers(self, votes: int) -> bool:
         """Always: rules draw no random numbers."""
         return True

@@ -84,6 +84,8 @@ class MllmReader:
         )  # fmt: skip
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
+    heeds_seed = True
+
     def repeats_answers(self, votes: int) -> bool:
         """Only of a model that is deterministic at temperature 0, where that is what it is asked with."""
         temperature = VOTING_TEMPERATURE if votes > 1 else self._model.manifest.defaults.get("temperature")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from cow_service.records import PlaceRelation
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the command line prints its help without records
+    from cow_service.records import PlaceRelation
 
 PREPOSITIONS: dict[PlaceRelation, str] = {
     "into": "into", "onto": "onto", "between": "between", "in-front-of": "in front of", "behind": "behind",
