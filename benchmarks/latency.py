@@ -15,12 +15,14 @@ import base64
 import json
 import os
 import resource
+import sqlite3
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +90,31 @@ def peak_memory_mb(pid: int) -> float:
     return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1000
 
 
+def kept_bytes(data: Path) -> dict[str, int]:
+    """What a data folder holds: the rows of the job database, and all files beside it."""
+    with sqlite3.connect(data / "jobs.sqlite3") as database:
+        pages, free, size = (
+            database.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "freelist_count", "page_size")
+        )
+    files = [path for path in data.rglob("*") if path.is_file() and not path.name.startswith("jobs.sqlite3")]
+    return {"database": (pages - free) * size, "files": sum(path.stat().st_size for path in files)}
+
+
+def throughput(address: str, ask: Callable[..., None], callers: int, runs: int) -> float:
+    """Requests per second of several callers, each with a connection of its own and one request at a time."""
+
+    def calls(_: int) -> None:
+        with httpx.Client(base_url=address, timeout=60) as client:
+            for _ in range(runs):
+                ask(client, video=False)
+
+    with ThreadPoolExecutor(callers) as pool:
+        list(pool.map(calls, range(callers)))  # workers are started when they are first needed
+        started = time.perf_counter()
+        list(pool.map(calls, range(callers)))
+        return callers * runs / (time.perf_counter() - started)
+
+
 def measure(image: Path, question: str, runs: int) -> dict[str, Any]:
     """All figures."""
     figures: dict[str, Any] = {"cores": os.cpu_count(), "image": image.name, "runs": runs}
@@ -105,15 +132,29 @@ def measure(image: Path, question: str, runs: int) -> dict[str, Any]:
         process, address, _ = start_server(Path(data))
         try:
             encoded = "data:image/jpeg;base64," + base64.b64encode(image.read_bytes()).decode()
+            body = {"image": encoded, "question": question}
+
+            def ask(client: httpx.Client, **rest: Any) -> None:
+                client.post("/simulate", json=body | rest, headers=FRESH).raise_for_status()
+
             with httpx.Client(base_url=address, timeout=60) as client:
-                for name, video in (
-                    ("POST /simulate, 3 frames", False),
-                    ("POST /simulate, 3 frames and 81-frame mp4", True),
-                ):
-                    body = {"image": encoded, "question": question, "video": video}
-                    figures[name] = timed(
-                        lambda body=body: client.post("/simulate", json=body, headers=FRESH).raise_for_status(), runs
-                    )
+                started = time.perf_counter()
+                ask(client, video=False)
+                first = 1000 * (time.perf_counter() - started)
+                warm = timed(lambda: ask(client, video=False), runs)
+                figures["POST /simulate, 3 frames"] = warm
+                figures["first request"] = {"ms": round(first, 1), "against warm": round(first / warm["p50_ms"], 2)}
+                before = kept_bytes(Path(data))
+                figures["POST /simulate, 3 frames and 81-frame mp4"] = timed(lambda: ask(client), runs)
+                count = runs + 1
+                figures["kept per job"] = {
+                    name: round((size - before[name]) / count) for name, size in kept_bytes(Path(data)).items()
+                }
+                alone = throughput(address, ask, 1, runs)
+                figures["throughput"] = {
+                    "one caller, 1/s": round(alone, 2),
+                    "two callers against one": round(throughput(address, ask, 2, runs) / alone, 2),
+                }
             figures["peak memory, MB"] = round(peak_memory_mb(process.pid), 1)
         finally:
             process.terminate()

@@ -12,8 +12,6 @@ pictures are given or taken as such.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from cow_service.client.http_library import import_httpx
-
 if TYPE_CHECKING:
     from cow_service.client import errors
     from cow_service.client.async_client import AsyncClient
@@ -67,8 +65,6 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name == "errors" or name in _MODULES:
-        import_httpx()
     if name == "errors":
         return import_module("cow_service.client.errors")
     if name not in _MODULES:

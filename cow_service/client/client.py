@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from cow_service.client.base import BaseClient
+from cow_service.client.http_library import import_httpx
 
 if TYPE_CHECKING:
     import httpx
@@ -52,6 +53,7 @@ class Client(_Base):
     """
 
     def _connect(self, *arguments: Any) -> Any:
+        import_httpx()
         from cow_service.client.connection import Connection  # noqa: PLC0415 - httpx and pydantic take 0.3 s to import
 
         return Connection(*arguments)
