@@ -126,10 +126,13 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
         server.should_exit = True
 
     readiness.start(failed)
-    readiness.wait(LOAD_WAIT_SECONDS)
-    engine.start()
-    server.run()
-    readiness.wait(0)
+    try:
+        readiness.wait(LOAD_WAIT_SECONDS)
+        engine.start()
+        server.run()
+        readiness.wait(0)
+    finally:
+        readiness.end()
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -158,15 +158,15 @@ class Database:
         return None if row is None else (row[0], unpacked(row[1]))
 
     def store_result(self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str]) -> None:
-        """Adds references to a stage's artifacts, then saves its result: in this order, each is valid alone."""
-        with self._cursor() as cursor:
+        """Adds references to a stage's artifacts, and saves its result."""
+        with self._cursor(writes=True) as cursor:
             self._add_references(cursor, job, artifacts)
             cursor.execute(self._plain(_SAVE), (key, job, stage, packed(result), time.time()))
             cursor.execute(self._plain(_DONE), (job, stage))
 
     def reuse_result(self, job: str, stage: str, artifacts: Iterable[str]) -> None:
         """Adds references to the artifacts of a result that another job had computed."""
-        with self._cursor() as cursor:
+        with self._cursor(writes=True) as cursor:
             self._add_references(cursor, job, artifacts)
             cursor.execute(self._plain(_DONE), (job, stage))
 
@@ -214,14 +214,18 @@ class Database:
             return set(connection.execute(query).scalars())
 
     @contextmanager
-    def _cursor(self) -> Generator[Any]:
-        """A cursor of a pooled connection. In PostgreSQL each statement is a transaction, in SQLite all together."""
+    def _cursor(self, *, writes: bool = False) -> Generator[Any]:
+        """A cursor of a pooled connection. In PostgreSQL each statement is a transaction, unless all of them write:
+        they are then sent together, and are one. In SQLite all together are.
+        """
         with database_errors():
             connection: Any = self.engine.raw_connection()
             try:
                 if self.file is None:
                     connection.dbapi_connection.autocommit = True  # else every statement takes three messages
-                yield connection.cursor()
+                sent_together = writes and self.file is None
+                with connection.dbapi_connection.pipeline() if sent_together else nullcontext():
+                    yield connection.cursor()
                 connection.commit()
                 if self.file is None:
                     connection.dbapi_connection.autocommit = False

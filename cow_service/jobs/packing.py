@@ -14,11 +14,11 @@ def packed(text: str) -> str:
     """The text as the database keeps it."""
     if len(text) < LEAST:
         return text
-    return MARK + base64.b85encode(zlib.compress(text.encode(), LEVEL)).decode()
+    return MARK + base64.b64encode(zlib.compress(text.encode(), LEVEL)).decode()
 
 
 def unpacked(kept: str) -> str:
     """The text that was packed; one of an earlier version is as it was written."""
     if not kept.startswith(MARK):
         return kept
-    return zlib.decompress(base64.b85decode(kept[len(MARK) :])).decode()
+    return zlib.decompress(base64.b64decode(kept[len(MARK) :])).decode()

@@ -23,6 +23,7 @@ class Readiness:
         self._service = service
         self._load_backends = load or service.check
         self._warm_up = warm_up
+        self._warming = threading.Lock()  # held while it warms up, and for ever once the process ends
         self._done = threading.Event()
         self._started = False
         self.error: CowError | None = None
@@ -37,6 +38,10 @@ class Readiness:
         self._done.wait(seconds)
         if self.error is not None:
             raise self.error
+
+    def end(self) -> None:
+        """Waits until no thread warms up, and has none begin: a process that ends in the middle of one crashes."""
+        self._warming.acquire()
 
     def check(self) -> None:
         """Raises `NotReady` while loading, `StorageUnavailable`, `ReaderUnavailable`, `GeneratorUnavailable`."""
@@ -54,7 +59,8 @@ class Readiness:
     def _load(self, failed: Callable[[], None]) -> None:
         try:
             self._load_backends()
-            self._warm_up()
+            with self._warming:
+                self._warm_up()
         except CowError as error:
             self.error = error
             failed()

@@ -295,8 +295,14 @@ def _image_velocity(mover: Placed, cameras: Cameras, way: Floats) -> Floats:
 def _apart(placed: list[Placed]) -> list[Placed]:
     """Makes bodies slimmer that would overlap: boxes are wider than the things in them."""
     bodies = list(placed)
+    centres = np.stack([body.centre for body in placed])
+    farthest = np.stack([body.half_width * np.maximum(1.0, body.depth_share) for body in placed])
+    heights = np.stack([body.half_height for body in placed])
     for i, a in enumerate(placed):
-        for j in range(i + 1, len(placed)):
+        gaps = np.linalg.norm(centres[i, :, [0, 2]].T - centres[i + 1 :, :, [0, 2]], axis=2)
+        near = APART * gaps < farthest[i] + farthest[i + 1 :]  # of the many others only a few may overlap
+        near &= np.abs(centres[i, :, 1] - centres[i + 1 :, :, 1]) < APART * (heights[i] + heights[i + 1 :])
+        for j in (i + 1 + np.nonzero(near.any(axis=1))[0]).tolist():
             b = placed[j]
             between = a.centre[:, [0, 2]] - b.centre[:, [0, 2]]
             gap = np.linalg.norm(between, axis=1)

@@ -1,6 +1,6 @@
 """Where the milliseconds of a simulation go: by stage and by function, at two image sizes.
 
-    python benchmarks/profile.py [--runs N] [--image FILE --question TEXT [--request JSON]] [--top N] [--json FILE]
+    python benchmarks/profile_stages.py [--runs N] [--top N] [--image FILE --question TEXT --request JSON] [--json FILE]
 
 The pipeline runs in this process, without server and job engine, every time anew. Stage times are medians in
 milliseconds of runs that nothing else watches. Functions are then found by sampling: every millisecond the stack is
@@ -36,7 +36,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "ball-and-mug"
 INTERVAL = 0.001  # seconds between looks at the stack
 PHOTO = 4000, 3000  # px
-GIVEN = {"grounding": {"point": [1650, 1870]}, "motion": {"direction": [1, 0]}, "video": False}
+GIVEN: dict[str, Any] = {"grounding": {"point": [1650, 1870]}, "motion": {"direction": [1, 0]}, "video": False}
 
 
 def photograph(width: int, height: int) -> bytes:
