@@ -20,6 +20,7 @@ from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_directi
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
+from cow_service.vision.circles import Edges
 from cow_service.vision.ghost_shadows import without_ghost_shadows
 from cow_service.vision.scene import Scene
 from cow_service.vision.trails import Position, Trail, TrailEnd, find_trails, trail_of
@@ -208,3 +209,13 @@ def test_a_rendered_trail() -> None:
     found = trail_of(Scene(image).trails, (182.8, 16.9, 261.6, 95.7))
     assert found is not None
     assert len(found.positions) == 4
+
+
+@given(st.floats(0, 640), st.floats(0, 400), st.floats(6, 90))
+def test_no_circle_is_fitted_where_none_may_be(x: float, y: float, radius: float) -> None:
+    edges = Edges.of(ball(floor(), (300, 240), 40, (200, 40, 40)))
+    assert edges is not None
+    places = np.array([(x, y), (300.0, 240.0)])
+    may = edges.may_fit(places, radius)
+    assert may[0] or edges.fit(x, y, radius) is None
+    assert may[1] or not 38 < radius < 42, "the ball's own outline"
