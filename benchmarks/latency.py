@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ import httpx
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "ball-and-mug"
+SAME_IMAGE = "What happens if the yellow ball moves to the right"
 USE = "from cow_service.client import Client; Client()"
 FRESH = {"Cache-Control": "no-cache"}  # no results of earlier runs
 
@@ -144,11 +146,18 @@ def measure(image: Path, question: str, runs: int) -> dict[str, Any]:
                 warm = timed(lambda: ask(client, video=False), runs)
                 figures["POST /simulate, 3 frames"] = warm
                 figures["first request"] = {"ms": round(first, 1), "against warm": round(first / warm["p50_ms"], 2)}
+                numbers = count(2)
+
+                def ask_other() -> None:
+                    other = {"question": f"{SAME_IMAGE} for {next(numbers)} seconds?", "video": False}
+                    client.post("/simulate", json=body | other).raise_for_status()
+
+                figures["another question about the image"] = timed(ask_other, runs)
                 before = kept_bytes(Path(data))
                 figures["POST /simulate, 3 frames and 81-frame mp4"] = timed(lambda: ask(client), runs)
-                count = runs + 1
+                made = runs + 1
                 figures["kept per job"] = {
-                    name: round((size - before[name]) / count) for name, size in kept_bytes(Path(data)).items()
+                    name: round((size - before[name]) / made) for name, size in kept_bytes(Path(data)).items()
                 }
                 alone = throughput(address, ask, 1, runs)
                 figures["throughput"] = {

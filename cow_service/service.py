@@ -34,6 +34,7 @@ from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUr
 from cow_service.settings import Settings, SettingsError
 from cow_service.stages.checks import check_request
 from cow_service.stages.run import Backends, Progress, Run, Step, compute_directly, ignore_progress, now, priority_of
+from cow_service.vision.seen_images import SeenImages
 from cow_service.weights.lock import ready
 from cow_service.weights.manifests import find_manifest, load_manifests
 
@@ -54,6 +55,7 @@ class Service:
         self.cpu = PrioritySemaphore(settings.concurrency)  # held around work on the CPU
         self._devices: dict[str, PrioritySemaphore] = {}  # of generators that make only so many clips at the same time
         self._guard = Lock()
+        self.seen = SeenImages()  # what jobs have measured in images, for those that come with the same
         self.metrics = Metrics()
         self._image_urls = ImageUrls(settings)
         self.artifacts = open_artifact_store(settings)

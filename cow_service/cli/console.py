@@ -24,7 +24,6 @@ from cow_service.client.wording import (
     readiness_words,
 )
 from cow_service.errors import InvalidRequest
-from cow_service.media.animations import FORMATS, frames_of
 from cow_service.media.images import DecodedImage
 from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
@@ -163,6 +162,8 @@ def _save_formats(out: Path, formats: Sequence[str]) -> list[str]:
     """Writes the clip of a folder in other forms; returns their names."""
     if not formats:
         return []
+    from cow_service.media.animations import FORMATS, frames_of  # noqa: PLC0415 # FFmpeg's bindings take long to import
+
     frames, fps = frames_of((out / "video.mp4").read_bytes())
     made = dict(FORMATS[each] for each in formats)
     with writable(out):

@@ -118,9 +118,12 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     request = spec.parsed()
     assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
     given = work.progress, work.image(), step, outages.wait_through, work.job_id, spec.created_at, spec.turn
+    seen = None if spec.fresh else service.seen
     if isinstance(request, AnswerRequest):
-        result = answer(outages.wait_through(lambda: service.prepare(request, *given)))
+        with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, work.owner) as run:
+            result = answer(run)
     else:
-        result = simulate(outages.wait_through(lambda: service.prepare(request, *given)))
+        with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, work.owner) as run:
+            result = simulate(run)
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
     return Outcome(result.model_dump_json(), computed)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 import uuid
+from collections import abc
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from pydantic import BaseModel
 
@@ -26,6 +27,7 @@ from cow_service.stages.checks import check_request
 from cow_service.stages.keys import BackendRole, StageKey, key_of
 from cow_service.stages.results import StageResult, Value
 from cow_service.vision.scene import Scene
+from cow_service.vision.seen_images import ImageKey, SeenImages
 
 ALMOST_DONE = 0.999  # of a stage whose end has not been reported
 
@@ -90,6 +92,9 @@ class Run(Generic[Request_co]):
     id: str = field(default_factory=lambda: str(uuid.uuid4()))
     created_at: str = field(default_factory=now)
     turn: int = 0  # of the job, among those of all callers: the lower comes first
+    seen: SeenImages | None = None  # images that other runs have measured; None: everything is measured anew
+    _first_scene: Scene | None = None
+    _image_key: ImageKey = (None, "")
     results: dict[Stage, StageResult[Any]] = field(default_factory=dict[Stage, StageResult[Any]])
     timings: dict[str, float] = field(default_factory=dict[str, float])  # seconds per stage
     reused: list[Stage] = field(default_factory=list[Stage])  # results that another request had computed
@@ -100,7 +105,21 @@ class Run(Generic[Request_co]):
     @cached_property
     def scene(self) -> Scene:
         """The image, and what is measured in it when first asked for."""
-        return Scene(self.image.pixels, trail_named=parse(self.request.question).motion.trail is not None)
+        scene = Scene(self.image.pixels, trail_named=parse(self.request.question).motion.trail is not None)
+        if self.seen is not None:
+            self.seen.recall(self._image_key, scene)
+        self._first_scene = scene
+        return scene
+
+    @contextmanager
+    def with_images(self, seen: SeenImages | None, owner: str | None = None) -> abc.Generator[Self]:
+        """The run, which finds what others of its owner have measured in its image, and has them find what it has."""
+        self.seen, self._image_key = seen, (owner, self.image.info.sha256)
+        try:
+            yield self
+        finally:
+            if seen is not None and self._first_scene is not None:
+                seen.keep(self._image_key, self._first_scene)
 
     def place_mover(self, bbox: BBox, cue: Cue | None) -> None:
         """Has the scene know where what moves is: which end of a trail it is, the other positions are taken out.

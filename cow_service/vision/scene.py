@@ -24,6 +24,9 @@ from cow_service.vision.trails import Trail, find_trails, trail_ending_at
 from cow_service.vision.types import Image, Mask
 
 Found = TypeVar("Found")
+Measured = dict[str, Any]
+"""Cached properties of a `Scene` by their names."""
+OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "_all_trails")  # neither mover nor words decide them
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +140,19 @@ class Scene:
     def _with_trails(self, **changes: Any) -> Scene:
         """The same image with other trails in it."""
         other = replace(self, **{"_masks": {}, "_found": {}, "_preset": {}, "_obstacles": {}, **changes})
-        kept = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "_all_trails")  # which an end of a trail changes not
-        other.__dict__.update({key: self.__dict__[key] for key in kept if key in self.__dict__})
+        other.__dict__.update({key: self.__dict__[key] for key in OF_THE_IMAGE if key in self.__dict__})
         return other
+
+    def measured(self) -> Measured:
+        """What was measured so far that depends on nothing but the image: not to be written to."""
+        alone = OF_THE_IMAGE
+        if self.__dict__.get("_all_trails") == ():  # then nothing depends on which end of one is meant
+            alone = (*alone, "clean", "regions")
+        return {key: self.__dict__[key] for key in alone if key in self.__dict__}
+
+    def take(self, measured: Measured) -> None:
+        """Takes over what another scene of the same image has measured."""
+        self.__dict__.update({key: value for key, value in measured.items() if key not in self.__dict__})
 
     def region_of(self, bbox: BBox) -> Region | None:
         """The region that a box [x0, y0, x1, y1] is about, if there is one."""
