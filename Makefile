@@ -37,6 +37,8 @@ bench: $(VENV)/.base ## the figures of the README
 	$(BIN)/python benchmarks/scenes.py examples
 	$(BIN)/python benchmarks/answers.py examples
 	$(BIN)/python benchmarks/latency.py
+	$(BIN)/python benchmarks/profile_stages.py
+	$(BIN)/python benchmarks/engine.py
 	$(BIN)/python benchmarks/chat.py
 
 clean: ## remove what the other targets made

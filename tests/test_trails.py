@@ -219,3 +219,14 @@ def test_no_circle_is_fitted_where_none_may_be(x: float, y: float, radius: float
     may = edges.may_fit(places, radius)
     assert may[0] or edges.fit(x, y, radius) is None
     assert may[1] or not 38 < radius < 42, "the ball's own outline"
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_no_circle_goes_through_edges_on_a_line(upright: bool) -> None:
+    along, fixed = np.arange(90.0, 111.0), np.full(21, 100.0)
+    points = np.stack([fixed, along] if upright else [along, fixed], axis=1)
+    normals = np.tile([1.0, 0.0] if upright else [0.0, 1.0], (21, 1))
+    edges = Edges(points[np.argsort(points[:, 1], kind="stable")], normals, (200, 200), (1.0, 1.0))
+    centre = (70.5, 100.5) if upright else (100.5, 70.5)
+    assert edges.may_fit(np.array([centre]), 30.0).all()
+    assert edges.fit(*centre, 30.0) is None

@@ -27,6 +27,7 @@ OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own poll
 CANCEL_POLL_SECONDS = 1.0  # for jobs that run here and were canceled by another process, and for processes that ended
 STALLED_SECONDS = 10.0  # between checks for stalled jobs
 GARBAGE_SECONDS = 600.0  # between garbage collections
+TURN_SECONDS = 0.9 * GARBAGE_SECONDS  # since the last one of any process, which may have begun late
 SUBMIT_SECONDS = 5.0  # within which a job is in the database after the reference to its image
 MAX_REMOVED_JOBS = 200  # at a time
 JOIN_TIMEOUT_SECONDS = 5.0
@@ -120,7 +121,7 @@ class Maintenance:
             self._stop.wait(CANCEL_POLL_SECONDS)
 
     def _tidy(self) -> None:
-        if takes_turn(self._open_jobs.database, GARBAGE_SECONDS / 2):
+        if takes_turn(self._open_jobs.database, TURN_SECONDS):
             self.collect_garbage()
 
     def _poll_cancellations(self) -> None:

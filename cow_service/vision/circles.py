@@ -104,7 +104,7 @@ class Edges:
         fx, fy = self.stretch
         x, y, radius = places[:, :1] / fx - 0.5, places[:, 1:] / fy - 0.5, 2 * radius / (fx + fy)
         near = self._near(x.min(), y.min(), x.max(), y.max(), radius)
-        on, _, _ = _on_circle(self.points[near], self.normals[near], x, y, radius, _first_reach(radius))
+        on, _, _ = _on_circle(self.points[near], self.normals[near], x, y, radius, _reach(radius, FIRST_REACH))
         return np.count_nonzero(on, axis=1) >= LEAST_ON
 
     def notch(self, a: Circle, b: Circle) -> float | None:
@@ -218,16 +218,16 @@ def _voted(points: Floats, normals: Floats, shape: tuple[int, int]) -> list[tupl
     return found
 
 
-def _first_reach(radius: float) -> float:
-    return max(2.0, FIRST_REACH * radius)
+def _reach(radius: float, share: float) -> float:
+    return max(2.0, share * radius)
 
 
 def _fitted(
     points: Floats, normals: Floats, x: float, y: float, radius: float
 ) -> tuple[float, float, float, frozenset[int]] | None:
     """The circle by least squares over the edges near one, twice; None where too few lie on it."""
-    for reach in (_first_reach(radius), None):
-        on, across, down = _on_circle(points, normals, x, y, radius, reach or max(2.0, SECOND_REACH * radius))
+    for share in (FIRST_REACH, SECOND_REACH):
+        on, across, down = _on_circle(points, normals, x, y, radius, _reach(radius, share))
         if np.count_nonzero(on) < LEAST_ON:
             return None
         a, b, fitted = _least_squares(across[on], down[on])
@@ -249,7 +249,7 @@ def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:
     xx, xy, yy = xx - x * x / count, xy - x * y / count, yy - y * y / count
     xz, yz = xz - x * z / count, yz - y * z / count
     determinant = xx * yy - xy * xy
-    if determinant < LINE * xx * yy:
+    if determinant <= LINE * xx * yy:  # equal where all of them have the same x or y
         return math.inf, math.inf, math.inf
     a, b = (xz * yy - yz * xy) / determinant / 2, (yz * xx - xz * xy) / determinant / 2
     return a, b, math.sqrt(max((z - 2 * a * x - 2 * b * y) / count + a * a + b * b, 0.0))
