@@ -7,7 +7,6 @@ IoU, direction error (degrees), path error (% of the image's width: mean distanc
 contact, to the computed path), centre error (px: where the mover is found in rendered frames against its trajectory),
 background error (grey levels: the largest difference to the input away from mover, hole and drawing), arrow error (grey
 levels: mean difference to clean.jpg where the arrow stood), and whether the encounters give the true answer.
-Scenes whose direction is an orientation must be refused; they are then run again with the true direction given.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from cow_service.errors import CannotReadDirection, CowError
+from cow_service.errors import CowError
 from cow_service.records import BBox, Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
@@ -71,18 +70,11 @@ def measure(service: Service, folder: Path) -> Row:
         "question": meta["question"],
         "frames": {"indices": INDICES, "max_side": None},
     }
-    needs_orientation = meta["motion"] == "linear" and not meta["arrow"]
-    outcome = "ok"
     try:
         simulation = service.simulate(SimulateRequest.model_validate(body))
     except CowError as error:
-        outcome = error.code
-        if not (needs_orientation and isinstance(error, CannotReadDirection)):
-            return Row(folder.name, meta["task"], outcome, truth=meta["answer"])
-        body["motion"] = {"direction": meta["direction"]}
-        simulation = service.simulate(SimulateRequest.model_validate(body))
-    expected_refusal = needs_orientation and outcome == "ok"
-    return _row(service, folder, meta, simulation, "not refused" if expected_refusal else outcome)
+        return Row(folder.name, meta["task"], error.code, truth=meta["answer"])
+    return _row(service, folder, meta, simulation, "ok")
 
 
 def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simulation, outcome: str) -> Row:

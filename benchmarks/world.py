@@ -3,12 +3,12 @@
     python benchmarks/world.py DIR [DIR ...] [--json FILE]
 
 Each DIR holds one folder per scene with image.jpg and meta.json, as `examples/` does. A scene is asked by image and
-question alone, but for the direction of vehicles, which the embedded reader cannot read. Per scene: the answer against
-the truth, with its probability; path error (% of the image's width: mean distance of the true centres, up to the first
-contact, to the path) and the same with the true path moved to where the path begins (the middle of a box is not where
-the middle of a car or a candle is seen), size error (% of the apparent size at the nearest point of the path, for what
-stands on a floor), push error (of what is pushed: distance of its last centre to the true one, as a share of how far
-off it would be if it had stayed), and whether the path shown agrees with the answer.
+question alone. Per scene: the answer against the truth, with its probability; path error (% of the image's width:
+mean distance of the true centres, up to the first contact, to the path) and the same with the true path moved to
+where the path begins (the middle of a box is not where the middle of a car or a candle is seen), size error (% of the
+apparent size at the nearest point of the path, for what stands on a floor), push error (of what is pushed: distance
+of its last centre to the true one, as a share of how far off it would be if it had stayed), and whether the path
+shown agrees with the answer.
 """
 
 from __future__ import annotations
@@ -64,8 +64,6 @@ def measure(service: Service, folder: Path) -> Row | None:
     form = meta.get("form") or meta["motion"]
     image, _ = service.keep_image((folder / "image.jpg").read_bytes())
     body: dict[str, Any] = {"image": {"artifact": image.sha256}, "question": meta["question"]}
-    if meta["motion"] == "linear" and " forward" in meta["question"]:
-        body["motion"] = {"direction": meta["direction"]}
     try:
         answer = service.answer(AnswerRequest.model_validate(body))
     except CowError as error:

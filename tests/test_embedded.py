@@ -236,7 +236,7 @@ def test_refusals_say_what_was_looked_for_what_was_seen_and_what_to_give() -> No
     told = refusal(CannotReadDirection, drawn(False), "If the red ball moves, will it hit the cube?")
     assert "names no direction" in told
     told = refusal(CannotReadDirection, drawn(False), "If the red ball moves forward, will it hit the cube?")
-    assert "faces is beyond the embedded reader" in told
+    assert "only of vehicles with wheels which way they face" in told
     told = refusal(CannotReadDirection, drawn(False), "If the red ball moves towards the green vase, will it hit it?")
     assert "'green vase'" in told
     told = refusal(CannotGround, drawn(False), "If the object inside the box moves left, what happens?")

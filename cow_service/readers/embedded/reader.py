@@ -13,6 +13,7 @@ from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, 
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
 from cow_service.readers.embedded.doubts import noun_warnings
+from cow_service.readers.embedded.facing import facing
 from cow_service.readers.embedded.kinds import is_kind_asked, things_of_kinds
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
@@ -22,6 +23,7 @@ from cow_service.readers.question.motion_words import MotionWords
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.relations import read_alternatives, read_asked, unread
 from cow_service.readers.question.sentences import Question, parse, parse_noun_phrase
+from cow_service.readers.question.shapes import is_vehicle
 from cow_service.readers.question.wording import same_name
 from cow_service.readers.question.words import ARROWS
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
@@ -250,12 +252,21 @@ def _as_shown(scene: Scene, question: Question, kind: MotionKind, grounding: Gro
     """The motion whose direction the image shows, by a trail or an arrow. Raises `CannotReadDirection`."""
     words = question.motion
     if words.forward is not None:
-        raise CannotReadDirection(
-            f"The question says that the {grounding.object} moves {'forward' if words.forward else 'backward'}. "
-            "Which way an object faces is beyond the embedded reader: it reads drawn arrows and words like left or "
-            f"up. {GIVE_DIRECTION}"
-        )
+        return _as_it_faces(scene, words.forward, kind, grounding)
     return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
+
+
+def _as_it_faces(scene: Scene, forward: bool, kind: MotionKind, grounding: Grounding) -> MotionReading:
+    """Forward or backward, by the way that a vehicle is seen to face."""
+    said = f"The question says that the {grounding.object} moves {'forward' if forward else 'backward'}."
+    if not is_vehicle(grounding.object):
+        raise CannotReadDirection(
+            f"{said} The embedded reader sees only of vehicles with wheels which way they face. {GIVE_DIRECTION}"
+        )
+    way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
+    if way is None:
+        raise CannotReadDirection(f"{said} Which way it faces could not be seen for certain. {GIVE_DIRECTION}")
+    return MotionReading(kind, way if forward else (-way[0], -way[1]), "orientation")
 
 
 def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:

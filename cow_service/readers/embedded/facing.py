@@ -1,0 +1,156 @@
+"""Which way a vehicle faces: the turn of a model car that shows paint, tyres, glass and lamps where the image does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from cow_service.physics.camera_fit import FOCAL_WIDTHS
+from cow_service.physics.floor_camera import FloorCamera
+from cow_service.readers.embedded.vehicle_model import DARK, OTHER, PAINT, Labels, VehicleModel
+from cow_service.records import BBox, Vector
+from cow_service.vision.masks import bbox_of, resized_mask, scaled
+from cow_service.vision.types import Floats, Floats32, Image, Mask
+
+WORKING_SIDE = 80  # px: the vehicle is compared at this size
+PITCHES = tuple(math.radians(degrees) for degrees in (20, 28, 36))  # cameras that are tried
+TURNS = np.radians(np.arange(0, 360, 10))
+FINE_TURNS = np.radians(np.arange(-9, 9.1, 1.5))  # about the best of them
+ELSEWHERE = math.cos(math.radians(72))  # of the angle between two headings from which they are different ones
+MIN_SCORE = 1.2  # of 2.2: what fits worse is no such vehicle, or is hidden in part
+MIN_PARTS = 0.03  # of the outline's area that are tyres, glass or lamps: paint alone tells no front
+MIN_LEAD = 0.03  # of the best score before that of another heading
+TYRES, GLASS = 0.6, 0.6  # what agreement in these parts counts, against 1 for the outline
+SMOOTHING = 0.03  # of the outline's area: parts smaller than this count little
+
+MARGIN, MARGIN_BELOW = 0.06, 0.25  # of the box, looked at around it: tyres may lie below what was found by colour
+TYRE_LIGHTNESS, TYRE_CHROMA = 28.0, 18.0  # Lab; also below a share of the floor's lightness
+TYRE_SHARE = 0.45
+LOW_PART = 0.6  # of the height: below it, what is darker than the paint is shade
+HIGH_PART = 0.45  # of the height: above it, what is dark is glass and no tyre
+OTHER_STEP, OTHER_SHARE = 14.0, 0.55  # Lab units from the paint's colour, and of its chroma
+SLIT = 5  # px at the working size
+NEUTRAL = 12.0  # chroma below which paint is told by its lightness alone
+BLACK = 32.0  # lightness below which paint hides the tyres
+TINTED, DARKER = 2.5, 0.55  # Lab units of glass from black paint, and its lightness against white
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The vehicle as labels [h, w], its box (px of the image), and where the window lies."""
+
+    labels: Labels
+    bbox: BBox
+    corner: tuple[int, int]
+    scale: float
+
+
+def facing(image: Image, mask: Mask, bbox: BBox) -> Vector | None:
+    """The way [x, y] (unit vector, px) that the vehicle under a mask [H, W], in a box of an image, faces.
+
+    None where no way fits clearly better than every other.
+    """
+    seen = _seen(image, mask, bbox)
+    if seen is None or np.isin(seen.labels, (DARK, OTHER)).sum() < MIN_PARTS * (seen.labels > 0).sum():
+        return None
+    fits = list(_fits(image, seen, PITCHES, TURNS))
+    if not fits:
+        return None
+    score, first = max(fits, key=lambda fit: fit[0])
+    rival = max((other for other, model in fits if math.cos(model.yaw - first.yaw) < ELSEWHERE), default=0.0)
+    fine = _fits(image, seen, (first.camera.pitch,), first.yaw + FINE_TURNS)
+    score, best = max(((score, first), *fine), key=lambda fit: fit[0])
+    if score < MIN_SCORE or score - rival < MIN_LEAD:
+        return None
+    x, y = best.ahead.tolist()
+    return x, y
+
+
+def _fits(image: Image, seen: _Seen, pitches: Iterable[float], turns: Floats) -> Iterable[tuple[float, VehicleModel]]:
+    """The models of these cameras and turns with their scores."""
+    height, width = image.shape[:2]
+    for pitch in pitches:
+        camera = FloorCamera(width, height, FOCAL_WIDTHS * width, pitch, 0.0, 1.0)
+        for yaw in turns.tolist():
+            model = VehicleModel.fitted(camera, seen.bbox, yaw)
+            if model is not None:
+                yield _score(seen.labels, model.drawn(seen.corner, seen.scale, seen.labels.shape[:2])), model
+
+
+def _score(seen: Labels, model: Labels) -> float:
+    """Intersection over union of the outlines, and the weighted agreement of the parts."""
+    inside, drawn = seen > 0, model > 0
+    whole = float((inside & drawn).sum()) / max(1, int((inside | drawn).sum()))
+    least = SMOOTHING * float(inside.sum())
+    tyres, glass = (_dice(seen == label, model == label, least) for label in (DARK, OTHER))
+    return whole + TYRES * tyres + GLASS * glass
+
+
+def _dice(a: Mask, b: Mask, least: float) -> float:
+    """Sørensen-Dice coefficient, smoothed: 1 where both are empty."""
+    return (2 * float((a & b).sum()) + least) / (float(a.sum() + b.sum()) + least)
+
+
+def _seen(image: Image, mask: Mask, bbox: BBox) -> _Seen | None:
+    x0, y0, x1, y1 = bbox
+    margin, below = MARGIN * max(x1 - x0, y1 - y0), MARGIN_BELOW * (y1 - y0)
+    left, top = max(0, int(x0 - margin)), max(0, int(y0 - margin))
+    window = slice(top, math.ceil(y1 + below)), slice(left, math.ceil(x1 + margin))
+    scale = min(1.0, WORKING_SIDE / max(mask[window].shape))
+    small = scaled(image[window], scale)
+    own = resized_mask(np.ascontiguousarray(mask[window]), (small.shape[1], small.shape[0]))
+    if not own.any():
+        return None
+    near = (x0 - left) * scale, (y0 - top) * scale, (x1 - left) * scale, (y1 - top) * scale
+    labels = _labels(np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32), own, near)
+    x0, y0, x1, y1 = (side / scale for side in bbox_of(labels > 0))
+    return _Seen(labels, (left + x0, top + y0, left + x1, top + y1), (left, top), scale)
+
+
+def _labels(lab: Floats32, own: Mask, near: BBox) -> Labels:
+    """Labels [h, w] of a window whose pixels have these Lab colours, of what a mask and a box are about."""
+    lightness, chroma = lab[..., 0], np.hypot(lab[..., 1], lab[..., 2])
+    inner = _eroded(own) if _eroded(own).any() else own
+    paint, colour = float(np.median(lightness[inner])), np.median(lab[..., 1:][inner], axis=0)
+    floor = float(np.median(lightness[~own])) if not own.all() else 100.0
+    dark = (lightness < min(TYRE_SHARE * floor, TYRE_LIGHTNESS)) & (chroma < TYRE_CHROMA) & (paint > BLACK)
+    whole = _with_tyres(own, dark, near)
+    filled = _filled(whole)
+    away = np.hypot(*(lab[..., 1:] - colour).transpose(2, 0, 1))
+    tint = float(np.hypot(*colour))
+    other = away > max(OTHER_STEP, OTHER_SHARE * tint)
+    if tint < NEUTRAL:
+        other |= away > TINTED if paint < BLACK else lightness < DARKER * paint
+    _, top, _, bottom = bbox_of(filled)
+    down = (np.arange(len(own))[:, None] - top) / max(1.0, bottom - 1 - top)
+    other &= (down <= LOW_PART) | (lightness > paint)
+    labels = np.where(filled, np.uint8(PAINT), np.uint8(0))
+    labels[_eroded(filled) & other | filled & ~whole] = OTHER
+    labels[filled & dark & (down > HIGH_PART)] = DARK
+    labels[filled & dark & (down <= HIGH_PART)] = OTHER
+    return labels
+
+
+def _with_tyres(own: Mask, dark: Mask, near: BBox) -> Mask:
+    """The mask with what is dark, touches it and lies in the lower half of a box [x0, y0, x1, y1] or below."""
+    x0, y0, x1, y1 = near
+    beside = 0.05 * (x1 - x0)
+    columns, rows = np.arange(own.shape[1])[None], np.arange(own.shape[0])[:, None]
+    tyres = dark & (rows > (y0 + y1) / 2) & (columns > x0 - beside) & (columns < x1 + beside)
+    count, parts = cv2.connectedComponents((own | tyres).astype(np.uint8))
+    return parts == int(np.argmax(np.bincount(parts[own], minlength=count)))
+
+
+def _filled(mask: Mask) -> Mask:
+    """The mask without holes and narrow slits."""
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((SLIT, SLIT), np.uint8))
+    outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.zeros(mask.shape, np.uint8), outlines, -1, 1, cv2.FILLED) > 0
+
+
+def _eroded(mask: Mask) -> Mask:
+    return cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
