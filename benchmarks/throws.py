@@ -29,10 +29,11 @@ import numpy as np
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera_fit import CameraFit, fit_shadow, prior
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.engine import RigidShape, run_worlds
+from cow_service.physics.engine import run_worlds
 from cow_service.physics.events import find_events
 from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.outcome import SURE
+from cow_service.physics.rigid import RigidShape
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
 from cow_service.stages.motion import THROW_DEPTH_DEVIATION

@@ -15,7 +15,8 @@ from worlds import RADIUS, rigid
 
 from cow_service.errors import InvalidRequest
 from cow_service.physics.course import Course, Leg, course_of
-from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
+from cow_service.physics.engine import WorldRun, run_worlds
+from cow_service.physics.rigid import RigidShape
 from cow_service.readers.base import MotionReading, Quantity
 from cow_service.records import Grounding, LocatedObject, MetresPerPixel, Motion
 from cow_service.stages.motion import read_motion
@@ -53,6 +54,12 @@ class TestCourse:
             found = run(gliding(course), rigid("box", position=(1.0, RADIUS, 0)))
             assert found.positions[0, -1, 0] == pytest.approx(1 - 2 * RADIUS, abs=0.02) or not halts
             assert (found.positions[1, -1, 0] > 1.1) is not halts
+
+    def test_what_it_stands_on_does_not_end_it(self) -> None:
+        table = rigid("box", half_width=1.0, half_depth=1.0, half_height=0.5, position=(0.0, 0.5, 0.0))
+        ball = gliding(Course((Leg(0.2, (1.0, 0.0, 0.0)),)), position=(0.0, 1.0 + RADIUS, 0.0))
+        found = run(ball, table)
+        assert found.positions[0, -1, 0] == pytest.approx(0.2, abs=0.02)
 
     def test_what_is_met_on_the_way_ends_the_course(self) -> None:
         course = Course((Leg(2.0, (1.0, 0.0, 0.0)), Leg(1.0, (0.0, 0.0, 5.0))))

@@ -38,7 +38,7 @@ def drawn_car(yaw: float, pitch: float) -> tuple[Image, Mask, tuple[float, float
     for label, colour in COLOURS.items():
         image[labels == label] = colour
     x, y = model.ahead.tolist()
-    return cv2.GaussianBlur(image, (3, 3), 0.8), labels > 0, (x, y)
+    return np.asarray(cv2.GaussianBlur(image, (3, 3), 0.8), np.uint8), labels > 0, (x, y)
 
 
 def grounded(reader: EmbeddedReader, asked: ReaderInput) -> Grounding:

@@ -18,7 +18,8 @@ from cow_service.generators.cutout import CutoutGenerator, create
 from cow_service.media.images import decode_own
 from cow_service.physics.carrying import Put
 from cow_service.physics.draws import ensemble
-from cow_service.physics.engine import RigidShape, run_worlds
+from cow_service.physics.engine import run_worlds
+from cow_service.physics.rigid import RigidShape
 from cow_service.physics.settling import settle
 from cow_service.records import Clip, Trajectory
 from cow_service.settings import Settings

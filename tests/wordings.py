@@ -63,7 +63,9 @@ def verdict(service: Service, item: dict[str, Any]) -> Verdict:
     if problem is not None:
         return Verdict(question, "refused", expected, problem.detail[:300])
     if answer.not_sure:
-        return Verdict(question, "not-sure", expected, " ".join(answer.warnings)[:300])
+        # Understood, and the worlds disagree where the picture alone does not settle it: what must be said.
+        open_ = expect["refuse"] is None and expect["answer"] is None and _reads_as(answer, expect)
+        return Verdict(question, "right" if open_ else "not-sure", expected, " ".join(answer.warnings)[:300])
     said = f"{answer.option or answer.answer}: {_reading(answer)}"
     if expect["refuse"]:
         warned = any(word in " ".join(answer.warnings).lower() for word in _words(expect["refuse"]))

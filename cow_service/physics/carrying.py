@@ -10,7 +10,8 @@ import numpy as np
 
 from cow_service.physics.containers import hollow_of
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import Meeting, RigidShape, WorldRun
+from cow_service.physics.engine import Meeting, WorldRun
+from cow_service.physics.rigid import RigidShape
 from cow_service.records import PlaceRelation
 from cow_service.vision.openings import SeenOpening
 from cow_service.vision.types import Floats

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cow_service.physics.engine import RigidShape, WorldRun
+from cow_service.physics.engine import WorldRun
 from cow_service.physics.projection import SeenPaths, turned
+from cow_service.physics.rigid import RigidShape
 from cow_service.physics.world import Worlds
 from cow_service.vision.types import Floats, Mask
 

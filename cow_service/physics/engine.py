@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from rapier3d import (
@@ -28,15 +28,13 @@ from rapier3d import (
 
 from cow_service.physics.containers import (
     BOX_SIDES,
-    Hollow,
     floor_radius,
     floor_thickness,
     relative_density,
     wall_segments,
 )
-from cow_service.physics.course import Course
 from cow_service.physics.dynamics import GRAVITY
-from cow_service.records import Shape
+from cow_service.physics.rigid import RigidShape
 from cow_service.vision.types import Floats, Mask
 
 ENGINE_SIZE = 0.15  # m inside the engine: half the width of the first body of the first world
@@ -49,30 +47,7 @@ MOST_GRAVITY = 500.0  # m/s^2 inside the engine: what is smaller than 3 mm would
 FORESEEN = 10.0  # m inside the engine, at most: contacts are found that far ahead of what is fast
 GAP = 1e-3  # m inside the engine: how far above what it stands on a body starts
 FLOOR = (-1, -1)  # its owner
-
-
-@dataclass(frozen=True)
-class RigidShape:
-    """A body of one world at its start. Of a pair that touches, restitution and friction are the products."""
-
-    shape: Shape
-    half_width: float  # m: the radius of a sphere, cylinder or cone, half the length of a box
-    half_depth: float  # m: half the breadth of a box, else the half width
-    half_height: float  # m: of a sphere, its radius
-    position: tuple[float, float, float]  # of its centre
-    yaw: float = 0.0  # radians about the vertical
-    turn: tuple[float, float, float, float] | None = None  # quaternion x, y, z, w, where it is not turned by yaw alone
-    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s
-    density: float = 1.0  # against that of the others
-    friction: float = 0.5
-    restitution: float = 0.5
-    starts: bool = False  # it is set in motion or let go; what is not sleeps until it is touched
-    glides: bool = False  # keeps its velocity, without friction, until it meets another body
-    falls: bool = True  # gravity acts on it
-    ghost: bool = False  # passes through everything; what it meets is told all the same
-    course: Course | None = None  # of what glides: its legs, and where it stops
-    hollow: Hollow | None = None  # it is an open container
-    follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
+AT_START = 0.1  # s: what stands on a body meets it then, which is no end of gliding over it
 
 
 @dataclass(frozen=True)
@@ -294,6 +269,9 @@ class _Engine:
         if not {a, b} & self.awake[k]:  # bodies that stand close together touch when nothing moves
             return
         self._wake(k, {a, b})
+        one, other = self.worlds[k][a], self.worlds[k][b]
+        if time < AT_START and (one.stands_on(other) or other.stands_on(one)):
+            return
         for i in (a, b):
             if self.worlds[k][i].glides:
                 course = self.courses.get((k, i))

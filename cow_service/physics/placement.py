@@ -16,7 +16,8 @@ import numpy as np
 
 from cow_service.physics.carrying import Put
 from cow_service.physics.containers import BOX_SIDES, Hollow
-from cow_service.physics.engine import RigidShape, WorldRun
+from cow_service.physics.engine import WorldRun
+from cow_service.physics.rigid import RigidShape
 from cow_service.records import PlacementResult, PlaceRelation
 from cow_service.vision.types import Floats, Mask
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cow_service.physics.carrying import SETTLES, Put, let_go
-from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
+from cow_service.physics.engine import WorldRun, run_worlds
 from cow_service.physics.placement import Placements, classify
+from cow_service.physics.rigid import RigidShape
 from cow_service.records import PlacementResult
 from cow_service.vision.types import Floats
 

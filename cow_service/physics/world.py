@@ -15,10 +15,11 @@ from cow_service.physics.camera_fit import CameraFit
 from cow_service.physics.carrying import Put, arc, carried, frames_carried, frames_to_run, height_over, let_go
 from cow_service.physics.course import course_of
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
+from cow_service.physics.engine import WorldRun, run_worlds
 from cow_service.physics.lift import BOX_SIDE, FARTHEST, Cameras, Placed
 from cow_service.physics.placement import Placements, classify
 from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place, speed_factors
+from cow_service.physics.rigid import RigidShape
 from cow_service.physics.settling import settle, standing_on
 from cow_service.records import FALLING_KINDS, Motion
 from cow_service.vision.types import Floats, Mask

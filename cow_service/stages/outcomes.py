@@ -15,11 +15,11 @@ from cow_service.stages.imagining import Imagined
 BY_ENCOUNTERS = (*KIND_OF, "tips", "moves", "leaves", "lands")  # relations that encounters and paths decide
 
 
-def can_tell(query: Query, present: int, placed: bool) -> bool:
+def can_tell(query: Query, present: int, placed: bool, on_floor: bool) -> bool:
     """Whether worlds can decide what is asked; what is taken away does nothing. `present` bodies are left; `placed`
-    says whether something is put somewhere."""
+    says whether something is put somewhere, `on_floor` whether what acts stands on the floor: it cannot land there."""
     by_paths = query.asked.relation in BY_ENCOUNTERS or (placed and query.asked.relation == "inside")
-    return by_paths and query.subject < present
+    return by_paths and query.subject < present and not (on_floor and query.asked.relation == "lands")
 
 
 def with_outcomes(

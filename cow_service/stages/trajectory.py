@@ -9,7 +9,7 @@ import numpy as np
 
 from cow_service.physics.anchors import spread_anchors
 from cow_service.physics.ballistic import FreePath, ballistic_path, given_path, latest, sampled
-from cow_service.physics.bodies import SeenBody
+from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import Camera
 from cow_service.physics.events import encounters
 from cow_service.physics.floor_camera import FloorCamera
@@ -85,7 +85,8 @@ def trajectory_of(
     # People aim at what they ask about; where that is put elsewhere, not at its place in the image.
     asked_about = None if world.asked in [each.body for each in before] else world.asked
     world = replace(world, bodies=tapered(world.bodies, put, before), put=put, put_before=before, asked=asked_about)
-    tellable = query if known and query is not None and can_tell(query, kept, put is not None) else None
+    on_floor = query is not None and _on_floor(bodies, query.subject, motion)
+    tellable = query if known and query is not None and can_tell(query, kept, put is not None, on_floor) else None
     if put is not None and asked is None:  # what is shown is what most worlds do
         tellable = Query(Asked(relation="inside"), put.targets[0])
     imagined = imagine(world, tellable, request.ensemble)
@@ -94,6 +95,12 @@ def trajectory_of(
     told = with_outcomes(trajectories, imagined, asked, query, grounding, changes)
     factual = told[1].model_copy(update={"anchors": ()}) if len(told) > 1 else None
     return told[0].model_copy(update={"factual": factual})
+
+
+def _on_floor(bodies: Sequence[SeenBody], index: int, motion: Motion) -> bool:
+    """Whether a body stands on the floor at first: not in the air, nor on another thing."""
+    in_air = flies(bodies[index], motion) if index == 0 else bodies[index].is_flying
+    return not in_air and supports_of(bodies)[index] is None
 
 
 def _free_path(scene: Scene, grounding: Grounding, motion: Motion, request: SimulateRequest) -> FreePath | None:

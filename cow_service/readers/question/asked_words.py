@@ -41,6 +41,7 @@ class Sentence:
     words: list[Word] = field(default_factory=list[Word])
     phrases: dict[str, ObjectPhrase] = field(default_factory=dict[str, ObjectPhrase])
     asks: bool = False  # it ends with a question mark, or with the text
+    dropped: frozenset[int] = frozenset()  # places of items that were left out of it because they change nothing
 
     @property
     def tokens(self) -> list[str]:

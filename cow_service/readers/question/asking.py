@@ -24,6 +24,7 @@ _ACTS = {
 }
 _FORMS: dict[str, AskedForm] = {"either": "which-first"}
 _FORMS.update({form.replace("-", "_"): form for form in get_args(AskedForm)})
+_BY_MOVER: dict[AskedRelation, AskedRelation] = {"covers": "covered", "covered": "covers"}  # "the mug hides it"
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
 _NEGATIONS = frozenset(
     {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"}
@@ -131,10 +132,10 @@ def _tokens(tree: Tree[Token] | None) -> list[Token]:
 
 
 def _together(asking: Asking, beside: str | None) -> Asking | None:
-    """ "Will they collide?": the two things that move."""
-    if beside is None or asking.target is not None:
+    """ "Will they collide?": the two things that move, or the mover and the one other thing."""
+    if asking.target is not None:
         return None
-    return replace(asking, subject=None, target=beside)
+    return replace(asking, subject=None, target=beside or IT)
 
 
 def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_to: bool) -> Asking:
@@ -159,5 +160,5 @@ def _with_subject(asking: Asking, tree: Tree[Token], subject: list[Token], done_
         )
     elif mover_acted and target is None:
         target, doer = thing, None
-        relation = "covered" if relation == "covers" else relation
+        relation = _BY_MOVER.get(relation, relation)
     return replace(asking, relation=relation, subject=doer, target=target)

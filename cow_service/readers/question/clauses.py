@@ -248,8 +248,10 @@ def _behind_participle(found: Sequence[Item], at: int) -> ObjectPhrase | None:
 
 
 def is_vague(item: Item) -> bool:
-    """Whether a noun phrase names no certain object: "which ball", "any cube"."""
-    return bool(item.words) and item.words[0] in lex.VAGUE_DETERMINERS
+    """Whether a noun phrase names no certain object: "which ball", "any cube", "the first thing"."""
+    content = [word for word in item.words if word not in lex.DETERMINERS]
+    order = bool(content) and content[0] == "first" and lex.GENERIC.issuperset(content[1:])
+    return bool(item.words) and (item.words[0] in lex.VAGUE_DETERMINERS or order)
 
 
 def clause_end(found: Sequence[Item], at: int) -> int:

@@ -15,6 +15,7 @@ from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.accounting import Unread, unread_words
 from cow_service.readers.question.asked_words import MAX_TOKENS, THEM, Sentence, sentences
 from cow_service.readers.question.asking import IT, Asking, read_clause
+from cow_service.readers.question.paraphrases import rephrased
 from cow_service.readers.question.parsing import parse_all
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import Question
@@ -55,9 +56,8 @@ def read_asked(question: Question) -> Asked | None:
     `read_alternatives`.
     """
     reading = _read(question)
-    falls = question.motion.kind in {"fall", "projectile"}
-    if reading is None or unread(question).turning or (reading.asking.relation == "lands" and not falls):
-        return None  # what stands on the floor lands on it by nothing that the worlds tell
+    if reading is None or unread(question).turning:
+        return None
     asking = reading.asking
     target = None if asking.target is None else _named(asking.target, reading, question)
     subject = None if asking.subject is None else _named(asking.subject, reading, question)
@@ -115,16 +115,17 @@ def _read(question: Question) -> _Reading | None:
     found, claim = _without_claim(sentences(question))
     if len(found) > MAX_SENTENCES or any(len(sentence.words) > MAX_TOKENS for sentence in found):
         return None
-    readings = [
-        (at, reading) for at, sentence in enumerate(found) if (reading := _read_sentence(sentence, question, claim))
-    ]
+    readings = _readings(found, question, claim)
+    if not readings:
+        found = [rephrased(sentence, question) for sentence in found]
+        readings = _readings(found, question, claim)
     if len(readings) != 1:
         return None
     at, reading = readings[0]
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
         return None
-    named = {found[at].words[place].at for place in reading.covered} | claim
+    named = {found[at].words[place].at for place in reading.covered} | claim | found[at].dropped
     named |= {at for at, item in enumerate(question.items) if listed and (item.phrase in listed or item.key == "or")}
     named |= {at for at, item in enumerate(question.items) if item.key == "still" and question.interventions}
     named |= _premise(found[: at + 1], reading, question)
@@ -134,6 +135,12 @@ def _read(question: Question) -> _Reading | None:
         return None
     within = min(limits.values(), default=None)
     return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within, claim=bool(claim))
+
+
+def _readings(found: Sequence[Sentence], question: Question, claim: Collection[int]) -> list[tuple[int, _Reading]]:
+    """What the sentences ask, each with its place."""
+    read = ((at, _read_sentence(sentence, question, claim)) for at, sentence in enumerate(found))
+    return [(at, reading) for at, reading in read if reading is not None]
 
 
 def _premise(told: Sequence[Sentence], reading: _Reading, question: Question) -> set[int]:

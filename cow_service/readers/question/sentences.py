@@ -37,7 +37,9 @@ from cow_service.records import MotionKind
 MAX_WORDS = 240  # of a question that are read
 _EACH_OF_TWO = lex.words("both each together")
 _HOW_MANY = lex.words("the all both either none two three")
-_SAME_TIME = re.compile(r"\bat the same (?:time|moment|instant)\b(?P<joins> as\b)?", re.IGNORECASE)
+_SAME_TIME = re.compile(
+    r"\b(?:at the (?:very )?same (?:time|moment|instant)|simultaneously)\b(?P<joins> as\b)?", re.IGNORECASE
+)
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
     r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
@@ -237,6 +239,7 @@ def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidat
         if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
         and each.at > best.at and each.kind not in {None, "static"}
         and each.start > best.at and each.subject is not None and (each.subject.noun or each.subject.colour)
+        and all(item.key != "whether" for item in found[best.at : each.at])  # it is asked, not told
         and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 

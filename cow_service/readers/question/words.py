@@ -13,7 +13,7 @@ _SAME: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(["get", "gets", "got", "gotten"], ("get",)),
     **dict.fromkeys(["has", "had"], ("have",)),
     "being": ("be", "-ing"), "getting": ("get", "-ing"), "having": ("have", "-ing"), "making": ("make", "-ing"),
-    "makes": ("make",), "elapses": ("elapse",), "longer": ("long", "-er"),
+    "makes": ("make",), "made": ("make",), "elapses": ("elapse",), "longer": ("long", "-er"),
     "n't": ("not",), "cannot": ("can", "not"), "wo": ("will",), "ca": ("can",),
 }  # fmt: skip
 ARROWS = frozenset(["arrow", "arrowhead"])
