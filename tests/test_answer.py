@@ -308,8 +308,6 @@ will it disappear?
 will it stop behind the vase?
 will it land behind the cube?
 will it come to rest on the cube?
-will it hit the floor?
-will it fall off the table?
 will it turn green?
 is it impossible for it to hit the vase?
 is it false that it hits the vase?
@@ -337,6 +335,14 @@ Will the red ball hit something if it rolls left, the vase or the cube?
 @pytest.mark.parametrize("question", UNREAD.strip().splitlines())
 def test_what_is_not_put_plainly_is_left_undecided(question: str) -> None:
     assert asked_of(question) is None
+
+
+def test_what_stands_on_the_floor_does_not_land_there(service: Service) -> None:
+    image = encode_png(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200)))
+    told = answered(service, image, "If the red ball rolls to the right, will it hit the floor?", options=["Yes", "No"])
+    assert told.simulation is not None
+    assert told.simulation.trajectory.outcome is not None
+    assert (told.simulation.trajectory.outcome.asked.relation, told.not_sure) == ("lands", True)
 
 
 VOCABULARY = sorted({word for line in (ASKED + UNREAD).splitlines() for word in re.findall(r"[\w']+|[?,.:]", line)})

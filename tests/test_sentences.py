@@ -79,7 +79,7 @@ The red ball is thrown along the arrow. Will it hit the cube?
 If the purple sphere is hit in the direction of the arrow, will it touch the cone?
     purple sphere | linear | arrow: along | others: cone
 If the couch is moved in the direction of the arrow, will it fit between the wall and the table?
-    couch | linear | arrow: along | others:
+    couch | linear | arrow: along | others: table
 The vase slides to the left while the red ball drops. Do they meet?
     vase | linear | direction: left | others: red ball
 If the ball keeps flying the way it has been flying, its last position being the one on the right, does it hit the mug?

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runs import run_of
 
-from cow_service.errors import CannotGround, CannotReadDirection
+from cow_service.errors import CannotReadDirection
 from cow_service.physics.camera_fit import prior
 from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_direction
@@ -139,9 +139,14 @@ def test_the_question_tells_the_end_and_the_trail_the_motion() -> None:
     assert not any("was assumed" in warning for result in run.results.values() for warning in result.warnings)
 
 
-def test_an_end_that_nothing_tells_is_refused() -> None:
-    with pytest.raises(CannotGround, match="4 places one after another"):
-        run_of(OPAQUE, reader=EmbeddedReader, question=QUESTION.format("")).stage("grounding", ground)
+def test_an_end_that_nothing_tells_is_that_nearest_to_what_is_asked_about() -> None:
+    run = run_of(OPAQUE, reader=EmbeddedReader, question=QUESTION.format(""))
+    grounding = run.stage("grounding", ground)
+    assert grounding.point == pytest.approx(PLACES[-1], abs=1.5)
+    assert any(
+        "4 places one after another" in each and "nearest to the green cube" in each
+        for each in run.results["grounding"].warnings
+    )
 
 
 def test_a_trail_that_is_not_there_is_refused() -> None:

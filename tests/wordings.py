@@ -27,7 +27,7 @@ _SAME = {
     "beside": "next-to",
     "over": "onto",
 }
-_WORDLESS = {"the", "a", "one", "it", "thing", "of", "toy", "object"}
+_WORDLESS = {"falling", "the", "a", "one", "it", "thing", "of", "toy", "object"}
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,9 @@ def verdict(service: Service, item: dict[str, Any]) -> Verdict:
         return Verdict(question, "refused", expected, problem.detail[:300])
     if answer.not_sure:
         # Understood, and the worlds disagree where the picture alone does not settle it: what must be said.
-        open_ = expect["refuse"] is None and expect["answer"] is None and _reads_as(answer, expect)
+        outcome = None if answer.simulation is None else answer.simulation.trajectory.outcome
+        decided = outcome is not None and outcome.probability is not None
+        open_ = expect["refuse"] is None and expect["answer"] is None and decided and _reads_as(answer, expect)
         return Verdict(question, "right" if open_ else "not-sure", expected, " ".join(answer.warnings)[:300])
     said = f"{answer.option or answer.answer}: {_reading(answer)}"
     if expect["refuse"]:

@@ -9,6 +9,8 @@ BROWN_LIGHTNESS = 42.0  # below it and muted, orange is called brown
 BROWN_CHROMA = 36.0
 RED_CHROMA = 34.0  # a paler red is called pink
 
+GREYS = (28.0, 70.0)  # lightness of what people may call grey: white in shade too
+
 # Upper end of each name's hue range, degrees in the a*b* plane.
 HUES = (
     (20.0, "pink"),
@@ -42,7 +44,7 @@ def colour_name(lightness: float, a: float, b: float) -> str:
 def colour_names(lightness: float, a: float, b: float) -> frozenset[str]:
     """Every name that people may give a Lab colour: its own, and that across a border it lies next to."""
     chroma, hue = math.hypot(a, b), math.atan2(b, a)
-    names: set[str] = set()
+    names: set[str] = {"grey"} if chroma < CHROMATIC and GREYS[0] < lightness < GREYS[1] else set()
     for turn in (-HUE_MARGIN, 0.0, HUE_MARGIN):
         for more in (-CHROMA_MARGIN, 0.0, CHROMA_MARGIN):
             for lift in (-LIGHTNESS_MARGIN, 0.0, LIGHTNESS_MARGIN):

@@ -9,7 +9,7 @@ from cow_service.readers.embedded.matching import describe, match_all, match_som
 from cow_service.readers.question.kinds import Kind, kind_of
 from cow_service.readers.question.options_said import may_name
 from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.relations import read_asked
+from cow_service.readers.question.relations import read_alternatives, read_asked
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import BBox, LocatedObject
@@ -36,12 +36,27 @@ def things_of_kinds(
                 f"The question asks about '{name}', and which things those are the image does not tell for certain. "
                 f"Seen: {describe(regions)}. {GIVE_OBJECT}"
             )
-        names = [f"{region.colour} {kind.phrase.head}" for region in fitting]
-        found += [
-            LocatedObject(object=each, bbox=region.bbox, source="embedded")
-            for each, region in zip(names, fitting, strict=True)
-        ]
-    return tuple(found)
+        found += _named(fitting, kind)
+    return (*found, *_alternatives(left, question, given))
+
+
+def _alternatives(regions: Sequence[Region], question: Question, given: Sequence[LocatedObject]) -> list[LocatedObject]:
+    """Those of the kind in "which mug does it hit first"; none where the image does not tell which those are."""
+    asked, found = read_asked(question), list[LocatedObject]()
+    for phrase in read_alternatives(question):
+        kind = kind_of(phrase.text) or Kind(phrase, None)
+        listed = asked is None or phrase.text in asked.among or phrase.colour is not None or kind.phrase.head is None
+        if not listed and not any(may_name(kind.phrase, each.object) for each in given):
+            found += _named(_of_kind(regions, kind, ()), kind)
+    return found
+
+
+def _named(regions: Sequence[Region], kind: Kind) -> list[LocatedObject]:
+    names = [f"{region.colour} {kind.phrase.head}" for region in regions]
+    return [
+        LocatedObject(object=name, bbox=region.bbox, source="embedded")
+        for name, region in zip(names, regions, strict=True)
+    ]
 
 
 def _of_kind(regions: Sequence[Region], kind: Kind, others: Sequence[ObjectPhrase]) -> list[Region]:

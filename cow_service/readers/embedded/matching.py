@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from cow_service.errors import CannotGround
+from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.embedded.naming import CLEARLY_WORSE, IMPOSSIBLE, is_clear, is_poor, log_ratios
 from cow_service.readers.embedded.singling import at_place, singled_out
 from cow_service.readers.question.phrases import ObjectPhrase
+from cow_service.readers.question.tables import TABLES
 from cow_service.records import BBox
 from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene
@@ -37,7 +39,14 @@ def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequen
 
 def _fitting(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[Region]:
     """Regions that fit a phrase about as well as the best does, where the other phrases have theirs."""
-    return singled_out(_foremost(regions, phrase, others), phrase)
+    tables = _tables(regions) if phrase.head in TABLES else []
+    return singled_out(_foremost(tables or regions, phrase, others), phrase)
+
+
+def _tables(regions: Sequence[Region]) -> list[Region]:
+    """Regions that others stand on."""
+    bodies = [SeenBody(region.colour, region.bbox, region.mask, "box") for region in regions]
+    return [regions[i] for i in dict.fromkeys(supports_of(bodies)) if i is not None]
 
 
 def _foremost(

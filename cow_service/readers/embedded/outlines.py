@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from cow_service.readers.question.lexicon import words
@@ -43,6 +44,13 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "car": ((0.3, 0.9), (0.82, 0.96), (0.2, 0.9), (0.5, 0.97), (0.85, 1.0), (0.75, 1.0), (0.2, 0.97)),
     "box": ((0.4, 1.6), (0.95, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.5, 1.0)),
 }
+# Share of things of which something reaches out on one side between their ends, or has a hole; of others `NO_HANDLE`.
+HANDLES = {"mug": 0.52, "cone": 0.45, "car": 0.3, "candle": 0.15}
+NO_HANDLE = 0.04
+_REACHES, _BARE = 0.15, 0.08  # of the width: so far out on one side at least, on the other at most
+_HOLE = 0.004  # of the area
+# The rows of the body beside a handle, at both ends, and those of the handle, as shares of the height.
+_UPPER, _LOWER, _BETWEEN = (0.06, 0.22), (0.72, 0.9), (0.2, 0.8)
 _ALIKE = {
     "ball": "sphere orb marble basketball football baseball balloon globe",
     "mug": "cup", "cone": "pyramid", "cylinder": "can jar", "box": "block brick cuboid",
@@ -67,9 +75,11 @@ def contradicts(region: Region, noun: str | None) -> bool:
 def log_ratio(region: Region, form: str) -> float:
     """Natural logarithm of how much more likely an outline is under a row of `OUTLINES` than under the others."""
     rivals = OUTLINES.keys() - _SAME.get(form, {form, "box"})
-    measured = _measures(region)
+    measured, handle = _measures(region), _has_handle(region.mask.patch)
     densities = {
-        name: _density(measured, name) * (CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
+        name: _density(measured, name)
+        * (CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
+        * (HANDLES.get(name, NO_HANDLE) if handle else 1 - HANDLES.get(name, NO_HANDLE))
         for name in (form, *rivals)
     }
     own = densities.pop(form)
@@ -110,6 +120,30 @@ def _measures(region: Region) -> list[float]:
     sides[:, [0, -1]] = mask[:, [0, -1]]
     filled = np.count_nonzero(mask) / np.count_nonzero(hull(sides))
     return [math.log(height / width), filled, *_widths(mask)]
+
+
+def _has_handle(mask: Mask) -> bool:
+    """Whether a mask [h, w] reaches out on one side alone between its ends, or has a hole."""
+    outlines, levels = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    inner = [cv2.contourArea(each) for each, level in zip(outlines, levels[0], strict=True) if level[3] >= 0]
+    if max(inner, default=0.0) > _HOLE * np.count_nonzero(mask):
+        return True
+    filled = mask.any(axis=1)
+    left = np.where(filled, mask.argmax(axis=1), mask.shape[1])
+    right = np.where(filled, mask[:, ::-1].argmax(axis=1), mask.shape[1])
+    down = (np.arange(len(mask)) + 0.5) / len(mask)
+    out: list[float] = []
+    ends = [
+        [float(side[(low <= down) & (down < high)].min(initial=mask.shape[1])) for side in (left, right)]
+        for low, high in (_UPPER, _LOWER)
+    ]
+    body = max(1.0, mask.shape[1] - max(ends[0][0], ends[1][0]) - max(ends[0][1], ends[1][1]))
+    for at, side in enumerate((left, right)):
+        share = (down - sum(_UPPER) / 2) / (sum(_LOWER) / 2 - sum(_UPPER) / 2)
+        line = ends[0][at] + (ends[1][at] - ends[0][at]) * share
+        between = (line - side)[(down > _BETWEEN[0]) & (down < _BETWEEN[1])]
+        out.append(float(between.max(initial=0.0)) / body)
+    return max(out) > _REACHES and min(out) < _BARE
 
 
 def _widths(mask: Mask) -> list[float]:

@@ -71,7 +71,7 @@ class EmbeddedReader:
             )
         with given.cpu():
             check_changes(question)
-            scene = scene_of_mover(scene, question)
+            scene, assumed = scene_of_mover(scene, question)
             removed = find_removed(scene, question, given.known)
             regions = without(scene.regions, removed)
             bbox = _mover(scene, regions, question, question.mover)
@@ -85,7 +85,11 @@ class EmbeddedReader:
             things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
             doubts = [*noun_warnings(scene, things), *_unread_warnings(question)]
         return GroundingReading(
-            question.mover.text, bbox, others=others, warnings=(*missing, *doubts), interventions=(*removed, *placed)
+            question.mover.text,
+            bbox,
+            others=others,
+            warnings=(*assumed, *missing, *doubts),
+            interventions=(*removed, *placed),
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:

@@ -15,28 +15,41 @@ from cow_service.vision.scene import Scene
 from cow_service.vision.trails import Trail, TrailEnd, trail_of
 
 
-def scene_of_mover(scene: Scene, question: Question) -> Scene:
-    """The scene in which the trail that the question may be about ends where the question says.
+def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, ...]]:
+    """The scene in which the trail that the question may be about ends where the question says, and a warning.
 
-    Raises `CannotGround` where the mover has a trail, and neither the image nor the words tell its present end.
+    Where neither the image nor the words tell the end, it is that from which the path leads on to what is asked about.
     """
     words, phrase = question.motion.trail, question.mover
     if phrase is None or not scene.trails:
-        return scene
+        return scene, ()
     fitting = best_matches(scene.regions, phrase, question.others)
     trails = [trail for trail in (trail_of(scene.trails, region.bbox) for region in fitting) if trail is not None]
     if len(trails) != 1:
-        return scene
-    trail = trails[0]
+        return scene, ()
+    trail, warnings = trails[0], ()
     if words is not None:
         trail = trail.ending(TrailEnd(_near(scene, words, trail), words.side, is_oldest=not words.last))
     if not trail.end_known:
-        raise CannotGround(
+        name, bbox = _ahead(scene, question, trail)
+        trail = trail.ending(TrailEnd(bbox))
+        warnings = (
             f"The image shows the {phrase.text} in {len(trail.positions)} places one after another, and neither they "
-            'nor the question tell which is the last. Say it like "on along its trail, the last of which is the '
-            f'leftmost", or "... is the one nearest to the cube". {GIVE_PLACE}'
+            f"nor the question tell which is the last: the one nearest to the {name} was taken for it. Say otherwise "
+            f'like "on along its trail, the last of which is the leftmost". {GIVE_PLACE}',
         )
-    return scene.with_mover(trail.present.bbox)
+    return scene.with_mover(trail.present.bbox), warnings
+
+
+def _ahead(scene: Scene, question: Question, trail: Trail) -> tuple[str, BBox]:
+    """What may lie ahead of a trail: the first thing that is asked about, else the middle of the image."""
+    beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
+    for phrase in question.others:
+        found = match_one(beside, phrase)
+        if found is not None:
+            return phrase.text, found.bbox
+    x, y = scene.width / 2, scene.height / 2
+    return "middle of the image", (x, y, x, y)
 
 
 def _near(scene: Scene, words: TrailWords, trail: Trail) -> BBox | None:

@@ -76,7 +76,8 @@ def _phrase_words(at: int, item: Item, phrase: ObjectPhrase, question: Question,
     determiners, before = words[: len(words) - len(content)], sentence.tokens
     if words in _TWO and before[-1:] == ["of"] and before[-2:-1] not in _CHANCES:
         return [Word("S", THEM, at)]
-    if words == ["each", "other"] or phrase.head in lex.NO_THINGS or set(content) <= _PLAIN_WORDS:
+    place = phrase.head in lex.NO_THINGS and not phrase.as_thing
+    if words == ["each", "other"] or place or set(content) <= _PLAIN_WORDS:
         return plain_words(["they"] if question.motion.others and words in _TWO else words, at)
     asked = words[0] in {"which", "what"}
     if means_mover(phrase, question) and not asked and words[0] not in _SOME:

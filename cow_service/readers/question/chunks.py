@@ -134,7 +134,7 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
         begun = begun or (verb.form == "base" and _is_label(found, at + 1))
         # "orange" is the one colour that is also a thing that moves: "the orange falls".
         return begun and not (verb.form == "s" and verb.kind is not None and before == "orange")
-    going = after == "put" or (after in lex.VERBS and lex.VERBS[after].form == "ing")
+    going = after in {"put", "clear"} or (after in lex.VERBS and lex.VERBS[after].form == "ing")
     goes_on = going and (verb.kind == "static" or verb.lemma in lex.WEAK)  # "will the mug remain standing?"
     if verb.form == "base":
         return not asked or (not goes_on and (after in lex.VERBS or after in _FINITE_BE))

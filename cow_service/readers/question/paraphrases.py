@@ -20,6 +20,7 @@ from cow_service.readers.question.words import Word, plain_words
 _MAX_CHANGES = 24  # of one sentence
 _THING = r"(?:M|T\d+|it|they|he|she)"
 _SLOTS = {"thing": _THING, "list": rf"{_THING}(?: , {_THING})*(?: ,)? or {_THING}", "some": r"S\d+", "rest": ".+"}
+_OBJECTS = frozenset({"OBJ", "OBJS"})  # an object or objects of no name
 _SLOT = re.compile(r"<(\w+?)(\d?)>")
 
 
@@ -66,7 +67,8 @@ def _applied(rule: _Rule, words: Sequence[Word]) -> list[Word] | None:
     for token in rule.tokens:
         slot = _SLOT.fullmatch(token)
         if slot is None:
-            said += plain_words([token], words[first].at)
+            at = words[first].at
+            said += [Word(token, token, at)] if token in _OBJECTS else plain_words([token], at)
         else:
             start, stop = found.span(slot[1] + slot[2])
             said += words[text[:start].count(" ") - 1 : text[: stop + 1].count(" ") - 1]

@@ -36,6 +36,7 @@ class ObjectPhrase:
     inside_box: bool = False
     number: int | None = None
     place: PlaceWords | None = None
+    as_thing: bool = False  # a table, where it is more than the place of what happens
 
     @property
     def head(self) -> str | None:
@@ -45,7 +46,7 @@ class ObjectPhrase:
     @property
     def is_thing(self) -> bool:
         """Whether it names a thing: not a place, the arrow or the image, and not the floor."""
-        return self.head is not None and self.head not in lex.NO_THINGS
+        return self.head is not None and (self.as_thing or self.head not in lex.NO_THINGS)
 
 
 @dataclass(frozen=True)

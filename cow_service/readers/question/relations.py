@@ -115,10 +115,17 @@ def _read(question: Question) -> _Reading | None:
     found, claim = _without_claim(sentences(question))
     if len(found) > MAX_SENTENCES or any(len(sentence.words) > MAX_TOKENS for sentence in found):
         return None
-    readings = _readings(found, question, claim)
-    if not readings:
-        found = [rephrased(sentence, question) for sentence in found]
-        readings = _readings(found, question, claim)
+    plain = _read_sentences(found, question, claim)
+    if plain is not None and not unread_words(question, plain.items).turning:
+        return plain
+    other = _read_sentences([rephrased(sentence, question) for sentence in found], question, claim)
+    return plain if other is None else other
+
+
+def _read_sentences(found: Sequence[Sentence], question: Question, claim: frozenset[int]) -> _Reading | None:
+    """What one of the sentences asks; None where none is understood, or several ask. `claim`: "true or false"."""
+    read = ((at, _read_sentence(sentence, question, claim)) for at, sentence in enumerate(found))
+    readings = [(at, reading) for at, reading in read if reading is not None]
     if len(readings) != 1:
         return None
     at, reading = readings[0]
@@ -135,12 +142,6 @@ def _read(question: Question) -> _Reading | None:
         return None
     within = min(limits.values(), default=None)
     return replace(reading, listed=listed, items=frozenset(named | limits.keys()), within=within, claim=bool(claim))
-
-
-def _readings(found: Sequence[Sentence], question: Question, claim: Collection[int]) -> list[tuple[int, _Reading]]:
-    """What the sentences ask, each with its place."""
-    read = ((at, _read_sentence(sentence, question, claim)) for at, sentence in enumerate(found))
-    return [(at, reading) for at, reading in read if reading is not None]
 
 
 def _premise(told: Sequence[Sentence], reading: _Reading, question: Question) -> set[int]:
@@ -282,7 +283,7 @@ def _as_named(target: ObjectPhrase, question: Question) -> str:
     texts = [other.text for other in question.others]
     if target.text in texts:
         return target.text
-    words = set(target.text.lower().split())
+    words = set(target.text.lower().split()) - {"one"}
     changed = [phrase.text for change in question.interventions for phrase in (change.object, *change.targets)]
     moving = [] if question.mover is None else [question.mover.text]
     fuller = {text for text in [*texts, *changed, *moving] if words <= set(text.lower().split())}

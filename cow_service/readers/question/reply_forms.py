@@ -36,6 +36,7 @@ _ABOUT_REPLY = re.compile(
 )
 _CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
 _LETTER = re.compile(r"\bletters?\b", re.IGNORECASE)
+_YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)  # what may be replied
 _HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)
 
 
@@ -66,7 +67,7 @@ def reply_text(prompt: str, reply: Reply) -> str:
 
 def without_reply_form(prompt: str) -> str:
     """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
-    sentences = _BETWEEN_SENTENCES.split(_HEADING.sub("", prompt))
+    sentences = _BETWEEN_SENTENCES.split(_YES_NO.sub("", _HEADING.sub("", prompt)))
     kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
     return "".join(each for each in _BETWEEN_PARTS.split(kept) if not _instructs(each))
 

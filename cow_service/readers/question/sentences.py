@@ -30,6 +30,7 @@ from cow_service.readers.question.openings import without_openings
 from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at, tokens
 from cow_service.readers.question.places_said import with_places
 from cow_service.readers.question.reply_forms import without_reply_form
+from cow_service.readers.question.tables import with_tables
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 from cow_service.readers.question.typing_errors import without_typing_errors
 from cow_service.records import MotionKind
@@ -78,7 +79,7 @@ def parse(question: str) -> Question:
     text, beyond = _cut(without_reply_form(split_options(question).rest))
     text, errors = without_typing_errors(_SAME_TIME.sub(lambda found: "and" if found["joins"] else "", text))
     text = without_openings(text)
-    changes, found = split_interventions(with_places(with_nouns(items(text))))
+    changes, found = split_interventions(with_places(with_nouns(with_tables(items(text)))))
     trail, found = split_trail(found)
     clauses = read_clauses(found)
     best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
@@ -325,7 +326,7 @@ def _others(
     interventions: Sequence[InterventionWords],
     trail: TrailWords | None,
 ) -> tuple[ObjectPhrase, ...]:
-    removed = [change.object for change in interventions if change.kind == "remove"]
+    changed = [change.object for change in interventions]
     named = [phrase for change in interventions for phrase in change.targets]
     named += [] if trail is None or trail.near is None else [trail.near]
     things = [(at, item, item.phrase) for at, item in enumerate(found)]
@@ -338,7 +339,7 @@ def _others(
         if phrase.noun in lex.ADJECTIVES and item.words[0] not in lex.DETERMINERS:
             continue  # "which ball will it hit first?"
         again = item.words[0] != "another" and any(
-            _repeats(phrase, known) for known in (mover, *named, *removed) if known
+            _repeats(phrase, known) for known in (mover, *named, *changed) if known
         )
         if not again:
             named.append(phrase)

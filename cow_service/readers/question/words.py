@@ -53,7 +53,7 @@ def _is_words(item: Item, phrase: ObjectPhrase) -> bool:
     """Whether a noun phrase names no object: a place, the trail, or an adjective alone as in "the last of which"."""
     if phrase.head in ARROWS:
         return True
-    if phrase.colour is not None or phrase.number is not None or phrase.inside_box:
+    if phrase.as_thing or phrase.colour is not None or phrase.number is not None or phrase.inside_box:
         return False
     content = [word for word in item.words if word not in lex.DETERMINERS]
     return phrase.head in lex.NO_THINGS or all(word == "one" or lex.is_modifier(word) for word in content)
