@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import cv2
 import numpy as np
 import pytest
-from conftest import example
+from conftest import ROOT, example
 from drawn import angle_between, ball, floor
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,7 +21,7 @@ from cow_service.readers.embedded.reader import EmbeddedReader, create
 from cow_service.readers.embedded.vehicle_model import DARK, OTHER, PAINT, VehicleModel
 from cow_service.records import Grounding
 from cow_service.settings import Settings
-from cow_service.vision.masks import bbox_of
+from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
 
@@ -85,6 +86,26 @@ def test_forward_and_backward_are_the_way_that_the_car_of_an_example_faces(word:
     assert reading.cue == "orientation"
     assert reading.direction is not None
     assert angle_between(reading.direction, (sense * x, sense * y)) <= 5
+
+
+VEHICLES = ROOT / "tests" / "data" / "vehicles"  # rendered, with where they truly are and face
+TRUTH = json.loads((VEHICLES / "truth.json").read_text())
+
+
+@pytest.mark.parametrize("name", sorted(TRUTH))
+def test_a_rendered_car_is_whole_and_faces_its_way(name: str) -> None:
+    """Its wheels, and the shade between them, belong to it: else it would meet them where it stands."""
+    truth = TRUTH[name]
+    pixels = cv2.imread(str(VEHICLES / f"{name}.jpg"))
+    assert pixels is not None
+    scene = Scene(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8))
+    region = scene.region_of(tuple(truth["bbox"]))
+    assert region is not None
+    assert iou(region.bbox, tuple(truth["bbox"])) > 0.8
+    assert not any(iou(other.bbox, region.bbox) > 0 for other in scene.obstacles(region.bbox))
+    way = facing(scene.clean, scene.silhouette(region.bbox), region.bbox)
+    assert way is not None
+    assert angle_between(way, tuple(truth["direction"])) <= 10
 
 
 def test_a_ball_has_no_front() -> None:

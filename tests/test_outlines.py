@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from drawn import Image, ball, block, floor, jpeg
 
+from cow_service.physics.bodies import SeenBody
 from cow_service.readers.embedded.matching import best_matches, match_one
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import parse_noun_phrase
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.regions import Region, find_regions
 
 PURPLE, GREEN = (120, 60, 170), (50, 150, 50)
@@ -91,3 +95,29 @@ def test_a_name_of_what_is_not_there_means_nothing(noun: str) -> None:
     regions = find_regions(jpeg(block(block(floor(), (150, 150, 250, 250), GREEN), (400, 160, 490, 250), PURPLE)))
     assert match_one(regions[:1], phrase_of(f"the {noun}")) is None
     assert match_one(regions, phrase_of(f"the {noun}"), [phrase_of("the green cube")]) is None
+
+
+def cup(reach: int) -> SeenBody:
+    """A vessel 60 px wide and 80 px high with a handle that reaches so many px to the right."""
+    mask = np.zeros((200, 300), bool)
+    mask[60:140, 100:160] = True
+    mask[80:120, 160 : 160 + reach] = True
+    cropped = CroppedMask.of(mask)
+    return SeenBody("mug", cropped.bbox, cropped, "cylinder")
+
+
+def test_a_handle_does_not_make_a_vessel_wider() -> None:
+    assert cup(25).bbox == (100, 60, 185, 140)
+    assert cup(25).core == (100, 60, 160, 140)
+    assert cup(0).core == cup(0).bbox
+    assert replace(cup(25), shape="box").core == cup(25).bbox
+
+
+@pytest.mark.parametrize("reach", [0, 25])
+def test_a_handle_tells_a_mug_from_a_cylinder(reach: int) -> None:
+    image = floor()
+    for x in (150, 400):
+        image[120:220, x : x + 75] = PURPLE
+    image[145:190, 475 : 475 + reach] = PURPLE
+    found = matches(find_regions(jpeg(image)), "the purple mug")
+    assert (len(found) == 1) is (reach > 0)

@@ -15,6 +15,8 @@ from cow_service.vision.masks import CroppedMask
 ON_TOP = 0.72  # of a support's height in the image, from its upper edge: a foot below that stands before it
 SHOWN = 0.1  # of a body's width: so much of its support's top is seen beside it, above its foot
 BESIDE = 3.0  # px beside a body's box where the support's upper edge is looked for
+ENDS = 0.2  # of the height, at the upper and at the lower end, where a vessel has no handle
+HANDLE, BARE = 0.12, 0.05  # of the width: so far a handle reaches at least, and the other side at most
 WIDER = 1.15  # a support is so much wider than what stands on it
 
 
@@ -37,6 +39,20 @@ class SeenBody:
     def foot(self) -> tuple[float, float]:
         """Where it stands, px: the middle of its box's lower edge."""
         return (self.bbox[0] + self.bbox[2]) / 2, self.bbox[3]
+
+    @cached_property
+    def core(self) -> BBox:
+        """Its box without a handle: without what reaches far out on one side alone, between its ends."""
+        x0, y0, x1, y1 = self.bbox
+        rows, columns = np.nonzero(self.mask.patch)
+        if self.shape != "cylinder" or not len(rows):
+            return self.bbox
+        height, width = int(rows.max()) + 1, int(columns.max()) + 1
+        ends = columns[(rows < ENDS * height) | (rows >= (1 - ENDS) * height)]
+        left, right = int(ends.min()) - int(columns.min()), width - 1 - int(ends.max())
+        if max(left, right) < HANDLE * width or min(left, right) > BARE * width:
+            return self.bbox
+        return (x0 + left, y0, x1, y1) if left > right else (x0, y0, x1 - right, y1)
 
     @cached_property
     def fullness(self) -> float:

@@ -179,10 +179,10 @@ def _stand(
     body, on = bodies[index], supports[index]
     plane = np.zeros(len(draws))
     if on is not None:
-        support = above(cameras, bodies[on].bbox, bodies[on].shape, draws, plane)
+        support = above(cameras, bodies[on].core, bodies[on].shape, draws, plane)
         if support is not None:
             plane = np.minimum(support.top, 0.95 * cameras.height)
-    return above(cameras, body.bbox, body.shape, draws, plane, depth_share, body.taper)
+    return above(cameras, body.core, body.shape, draws, plane, depth_share, body.taper)
 
 
 def _depth_share(

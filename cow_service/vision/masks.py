@@ -79,6 +79,12 @@ def hull(mask: Mask) -> Mask:
     return filled > 0
 
 
+def without_holes(mask: Mask) -> Mask:
+    """The mask [H, W] with what it encloses."""
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.zeros(mask.shape, np.uint8), outlines, -1, 1, cv2.FILLED) > 0
+
+
 @dataclass(frozen=True, eq=False)
 class CroppedMask:
     """A mask of an image, of which only the part that is not empty is stored."""

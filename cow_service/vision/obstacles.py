@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from cow_service.records import BBox, LocatedObject
-from cow_service.vision.masks import CroppedMask, iou
+from cow_service.vision.masks import CroppedMask, iou, without_holes
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region, region_of
 from cow_service.vision.types import Mask
 
@@ -36,7 +36,7 @@ def find_obstacles(
     taken, unless a mask was given.
     """
     body = silhouette(mover)
-    body_area = np.count_nonzero(body)
+    body_area, whole = np.count_nonzero(body), without_holes(body)
     near = cv2.dilate(body.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     obstacles: list[Obstacle] = []
     for other in named:
@@ -48,7 +48,7 @@ def find_obstacles(
             obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
     for region in regions:
         area = region.mask.area
-        if iou(region.bbox, mover) >= SAME_OBJECT_IOU or region.mask.shared_with(body) > 0.5 * area:
+        if iou(region.bbox, mover) >= SAME_OBJECT_IOU or region.mask.shared_with(whole) > 0.5 * area:
             continue
         if area < OWN_SHARE * body_area and region.mask.shared_with(near):
             continue

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision.colours import colour_name, colour_names
 from cow_service.vision.discs import as_disc
-from cow_service.vision.masks import CroppedMask, enlarged, iou, outline_of, scaled, window_of
+from cow_service.vision.masks import CroppedMask, bbox_of, enlarged, iou, outline_of, scaled, window_of
 from cow_service.vision.mouths import neck_between
 from cow_service.vision.tops import standing_on
 from cow_service.vision.types import Floats32, Image, Mask
+from cow_service.vision.undersides import is_underside
 from cow_service.vision.view import BRIGHT_STEP, CHROMA_STEP, View, view_of
 from cow_service.vision.whites import white_sides
 
@@ -41,6 +42,7 @@ MIN_REST = 0.05  # of a component: less is no part of its own
 OWN_WIDTH = 0.55  # of the broadest colour: black narrower than this is a neck or a wheel
 MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
 TOP_AREA = 0.3  # of a region: a larger one above it is another object, not what stands on it
+DARK = 28.0  # lightness below which a part may be the underside of another
 SAME_TOP = 0.6  # of a smaller region, taken up by what stands on another: it is no object of its own
 
 SURE_CONTRAST = 20.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
@@ -111,7 +113,8 @@ def find_regions(image: Image) -> tuple[Region, ...]:
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
                 found.append(_Found(whole, near.lab[part], confidence, disc is not None))
-    regions = [_region(one, (height, width)) for one in _with_tops(view, _with_mouths(view, found))]
+    whole_ones = _with_undersides(_with_tops(view, _with_mouths(view, found)))
+    regions = [_region(one, (height, width)) for one in whole_ones]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
@@ -288,6 +291,26 @@ def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
             if np.count_nonzero(found[j].mask & top) > SAME_TOP * areas[j]:
                 del kept[j]
     return list(kept.values())
+
+
+def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
+    """Joins dark lower ends, such as a car's wheels with the shade between them, with what they carry."""
+    dark = [one for one in found if not one.is_disc and _is_black(one)]
+    whole = {i: one for i, one in enumerate(found) if all(one is not other for other in dark)}
+    for part in dark:
+        box, near = bbox_of(part.mask), cv2.dilate(part.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        carried = [i for i, one in whole.items() if (one.mask & near).any() and is_underside(box, bbox_of(one.mask))]
+        if len(carried) == 1:
+            body = whole[carried[0]]
+            whole[carried[0]] = replace(body, mask=body.mask | part.mask)
+        else:
+            whole[len(found) + len(whole)] = part
+    return list(whole.values())
+
+
+def _is_black(one: _Found) -> bool:
+    lightness, a, b = (float(value) for value in np.median(one.lab, axis=0))
+    return colour_name(lightness, a, b) in {"black", "brown"} and lightness < DARK
 
 
 def _region(found: _Found, size: tuple[int, int]) -> Region:

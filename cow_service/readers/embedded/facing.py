@@ -13,7 +13,7 @@ from cow_service.physics.camera_fit import FOCAL_WIDTHS
 from cow_service.physics.floor_camera import FloorCamera
 from cow_service.readers.embedded.vehicle_model import DARK, OTHER, PAINT, Labels, VehicleModel
 from cow_service.records import BBox, Vector
-from cow_service.vision.masks import bbox_of, resized_mask, scaled
+from cow_service.vision.masks import bbox_of, resized_mask, scaled, without_holes
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_SIDE = 80  # px: the vehicle is compared at this size
@@ -119,7 +119,7 @@ def _labels(lab: Floats32, own: Mask, near: BBox) -> Labels:
     floor = float(np.median(lightness[~own])) if not own.all() else 100.0
     dark = (lightness < min(TYRE_SHARE * floor, TYRE_LIGHTNESS)) & (chroma < TYRE_CHROMA) & (paint > BLACK)
     whole = _with_tyres(own, dark, near)
-    filled = _filled(whole)
+    filled = without_holes(_closed(whole))
     away = np.hypot(*(lab[..., 1:] - colour).transpose(2, 0, 1))
     tint = float(np.hypot(*colour))
     other = away > max(OTHER_STEP, OTHER_SHARE * tint)
@@ -145,11 +145,9 @@ def _with_tyres(own: Mask, dark: Mask, near: BBox) -> Mask:
     return parts == int(np.argmax(np.bincount(parts[own], minlength=count)))
 
 
-def _filled(mask: Mask) -> Mask:
-    """The mask without holes and narrow slits."""
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((SLIT, SLIT), np.uint8))
-    outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(np.zeros(mask.shape, np.uint8), outlines, -1, 1, cv2.FILLED) > 0
+def _closed(mask: Mask) -> Mask:
+    """The mask without narrow slits."""
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((SLIT, SLIT), np.uint8)) > 0
 
 
 def _eroded(mask: Mask) -> Mask:

@@ -11,6 +11,7 @@ from typing import Literal
 
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at
+from cow_service.readers.question.words import ARROWS
 from cow_service.records import MotionKind
 
 SENTENCE_END = frozenset(".?!;:")
@@ -264,8 +265,11 @@ def clause_end(found: Sequence[Item], at: int) -> int:
 
 def _ends_clause(found: Sequence[Item], at: int) -> bool:
     item, key, after = found[at], found[at].key, at + 1
-    if key in SENTENCE_END or key in lex.CONDITIONALS or key in {"what", "how", "why"} or _is_inversion(found, at):
+    if key in SENTENCE_END or key in lex.CONDITIONALS or key in {"what", "why"} or _is_inversion(found, at):
         return True
+    if key == "how":  # "thrown how the arrow shows"
+        arrow = phrase_at(found, at + 1)
+        return arrow is None or arrow.head not in ARROWS
     if key == ",":
         joined = key_at(found, after) in {"and", "then", "but"}
         after += joined

@@ -14,6 +14,7 @@ from cow_service.readers.question.words import words_of
 from cow_service.records import InterventionKind, PlaceRelation
 
 MAX_TRIES = 6  # of one question: each takes some ms; what comes after them is not looked for
+_FITS = frozenset({"fit", "go", "get"})
 _WINDOW = 16  # words that one may have
 _BEFORE = lex.CONDITIONALS | lex.words(". ! ? ; : , and but then also that with")
 _ANYWHERE = lex.words("without with remove taking in")
@@ -75,8 +76,8 @@ def _goes_on(found: Sequence[Item], start: int, end: int) -> bool:
 
 def implied_placing(found: Sequence[Item]) -> tuple[tuple[InterventionWords, ...], frozenset[int]]:
     """ "Will the apple fit into the bowl?": where nothing moves, the apple is put there; and which places say so."""
-    fits = (at for at, item in enumerate(found) if lex.lemma(item.key) == "fit")
-    for start in (start for at in fits for start in range(max(at - 3, 0), at)):
+    fits = (at for at, item in enumerate(found) if lex.lemma(item.key) in _FITS)
+    for start in (start for at in fits for start in range(max(at - 4, 0), at)):
         parsed = read_from("fitting", found, start, _WINDOW)
         if parsed is not None:
             tree, end = parsed
@@ -109,7 +110,7 @@ def _read(found: Sequence[Item], at: int) -> tuple[list[InterventionWords], int]
     if not named:
         return None
     if next(tree.find_data("removal"), None) is not None:
-        return [InterventionWords("remove", phrase) for phrase in named], end
+        return [InterventionWords("remove", phrase) for phrase in dict.fromkeys(named)], end
     alone = len(named) == 2 and named[1].text.endswith(named[1].head or "")  # "between the cube": and what else?
     return ([_placing(tree, named)], end) if not alone or not list(tree.find_data("between")) else None
 

@@ -186,7 +186,7 @@ def _falling(
 ) -> tuple[str, MotionKind | None]:
     """ "What does it touch on its way down?", "the falling ball", and "where would it land?" without its support."""
     removed = any(change.kind == "remove" for change in changes)
-    falls = any(removed and lex.lemma(item.key) == "land" for item in found) or any(
+    falls = any(removed and lex.lemma(item.key) in {"land", "happen"} for item in found) or any(
         item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
         for at, item in enumerate(found)
     )
