@@ -271,18 +271,17 @@ def build(case: Case, profile: Profile) -> WanTrackPipeline:
         # Where parts are offloaded they start on the CPU.
         place = case.device if profile.acceleration.offload == "none" else torch.device("cpu")
         dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
-        pipeline = _random_pipeline(case, dtype, dtype, vae_dtype, place)
+        pipeline = _random_pipeline(case, dtype, vae_dtype, place)
     pipeline.set_progress_bar_config(disable=True)
     return pipeline
 
 
 def build_plain(case: Case) -> WanImageToVideoPipeline:
     """diffusers' own pipeline in the precisions that its documentation gives, on the device, with nothing changed."""
-    full = torch.float32
     parts = (
         make_tiny(case.manifest.architecture)
         if case.toy
-        else _random_pipeline(case, torch.bfloat16, full, full, case.device)
+        else _random_pipeline(case, torch.bfloat16, torch.float32, case.device)
     )
     pipeline = WanImageToVideoPipeline(**parts.components)
     # diffusers' default, said because the choice of a profile that ran before holds for the whole process.
@@ -311,10 +310,8 @@ def do_without_ftfy() -> bool:
     return True
 
 
-def _random_pipeline(
-    case: Case, dtype: torch.dtype, image_dtype: torch.dtype, vae_dtype: torch.dtype, place: torch.device
-) -> WanTrackPipeline:
-    """Made on the case's device, whose random numbers are fast, and put to `place`.
+def _random_pipeline(case: Case, dtype: torch.dtype, vae_dtype: torch.dtype, place: torch.device) -> WanTrackPipeline:
+    """Made on the case's device, whose random numbers are fast, and put to `place`; its image encoder is float32.
 
     Tokenizer and scheduler are the toy's: neither takes time.
     """
@@ -322,7 +319,7 @@ def _random_pipeline(
     fill(parts["transformer"], dtype, case.device, place, parts["transformer"]._keep_in_fp32_modules)
     # transformers keeps nothing in float32, unless all the rest is float16.
     fill(parts["text_encoder"], dtype, case.device, place)
-    fill(parts["image_encoder"], image_dtype, case.device, place)
+    fill(parts["image_encoder"], torch.float32, case.device, place)
     parts["text_encoder"].tie_weights()
     for part in parts.values():
         part.to(place).eval().requires_grad_(False)

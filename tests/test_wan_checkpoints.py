@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from golden import original_folder, original_weights
@@ -270,6 +271,11 @@ class TestTheOtherParts:
         for part in ("vae", "text_encoder", "image_encoder"):
             assert same(getattr(found, part).state_dict(), getattr(wanted, part).state_dict()), part
         assert torch.equal(found.embed_text("a ball"), wanted.embed_text("a ball"))
+
+    def test_the_image_encoder_is_not_run_in_bfloat16(self, base: Path) -> None:
+        found = assemble(self.transformer(), base, torch.bfloat16, torch.float32)
+        assert (found.text_encoder.dtype, found.image_encoder.dtype) == (torch.bfloat16, torch.float32)
+        assert found.embed_image(np.zeros((64, 128, 3), np.uint8), 128, 64, 5).embeds.isfinite().all()
 
     @pytest.mark.parametrize("part", ["vae", "text_encoder", "image_encoder"])
     @pytest.mark.parametrize("breakage", ["missing", "unknown", "of another shape", "damaged"])

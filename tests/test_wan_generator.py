@@ -13,8 +13,10 @@ import torch
 from conftest import Example, example
 
 from cow_service.errors import Canceled, CowError, GeneratorOutOfMemory, GeneratorUnavailable, InvalidRequest
+from cow_service.generators.wan.execution import wait_until_done
 from cow_service.generators.wan.generator import WanGenerator
 from cow_service.generators.wan.pipeline import WanTrackPipeline
+from cow_service.generators.wan.profiles import profile_of
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
@@ -121,6 +123,39 @@ def test_progress_after_every_step(toys: Service) -> None:
     assert heard == sorted(heard)
     assert [round(done, 3) for done in heard if 0 < done < 0.95] == [0.225, 0.45, 0.675, 0.9]
     assert heard[-1] == 1
+
+
+def test_a_step_is_told_when_the_device_has_done_it(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[str] = []
+    monkeypatch.setattr("cow_service.generators.wan.pipeline.wait_until_done", lambda device: heard.append("done"))
+    simulate(toys, lambda stage, done: heard.append("told") if stage == "generation" and 0 < done < 0.95 else None)
+    assert heard == ["done", "told"] * 4
+
+
+def test_a_gpu_is_waited_for_by_an_event(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no GPU here: its event and stream are fakes."""
+    heard: list[object] = []
+
+    class Event:
+        def record(self, stream: object) -> None:
+            heard.append(stream)
+
+        def synchronize(self) -> None:
+            heard.append("waited")
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: f"stream of {device}")
+    wait_until_done(torch.device("cpu"))
+    wait_until_done(torch.device("cuda", 0))
+    assert heard == ["stream of cuda:0", "waited"]
+
+
+def test_wan_move_has_the_noise_schedule_of_its_public_code_at_480p() -> None:
+    for name, shift in (("wan-move", 3.0), ("ati", 5.0)):
+        manifest = load_manifests()[name]
+        shifts = {profile: profile_of(manifest, profile).sampling.shift for profile in manifest.profiles}
+        assert shifts.pop("turbo") == 5.0  # as its LoRA was distilled
+        assert set(shifts.values()) == {shift}
 
 
 def count(monkeypatch: pytest.MonkeyPatch, pipeline: WanTrackPipeline, *names: str) -> dict[str, int]:

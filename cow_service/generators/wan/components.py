@@ -20,10 +20,11 @@ def assemble(
 ) -> WanTrackPipeline:
     """The pipeline of a transformer and the other parts in the diffusers folder `base`, all still on the CPU.
 
+    The image encoder is float32 whatever `dtype` is: the public implementations do not run it in bfloat16 either.
     Raises `CheckpointInvalid` naming the part and what does not fit.
     """
     text_encoder = _model(UMT5EncoderModel, base, "text_encoder", dtype)
-    image_encoder = _model(CLIPVisionModel, base, "image_encoder", dtype)
+    image_encoder = _model(CLIPVisionModel, base, "image_encoder", torch.float32)
     sizes: Any = transformer.config
     for name, wanted, found in (
         ("text_encoder", sizes.text_dim, text_encoder.config.d_model),

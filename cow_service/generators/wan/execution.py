@@ -33,6 +33,14 @@ def exclusive_use(device: torch.device, check_canceled: Callable[[], None]) -> G
         lock.release()
 
 
+def wait_until_done(device: torch.device) -> None:
+    """Waits for what was given to the device so far: a GPU takes work long before it does it."""
+    if device.type == "cuda":
+        done = torch.cuda.Event()
+        done.record(torch.cuda.current_stream(device))
+        done.synchronize()
+
+
 @contextmanager
 def within_memory(device: torch.device, clear_caches: Callable[[], None], what: str) -> Generator[None]:
     """Turns running out of memory into `GeneratorOutOfMemory`, after `clear_caches` and after freeing all tensors.

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from cow_service.generators.wan.acceleration import reset_cache
 from cow_service.generators.wan.checkpoints import TEXT_LENGTH
+from cow_service.generators.wan.execution import wait_until_done
 from cow_service.generators.wan.sampling import Sampling
 
 LATENT_CHANNELS = 16
@@ -98,7 +99,10 @@ class WanTrackPipeline(WanImageToVideoPipeline):
 
     @torch.no_grad()
     def denoise(self, noise: Tensor, given: Conditioning, sampling: Sampling, on_step: StepCallback) -> Tensor:
-        """Latents [1, 16, T, h, w] from noise of that shape. `on_step(done, total)` may raise to cancel."""
+        """Latents [1, 16, T, h, w] from noise of that shape.
+
+        `on_step(done, total)` is called when the device has done a step, and may raise to cancel.
+        """
         device = self._execution_device
         dtype = cast(torch.dtype, self.transformer.dtype)  # found by a walk over all weights: once per clip
         schedule = sampling.schedule(device)
@@ -115,6 +119,7 @@ class WanTrackPipeline(WanImageToVideoPipeline):
                 plain = self._velocity("uncond", states, time, negative, image)
                 velocity = plain + sampling.guidance_scale * (velocity - plain)
             latents = schedule.step(velocity, time, latents, return_dict=False)[0]
+            wait_until_done(device)  # else the steps of a solver that never reads a value are told before they are done
             on_step(step + 1, sampling.steps)
         return latents
 

@@ -61,7 +61,8 @@ class Acceleration(Record):
     )
     vae_tiling: bool = Field(
         default=False,
-        description="Encodes and decodes in overlapping tiles of 256 px: less memory, more time, faint seams at most.",
+        description="Encodes and decodes in overlapping tiles of 256 px: less memory, more time, and frames that "
+        "differ in details, because the first frame is encoded in tiles, too.",
     )
     context_parallel: int = Field(
         default=1,
@@ -84,7 +85,7 @@ class Profile(Record):
 
     summary: str
     sampling: Sampling
-    dtype: Precision = Field(default="bfloat16", description="Of the transformer and the encoders.")
+    dtype: Precision = Field(default="bfloat16", description="Of the transformer and the text encoder.")
     vae_dtype: Precision = Field(
         default="float32", description="Of the VAE; bfloat16 decodes in less time, with slightly banded gradients."
     )
