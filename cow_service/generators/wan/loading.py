@@ -15,13 +15,14 @@ from cow_service.generators.wan.components import assemble
 from cow_service.generators.wan.execution import within_memory
 from cow_service.generators.wan.generator import LoadedModel, WanGenerator
 from cow_service.generators.wan.lora import add_lora
+from cow_service.generators.wan.memory import check_memory
 from cow_service.generators.wan.pipeline import WanTrackPipeline
 from cow_service.generators.wan.profiles import Profile, profile_of
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
 from cow_service.weights.building import BUILD_LOCK
 from cow_service.weights.device import choose_device
-from cow_service.weights.lock import read_lock, verify, weights_identity
+from cow_service.weights.lock import folder_of, read_lock, verify, weights_identity
 from cow_service.weights.manifests import Manifest, load_manifests
 
 
@@ -82,11 +83,16 @@ def _from_weights(manifest: Manifest, profile: Profile, settings: Settings, devi
     """The pipeline of the pulled weights, except for parts that come from the user's own checkpoint."""
     own = settings.own_parts(manifest.name)
 
+    def unverified(part: str) -> Path:
+        repository = manifest.sources[part].repository
+        return settings.checkpoints[manifest.name] if part in own else folder_of(settings.weights_dir, repository)
+
     def folder(part: str) -> Path:
         if part in own:
             return settings.checkpoints[manifest.name]
         return verify(manifest.sources[part], settings.weights_dir, manifest.name)
 
+    check_memory(manifest, settings.profile, unverified("transformer"), unverified("base"), device)
     checkpoint, base = folder("transformer"), folder("base")
     lora = profile.lora
     lora_file = None if lora is None else folder(lora.source) / manifest.sources[lora.source].files[0]

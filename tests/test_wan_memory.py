@@ -1,0 +1,74 @@
+"""What weights take of memory, before they are read: computed from headers, compared with what loads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from cow_service.errors import GeneratorUnavailable
+from cow_service.generators.wan import memory
+from cow_service.generators.wan.components import assemble
+from cow_service.generators.wan.memory import check_memory, need_of
+from cow_service.generators.wan.profiles import profile_of
+from cow_service.generators.wan.tiny import make_tiny
+from cow_service.weights.manifests import load_manifests
+
+ATI = load_manifests()["ati"]
+TOY = load_manifests()["tiny-ati"].architecture
+GPU = torch.device("cuda", 0)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy as diffusers saves it: transformer and base in one folder."""
+    folder = tmp_path_factory.mktemp("toy")
+    make_tiny(TOY).save_pretrained(folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("profile", "device", "host"),
+    [("exact", 47.2, 0), ("turbo", 46.9, 0), ("fast", 30.8, 47.2), ("small", 2.1, 47.2)],
+)
+def test_what_the_published_weights_take(profile: str, device: float, host: float) -> None:
+    need = need_of(profile_of(ATI, profile), ATI.parameters, 40)
+    assert (need.device / 1e9, need.host / 1e9) == (pytest.approx(device, abs=0.1), pytest.approx(host, abs=0.1))
+
+
+def test_it_is_what_the_loaded_parts_take(checkpoint: Path) -> None:
+    parts = assemble(make_tiny(TOY).transformer.to(torch.bfloat16), checkpoint, torch.bfloat16, torch.float32)
+    models = [part for part in parts.components.values() if isinstance(part, torch.nn.Module)]
+    taken = sum(weight.numel() * weight.element_size() for model in models for weight in model.parameters())
+    found = memory._parameters(checkpoint, checkpoint)
+    assert found is not None
+    assert need_of(profile_of(ATI, "exact"), found, 2).device == pytest.approx(taken, rel=0.03)
+
+
+def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no GPU here: its size, and what it can do, are fakes."""
+    monkeypatch.setattr(memory, "check_device", lambda wanted, device: None)
+    found = memory._parameters(checkpoint, checkpoint)
+    assert found is not None
+    need = {name: need_of(profile_of(ATI, name), found, ATI.architecture["num_layers"]) for name in ATI.profiles}
+    monkeypatch.setattr(memory, "_room", lambda device: need["fast"].device)
+    monkeypatch.setattr(memory, "_host", lambda: need["small"].host)
+    check_memory(ATI, "fast", checkpoint, checkpoint, GPU)
+    with pytest.raises(GeneratorUnavailable, match=r"'exact' take .* of the GPU's memory.*fit: fast, .*small"):
+        check_memory(ATI, "exact", checkpoint, checkpoint, GPU)
+    monkeypatch.setattr(memory, "_host", lambda: need["small"].host - 1)
+    with pytest.raises(GeneratorUnavailable, match=r"of this machine's memory.*fit: turbo"):
+        check_memory(ATI, "small", checkpoint, checkpoint, GPU)
+    monkeypatch.setattr(memory, "_room", lambda device: need["small"].device - 1)
+    with pytest.raises(GeneratorUnavailable, match="None of its profiles fits"):
+        check_memory(ATI, "turbo", checkpoint, checkpoint, GPU)
+    with pytest.raises(GeneratorUnavailable, match="of this machine's memory"):
+        check_memory(ATI, "portable", checkpoint, checkpoint, torch.device("cpu"))
+
+
+def test_what_cannot_be_read_is_left_to_loading(checkpoint: Path, tmp_path: Path) -> None:
+    check_memory(ATI, "exact", tmp_path, checkpoint, GPU)
+    (tmp_path / "text_encoder").mkdir()
+    (tmp_path / "text_encoder" / "model.safetensors").write_bytes(b"damaged")
+    check_memory(ATI, "exact", checkpoint, tmp_path, GPU)
