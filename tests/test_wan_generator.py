@@ -311,6 +311,26 @@ def test_a_moved_track_moves_the_condition(toys: Service) -> None:
     np.testing.assert_allclose(columns, middle / 832 * (mask.shape[2] - 1), atol=0.5)
 
 
+def kept_states(pipeline: WanTrackPipeline) -> int:
+    """How many states the step cache's hooks hold, whose tensors are as large as hidden states."""
+    registries = [getattr(module, "_diffusers_hook", None) for module in pipeline.transformer.modules()]
+    hooks = [hook for registry in registries if registry is not None for hook in registry.hooks.values()]
+    return sum(len(hook.state_manager._state_cache) for hook in hooks if hasattr(hook, "state_manager"))
+
+
+def test_nothing_of_the_steps_is_kept_while_a_clip_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Service(Settings(data_dir=tmp_path, profile="fast", generator="tiny-ati")) as service:
+        pipeline, held = pipeline_of(service), list[int]()
+        decode, step = pipeline.decode, "cow_service.generators.wan.pipeline.wait_until_done"
+        monkeypatch.setattr(step, lambda device: held.append(kept_states(pipeline)))
+        monkeypatch.setattr(
+            pipeline, "decode", lambda latents: (held.append(kept_states(pipeline)), decode(latents))[1]
+        )
+        simulate(service, video=False)
+    assert held[0] > 0
+    assert held[-1] == 0
+
+
 class TestProfiles:
     @pytest.mark.parametrize("profile", ["fast", "turbo"])
     def test_they_make_a_clip(self, tmp_path: Path, profile: str) -> None:

@@ -111,16 +111,19 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         image, prompt = given.image.to(dtype), given.prompt.to(dtype)
         negative = None if given.negative_prompt is None else given.negative_prompt.to(dtype)
         reset_cache(self.transformer, sampling.steps)
-        for step, time in enumerate(schedule.timesteps):
-            states = torch.cat([latents, guided], dim=1).to(dtype)
-            velocity = self._velocity("cond", states, time, prompt, image)
-            if negative is not None and sampling.guides(step):
-                states = torch.cat([latents, unguided], dim=1).to(dtype)
-                plain = self._velocity("uncond", states, time, negative, image)
-                velocity = plain + sampling.guidance_scale * (velocity - plain)
-            latents = schedule.step(velocity, time, latents, return_dict=False)[0]
-            wait_until_done(device)  # else the steps of a solver that never reads a value are told before they are done
-            on_step(step + 1, sampling.steps)
+        try:
+            for step, time in enumerate(schedule.timesteps):
+                states = torch.cat([latents, guided], dim=1).to(dtype)
+                velocity = self._velocity("cond", states, time, prompt, image)
+                if negative is not None and sampling.guides(step):
+                    states = torch.cat([latents, unguided], dim=1).to(dtype)
+                    plain = self._velocity("uncond", states, time, negative, image)
+                    velocity = plain + sampling.guidance_scale * (velocity - plain)
+                latents = schedule.step(velocity, time, latents, return_dict=False)[0]
+                wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
+                on_step(step + 1, sampling.steps)
+        finally:  # what was kept for the next step would lie in memory while the clip is decoded
+            reset_cache(self.transformer, sampling.steps)
         return latents
 
     @torch.no_grad()
