@@ -24,6 +24,8 @@ from cow_service.jobs.state import (
     ATTRIBUTE_TURN,
 )
 
+POLL_SECONDS = 1.0
+
 
 class Dispatch:
     """What it is given is in the database when its methods return. They raise `StorageUnavailable`."""
@@ -45,6 +47,21 @@ class Dispatch:
                 self._registered.add(name)
             with _attributes(job_id, spec, owner, queue), SetEnqueueOptions(priority=spec.turn + 1):
                 DBOS.enqueue_workflow(name, _workflow(spec), spec.model_dump())
+
+
+def result_of(handle: WorkflowHandle[str]) -> str:
+    """Waits for the outcome of a job that was started in this process, or elsewhere before.
+
+    DBOS' own waiting has no end for a job that was canceled and then deleted; here it ends with
+    `DBOSNonExistentWorkflowError`. Raises what the job came to.
+    """
+    running: Any = handle
+    if (future := getattr(running, "future", None)) is not None:
+        try:
+            return future.result()
+        except (dbos_error.DBOSWorkflowCancelledError, dbos_error.DBOSAwaitedWorkflowCancelledError):
+            pass  # it may have come to an end all the same: the database says
+    return running.dbos._sys_db.await_workflow_result(handle.get_workflow_id(), POLL_SECONDS, fail_if_missing=True)
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from cow_service.errors import (
 from cow_service.jobs import state, workflows
 from cow_service.jobs.computing import Computer
 from cow_service.jobs.database import database_errors
-from cow_service.jobs.dispatch import Dispatch
+from cow_service.jobs.dispatch import Dispatch, result_of
 from cow_service.jobs.in_process import InProcess
 from cow_service.jobs.launching import launch
 from cow_service.jobs.leases import lease_of
@@ -325,7 +325,7 @@ class JobEngine:
         """Waits in a thread of its own until the database has the outcome of a job, and announces it."""
         outcome: str | CowError | None = None
         try:
-            outcome = handle.get_result()
+            outcome = result_of(handle)
         except CowError as error:
             outcome = error
         except (dbos_error.DBOSException, SQLAlchemyError) as error:

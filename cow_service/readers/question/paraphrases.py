@@ -19,7 +19,7 @@ from cow_service.readers.question.words import Word, plain_words
 
 _MAX_CHANGES = 24  # of one sentence
 _THING = r"(?:M|T\d+|it|they|he|she)"
-_SLOTS = {"thing": _THING, "list": rf"{_THING}(?: , {_THING})*(?: ,)? or {_THING}", "some": r"S\d+", "rest": ".+"}
+_SLOTS = {"thing": _THING, "list": r"T\d+(?: , T\d+)*(?: ,)? or T\d+", "some": r"S\d+", "rest": ".+"}
 _OBJECTS = frozenset({"OBJ", "OBJS"})  # an object or objects of no name
 _SLOT = re.compile(r"<(\w+?)(\d?)>")
 
@@ -71,5 +71,6 @@ def _applied(rule: _Rule, words: Sequence[Word]) -> list[Word] | None:
             said += [Word(token, token, at)] if token in _OBJECTS else plain_words([token], at)
         else:
             start, stop = found.span(slot[1] + slot[2])
-            said += words[text[:start].count(" ") - 1 : text[: stop + 1].count(" ") - 1]
+            if start >= 0:  # of two ways to say it, the one that was said
+                said += words[text[:start].count(" ") - 1 : text[: stop + 1].count(" ") - 1]
     return [*words[:first], *said, *words[end:]]
