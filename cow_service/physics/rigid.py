@@ -9,9 +9,7 @@ from cow_service.physics.course import Course
 from cow_service.records import Shape
 from cow_service.vision.types import Floats
 
-RESTS = (
-    0.3  # of half the height of the lower of two bodies: so far apart their ends may be where one stands on the other
-)
+RESTS = 0.3  # of the lower body's half height: how far apart the ends of two bodies may be that stand on each other
 
 
 @dataclass(frozen=True)

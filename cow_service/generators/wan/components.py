@@ -13,6 +13,7 @@ from transformers import AutoTokenizer, CLIPImageProcessor, CLIPVisionModel, UMT
 from cow_service.errors import CheckpointInvalid
 from cow_service.generators.wan.checkpoints import counted
 from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
+from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE
 
 
 def assemble(
@@ -20,11 +21,11 @@ def assemble(
 ) -> WanTrackPipeline:
     """The pipeline of a transformer and the other parts in the diffusers folder `base`, all still on the CPU.
 
-    The image encoder is float32 whatever `dtype` is: the public implementations do not run it in bfloat16 either.
+    The image encoder has `IMAGE_ENCODER_DTYPE`, whatever `dtype` is.
     Raises `CheckpointInvalid` naming the part and what does not fit.
     """
     text_encoder = _model(UMT5EncoderModel, base, "text_encoder", dtype)
-    image_encoder = _model(CLIPVisionModel, base, "image_encoder", torch.float32)
+    image_encoder = _model(CLIPVisionModel, base, "image_encoder", getattr(torch, IMAGE_ENCODER_DTYPE))
     sizes: Any = transformer.config
     for name, wanted, found in (
         ("text_encoder", sizes.text_dim, text_encoder.config.d_model),

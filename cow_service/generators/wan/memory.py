@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable
 from cow_service.generators.wan.acceleration import check_device
 from cow_service.generators.wan.checkpoints import checkpoint_files
-from cow_service.generators.wan.profiles import Profile, profile_of
+from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
 from cow_service.weights.manifests import Manifest
 
 BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
@@ -37,7 +37,7 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
     sizes = {
         "transformer": parameters["transformer"] * BYTES[profile.dtype],
         "text_encoder": parameters["text_encoder"] * BYTES[profile.dtype],
-        "image_encoder": parameters["image_encoder"] * BYTES["float32"],
+        "image_encoder": parameters["image_encoder"] * BYTES[IMAGE_ENCODER_DTYPE],
         "vae": parameters["vae"] * BYTES[profile.vae_dtype],
     }
     whole = sum(sizes.values())

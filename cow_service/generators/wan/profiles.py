@@ -12,6 +12,7 @@ from cow_service.records import Record
 from cow_service.weights.manifests import Manifest
 
 Precision = Literal["float32", "bfloat16", "float16"]
+IMAGE_ENCODER_DTYPE: Precision = "float32"  # in every profile: the public implementations do not run it in bfloat16
 
 
 class Acceleration(Record):

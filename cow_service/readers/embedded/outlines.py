@@ -49,6 +49,7 @@ HANDLES = {"mug": 0.52, "cone": 0.45, "car": 0.3, "candle": 0.15}
 NO_HANDLE = 0.04
 _REACHES, _BARE = 0.15, 0.08  # of the width: so far out on one side at least, on the other at most
 _HOLE = 0.004  # of the area
+_SIDE = 0.25  # of the width: so far from the middle is the hole inside a handle, and not a window
 # The rows of the body beside a handle, at both ends, and those of the handle, as shares of the height.
 _UPPER, _LOWER, _BETWEEN = (0.06, 0.22), (0.72, 0.9), (0.2, 0.8)
 _ALIKE = {
@@ -79,7 +80,7 @@ def log_ratio(region: Region, form: str) -> float:
     densities = {
         name: _density(measured, name)
         * (CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
-        * (HANDLES.get(name, NO_HANDLE) if handle else 1 - HANDLES.get(name, NO_HANDLE))
+        * (HANDLES.get(name, NO_HANDLE) if handle else 1.0)  # one that is not seen may be behind the thing
         for name in (form, *rivals)
     }
     own = densities.pop(form)
@@ -123,11 +124,13 @@ def _measures(region: Region) -> list[float]:
 
 
 def _has_handle(mask: Mask) -> bool:
-    """Whether a mask [h, w] reaches out on one side alone between its ends, or has a hole."""
+    """Whether a mask [h, w] reaches out on one side alone between its ends, or has a hole at a side."""
     outlines, levels = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    inner = [cv2.contourArea(each) for each, level in zip(outlines, levels[0], strict=True) if level[3] >= 0]
-    if max(inner, default=0.0) > _HOLE * np.count_nonzero(mask):
-        return True
+    for hole, level in zip(outlines, levels[0], strict=True):
+        x, _, across, _ = cv2.boundingRect(hole)
+        at_side = abs((x + across / 2) / mask.shape[1] - 0.5) > _SIDE
+        if level[3] >= 0 and at_side and cv2.contourArea(hole) > _HOLE * np.count_nonzero(mask):
+            return True
     filled = mask.any(axis=1)
     left = np.where(filled, mask.argmax(axis=1), mask.shape[1])
     right = np.where(filled, mask[:, ::-1].argmax(axis=1), mask.shape[1])

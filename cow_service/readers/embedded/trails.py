@@ -19,6 +19,7 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     """The scene in which the trail that the question may be about ends where the question says, and a warning.
 
     Where neither the image nor the words tell the end, it is that from which the path leads on to what is asked about.
+    Raises `CannotGround` where the thing that the words tell the end by was not found.
     """
     words, phrase = question.motion.trail, question.mover
     if phrase is None or not scene.trails:
