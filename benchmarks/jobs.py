@@ -34,7 +34,7 @@ from cow_service.stages.run import now
 
 FAILED_EVERY = 100
 DBOS_TABLES = ("workflow_status", "workflow_input", "workflow_output")
-OUR_TABLES = {"cow_stage_results": "key", "cow_holds": None, "cow_job_stages": None}
+OUR_TABLES = {"cow_stage_results": "key", "cow_trajectories": None, "cow_holds": None, "cow_job_stages": None}
 GIVEN: dict[str, Any] = {"grounding": {"bbox": [10, 20, 30, 40]}, "num_frames": 9, "video": False}
 
 

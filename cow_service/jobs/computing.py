@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from cow_service.jobs.database import Database
+from cow_service.jobs.kept_apart import without
 from cow_service.jobs.outages import Outages
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.stage_cache import HoldKey, StoredStep
@@ -36,7 +37,10 @@ class Work:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a job came to: the result as JSON, and the time of each stage that was computed for it, s."""
+    """What a job came to: the result as JSON, and the time of each stage that was computed for it, s.
+
+    A trajectory that was kept apart (`kept_apart.py`) is not in it.
+    """
 
     result: str
     timings: dict[str, float]
@@ -126,4 +130,5 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
         with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, work.owner) as run:
             result = simulate(run)
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
-    return Outcome(result.model_dump_json(), computed)
+    text = result.model_dump_json()
+    return Outcome(text if step.trajectory is None else without(text, "trajectory", step.trajectory), computed)

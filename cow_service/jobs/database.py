@@ -1,7 +1,8 @@
 """The job database: SQLite in the data folder, or PostgreSQL by COW_DATABASE_URL. DBOS keeps its tables beside ours.
 
-`cow_stage_results` keeps the results of stages under their cache keys. `cow_holds` has the artifact references: which
-job needs which artifact. An artifact without a reference may be removed.
+`cow_stage_results` keeps the results of stages under their cache keys, `cow_trajectories` the trajectories, which are
+most of them (`kept_apart.py`). `cow_holds` has the artifact references: which job needs which artifact. An artifact
+without a reference may be removed.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from sqlalchemy import event
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
-from cow_service.jobs.packing import packed, unpacked
-from cow_service.jobs.tables import METADATA, REFERENCES, RESULTS, STAGES
+from cow_service.jobs.kept_apart import lacks, whole
+from cow_service.jobs.packing import deflated, inflated, packed, unpacked
+from cow_service.jobs.tables import METADATA, REFERENCES, RESULTS, STAGES, TRAJECTORIES
 from cow_service.settings import Settings, SettingsError
 
 BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
@@ -40,6 +42,11 @@ _SAVE = (
     "ON CONFLICT (key) DO UPDATE SET job_id = excluded.job_id, result = excluded.result, "
     "created_at = excluded.created_at"
 )
+_SAVE_TRAJECTORY = (
+    "INSERT INTO cow_trajectories (job_id, trajectory) VALUES (?, ?) "
+    "ON CONFLICT (job_id) DO UPDATE SET trajectory = excluded.trajectory"
+)
+_FIND_TRAJECTORY = "SELECT trajectory FROM cow_trajectories WHERE job_id = ?"
 _DONE = "INSERT INTO cow_job_stages (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
 _ADD_REFERENCES = "INSERT INTO cow_holds (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
 
@@ -155,12 +162,31 @@ class Database:
         with self._cursor() as cursor:
             cursor.execute(self._plain(_FIND), (key,))
             row = cursor.fetchone()
-        return None if row is None else (row[0], unpacked(row[1]))
+        if row is None:
+            return None
+        job, text = row[0], self.whole(row[0], unpacked(row[1]), "value")
+        return None if text is None else (job, text)
 
-    def store_result(self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str]) -> None:
-        """Adds references to a stage's artifacts, and saves its result."""
+    def whole(self, job: str, text: str, name: str = "trajectory") -> str | None:
+        """The result of a job as JSON, or of a stage, with the trajectory that the job keeps apart from it.
+
+        None where there is none any more: the job was deleted.
+        """
+        if not lacks(text, name):
+            return text
+        with self._cursor() as cursor:
+            cursor.execute(self._plain(_FIND_TRAJECTORY), (job,))
+            row = cursor.fetchone()
+        return None if row is None else whole(text, name, inflated(row[0]))
+
+    def store_result(
+        self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str], trajectory: str | None = None
+    ) -> None:
+        """Adds references to a stage's artifacts, and saves its result, and the trajectory that is apart from it."""
         with self._cursor(writes=True) as cursor:
             self._add_references(cursor, job, artifacts)
+            if trajectory is not None:
+                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, deflated(trajectory)))
             cursor.execute(self._plain(_SAVE), (key, job, stage, packed(result), time.time()))
             cursor.execute(self._plain(_DONE), (job, stage))
 
@@ -187,8 +213,8 @@ class Database:
                 theirs = sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(chunk)).distinct()
                 artifacts |= set(connection.execute(theirs).scalars())
                 connection.execute(sa.delete(REFERENCES).where(REFERENCES.c.job_id.in_(chunk)))
-                connection.execute(sa.delete(RESULTS).where(RESULTS.c.job_id.in_(chunk)))
-                connection.execute(sa.delete(STAGES).where(STAGES.c.job_id.in_(chunk)))
+                for ours in (RESULTS, TRAJECTORIES, STAGES):
+                    connection.execute(sa.delete(ours).where(ours.c.job_id.in_(chunk)))
         return list(artifacts - self.referenced(artifacts))
 
     def referenced(self, artifacts: Iterable[str]) -> set[str]:

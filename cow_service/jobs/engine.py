@@ -12,7 +12,6 @@ import threading
 import uuid
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from http import HTTPStatus
 from typing import Any, cast
 
@@ -225,11 +224,9 @@ class JobEngine:
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> JobState:
         """The state of a job. Raises `JobNotFound`, also for the job of another owner."""
         self.database.check_server()
-        found = state.find(job_id, self.active, full=full)
+        found = self.open_jobs.find(job_id, full=full)
         if found is None or (owner is not None and found.owner != owner):
             raise _no_job(job_id)
-        if found.job.status == "queued":
-            return replace(found, job=found.job.model_copy(update=self.open_jobs.place_in_line(job_id)))
         return found
 
     @without_retries

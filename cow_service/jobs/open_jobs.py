@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 from dbos import DBOS
 
-from cow_service.errors import CowError
+from cow_service.errors import CowError, StorageUnavailable
 from cow_service.jobs import state
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.pace import Pace
-from cow_service.jobs.state import OpenJob
+from cow_service.jobs.state import JobState, OpenJob
 from cow_service.jobs.turns import moves, next_turn, step_of
 from cow_service.jobs.webhooks import attempt_ids
 from cow_service.requests import Priority
@@ -54,19 +54,17 @@ class OpenJobs:
         with self.lock:
             return sum(each.owner == owner for each in self._open.values())
 
-    def place_in_line(self, job_id: str) -> dict[str, float | None]:
-        """`position` and `expected_wait` of a queued job."""
-        with self.lock:
-            own = self._open.get(job_id)
-            if own is None:
-                return {}
-            before = sum(
-                (each.turn, each.created_at) < (own.turn, own.created_at) and self.active.at(other) is None
-                for other, each in self._open.items()
-                if each.queue == own.queue
-            )
-            pace = self._paces[own.queue].jobs_per_second()
-        return {"position": before, "expected_wait": None if pace is None else round((before + 1) / pace, 1)}
+    def find(self, job_id: str, *, full: bool = True) -> JobState | None:
+        """A job by its id: with its result or problem unless `full` is false, with its place while it waits."""
+        found = state.find(job_id, self.active, full=full)
+        if found is None:
+            return None
+        if found.result is not None:
+            result = self.database.whole(job_id, found.result)
+            return None if result is None else replace(found, result=result)
+        if found.job.status == "queued":
+            return replace(found, job=found.job.model_copy(update=self._place_in_line(job_id)))
+        return found
 
     def take_turn(self, owner: str | None, queue: str, priority: Priority) -> Turn:
         """The turn of an owner's next job in a queue; moves back what comes behind it, here and not in the database."""
@@ -109,6 +107,11 @@ class OpenJobs:
     def ended(self, job_id: str, outcome: str | CowError | None, created_at: str | None = None) -> None:
         """The database says that a job has ended. `outcome` and `created_at` as in `ActiveJobs.notify_ended`."""
         self.record(job_id, None)
+        if isinstance(outcome, str):
+            try:
+                outcome = self.database.whole(job_id, outcome)
+            except StorageUnavailable:
+                outcome = None  # who waits for it reads it when the database is back
         self.active.notify_ended(job_id, outcome, created_at)
 
     def remove(self, jobs: list[str], untouched_since: float) -> None:
@@ -117,3 +120,17 @@ class OpenJobs:
             DBOS.delete_workflows([*jobs, *(attempt for job_id in jobs for attempt in attempt_ids(job_id))])
         for sha256 in self.database.remove_jobs(jobs):
             self.service.artifacts.delete(sha256, untouched_since + 1)
+
+    def _place_in_line(self, job_id: str) -> dict[str, float | None]:
+        """`position` and `expected_wait` of a queued job."""
+        with self.lock:
+            own = self._open.get(job_id)
+            if own is None:
+                return {}
+            before = sum(
+                (each.turn, each.created_at) < (own.turn, own.created_at) and self.active.at(other) is None
+                for other, each in self._open.items()
+                if each.queue == own.queue
+            )
+            pace = self._paces[own.queue].jobs_per_second()
+        return {"position": before, "expected_wait": None if pace is None else round((before + 1) / pace, 1)}

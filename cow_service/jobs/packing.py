@@ -14,11 +14,21 @@ def packed(text: str) -> str:
     """The text as the database keeps it."""
     if len(text) < LEAST:
         return text
-    return MARK + base64.b64encode(zlib.compress(text.encode(), LEVEL)).decode()
+    return MARK + base64.b64encode(deflated(text)).decode()
 
 
 def unpacked(kept: str) -> str:
     """The text that was packed; one of an earlier version is as it was written."""
     if not kept.startswith(MARK):
         return kept
-    return zlib.decompress(base64.b64decode(kept[len(MARK) :])).decode()
+    return inflated(base64.b64decode(kept[len(MARK) :]))
+
+
+def deflated(text: str) -> bytes:
+    """The text as a column of bytes keeps it."""
+    return zlib.compress(text.encode(), LEVEL)
+
+
+def inflated(kept: bytes) -> str:
+    """The text that was deflated."""
+    return zlib.decompress(kept).decode()

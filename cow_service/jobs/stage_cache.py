@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from cow_service.errors import ArtifactNotFound
 from cow_service.jobs.database import Database
+from cow_service.jobs.kept_apart import without
 from cow_service.jobs.outages import Outages
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.requests import Stage
@@ -63,6 +64,7 @@ class StoredStep:
     looked_for: Callable[[Stage, bool], None]  # hears whether a stage was found
     hold_key: HoldKey
     outages: Outages
+    trajectory: str | None = None  # as JSON, once it is kept apart for this job: not where an earlier start did it
 
     def __call__(
         self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
@@ -83,9 +85,17 @@ class StoredStep:
             self.looked_for(stage, False)
             result = self.outages.wait_through(compute)
             self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
-            kept = digest, self.job_id, stage, result.model_dump_json(), result.artifacts
-            self.outages.wait_through(lambda: self.database.store_result(*kept))
+            self._store(stage, digest, result)
             return result, False
+
+    def _store(self, stage: Stage, digest: str, result: StageResult[Any]) -> None:
+        text, trajectory = result.model_dump_json(), None
+        if stage == "trajectory":
+            trajectory = result.value.model_dump_json()
+            text = without(text, "value", trajectory)
+        kept = digest, self.job_id, stage, text, result.artifacts, trajectory
+        self.outages.wait_through(lambda: self.database.store_result(*kept))
+        self.trajectory = trajectory or self.trajectory
 
     def _stored_as(self, digest: str, shareable: bool) -> str:
         """What a result is stored under, where not all jobs may find it."""

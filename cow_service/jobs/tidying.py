@@ -7,7 +7,7 @@ import time
 import sqlalchemy as sa
 
 from cow_service.jobs.database import Database, database_errors
-from cow_service.jobs.tables import REFERENCES, RESULTS, TIDYING
+from cow_service.jobs.tables import REFERENCES, RESULTS, TIDYING, TRAJECTORIES
 from cow_service.jobs.workflow_table import workflow_table
 
 
@@ -26,7 +26,7 @@ def without_job(database: Database) -> list[str]:
     table = workflow_table(database.engine)
     with database_errors(), database.engine.connect() as connection:
         found: set[str] = set()
-        for ours in (RESULTS, REFERENCES):
+        for ours in (RESULTS, TRAJECTORIES, REFERENCES):
             known = sa.select(table.c.workflow_uuid).where(table.c.workflow_uuid == ours.c.job_id).exists()
             found |= set(connection.execute(sa.select(ours.c.job_id).distinct().where(~known)).scalars())
     return sorted(found)
