@@ -39,10 +39,12 @@ def test_long_results_are_kept_small_and_short_ones_as_they_are() -> None:
 def test_one_process_tidies_at_a_time(tmp_path: Path) -> None:
     migrate(Settings(data_dir=tmp_path))
     one, other = (Database(Settings(data_dir=tmp_path)) for _ in range(2))
-    assert takes_turn(one, 600)
-    assert not takes_turn(other, 600)
-    assert not takes_turn(one, 600)
-    assert takes_turn(other, 0), "the turn is over"
+    assert takes_turn(one, "jobs", 600)
+    assert not takes_turn(other, "jobs", 600)
+    assert not takes_turn(one, "jobs", 600)
+    assert takes_turn(other, "artifacts", 600), "that is another turn"
+    assert takes_turn(other, "jobs", 0), "the turn is over"
+    assert not takes_turn(one, "artifacts", 600)
     one.close()
     other.close()
 

@@ -28,6 +28,9 @@ CANCEL_POLL_SECONDS = 1.0  # for jobs that run here and were canceled by another
 STALLED_SECONDS = 10.0  # between checks for stalled jobs
 GARBAGE_SECONDS = 600.0  # between garbage collections
 TURN_SECONDS = 0.9 * GARBAGE_SECONDS  # since the last one of any process, which may have begun late
+# The same where artifacts are listed, which costs seconds for hundreds of thousands. It must be done sooner only where
+# they have a budget: without a reference they are kept for an hour anyway.
+LISTING_SECONDS = 0.9 * 3600.0
 SUBMIT_SECONDS = 5.0  # within which a job is in the database after the reference to its image
 MAX_REMOVED_JOBS = 200  # at a time
 JOIN_TIMEOUT_SECONDS = 5.0
@@ -71,6 +74,10 @@ class Maintenance:
 
     def collect_garbage(self) -> None:
         """Removes jobs past their retention, and artifacts without references."""
+        self._collect_jobs()
+        self._collect_artifacts()
+
+    def _collect_jobs(self) -> None:
         open_jobs = self._open_jobs
         before = datetime.now(UTC) - timedelta(hours=open_jobs.service.settings.job_retention_hours)
         while not self._stop.is_set() and (jobs := state.ended_before(before, MAX_REMOVED_JOBS)):
@@ -80,10 +87,12 @@ class Maintenance:
         missing = without_job(open_jobs.database)
         if missing and not self._stop.wait(SUBMIT_SECONDS):
             open_jobs.database.remove_jobs(sorted(set(missing) & set(without_job(open_jobs.database))))
-        if self._stop.is_set():
-            return
-        collect_artifacts(open_jobs.service, open_jobs.database, self._stop.is_set)
-        open_jobs.database.give_room_back(self._stop.is_set)
+        if not self._stop.is_set():
+            open_jobs.database.give_room_back(self._stop.is_set)
+
+    def _collect_artifacts(self) -> None:
+        if not self._stop.is_set():
+            collect_artifacts(self._open_jobs.service, self._open_jobs.database, self._stop.is_set)
 
     def _announce_ends(self) -> None:
         while self._has_finished.wait() and not self._stop.is_set():
@@ -121,8 +130,11 @@ class Maintenance:
             self._stop.wait(CANCEL_POLL_SECONDS)
 
     def _tidy(self) -> None:
-        if takes_turn(self._open_jobs.database, TURN_SECONDS):
-            self.collect_garbage()
+        database, settings = self._open_jobs.database, self._open_jobs.service.settings
+        if takes_turn(database, "jobs", TURN_SECONDS):
+            self._collect_jobs()
+        if takes_turn(database, "artifacts", LISTING_SECONDS if settings.artifacts_max_gb is None else TURN_SECONDS):
+            self._collect_artifacts()
 
     def _poll_cancellations(self) -> None:
         """Another process may have canceled or deleted a job that runs here, or taken it while this one was frozen."""

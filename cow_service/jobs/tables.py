@@ -41,11 +41,11 @@ STORES = sa.Table(
     sa.Column("id", sa.Integer, primary_key=True),  # always 1
     sa.Column("address", sa.Text, nullable=False),
 )
-# When a process last began to tidy: one row. It is not every process's work.
+# When a process last began to tidy jobs, and artifacts: a row each. It is not every process's work.
 TIDYING = sa.Table(
     "cow_tidying",
     METADATA,
-    sa.Column("id", sa.Integer, primary_key=True),  # always 1
+    sa.Column("id", sa.Integer, primary_key=True),  # 1: jobs; 2: artifacts
     sa.Column("begun", sa.Float, nullable=False),  # Unix time, s
 )
 # One row for each process that runs an engine.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Literal
 
 import sqlalchemy as sa
 
@@ -10,14 +11,18 @@ from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.tables import REFERENCES, RESULTS, TIDYING, TRAJECTORIES
 from cow_service.jobs.workflow_table import workflow_table
 
+Tidying = Literal["jobs", "artifacts"]
+_ROWS: dict[Tidying, int] = {"jobs": 1, "artifacts": 2}
 
-def takes_turn(database: Database, seconds: float) -> bool:
-    """Whether no process has begun to tidy for so long: it is then the caller's turn, and nobody else's."""
-    now = time.time()
-    first = "INSERT INTO cow_tidying (id, begun) VALUES (1, 0) ON CONFLICT DO NOTHING"
-    taken = sa.update(TIDYING).where(TIDYING.c.begun <= now - seconds).values(begun=now)
+
+def takes_turn(database: Database, what: Tidying, seconds: float) -> bool:
+    """Whether no process has begun to tidy that for so long: it is then the caller's turn, and nobody else's."""
+    now, row = time.time(), _ROWS[what]
+    first = "INSERT INTO cow_tidying (id, begun) VALUES (:row, 0) ON CONFLICT DO NOTHING"
+    due = TIDYING.c.id == row, TIDYING.c.begun <= now - seconds
+    taken = sa.update(TIDYING).where(*due).values(begun=now)
     with database_errors(), database.engine.begin() as connection:
-        connection.execute(sa.text(first))
+        connection.execute(sa.text(first), {"row": row})
         return connection.execute(taken).rowcount > 0
 
 
