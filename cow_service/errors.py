@@ -28,6 +28,7 @@
     │   ├── WeightsUnavailable     weights-unavailable      503
     │   └── CheckpointInvalid      checkpoint-invalid       503
     ├── GeneratorOutOfMemory       generator-out-of-memory  503
+    ├── DeviceFailed               device-failed            503
     ├── ModelNotFound              model-not-found          404
     ├── JobNotFound                job-not-found            404
     ├── DownloadUnavailable        download-unavailable     409
@@ -273,6 +274,12 @@ class GeneratorOutOfMemory(CowError):
     """The clip does not fit into the memory of the device."""
 
     code, status = "generator-out-of-memory", 503
+
+
+class DeviceFailed(CowError):
+    """The GPU failed in the middle of a clip."""
+
+    code, status = "device-failed", 503
 
 
 class ModelNotFound(CowError):

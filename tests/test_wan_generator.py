@@ -12,7 +12,14 @@ import pytest
 import torch
 from conftest import Example, example
 
-from cow_service.errors import Canceled, CowError, GeneratorOutOfMemory, GeneratorUnavailable, InvalidRequest
+from cow_service.errors import (
+    Canceled,
+    CowError,
+    DeviceFailed,
+    GeneratorOutOfMemory,
+    GeneratorUnavailable,
+    InvalidRequest,
+)
 from cow_service.generators.wan.execution import wait_until_done
 from cow_service.generators.wan.generator import WanGenerator
 from cow_service.generators.wan.pipeline import WanTrackPipeline
@@ -220,6 +227,20 @@ def test_running_out_of_memory(toys: Service, monkeypatch: pytest.MonkeyPatch) -
     assert caught.value.__cause__ is None  # no traceback that holds the tensors
     assert pictures(simulate(toys, video=False)) == before
     assert calls["embed_image"] == 1  # what was kept had been let go
+
+
+def test_a_gpu_that_fails(toys: Service) -> None:
+    """PyTorch's own error for it, in the middle of a step."""
+
+    def fail(module: torch.nn.Module, args: object, output: object) -> None:
+        raise torch.AcceleratorError("CUDA error: unspecified launch failure\nCompile with `TORCH_USE_CUDA_DSA`.")
+
+    hook = pipeline_of(toys).transformer.register_forward_hook(fail)
+    try:
+        with pytest.raises(DeviceFailed, match=r"failed \(CUDA error: unspecified launch failure\)\. .*nvidia-smi"):
+            simulate(toys, video=False)
+    finally:
+        hook.remove()
 
 
 def test_other_failures_pass_through(toys: Service) -> None:

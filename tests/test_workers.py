@@ -60,6 +60,15 @@ def test_too_much_memory_ends_the_job_alone(served: Served) -> None:
     assert served.http.post("/simulate", json=slow(0.1, seed=102)).status_code == 200
 
 
+def test_a_worker_whose_device_fails_is_replaced(served: Served) -> None:
+    before = {one.pid for one in workers_of(served)}
+    told = problem(served.http.post("/simulate", json=poison("device", seed=120)), 503, "device-failed")
+    assert told["detail"] == "The GPU failed."
+    assert served.clips().count(120) == 3, "another process may be able to use it"
+    assert served.http.post("/simulate", json=slow(0.1, seed=121)).status_code == 200
+    assert not before & {one.pid for one in workers_of(served)}
+
+
 @pytest.mark.soak_only
 def test_a_job_that_never_ends_is_ended(served: Served) -> None:
     problem(served.http.post("/simulate", json=poison("hang", seed=103)), 504, "job-timeout")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from cow_service.errors import DeviceFailed
 from cow_service.generators.base import GeneratorInput
 from cow_service.records import GeneratorInfo
 
@@ -25,7 +26,7 @@ class SlowOptions(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     seconds: float = Field(default=0.2, ge=0, le=3600)
-    end: Literal["well", "kill", "memory", "hang"] = "well"
+    end: Literal["well", "kill", "memory", "hang", "device"] = "well"
 
 
 def _end(how: str) -> None:
@@ -36,6 +37,8 @@ def _end(how: str) -> None:
     while how == "memory":
         held.append(bytearray(os.urandom(1_000_000)) * 50)
         time.sleep(0.05)
+    if how == "device":
+        raise DeviceFailed("The GPU failed.")
     if how == "hang":
         time.sleep(3600)
 

@@ -16,7 +16,7 @@ from itertools import count
 import psutil
 
 from cow_service.concurrency import PrioritySemaphore
-from cow_service.errors import ShuttingDown, WorkerEnded
+from cow_service.errors import DeviceFailed, ShuttingDown, WorkerEnded
 from cow_service.jobs.computing import Outcome, Work, WorkerState
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
 from cow_service.jobs.stage_cache import KeyLocks
@@ -26,7 +26,7 @@ from cow_service.stages.run import priority_of
 from cow_service.weights.manifests import find_manifest
 from cow_service.workers.process import Worker, WorkerGone
 
-MAX_CRASHES = 3  # of workers that had nothing but the job
+MAX_CRASHES = 3  # of workers that had nothing but the job, or of their device
 HEARTBEAT_TIMEOUT_SECONDS = 15.0  # after which a worker that says nothing is ended
 WATCH_SECONDS = 0.5  # between two looks at each worker
 SHARE_OF_MEMORY = 0.8  # of the machine's, that one worker may take where no setting says how much
@@ -167,7 +167,10 @@ class WorkerPool:
                 group.was_loaded |= worker.wait_loaded(0 if group.was_loaded else None)
 
     def compute(self, work: Work) -> Outcome:
-        """Gives a job to a worker, in its turn. Raises the `CowError` that it fails with, `Canceled`, `WorkerEnded`."""
+        """Gives a job to a worker, in its turn. Raises the `CowError` that it fails with, `Canceled`, `WorkerEnded`.
+
+        After a crash, or where its device failed, the job is tried again in another process.
+        """
         group = self._group(queue_of(work.spec.reader, work.spec.generator, self._settings))
         priority = priority_of(work.spec.turn, work.spec.created_at)
         crashes, alone = 0, group.jobs_each == 1
@@ -178,10 +181,15 @@ class WorkerPool:
                         with group.alone:
                             return self._computed(work, group, fresh=True)
                     return self._computed(work, group, fresh=False)
+                except DeviceFailed:
+                    crashes += 1
+                    log.warning("the device of the worker of job %s failed", work.job_id)
+                    if crashes >= MAX_CRASHES:
+                        raise
                 except WorkerGone as gone:
                     crashes += alone
                     log.warning("the worker of job %s %s", work.job_id, gone)
-                    if crashes == MAX_CRASHES or (alone and gone.is_final):
+                    if crashes >= MAX_CRASHES or (alone and gone.is_final):
                         raise WorkerEnded(f"The process that computed the job {gone}. It is not tried again.") from gone
                     alone = True  # the next crash is this job's own
 
@@ -189,6 +197,9 @@ class WorkerPool:
         worker, renew = group.take(fresh=fresh), fresh
         try:
             return worker.run(work, self._locks)
+        except DeviceFailed:
+            renew = True  # the process can use it no more, a new one may
+            raise
         finally:
             renew |= worker.jobs_done >= self._settings.worker_jobs
             renew |= worker.memory_bytes > RENEW_SHARE * self._memory_limit

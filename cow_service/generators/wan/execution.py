@@ -11,7 +11,7 @@ from threading import Lock
 
 import torch
 
-from cow_service.errors import GeneratorOutOfMemory
+from cow_service.errors import DeviceFailed, GeneratorOutOfMemory
 from cow_service.weights.device import is_out_of_memory
 
 CANCEL_POLL_SECONDS = 0.2  # how often a caller that waits for the device checks whether it was canceled
@@ -45,7 +45,8 @@ def wait_until_done(device: torch.device) -> None:
 def within_memory(device: torch.device, clear_caches: Callable[[], None], what: str) -> Generator[None]:
     """Turns running out of memory into `GeneratorOutOfMemory`, after `clear_caches` and after freeing all tensors.
 
-    `what` begins the message: what was being made.
+    A GPU that fails becomes `DeviceFailed`: nothing can be computed on it in this process any more. `what` begins the
+    messages: what was being made.
     """
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -53,6 +54,8 @@ def within_memory(device: torch.device, clear_caches: Callable[[], None], what: 
         yield
     except RuntimeError as error:
         if not is_out_of_memory(error):
+            if isinstance(error, torch.AcceleratorError):
+                raise _failed(what, error) from error
             raise
         # The frames of the failed call hold its tensors, and live as long as the traceback does.
         traceback.clear_frames(error.__traceback__)
@@ -64,6 +67,15 @@ def within_memory(device: torch.device, clear_caches: Callable[[], None], what: 
     if device.type == "cuda":
         torch.cuda.empty_cache()
     raise failure
+
+
+def _failed(what: str, error: torch.AcceleratorError) -> DeviceFailed:
+    reason = (str(error).splitlines() or [""])[0][:200]
+    return DeviceFailed(
+        f"{what} was not finished: the GPU failed ({reason}). A worker process is replaced, and the job tried "
+        "again; without workers (COW_WORKERS=false) restart the server. If it fails again and again, look at "
+        "`nvidia-smi` and at the Xid messages of the system's log: the GPU may need a reset."
+    )
 
 
 def _usage_and_remedy(device: torch.device) -> str:
