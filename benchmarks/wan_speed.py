@@ -1,11 +1,15 @@
 """Measures how fast the video model runs on this machine: each profile of a manifest, part by part.
 
     python benchmarks/wan_speed.py [--model ati] [--profile exact ...] [--against plain] [--num-frames 81]
-        [--width 832 --height 480] [--steps N] [--runs N] [--json FILE]
+        [--width 832 --height 480] [--steps N] [--runs N] [--budget SECONDS] [--plan] [--json FILE]
 
 On a GPU it is the 14B model with random weights; without one, the toy. Every profile gets a pipeline of its own and one
 clip that is not counted, of the full size and two steps, in which everything is compiled. Then come `--runs` clips,
 whose medians are given; text and picture are encoded anew in each. `plain` is diffusers' own pipeline, in the same run.
+First, every attention backend that the machine has is timed alone, at the shape of the clip.
+
+With `--budget`, clips have four steps, from which all of a profile's are computed, and what will not be done in time is
+left out; `--plan` says what would be run and what it is reckoned to take. The file has each row as soon as it is known.
 
 Floating-point operations are counted by formula (`pass_flops`), 135 PFLOP for 832x480x81 in 40 guided steps; those that
 a cache skipped are left out. Their share of the peak is that of bfloat16 matrix products measured here, whatever the
@@ -22,8 +26,9 @@ import platform
 import resource
 import statistics
 import sys
+import time
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -36,21 +41,21 @@ import transformers
 # On a bare GPU machine the package is not installed.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from wan_flops import pass_flops
 from wan_models import Case, Clock, Studio, Timing, do_without_ftfy
+from wan_plan import Budget, missing_packages, reckoned_seconds, steps_within_budget
 
 from cow_service.errors import CowError, GeneratorUnavailable
-from cow_service.generators.wan.capabilities import detect_capabilities, refusals
-from cow_service.generators.wan.checkpoints import diffusers_config
+from cow_service.generators.wan.attention import shape_of, time_backends
+from cow_service.generators.wan.capabilities import ATTENTION_BACKENDS, detect_capabilities, refusals
 from cow_service.generators.wan.execution import within_memory
-from cow_service.generators.wan.pipeline import TEXT_LENGTH, latent_shape
-from cow_service.generators.wan.profiles import Profile, profile_of
+from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
 from cow_service.generators.wan.tracks import nearest_lengths
 from cow_service.weights.device import choose_device, cpu_threads
 from cow_service.weights.manifests import load_manifests
 
 PLAIN = "plain"
 WARM_UP_STEPS = 2
-IMAGE_TOKENS = 257  # of CLIP ViT-H: 16 x 16 patches and one for the whole
 PARTS = ("text encoder", "image encoder", "VAE encode", "condition", "denoising", "decode", "other")
 MATMUL_SECONDS, MATMUL_TRIES = 0.2, 5  # the best try counts
 
@@ -60,41 +65,11 @@ class Result:
     """What one profile gave."""
 
     name: str
-    status: Literal["measured", "refused", "failed"]
+    status: Literal["measured", "refused", "failed", "skipped"]
     reason: str | None = None
     notes: tuple[str, ...] = ()
     figures: dict[str, Any] = field(default_factory=dict)
-
-
-def pass_flops(
-    architecture: Mapping[str, Any],
-    num_frames: int,
-    width: int,
-    height: int,
-    image_tokens: int = IMAGE_TOKENS,
-    layers: int | None = None,
-) -> int:
-    """Floating-point operations of the matrix products in one pass through the transformer, or through `layers` of it.
-
-    A linear layer takes 2 x its weights per token. With L tokens of the video, C of text and image, width d and inner
-    width f, each layer takes
-        2 L (6 d^2 + 2 d f)   self-attention's query, key, value, output; cross-attention's query, output; feed-forward
-        2 C (2 d^2)           cross-attention's keys and values
-        4 L^2 d + 4 L C d     self- and cross-attention: 2 for scores, 2 for their product with the values
-    and around the layers lie patches, embeddings of time, text and image, and the last layer: a thousandth.
-    """
-    config = diffusers_config(architecture)
-    _, _, frames, rows, columns = latent_shape(width, height, num_frames)
-    tokens, context = frames * (rows // 2) * (columns // 2), TEXT_LENGTH + image_tokens
-    d, f = int(architecture["dim"]), int(config["ffn_dim"])
-    text, image, frequencies = config["text_dim"], config["image_dim"], config["freq_dim"]
-    linear = 2 * tokens * (6 * d * d + 2 * d * f) + 2 * context * 2 * d * d
-    attention = 4 * tokens * tokens * d + 4 * tokens * context * d
-    patches = 2 * tokens * 4 * d * (config["in_channels"] + config["out_channels"])
-    embeddings = 2 * (TEXT_LENGTH * (text * d + d * d) + image_tokens * (image * image + image * d))
-    times = 2 * (frequencies * d + 7 * d * d)
-    count = config["num_layers"] if layers is None else layers
-    return count * (linear + attention) + patches + embeddings + times
+    seconds: float = 0.0  # that all of it took
 
 
 def matmul_peak(device: torch.device) -> float:
@@ -113,9 +88,7 @@ def matmul_peak(device: torch.device) -> float:
 
 def measure(name: str, case: Case, peak: float) -> Result:
     """One profile, or `plain`; whatever goes wrong becomes its result, and the memory is free afterwards."""
-    profile = profile_of(case.manifest, next(iter(case.manifest.profiles)) if name == PLAIN else name)
-    if name == PLAIN:  # of the first profile it takes the sampling alone
-        profile = Profile(summary="", sampling=profile.sampling)
+    profile = measured_profile(name, case)
     sentences = refusals(profile.acceleration, detect_capabilities(case.device))
     if sentences:
         return Result(name, "refused", " ".join(sentences))
@@ -137,6 +110,12 @@ def measure(name: str, case: Case, peak: float) -> Result:
         gc.collect()
         if case.device.type == "cuda":
             torch.cuda.empty_cache()
+
+
+def measured_profile(name: str, case: Case) -> Profile:
+    """The profile of that name; `plain` takes the sampling alone of the first one."""
+    profile = profile_of(case.manifest, next(iter(case.manifest.profiles)) if name == PLAIN else name)
+    return Profile(summary="", sampling=profile.sampling) if name == PLAIN else profile
 
 
 def _notes(name: str, profile: Profile) -> tuple[str, ...]:
@@ -213,18 +192,81 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-def survey(case: Case, names: Iterable[str], file: Path | None) -> dict[str, Any]:
+def survey(case: Case, names: Iterable[str], file: Path | None, budget: Budget | None = None) -> dict[str, Any]:
     """Measures one after the other. What is there so far is in `file` whenever one is done."""
     peak = matmul_peak(case.device)
-    found = {**_surroundings(case), "matmul_bf16_tflops": _rounded(peak / 1e12)}
+    found = {**_surroundings(case), "matmul_bf16_tflops": _rounded(peak / 1e12), "results": []}
     results: list[Result] = []
-    for name in names:
-        print(f"{name} ...", file=sys.stderr, flush=True)
-        results.append(measure(name, case, peak))
-        found["results"] = [asdict(result) for result in _compared(results)]
+
+    def keep() -> None:
         if file is not None:
             file.write_text(json.dumps(found, indent=2) + "\n")
+
+    print("attention ...", file=sys.stderr, flush=True)
+    found["attention"] = measure_attention(case)
+    keep()
+    for name in names:
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        results.append(_measured_in_time(name, case, peak, budget))
+        found["results"] = [asdict(result) for result in _compared(results)]
+        keep()
     return found
+
+
+def _measured_in_time(name: str, case: Case, peak: float, budget: Budget | None) -> Result:
+    """As `measure`, with the steps of a budget; skipped where it would not be done in time."""
+    begun, profile = time.monotonic(), measured_profile(name, case)
+    if budget is None:
+        return replace(measure(name, case, peak), seconds=_rounded(time.monotonic() - begun))
+    short = replace(case, steps=steps_within_budget(case, profile))
+    reckoned = reckoned_seconds(short, profile, peak, WARM_UP_STEPS)
+    expected, left = budget.expected(reckoned), budget.left
+    if expected > left:
+        return Result(name, "skipped", f"It would take {expected:.0f} s (reckoned), and {max(0, left):.0f} s are left.")
+    result, took = measure(name, short, peak), time.monotonic() - begun
+    if result.status == "measured":
+        budget.took(reckoned, took)
+    return replace(result, seconds=_rounded(took))
+
+
+def measure_attention(case: Case) -> list[dict[str, Any]]:
+    """Each attention backend that this machine has, by itself, at the shape of the clip."""
+    machine = detect_capabilities(case.device)
+    shape = shape_of(case.manifest.architecture, case.width, case.height, case.num_frames)
+    names = [name for name in ATTENTION_BACKENDS if not refusals(Acceleration(attention=name), machine)]
+    if case.device.type == "cuda":  # a matrix of tokens x tokens would not fit
+        names.remove("_native_math")
+    dtype = torch.bfloat16 if case.device.type == "cuda" else torch.float32
+    flop = 4 * shape.tokens**2 * shape.heads * shape.width
+    return [
+        {
+            "name": one.name,
+            "ms": None if one.seconds is None else _rounded(1000 * one.seconds),
+            "tflops": None if one.seconds is None else _rounded(flop / one.seconds / 1e12),
+            "error": None if one.error is None else _rounded(one.error),
+            "reason": one.reason,
+        }
+        for one in time_backends(names, shape, dtype, case.device)
+    ]
+
+
+def plan(case: Case, names: Iterable[str], budget: Budget | None) -> str:
+    """What would be run, in this order, and what it is reckoned to take."""
+    peak, machine, total, lines = matmul_peak(case.device), detect_capabilities(case.device), 0.0, list[str]()
+    for name in names:
+        profile = measured_profile(name, case)
+        if sentences := refusals(profile.acceleration, machine):
+            lines.append(f"{name}: refused. {' '.join(sentences)}")
+            continue
+        short = case if budget is None else replace(case, steps=steps_within_budget(case, profile))
+        seconds = reckoned_seconds(short, profile, peak, WARM_UP_STEPS)
+        total += seconds
+        left_out = budget is not None and total > budget.seconds
+        steps = short.sampled(profile.sampling).steps
+        lines.append(f"{name}: {steps} steps, {seconds:.0f} s (reckoned)" + (", not within the budget" * left_out))
+    if missing := missing_packages(machine):
+        lines.append(f"Not installed here: {', '.join(missing)}.")
+    return "\n".join([f"In all {total:.0f} s (reckoned).", *lines])
 
 
 def _compared(results: list[Result]) -> list[Result]:
@@ -280,12 +322,19 @@ def table(found: dict[str, Any]) -> str:
         f"{machine['device']}: {machine['name']}, {machine['memory_gb']:g} GB, {machine['cores']} cores. torch "
         f"{versions['torch']}, diffusers {versions['diffusers']}.",
         f"Matrix products in bfloat16: {found['matmul_bf16_tflops']:g} TFLOP/s.",
+        *(f"attention {one['name']}: {_attention_words(one)}" for one in found["attention"]),
         "",
     ]
     for first, *cells in rows:
         shown = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
         lines.append("  ".join([first.ljust(widths[0]), *shown]).rstrip())
     return "\n".join([*lines, "", *_words(found["results"])]).rstrip()
+
+
+def _attention_words(one: dict[str, Any]) -> str:
+    if one["ms"] is None:
+        return f"cannot be used ({one['reason']})"
+    return f"{one['ms']:g} ms, {one['tflops']:g} TFLOP/s, {one['error']:.1g} off native"
 
 
 def _rows(figures: list[dict[str, Any]]) -> list[list[str]]:
@@ -383,6 +432,8 @@ def main() -> int:
     parser.add_argument("--height", type=_count, help="px")
     parser.add_argument("--steps", type=_count, help="instead of the profile's own")
     parser.add_argument("--runs", type=_count, help="clips that count; by default 1, of a toy 5")
+    parser.add_argument("--budget", type=_count, help="seconds for all of it")
+    parser.add_argument("--plan", action="store_true", help="say what would be run, and run nothing")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
     try:
@@ -395,7 +446,11 @@ def main() -> int:
         return 2
     if do_without_ftfy():
         print("ftfy is not installed: texts are encoded without its clean-up, which takes no time.", file=sys.stderr)
-    found = survey(case, dict.fromkeys(names), arguments.json)
+    budget = None if arguments.budget is None else Budget(arguments.budget)
+    if arguments.plan:
+        print(plan(case, dict.fromkeys(names), budget))
+        return 0
+    found = survey(case, dict.fromkeys(names), arguments.json, budget)
     print(table(found))
     return 1 if any(result["status"] == "failed" for result in found["results"]) else 0
 

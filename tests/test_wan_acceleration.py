@@ -499,7 +499,7 @@ def with_capability(major: int, minor: int) -> Capabilities:
         (
             {"attention": "quick"},
             H200,
-            f"attention: there is no 'quick'; choose one of {', '.join(ATTENTION_BACKENDS)}.",
+            f"attention: there is no 'quick'; choose one of auto, {', '.join(ATTENTION_BACKENDS)}.",
         ),
         (
             {"attention": "flash"},
@@ -517,7 +517,7 @@ def with_capability(major: int, minor: int) -> Capabilities:
             {"attention": "sage"},
             without("sageattention"),
             "attention: 'sage' needs the package sageattention 2.1.1 or newer, which is not installed; install it, or "
-            "choose native.",
+            "choose sage_hub or native.",
         ),
         (
             {"compile": "regional"},

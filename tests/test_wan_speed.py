@@ -23,7 +23,9 @@ from cow_service.weights.manifests import load_manifests
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import wan_flops  # noqa: E402
 import wan_models  # noqa: E402
+import wan_plan  # noqa: E402
 import wan_speed  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -160,6 +162,57 @@ def test_what_cannot_be_measured_is_said(changes: dict[str, Any], told: str) -> 
         wan_speed.case_of(Namespace(**(nothing | {"model": "tiny-ati"} | changes)))
 
 
+def test_attention_is_timed_alone(whole: Whole) -> None:
+    rows = {row["name"]: row for row in whole.found["attention"]}
+    assert {"native", "_native_math"} <= set(rows)
+    assert rows["native"]["error"] == 0
+    assert all(row["ms"] > 0 and row["tflops"] > 0 for row in rows.values() if row["reason"] is None)
+    assert "attention native: " in whole.told
+
+
+def test_a_budget_leaves_out_what_would_not_be_done_in_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What is guessed is made far too little for the first one: the others are then known to take too long."""
+    file, case = tmp_path / "found.json", replace(SMALLEST, steps=None)
+    monkeypatch.setattr(wan_speed, "reckoned_seconds", lambda *_: 0.001)
+    budget = wan_plan.Budget(20)
+    monkeypatch.setattr(wan_plan.Budget, "left", property(lambda _: 0.01))
+    wan_speed.survey(case, ["exact", "turbo"], file, budget)
+    exact, turbo = json.loads(file.read_text())["results"]
+    assert exact["status"] == "measured"
+    assert exact["figures"]["steps"] == TINY.profiles["exact"]["sampling"]["steps"] == wan_plan.BUDGET_STEPS
+    assert exact["seconds"] > 0.01
+    assert turbo["status"] == "skipped"
+    assert "s are left" in turbo["reason"]
+
+
+def test_steps_of_a_budget_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = replace(SMALLEST, manifest=ATI, steps=None)
+    steps = {name: wan_plan.steps_within_budget(case, wan_speed.measured_profile(name, case)) for name in ATI.profiles}
+    assert set(steps.values()) == {4}
+    peak = 800e12  # FLOP/s
+    whole, short = (
+        wan_plan.reckoned_seconds(replace(case, steps=steps, num_frames=81, width=832, height=480),
+                                  wan_speed.measured_profile("exact", case), peak, 2)
+        for steps in (None, 4)
+    )  # fmt: skip
+    assert whole > 3 * short
+
+
+def test_the_plan_says_what_would_be_run_and_runs_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(wan_models, "build", None)  # whoever builds a model fails
+    arguments = ["--model", "tiny-ati", "--plan", "--budget", "5", "--profile", "exact", "--profile", "turbo"]
+    monkeypatch.setattr(sys, "argv", ["wan_speed.py", *arguments])
+    assert wan_speed.main() == 0
+    told = capsys.readouterr().out
+    assert "exact: 4 steps, 10 s (reckoned), not within the budget" in told
+    assert "turbo: " in told
+    assert "Not installed here: flash-attn>=2.6.3" in told
+
+
 def with_profile(name: str, **options: Any) -> wan_models.Case:
     profile = {**TINY.profiles["exact"], "acceleration": options}
     return replace(SMALLEST, manifest=TINY.model_copy(update={"profiles": {name: profile, **TINY.profiles}}))
@@ -197,9 +250,9 @@ def test_one_that_fails_takes_no_other_with_it(
 
 class TestTheFormula:
     def test_the_whole_clip_of_the_14b_model(self) -> None:
-        one = wan_speed.pass_flops(ATI.architecture, 81, 832, 480)
+        one = wan_flops.pass_flops(ATI.architecture, 81, 832, 480)
         assert 80 * one == pytest.approx(135e15, rel=0.03)
-        assert wan_speed.pass_flops(ATI.architecture, 81, 832, 480, layers=0) < 0.002 * one
+        assert wan_flops.pass_flops(ATI.architecture, 81, 832, 480, layers=0) < 0.002 * one
 
     @pytest.mark.parametrize(("num_frames", "width", "height"), [(5, 32, 48), (17, 112, 64)])
     def test_it_counts_what_pytorch_counts(self, num_frames: int, width: int, height: int) -> None:
@@ -207,7 +260,7 @@ class TestTheFormula:
         states = torch.zeros(1, 36, (num_frames - 1) // 4 + 1, height // 8, width // 8)
         with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
             transformer(states, torch.ones(1), torch.zeros(1, 512, 16), torch.zeros(1, 17, 32))
-        assert wan_speed.pass_flops(TINY.architecture, num_frames, width, height, 17) == counter.get_total_flops()
+        assert wan_flops.pass_flops(TINY.architecture, num_frames, width, height, 17) == counter.get_total_flops()
 
 
 class TestTheModels:

@@ -141,7 +141,8 @@ def _offload_groups(parts: Any, device: torch.device) -> None:
             model.to(device)
         elif name == "transformer":
             streams = device.type == "cuda"
-            apply_group_offloading(model, device, num_blocks_per_group=1, use_stream=streams)
+            # With `record_stream` the CPU does not wait for the copies of each block.
+            apply_group_offloading(model, device, num_blocks_per_group=1, use_stream=streams, record_stream=streams)
         else:
             apply_group_offloading(model, device, offload_type="leaf_level")
 

@@ -18,6 +18,7 @@ from pydantic import Field
 from cow_service.generators.wan.profiles import Acceleration
 from cow_service.records import Record
 
+AUTO = "auto"  # in place of a backend's name
 ComputeCapability = tuple[int, int]
 HOPPER, ADA, AMPERE, VOLTA = (9, 0), (8, 9), (8, 0), (7, 0)
 
@@ -29,11 +30,12 @@ class AttentionBackend(NamedTuple):
     at_least: ComputeCapability | None = None
     at_most: ComputeCapability | None = None
     context_parallel: bool = False  # whether several GPUs can share one clip
+    in_auto: bool = True  # whether `auto` may choose it: it computes the same as native to rounding
 
 
 ATTENTION_BACKENDS: Mapping[str, AttentionBackend] = {
     "native": AttentionBackend(context_parallel=True),
-    "_native_math": AttentionBackend(),
+    "_native_math": AttentionBackend(in_auto=False),  # its memory grows with the square of the tokens
     "_native_flash": AttentionBackend(None, AMPERE, context_parallel=True),
     "_native_cudnn": AttentionBackend(None, AMPERE, context_parallel=True),
     "_native_efficient": AttentionBackend(None, VOLTA),
@@ -41,12 +43,16 @@ ATTENTION_BACKENDS: Mapping[str, AttentionBackend] = {
     "flash_hub": AttentionBackend("kernels", AMPERE, context_parallel=True),
     "_flash_3": AttentionBackend("flash-attn-3", HOPPER, HOPPER),
     "_flash_3_hub": AttentionBackend("kernels", HOPPER, HOPPER, context_parallel=True),
-    "sage": AttentionBackend("sageattention", AMPERE, context_parallel=True),
-    "sage_hub": AttentionBackend("kernels", AMPERE, context_parallel=True),
-    "_sage_qk_int8_pv_fp16_cuda": AttentionBackend("sageattention", AMPERE),
-    "_sage_qk_int8_pv_fp8_cuda_sm90": AttentionBackend("sageattention", HOPPER, HOPPER),
+    "flash_4_hub": AttentionBackend("kernels", HOPPER),
+    "sage": AttentionBackend("sageattention", AMPERE, context_parallel=True, in_auto=False),
+    "sage_hub": AttentionBackend("kernels", AMPERE, context_parallel=True, in_auto=False),
+    "_sage_qk_int8_pv_fp16_cuda": AttentionBackend("sageattention", AMPERE, in_auto=False),
+    "_sage_qk_int8_pv_fp8_cuda": AttentionBackend("sageattention", ADA, in_auto=False),
+    "_sage_qk_int8_pv_fp8_cuda_sm90": AttentionBackend("sageattention", HOPPER, HOPPER, in_auto=False),
     "xformers": AttentionBackend("xformers", VOLTA),
 }
+# What to take in place of a package that has to be built: the backend that fetches the kernel from the hub.
+HUB: Mapping[str, str] = {"flash-attn": "flash_hub", "flash-attn-3": "_flash_3_hub", "sageattention": "sage_hub"}
 # Distributions and the minimum versions that diffusers accepts (a test compares them).
 MINIMUM_VERSIONS: Mapping[str, str] = {
     "accelerate": "0.17.0",
@@ -105,10 +111,25 @@ def refusals(acceleration: Acceleration, available: Capabilities) -> tuple[str, 
     return tuple(sentence for check in checks for sentence in check(acceleration, available))
 
 
+def backends_for_auto(acceleration: Acceleration, available: Capabilities) -> tuple[str, ...]:
+    """The attention backends that a device supports and `attention: auto` may choose; native is one of them."""
+    return tuple(
+        name
+        for name, backend in ATTENTION_BACKENDS.items()
+        if backend.in_auto
+        and (backend.context_parallel or acceleration.context_parallel == 1)
+        and not any(_attention(acceleration.model_copy(update={"attention": name}), available))
+    )
+
+
 def _attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     name, backend = wanted.attention, ATTENTION_BACKENDS.get(wanted.attention)
+    if name == AUTO:
+        if available.device != "cuda":
+            yield f"attention: auto times the backends of a GPU, and {available.description}; choose native."
+        return
     if backend is None:
-        yield f"attention: there is no '{name}'; choose one of {', '.join(ATTENTION_BACKENDS)}."
+        yield f"attention: there is no '{name}'; choose one of {', '.join((AUTO, *ATTENTION_BACKENDS))}."
         return
     low, high, own = backend.at_least, backend.at_most, available.compute_capability
     if low and (own is None or not low <= own <= (high or own)):
@@ -116,7 +137,8 @@ def _attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
         needed = f"a GPU of compute capability {least}"
         yield f"attention: '{name}' needs {needed}, and {available.description}; choose native."
     if backend.package and backend.package not in available.packages:
-        yield f"attention: '{name}' needs {_package(backend.package)}; install it, or choose native."
+        others = f"{HUB[backend.package]} or native" if backend.package in HUB else "native"
+        yield f"attention: '{name}' needs {_package(backend.package)}; install it, or choose {others}."
 
 
 def _compiling(wanted: Acceleration, available: Capabilities) -> Iterator[str]:

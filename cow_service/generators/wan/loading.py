@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan import conditioning
 from cow_service.generators.wan.acceleration import accelerate, check_device
+from cow_service.generators.wan.attention import with_attention
 from cow_service.generators.wan.checkpoints import checkpoint_files, load_transformer
 from cow_service.generators.wan.components import assemble
 from cow_service.generators.wan.execution import within_memory
@@ -44,7 +46,9 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     if own is not None:
         checkpoint_files(own)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
+    side = math.isqrt(int(manifest.defaults["max_area"]))
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
+        profile = with_attention(profile, manifest.architecture, side, side, device)
         if manifest.sources:
             pipeline = _from_weights(manifest, profile, settings, device)
         else:

@@ -1,0 +1,133 @@
+"""Which attention backend is the fastest for a clip: those that a machine has are timed once, at the clip's shape.
+
+It cannot be told beforehand: cuDNN's is the faster one on some GPUs and the slower one on others, and lacks shapes.
+"""
+
+from __future__ import annotations
+
+import logging
+import statistics
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from diffusers.models.attention_dispatch import attention_backend, dispatch_attention_fn
+from torch import Tensor
+
+from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities
+from cow_service.generators.wan.checkpoints import diffusers_config
+from cow_service.generators.wan.execution import wait_until_done
+from cow_service.generators.wan.pipeline import latent_shape
+from cow_service.generators.wan.profiles import Profile
+from cow_service.weights.device import is_out_of_memory
+
+NATIVE = "native"  # what the others are compared with
+TRIALS = 3  # after one that is not counted
+MARGIN = 1.05  # that another one must be faster than native: else noise would choose, each time another
+MAX_ERROR = 0.02  # of the largest value: the roundings of bfloat16 stay below it
+FRAMES = 81  # of the longest clip
+
+log = logging.getLogger("cow_service")
+
+
+class AttentionShape(NamedTuple):
+    """What a self-attention is given: queries, keys and values, each [1, tokens, heads, width]."""
+
+    tokens: int
+    heads: int
+    width: int
+
+
+@dataclass(frozen=True)
+class TimedBackend:
+    """One backend at one shape."""
+
+    name: str
+    seconds: float | None  # median; None where it cannot be used
+    error: float | None  # largest difference from native, as a share of native's largest value
+    reason: str | None = None  # why it cannot be used
+
+    @property
+    def usable(self) -> bool:
+        """Whether it computes the same to rounding."""
+        return self.seconds is not None and self.error is not None and self.error <= MAX_ERROR
+
+
+def shape_of(architecture: Mapping[str, Any], width: int, height: int, num_frames: int = FRAMES) -> AttentionShape:
+    """The shape at which a model attends to a clip of that size (px)."""
+    config = diffusers_config(architecture)
+    _, _, frames, rows, columns = latent_shape(width, height, num_frames)
+    return AttentionShape(
+        frames * (rows // 2) * (columns // 2), config["num_attention_heads"], config["attention_head_dim"]
+    )
+
+
+def time_backends(
+    names: Iterable[str], shape: AttentionShape, dtype: torch.dtype, device: torch.device
+) -> tuple[TimedBackend, ...]:
+    """Times each backend on the same random inputs. One that fails says why; a GPU that fails is raised."""
+    drawn = torch.Generator(device).manual_seed(0)
+    q, k, v = (torch.randn(1, *shape, generator=drawn, device=device).to(dtype) for _ in range(3))
+    expected = _attended(NATIVE, q, k, v)
+    return tuple(_timed(name, expected, q, k, v) for name in names)
+
+
+def fastest(timed: Iterable[TimedBackend]) -> str:
+    """The fastest of those that compute the same; native unless another one is clearly faster."""
+    seconds = {one.name: one.seconds for one in timed if one.usable and one.seconds is not None}
+    if not seconds:
+        return NATIVE
+    best = min(seconds, key=lambda name: seconds[name])
+    return NATIVE if NATIVE in seconds and seconds[NATIVE] < MARGIN * seconds[best] else best
+
+
+def with_attention(
+    profile: Profile, architecture: Mapping[str, Any], width: int, height: int, device: torch.device
+) -> Profile:
+    """The profile with the backend that `attention: auto` comes to on this device; any other profile as it is.
+
+    `width`, `height`: px of a clip.
+    """
+    wanted = profile.acceleration
+    if wanted.attention != AUTO:
+        return profile
+    names = backends_for_auto(wanted, detect_capabilities(device))
+    timed = () if len(names) < 2 else time_backends(
+        names, shape_of(architecture, width, height), getattr(torch, profile.dtype), device
+    )  # fmt: skip
+    chosen = fastest(timed)
+    log.info("attention: %s%s", chosen, "".join(f"; {_words(one)}" for one in timed))
+    return profile.model_copy(update={"acceleration": wanted.model_copy(update={"attention": chosen})})
+
+
+def _timed(name: str, expected: Tensor, q: Tensor, k: Tensor, v: Tensor) -> TimedBackend:
+    try:
+        found = _attended(name, q, k, v)
+        error = float((found - expected).abs().max() / expected.abs().max())
+        del found
+        seconds: list[float] = []
+        for _ in range(TRIALS):
+            begun = time.perf_counter()
+            _attended(name, q, k, v)
+            seconds.append(time.perf_counter() - begun)
+        return TimedBackend(name, statistics.median(seconds), error)
+    except Exception as problem:
+        if isinstance(problem, torch.AcceleratorError) and not is_out_of_memory(problem):
+            raise  # nothing can be computed on the device any more
+        return TimedBackend(name, None, None, f"{type(problem).__name__}: {(str(problem).splitlines() or [''])[0]}")
+
+
+@torch.no_grad()
+def _attended(name: str, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    with attention_backend(name):
+        found = dispatch_attention_fn(q, k, v)
+    wait_until_done(q.device)
+    return found
+
+
+def _words(one: TimedBackend) -> str:
+    if one.seconds is None or one.error is None:
+        return f"{one.name} cannot be used ({one.reason})"
+    return f"{one.name} {1000 * one.seconds:.3g} ms" + ("" if one.usable else f", off by {one.error:.2g}")

@@ -1,0 +1,118 @@
+"""`attention: auto`: real backends timed on the CPU, what is chosen of them, and what a GPU would be offered."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cow_service.generators.wan import attention
+from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
+from cow_service.generators.wan.capabilities import (
+    ATTENTION_BACKENDS,
+    MINIMUM_VERSIONS,
+    Capabilities,
+    backends_for_auto,
+    refusals,
+)
+from cow_service.generators.wan.profiles import Acceleration, profile_of
+from cow_service.weights.manifests import load_manifests
+
+CPU = torch.device("cpu")
+ATI, TINY = load_manifests()["ati"], load_manifests()["tiny-ati"]
+SMALL = AttentionShape(tokens=48, heads=2, width=12)
+
+
+def gpu(major: int, minor: int, *packages: str) -> Capabilities:
+    return Capabilities(
+        device="cuda",
+        name="GPU",
+        compute_capability=(major, minor),
+        memory=80_000_000_000,
+        gpus=1,
+        packages=packages,
+        compiler=True,
+    )
+
+
+def test_backends_that_work_are_timed_and_the_others_say_why_not() -> None:
+    timed = {one.name: one for one in time_backends(("native", "_native_math", "flash"), SMALL, torch.float32, CPU)}
+    assert timed["native"].error == 0
+    assert timed["_native_math"].usable
+    assert all((timed[name].seconds or 0) > 0 for name in ("native", "_native_math"))
+    assert not timed["flash"].usable
+    assert "flash" in (timed["flash"].reason or "").lower()
+
+
+def test_a_gpu_that_fails_is_no_missing_backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str, *tensors: Any) -> Any:
+        if name != "native":
+            raise torch.AcceleratorError("CUDA error: an illegal memory access was encountered")
+        return tensors[0]
+
+    monkeypatch.setattr(attention, "_attended", fail)
+    with pytest.raises(torch.AcceleratorError):
+        time_backends(("native", "_native_cudnn"), SMALL, torch.float32, CPU)
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0.001, 1), st.sampled_from([0.0, 0.01, 0.03, float("nan")])),
+        min_size=1,
+        max_size=5,
+    )
+)
+def test_the_fastest_that_computes_the_same_is_chosen(others: list[tuple[float, float]]) -> None:
+    native = TimedBackend("native", 0.1, 0.0)
+    timed = [native, *(TimedBackend(f"other-{i}", seconds, error) for i, (seconds, error) in enumerate(others))]
+    chosen = next(one for one in timed if one.name == fastest(timed))
+    exact = [seconds for seconds, error in others if error <= attention.MAX_ERROR]
+    if chosen is native:
+        assert all(attention.MARGIN * seconds > 0.1 for seconds in exact), "none is clearly faster"
+    else:
+        assert chosen.seconds == min(exact)
+        assert chosen.usable
+    assert fastest([TimedBackend("native", None, None, "memory")]) == "native"
+
+
+def test_a_profile_names_what_was_chosen(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """So that a clip's description and its fingerprint do."""
+    monkeypatch.setattr(attention, "backends_for_auto", lambda *_: ("native", "_native_math"))
+    given_ = profile_of(TINY, "exact")
+    assert attention.with_attention(given_, TINY.architecture, 128, 64, CPU) is given_
+    auto = given_.model_copy(update={"acceleration": Acceleration(attention="auto", vae_tiling=True)})
+    with caplog.at_level(logging.INFO, logger="cow_service"):
+        found = attention.with_attention(auto, TINY.architecture, 128, 64, CPU).acceleration
+    assert found.attention in {"native", "_native_math"}
+    assert found == Acceleration(attention=found.attention, vae_tiling=True)
+    (told,) = caplog.messages
+    assert told.startswith(f"attention: {found.attention}; native ")
+    assert "_native_math" in told
+
+
+def test_the_shape_is_that_of_the_transformer() -> None:
+    assert shape_of(ATI.architecture, 832, 480) == (32760, 40, 128)
+
+
+def test_only_what_is_exact_and_there_is_tried() -> None:
+    auto = Acceleration(attention="auto")
+    natives = ("native", "_native_flash", "_native_cudnn", "_native_efficient")
+    assert backends_for_auto(auto, gpu(8, 0)) == natives
+    assert backends_for_auto(auto, gpu(7, 5)) == ("native", "_native_efficient")
+    everything = backends_for_auto(auto, gpu(9, 0, *MINIMUM_VERSIONS))
+    assert {"_flash_3", "_flash_3_hub", "flash_4_hub", "xformers"} <= set(everything)
+    assert not [name for name in everything if "sage" in name or name == "_native_math"]
+    shared = backends_for_auto(Acceleration(attention="auto", context_parallel=2), gpu(9, 0, *MINIMUM_VERSIONS))
+    assert all(ATTENTION_BACKENDS[name].context_parallel for name in shared)
+
+
+def test_auto_needs_a_gpu() -> None:
+    assert refusals(Acceleration(attention="auto"), gpu(9, 0)) == ()
+    bare = Capabilities(device="cpu", name="x86_64", memory=1, gpus=0, compiler=False)
+    assert refusals(Acceleration(attention="auto"), bare) == (
+        "attention: auto times the backends of a GPU, and this device is the CPU; choose native.",
+    )
