@@ -63,6 +63,7 @@ def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint: Path, m
     monkeypatch.setattr(memory, "_room", lambda device: min(each.device for each in need.values()) - 1)
     with pytest.raises(GeneratorUnavailable, match="None of its profiles fits"):
         check_memory(ATI, "turbo", checkpoint, checkpoint, GPU)
+    monkeypatch.setattr(memory, "_host", lambda: need["portable"].device - 1)
     with pytest.raises(GeneratorUnavailable, match="of this machine's memory"):
         check_memory(ATI, "portable", checkpoint, checkpoint, torch.device("cpu"))
 
