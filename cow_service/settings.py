@@ -148,8 +148,8 @@ class Settings(BaseSettings):
     )
     warmup: bool = Field(
         default=True,
-        description="Compute something small before /readyz says ready; else the first request takes several times as "
-        "long.",
+        description="Compute something small before /readyz says ready, and compile a video model for clips of any "
+        "size when it is loaded; else the first requests take several times as long.",
     )
     job_timeout: float = Field(
         default=3600,

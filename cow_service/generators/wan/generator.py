@@ -12,6 +12,7 @@ import torch
 
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.generators.base import GeneratorInput
+from cow_service.generators.wan.compiling import FRAMES, ClipSize, compile_for
 from cow_service.generators.wan.conditioning import TrackConditioning
 from cow_service.generators.wan.embedding_cache import EmbeddingCache
 from cow_service.generators.wan.execution import exclusive_use, within_memory
@@ -24,6 +25,7 @@ from cow_service.records import GeneratorInfo
 from cow_service.vision.types import Image
 from cow_service.weights.device import cpu_threads
 
+USUAL_SIDES = 832, 480  # their ratio
 SIDE_MULTIPLE = 16  # px: the sides of a clip are multiples of it
 MAX_SIDE = 1024 * SIDE_MULTIPLE  # px: the model has 1024 positions each way
 DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
@@ -82,6 +84,23 @@ class WanGenerator(WanLimits):
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
             raise InvalidRequest(f"`image`: {detail}.", errors=(FieldError("/image", detail),))
         return clip_width, clip_height
+
+    def compile(self) -> None:
+        """Compiles for clips of any size, most images' first; does nothing where the profile compiles nothing.
+
+        Else the first clip would wait for it, and the first of a second size once more.
+        """
+        model = self._model
+        if model.profile.acceleration.compile == "none":
+            return
+        width, height = self.size(*USUAL_SIDES)
+        sizes = [ClipSize(width, height, frames) for frames in FRAMES]
+        with (
+            exclusive_use(model.device, lambda: None),
+            cpu_threads(model.threads),
+            within_memory(model.device, self._embeddings.clear, f"A clip of {width} x {height}"),
+        ):
+            compile_for(model.pipeline, model.profile.sampling, sizes)
 
     def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""

@@ -13,6 +13,7 @@ from cow_service.generators.wan import conditioning
 from cow_service.generators.wan.acceleration import accelerate, check_device
 from cow_service.generators.wan.attention import with_attention
 from cow_service.generators.wan.checkpoints import checkpoint_files, load_transformer
+from cow_service.generators.wan.compiling import keep_compiled_code
 from cow_service.generators.wan.components import assemble
 from cow_service.generators.wan.execution import within_memory
 from cow_service.generators.wan.generator import LoadedModel, WanGenerator
@@ -34,6 +35,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     Raises `WeightsUnavailable`, `CheckpointInvalid`, `GeneratorOutOfMemory`, or `GeneratorUnavailable` for what this
     machine cannot do.
     """
+    keep_compiled_code(settings.data_dir / "compiled")  # first: PyTorch sets its own folder when it is first used
     manifest = load_manifests()[name]
     profile = profile_of(manifest, settings.profile)
     device = choose_device(settings.device, GeneratorUnavailable)
@@ -57,7 +59,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
         accelerate(pipeline, profile.acceleration, device)
     revisions = _revisions(manifest, profile, settings)
     repository = manifest.sources["transformer"].repository if manifest.sources else None
-    return WanGenerator(
+    generator = WanGenerator(
         LoadedModel(
             name=name,
             repository=repository if own is None else own.name,
@@ -74,6 +76,9 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
             threads=int(manifest.defaults["threads"]) if "threads" in manifest.defaults else None,
         )
     )
+    if settings.warmup:
+        generator.compile()
+    return generator
 
 
 # The factories of the entry points in pyproject.toml.
