@@ -6,7 +6,8 @@
 On a GPU it is the 14B model with random weights; without one, the toy. Every profile gets a pipeline of its own and one
 clip that is not counted, of the full size and two steps, in which everything is compiled. Then come `--runs` clips,
 whose medians are given; text and picture are encoded anew in each. `plain` is diffusers' own pipeline, in the same run.
-First, every attention backend that the machine has is timed alone, at the shape of the clip.
+First, a toy with the public implementation's weights is compared with its figures, in float32 and bfloat16, and every
+attention backend that the machine has is timed alone, at the shape of the clip.
 
 With `--budget`, clips have four steps, from which all of a profile's are computed, and what will not be done in time is
 left out; `--plan` says what would be run and what it is reckoned to take. The file has each row as soon as it is known.
@@ -42,6 +43,7 @@ import transformers
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from wan_flops import pass_flops
+from wan_golden import distances
 from wan_models import Case, Clock, Studio, Timing, do_without_ftfy
 from wan_plan import Budget, missing_packages, reckoned_seconds, steps_within_budget
 
@@ -202,6 +204,12 @@ def survey(case: Case, names: Iterable[str], file: Path | None, budget: Budget |
         if file is not None:
             file.write_text(json.dumps(found, indent=2) + "\n")
 
+    print("golden figures ...", file=sys.stderr, flush=True)
+    found["golden"] = {
+        name: {part: _rounded(value) for part, value in distances(case.device, getattr(torch, name)).items()}
+        for name in ("float32", "bfloat16")
+    }
+    keep()
     print("attention ...", file=sys.stderr, flush=True)
     found["attention"] = measure_attention(case)
     keep()
@@ -322,6 +330,11 @@ def table(found: dict[str, Any]) -> str:
         f"{machine['device']}: {machine['name']}, {machine['memory_gb']:g} GB, {machine['cores']} cores. torch "
         f"{versions['torch']}, diffusers {versions['diffusers']}.",
         f"Matrix products in bfloat16: {found['matmul_bf16_tflops']:g} TFLOP/s.",
+        *(
+            f"Off the public implementation in {name}: forward pass {one['forward_pass']:.1g}, sampling "
+            f"{one['sampling']:.1g}."
+            for name, one in found["golden"].items()
+        ),
         *(f"attention {one['name']}: {_attention_words(one)}" for one in found["attention"]),
         "",
     ]

@@ -162,6 +162,13 @@ def test_what_cannot_be_measured_is_said(changes: dict[str, Any], told: str) -> 
         wan_speed.case_of(Namespace(**(nothing | {"model": "tiny-ati"} | changes)))
 
 
+def test_golden_figures_are_compared_in_both_precisions(whole: Whole) -> None:
+    golden = whole.found["golden"]
+    assert max(golden["float32"].values()) < 1e-5
+    assert 1e-4 < max(golden["bfloat16"].values()) < 0.1, "that is the precision, and it was really used"
+    assert "Off the public implementation in bfloat16: forward pass 0.0" in whole.told
+
+
 def test_attention_is_timed_alone(whole: Whole) -> None:
     rows = {row["name"]: row for row in whole.found["attention"]}
     assert {"native", "_native_math"} <= set(rows)
