@@ -114,5 +114,5 @@ def test_auto_needs_a_gpu() -> None:
     assert refusals(Acceleration(attention="auto"), gpu(9, 0)) == ()
     bare = Capabilities(device="cpu", name="x86_64", memory=1, gpus=0, compiler=False)
     assert refusals(Acceleration(attention="auto"), bare) == (
-        "attention: auto times the backends of a GPU, and this device is the CPU; choose native.",
+        "attention: auto needs a GPU, whose backends it times, and this device is the CPU; choose native.",
     )

@@ -126,7 +126,7 @@ def _attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     name, backend = wanted.attention, ATTENTION_BACKENDS.get(wanted.attention)
     if name == AUTO:
         if available.device != "cuda":
-            yield f"attention: auto times the backends of a GPU, and {available.description}; choose native."
+            yield f"attention: auto needs a GPU, whose backends it times, and {available.description}; choose native."
         return
     if backend is None:
         yield f"attention: there is no '{name}'; choose one of {', '.join((AUTO, *ATTENTION_BACKENDS))}."
