@@ -21,6 +21,7 @@ MOVED_BYTES_PER_SECOND = 15e9  # from the machine's memory to the GPU's
 COMPILE_SECONDS = 60.0
 OTHER_SECONDS = 12.0  # of a clip of the full size: encoders and decoding
 BUDGET_STEPS = 4  # of a clip, where there is a budget: the others are computed from them
+FIRST_SECONDS = 15.0  # golden figures and attention
 TOY_SECONDS = 10.0  # to build a toy and to warm it up
 
 

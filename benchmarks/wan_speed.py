@@ -45,7 +45,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from wan_flops import pass_flops
 from wan_golden import distances
 from wan_models import Case, Clock, Studio, Timing, do_without_ftfy
-from wan_plan import Budget, missing_packages, reckoned_seconds, steps_within_budget
+from wan_plan import FIRST_SECONDS, Budget, missing_packages, reckoned_seconds, steps_within_budget
 
 from cow_service.errors import CowError, GeneratorUnavailable
 from cow_service.generators.wan.attention import shape_of, time_backends
@@ -260,7 +260,7 @@ def measure_attention(case: Case) -> list[dict[str, Any]]:
 
 def plan(case: Case, names: Iterable[str], budget: Budget | None) -> str:
     """What would be run, in this order, and what it is reckoned to take."""
-    peak, machine, total, lines = matmul_peak(case.device), detect_capabilities(case.device), 0.0, list[str]()
+    peak, machine, total, lines = matmul_peak(case.device), detect_capabilities(case.device), FIRST_SECONDS, list[str]()
     for name in names:
         profile = measured_profile(name, case)
         if sentences := refusals(profile.acceleration, machine):
@@ -268,8 +268,8 @@ def plan(case: Case, names: Iterable[str], budget: Budget | None) -> str:
             continue
         short = case if budget is None else replace(case, steps=steps_within_budget(case, profile))
         seconds = reckoned_seconds(short, profile, peak, WARM_UP_STEPS)
-        total += seconds
-        left_out = budget is not None and total > budget.seconds
+        left_out = budget is not None and total + seconds > budget.seconds
+        total += 0 if left_out else seconds
         steps = short.sampled(profile.sampling).steps
         lines.append(f"{name}: {steps} steps, {seconds:.0f} s (reckoned)" + (", not within the budget" * left_out))
     if missing := missing_packages(machine):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cow_service.errors import Canceled, CowError, InvalidRequest, MllmUnavailable, ReaderUnavailable
+from cow_service.errors import Canceled, CowError, DeviceFailed, InvalidRequest, MllmUnavailable, ReaderUnavailable
 from cow_service.readers.question.choices import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
@@ -95,8 +95,8 @@ def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, CowError | Non
     """The simulation, or the error for which there is none. Raises what leaves no answer either."""
     try:
         return simulate(run), None
-    except (InvalidRequest, Canceled, MllmUnavailable, ReaderUnavailable):
-        raise
+    except (InvalidRequest, Canceled, MllmUnavailable, ReaderUnavailable, DeviceFailed):
+        raise  # the last: another process may be able to imagine
     except CowError as error:
         return None, error
 

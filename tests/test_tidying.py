@@ -14,7 +14,7 @@ from cow_service.jobs.database import Database
 from cow_service.jobs.migration import migrate
 from cow_service.jobs.packing import LEAST, packed, unpacked
 from cow_service.jobs.serializer import JsonSerializer
-from cow_service.jobs.tidying import takes_turn, without_job
+from cow_service.jobs.tidying import give_turn_back, takes_turn, without_job
 from cow_service.settings import Settings
 
 
@@ -45,6 +45,9 @@ def test_one_process_tidies_at_a_time(tmp_path: Path) -> None:
     assert takes_turn(other, "artifacts", 600), "that is another turn"
     assert takes_turn(other, "jobs", 0), "the turn is over"
     assert not takes_turn(one, "artifacts", 600)
+    give_turn_back(other, "artifacts")
+    assert takes_turn(one, "artifacts", 600), "its work was not done"
+    assert not takes_turn(one, "jobs", 600)
     one.close()
     other.close()
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch._dynamo.testing import CompileCounter
 
-from cow_service.generators.wan import acceleration, conditioning, loading
+from cow_service.generators.wan import acceleration, conditioning, generator, loading
 from cow_service.generators.wan.capabilities import detect_capabilities
 from cow_service.generators.wan.compiling import ClipSize, compile_for
 from cow_service.generators.wan.generator import WanGenerator
@@ -65,3 +65,12 @@ def test_no_clip_waits_for_the_compiler(
 def test_it_can_be_left_to_the_first_clip(graphs: CompileCounter, tmp_path: Path) -> None:
     loaded(tmp_path, warmup=False)
     assert graphs.frame_count == 0
+
+
+def test_a_size_that_does_not_fit_is_left_to_the_first_clip(
+    graphs: CompileCounter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Shorter clips may fit: the model can be used all the same."""
+    monkeypatch.setattr(generator, "compile_for", lambda *_: torch.empty(2**50, dtype=torch.float64))
+    assert loaded(tmp_path, warmup=True).concurrency == 1
+    assert "not compiled beforehand: A clip of 112 x 64 does not fit into memory" in caplog.text

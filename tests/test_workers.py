@@ -60,11 +60,12 @@ def test_too_much_memory_ends_the_job_alone(served: Served) -> None:
     assert served.http.post("/simulate", json=slow(0.1, seed=102)).status_code == 200
 
 
-def test_a_worker_whose_device_fails_is_replaced(served: Served) -> None:
+@pytest.mark.parametrize(("path", "seed"), [("/simulate", 120), ("/answer", 122)])
+def test_a_worker_whose_device_fails_is_replaced(path: str, seed: int, served: Served) -> None:
     before = {one.pid for one in workers_of(served)}
-    told = problem(served.http.post("/simulate", json=poison("device", seed=120)), 503, "device-failed")
+    told = problem(served.http.post(path, json=poison("device", seed=seed)), 503, "device-failed")
     assert told["detail"] == "The GPU failed."
-    assert served.clips().count(120) == 3, "another process may be able to use it"
+    assert served.clips().count(seed) == 3, "another process may be able to use it"
     assert served.http.post("/simulate", json=slow(0.1, seed=121)).status_code == 200
     assert not before & {one.pid for one in workers_of(served)}
 

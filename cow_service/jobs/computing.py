@@ -131,4 +131,4 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
             result = simulate(run)
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
     text = result.model_dump_json()
-    return Outcome(text if step.trajectory is None else without(text, "trajectory", step.trajectory), computed)
+    return Outcome(text if step.trajectory is None else without(text, "trajectory", *step.trajectory), computed)

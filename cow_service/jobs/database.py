@@ -21,7 +21,7 @@ from sqlalchemy import event
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
-from cow_service.jobs.kept_apart import lacks, whole
+from cow_service.jobs.kept_apart import key_in, whole
 from cow_service.jobs.packing import deflated, inflated, packed, unpacked
 from cow_service.jobs.tables import METADATA, REFERENCES, RESULTS, STAGES, TRAJECTORIES
 from cow_service.settings import Settings, SettingsError
@@ -43,10 +43,10 @@ _SAVE = (
     "created_at = excluded.created_at"
 )
 _SAVE_TRAJECTORY = (
-    "INSERT INTO cow_trajectories (job_id, trajectory) VALUES (?, ?) "
-    "ON CONFLICT (job_id) DO UPDATE SET trajectory = excluded.trajectory"
+    "INSERT INTO cow_trajectories (job_id, key, trajectory) VALUES (?, ?, ?) "
+    "ON CONFLICT (job_id, key) DO UPDATE SET trajectory = excluded.trajectory"
 )
-_FIND_TRAJECTORY = "SELECT trajectory FROM cow_trajectories WHERE job_id = ?"
+_FIND_TRAJECTORY = "SELECT trajectory FROM cow_trajectories WHERE job_id = ? AND key = ?"
 _DONE = "INSERT INTO cow_job_stages (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
 _ADD_REFERENCES = "INSERT INTO cow_holds (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
 
@@ -172,12 +172,13 @@ class Database:
 
         None where there is none any more: the job was deleted.
         """
-        if not lacks(text, name):
+        key = key_in(text, name)
+        if key is None:
             return text
         with self._cursor() as cursor:
-            cursor.execute(self._plain(_FIND_TRAJECTORY), (job,))
+            cursor.execute(self._plain(_FIND_TRAJECTORY), (job, key))
             row = cursor.fetchone()
-        return None if row is None else whole(text, name, inflated(row[0]))
+        return None if row is None else whole(text, name, inflated(row[0]), key)
 
     def store_result(
         self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str], trajectory: str | None = None
@@ -186,7 +187,7 @@ class Database:
         with self._cursor(writes=True) as cursor:
             self._add_references(cursor, job, artifacts)
             if trajectory is not None:
-                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, deflated(trajectory)))
+                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, key, deflated(trajectory)))
             cursor.execute(self._plain(_SAVE), (key, job, stage, packed(result), time.time()))
             cursor.execute(self._plain(_DONE), (job, stage))
 

@@ -20,7 +20,7 @@ from cow_service.jobs.news import JobNews, News
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.queues import PREFIX
 from cow_service.jobs.recovery import recover
-from cow_service.jobs.tidying import takes_turn, without_job
+from cow_service.jobs.tidying import give_turn_back, takes_turn, without_job
 
 OUTCOME_POLL_SECONDS = 0.005  # while the database has not got the outcome of finished work
 OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own polling
@@ -133,8 +133,14 @@ class Maintenance:
         database, settings = self._open_jobs.database, self._open_jobs.service.settings
         if takes_turn(database, "jobs", TURN_SECONDS):
             self._collect_jobs()
-        if takes_turn(database, "artifacts", LISTING_SECONDS if settings.artifacts_max_gb is None else TURN_SECONDS):
+        seconds = LISTING_SECONDS if settings.artifacts_max_gb is None else TURN_SECONDS
+        if self._stop.is_set() or not takes_turn(database, "artifacts", seconds):
+            return
+        try:
             self._collect_artifacts()
+        except BaseException:
+            give_turn_back(database, "artifacts")  # an hour is long
+            raise
 
     def _poll_cancellations(self) -> None:
         """Another process may have canceled or deleted a job that runs here, or taken it while this one was frozen."""

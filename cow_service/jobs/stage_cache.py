@@ -64,7 +64,8 @@ class StoredStep:
     looked_for: Callable[[Stage, bool], None]  # hears whether a stage was found
     hold_key: HoldKey
     outages: Outages
-    trajectory: str | None = None  # as JSON, once it is kept apart for this job: not where an earlier start did it
+    # As JSON, and its key, once it is kept apart for this job: not where an earlier start did it.
+    trajectory: tuple[str, str] | None = None
 
     def __call__(
         self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
@@ -92,10 +93,10 @@ class StoredStep:
         text, trajectory = result.model_dump_json(), None
         if stage == "trajectory":
             trajectory = result.value.model_dump_json()
-            text = without(text, "value", trajectory)
+            text = without(text, "value", trajectory, digest)
         kept = digest, self.job_id, stage, text, result.artifacts, trajectory
         self.outages.wait_through(lambda: self.database.store_result(*kept))
-        self.trajectory = trajectory or self.trajectory
+        self.trajectory = self.trajectory if trajectory is None else (trajectory, digest)
 
     def _stored_as(self, digest: str, shareable: bool) -> str:
         """What a result is stored under, where not all jobs may find it."""

@@ -14,11 +14,12 @@ RESULTS = sa.Table(
     sa.Column("result", sa.Text, nullable=False),
     sa.Column("created_at", sa.Float, nullable=False),
 )
-# The trajectory that a job computed: its result and that of its stage have a mark in its place (`kept_apart.py`).
+# The trajectories that jobs computed, by the keys of their stages; results have a mark in their place.
 TRAJECTORIES = sa.Table(
     "cow_trajectories",
     METADATA,
     sa.Column("job_id", sa.String(64), primary_key=True),
+    sa.Column("key", sa.String(64), primary_key=True),
     sa.Column("trajectory", sa.LargeBinary, nullable=False),  # JSON, deflated
 )
 REFERENCES = sa.Table(

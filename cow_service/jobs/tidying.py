@@ -26,6 +26,12 @@ def takes_turn(database: Database, what: Tidying, seconds: float) -> bool:
         return connection.execute(taken).rowcount > 0
 
 
+def give_turn_back(database: Database, what: Tidying) -> None:
+    """The work of a turn was not done: whoever asks next may take it."""
+    with database_errors(), database.engine.begin() as connection:
+        connection.execute(sa.update(TIDYING).where(TIDYING.c.id == _ROWS[what]).values(begun=0))
+
+
 def without_job(database: Database) -> list[str]:
     """The ids under which there are results or references, and no job: it was deleted while it ran."""
     table = workflow_table(database.engine)

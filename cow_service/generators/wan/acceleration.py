@@ -152,7 +152,7 @@ def _translated(option: str) -> Generator[None]:
     """Turns any exception of a library into `GeneratorUnavailable` naming the option and the reason, without paths."""
     try:
         yield
-    except (CowError, torch.OutOfMemoryError):
+    except (CowError, torch.OutOfMemoryError, torch.AcceleratorError):
         raise
     except Exception as error:
         reason = re.sub(r"(/[\w.+-]+)+/", "", (str(error).splitlines() or [""])[0])[:300]

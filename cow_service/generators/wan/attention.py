@@ -18,14 +18,14 @@ from torch import Tensor
 
 from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities
 from cow_service.generators.wan.checkpoints import diffusers_config
-from cow_service.generators.wan.execution import wait_until_done
+from cow_service.generators.wan.execution import has_failed, wait_until_done
 from cow_service.generators.wan.pipeline import latent_shape
 from cow_service.generators.wan.profiles import Profile
 from cow_service.weights.device import is_out_of_memory
 
 NATIVE = "native"  # what the others are compared with
 TRIALS = 3  # after one that is not counted
-MARGIN = 1.05  # that another one must be faster than native: else noise would choose, each time another
+MARGIN = 1.05  # within which the first one is taken: else noise would choose, each time another
 MAX_ERROR = 0.02  # of the largest value: the roundings of bfloat16 stay below it
 FRAMES = 81  # of the longest clip
 
@@ -75,12 +75,10 @@ def time_backends(
 
 
 def fastest(timed: Iterable[TimedBackend]) -> str:
-    """The fastest of those that compute the same; native unless another one is clearly faster."""
+    """The first of those that compute the same than which none is clearly faster; native where there is none."""
     seconds = {one.name: one.seconds for one in timed if one.usable and one.seconds is not None}
-    if not seconds:
-        return NATIVE
-    best = min(seconds, key=lambda name: seconds[name])
-    return NATIVE if NATIVE in seconds and seconds[NATIVE] < MARGIN * seconds[best] else best
+    best = min(seconds.values(), default=0.0)
+    return next((name for name, each in seconds.items() if each <= MARGIN * best), NATIVE)
 
 
 def with_attention(
@@ -114,7 +112,7 @@ def _timed(name: str, expected: Tensor, q: Tensor, k: Tensor, v: Tensor) -> Time
             seconds.append(time.perf_counter() - begun)
         return TimedBackend(name, statistics.median(seconds), error)
     except Exception as problem:
-        if isinstance(problem, torch.AcceleratorError) and not is_out_of_memory(problem):
+        if isinstance(problem, RuntimeError) and not is_out_of_memory(problem) and has_failed(q.device, problem):
             raise  # nothing can be computed on the device any more
         return TimedBackend(name, None, None, f"{type(problem).__name__}: {(str(problem).splitlines() or [''])[0]}")
 

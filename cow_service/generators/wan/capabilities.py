@@ -58,7 +58,7 @@ MINIMUM_VERSIONS: Mapping[str, str] = {
     "accelerate": "0.17.0",
     "flash-attn": "2.6.3",
     "flash-attn-3": "3.0.0",
-    "kernels": "0.12",
+    "kernels": "0.12.3",
     "sageattention": "2.1.1",
     "torchao": "0.15.0",
     "triton": "3.0.0",

@@ -54,7 +54,7 @@ def within_memory(device: torch.device, clear_caches: Callable[[], None], what: 
         yield
     except RuntimeError as error:
         if not is_out_of_memory(error):
-            if isinstance(error, torch.AcceleratorError):
+            if has_failed(device, error):
                 raise _failed(what, error) from error
             raise
         # The frames of the failed call hold its tensors, and live as long as the traceback does.
@@ -69,7 +69,18 @@ def within_memory(device: torch.device, clear_caches: Callable[[], None], what: 
     raise failure
 
 
-def _failed(what: str, error: torch.AcceleratorError) -> DeviceFailed:
+def has_failed(device: torch.device, error: RuntimeError) -> bool:
+    """Whether the GPU can be used no more after an error of whatever library. Not every error of CUDA is so."""
+    if device.type != "cuda":
+        return isinstance(error, torch.AcceleratorError)
+    try:
+        torch.cuda.synchronize(device)
+    except RuntimeError:
+        return True
+    return False
+
+
+def _failed(what: str, error: RuntimeError) -> DeviceFailed:
     reason = (str(error).splitlines() or [""])[0][:200]
     return DeviceFailed(
         f"{what} was not finished: the GPU failed ({reason}). A worker process is replaced, and the job tried "

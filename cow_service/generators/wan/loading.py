@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from cow_service.errors import GeneratorUnavailable
+from cow_service.errors import GeneratorOutOfMemory, GeneratorUnavailable
 from cow_service.generators.wan import conditioning
 from cow_service.generators.wan.acceleration import accelerate, check_device
 from cow_service.generators.wan.attention import with_attention
@@ -27,6 +28,8 @@ from cow_service.weights.building import BUILD_LOCK
 from cow_service.weights.device import choose_device
 from cow_service.weights.lock import folder_of, read_lock, verify, weights_identity
 from cow_service.weights.manifests import Manifest, load_manifests
+
+log = logging.getLogger("cow_service")
 
 
 def load(name: str, track_conditioning: conditioning.TrackConditioning, settings: Settings) -> WanGenerator:
@@ -77,7 +80,10 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
         )
     )
     if settings.warmup:
-        generator.compile()
+        try:
+            generator.compile()
+        except GeneratorOutOfMemory as error:  # shorter clips may fit
+            log.warning("not compiled beforehand: %s", error.detail)
     return generator
 
 
