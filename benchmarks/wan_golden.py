@@ -34,8 +34,8 @@ def distances(device: torch.device, dtype: torch.dtype) -> dict[str, float]:
         pipeline.transformer = load_transformer(original_folder(Path(folder)), {}, dtype, device)
     pipeline.to(device)
     condition = golden["condition_after"]
-    prompts = (golden[name][None].to(device) for name in ("prompt_embeds", "negative_prompt_embeds"))
-    given = Conditioning(*prompts, image_embeds().to(device), condition, condition)
+    prompt, negative = (golden[name][None].to(device) for name in ("prompt_embeds", "negative_prompt_embeds"))
+    given = Conditioning(prompt, negative, image_embeds().to(device), condition, condition)
     states = torch.cat([golden["noise"], condition])[None].to(device, dtype)
     with torch.no_grad():
         velocity = pipeline.transformer(

@@ -52,13 +52,14 @@ def _zeros(pipeline: WanTrackPipeline, size: ClipSize, *, guided: bool) -> Condi
     config: Any = pipeline.transformer.config
     vision: Any = pipeline.image_encoder.config
     _, _, frames, rows, columns = latent_shape(*size)
-    text = torch.zeros(1, TEXT_LENGTH, config.text_dim, device=pipeline._execution_device)
+    device = pipeline._execution_device  # pyright: ignore[reportPrivateUsage] - where weights may be offloaded
+    text = torch.zeros(1, TEXT_LENGTH, config.text_dim, device=device)
     tokens = (vision.image_size // vision.patch_size) ** 2 + 1
     condition = torch.zeros(CONDITION_CHANNELS, frames, rows, columns)
     return Conditioning(
         prompt=text,
         negative_prompt=text if guided else None,
-        image=torch.zeros(1, tokens, config.image_dim, device=text.device),
+        image=torch.zeros(1, tokens, config.image_dim, device=device),
         condition=condition,
         unconditional=condition,
     )
