@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cow_service.generators.wan.checkpoints import diffusers_config
-from cow_service.generators.wan.pipeline import TEXT_LENGTH, latent_shape
+from cow_service.generators.wan.pipeline import TEXT_LENGTH, token_count
 
 IMAGE_TOKENS = 257  # of CLIP ViT-H: 16 x 16 patches and one for the whole
 
@@ -29,8 +29,7 @@ def pass_flops(
     and around the layers lie patches, embeddings of time, text and image, and the last layer: a thousandth.
     """
     config = diffusers_config(architecture)
-    _, _, frames, rows, columns = latent_shape(width, height, num_frames)
-    tokens, context = frames * (rows // 2) * (columns // 2), TEXT_LENGTH + image_tokens
+    tokens, context = token_count(width, height, num_frames), TEXT_LENGTH + image_tokens
     d, f = int(architecture["dim"]), int(config["ffn_dim"])
     text, image, frequencies = config["text_dim"], config["image_dim"], config["freq_dim"]
     linear = 2 * tokens * (6 * d * d + 2 * d * f) + 2 * context * 2 * d * d

@@ -29,7 +29,7 @@ from cow_service.generators.wan import conditioning
 from cow_service.generators.wan.acceleration import accelerate
 from cow_service.generators.wan.attention import with_attention
 from cow_service.generators.wan.checkpoints import diffusers_config
-from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, latent_shape
+from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, latent_shape, token_count
 from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tiny import make_tiny
@@ -74,8 +74,7 @@ class Case:
     @property
     def tokens(self) -> int:
         """Of the video, in every layer."""
-        _, _, frames, rows, columns = latent_shape(self.width, self.height, self.num_frames)
-        return frames * (rows // 2) * (columns // 2)
+        return token_count(self.width, self.height, self.num_frames)
 
     @cached_property
     def picture(self) -> NDArray[np.uint8]:

@@ -19,7 +19,7 @@ from torch import Tensor
 from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities
 from cow_service.generators.wan.checkpoints import diffusers_config
 from cow_service.generators.wan.execution import has_failed, wait_until_done
-from cow_service.generators.wan.pipeline import latent_shape
+from cow_service.generators.wan.pipeline import token_count
 from cow_service.generators.wan.profiles import Profile
 from cow_service.weights.device import is_out_of_memory
 
@@ -58,10 +58,8 @@ class TimedBackend:
 def shape_of(architecture: Mapping[str, Any], width: int, height: int, num_frames: int = FRAMES) -> AttentionShape:
     """The shape at which a model attends to a clip of that size (px)."""
     config = diffusers_config(architecture)
-    _, _, frames, rows, columns = latent_shape(width, height, num_frames)
-    return AttentionShape(
-        frames * (rows // 2) * (columns // 2), config["num_attention_heads"], config["attention_head_dim"]
-    )
+    tokens = token_count(width, height, num_frames)
+    return AttentionShape(tokens, config["num_attention_heads"], config["attention_head_dim"])
 
 
 def time_backends(

@@ -15,7 +15,13 @@ from typing import Any, NamedTuple
 
 import torch
 
-from cow_service.generators.wan.pipeline import TEXT_LENGTH, Conditioning, WanTrackPipeline, latent_shape
+from cow_service.generators.wan.pipeline import (
+    TEXT_LENGTH,
+    Conditioning,
+    WanTrackPipeline,
+    image_token_count,
+    latent_shape,
+)
 from cow_service.generators.wan.sampling import Sampling
 
 FRAMES = (81, 17)  # of the two clips: the longest, which is the default of most requests, then any other
@@ -50,11 +56,10 @@ def compile_for(pipeline: WanTrackPipeline, sampling: Sampling, sizes: Iterable[
 
 def _zeros(pipeline: WanTrackPipeline, size: ClipSize, *, guided: bool) -> Conditioning:
     config: Any = pipeline.transformer.config
-    vision: Any = pipeline.image_encoder.config
     _, _, frames, rows, columns = latent_shape(*size)
     device = pipeline._execution_device  # pyright: ignore[reportPrivateUsage] - where weights may be offloaded
     text = torch.zeros(1, TEXT_LENGTH, config.text_dim, device=device)
-    tokens = (vision.image_size // vision.patch_size) ** 2 + 1
+    tokens = image_token_count(pipeline.image_encoder)
     condition = torch.zeros(CONDITION_CHANNELS, frames, rows, columns)
     return Conditioning(
         prompt=text,

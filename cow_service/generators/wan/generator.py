@@ -31,6 +31,14 @@ MAX_SIDE = 1024 * SIDE_MULTIPLE  # px: the model has 1024 positions each way
 DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
 
 
+def clip_size(max_area: int, width: int, height: int) -> tuple[int, int]:
+    """An area (px) at an aspect ratio, sides rounded down to multiples of 16 px."""
+    sides = math.sqrt(max_area * width / height), math.sqrt(max_area * height / width)
+    # The small term keeps an exact 480 from becoming 464 when the root is a hair below it.
+    clip_width, clip_height = (max(SIDE_MULTIPLE, int(side / SIDE_MULTIPLE + 1e-6) * SIDE_MULTIPLE) for side in sides)
+    return clip_width, clip_height
+
+
 @dataclass(frozen=True)
 class LoadedModel:
     """A loaded model, and what would have to be the same to make its clips again."""
@@ -74,12 +82,7 @@ class WanGenerator(WanLimits):
 
         Raises `InvalidRequest` for an image so narrow that no clip of that shape can be made.
         """
-        area = self._model.max_area
-        sides = math.sqrt(area * width / height), math.sqrt(area * height / width)
-        # The small term keeps an exact 480 from becoming 464 when the root is a hair below it.
-        clip_width, clip_height = (
-            max(SIDE_MULTIPLE, int(side / SIDE_MULTIPLE + 1e-6) * SIDE_MULTIPLE) for side in sides
-        )
+        clip_width, clip_height = clip_size(self._model.max_area, width, height)
         if max(clip_width, clip_height) > MAX_SIDE:
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
             raise InvalidRequest(f"`image`: {detail}.", errors=(FieldError("/image", detail),))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from cow_service.generators.wan.checkpoints import checkpoint_files, load_transf
 from cow_service.generators.wan.compiling import keep_compiled_code
 from cow_service.generators.wan.components import assemble
 from cow_service.generators.wan.execution import within_memory
-from cow_service.generators.wan.generator import LoadedModel, WanGenerator
+from cow_service.generators.wan.generator import USUAL_SIDES, LoadedModel, WanGenerator, clip_size
 from cow_service.generators.wan.lora import add_lora
 from cow_service.generators.wan.memory import check_memory
 from cow_service.generators.wan.pipeline import WanTrackPipeline
@@ -51,9 +50,9 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     if own is not None:
         checkpoint_files(own)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
-    side = math.isqrt(int(manifest.defaults["max_area"]))
+    max_area = int(manifest.defaults["max_area"])
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
-        profile = with_attention(profile, manifest.architecture, side, side, device)
+        profile = with_attention(profile, manifest.architecture, *clip_size(max_area, *USUAL_SIDES), device)
         if manifest.sources:
             pipeline = _from_weights(manifest, profile, settings, device)
         else:
@@ -74,7 +73,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
             profile_name=settings.profile,
             profile=profile,
             conditioning=track_conditioning,
-            max_area=int(manifest.defaults["max_area"]),
+            max_area=max_area,
             negative_prompt=str(manifest.defaults.get("negative_prompt", "")),
             threads=int(manifest.defaults["threads"]) if "threads" in manifest.defaults else None,
         )

@@ -60,6 +60,18 @@ def latent_shape(width: int, height: int, num_frames: int) -> tuple[int, int, in
     return 1, LATENT_CHANNELS, (num_frames - 1) // 4 + 1, height // 8, width // 8
 
 
+def token_count(width: int, height: int, num_frames: int) -> int:
+    """Tokens of such a clip, in every layer of the transformer: its patches are 2 x 2 latent cells."""
+    _, _, frames, rows, columns = latent_shape(width, height, num_frames)
+    return frames * (rows // 2) * (columns // 2)
+
+
+def image_token_count(image_encoder: Any) -> int:
+    """Tokens of the image encoder: its patches, and one for the whole."""
+    config = image_encoder.config
+    return (config.image_size // config.patch_size) ** 2 + 1
+
+
 class WanTrackPipeline(WanImageToVideoPipeline):
     """The steps of making one clip. Not safe for two clips at a time."""
 
