@@ -6,7 +6,6 @@ Graphics cards are described, never needed: what only they can do is tested as a
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -365,7 +364,7 @@ def saved(tensors: dict[str, Tensor], folder: Path, said: dict[str, str] | None 
 def changes(tensors: dict[str, Tensor], folder: Path, scale: float = 1.0) -> dict[str, Tensor]:
     pipeline = toy()
     before = {name: weight.clone() for name, weight in pipeline.transformer.state_dict().items()}
-    add_lora(pipeline, saved(tensors, folder), scale)
+    add_lora(pipeline.transformer, saved(tensors, folder), scale)
     after = pipeline.transformer.state_dict()
     return {name: after[name] - before[name] for name in before if not torch.equal(before[name], after[name])}
 
@@ -421,7 +420,7 @@ def test_diffusers_own_way_gives_the_same_weights(tmp_path: Path):
     ours, theirs = toy(), toy()
     both = {name: tensor for name, tensor in ORIGINAL.items() if "k_img" not in name}  # it wants v_img with k_img
     file = saved({**both, "diffusion_model.blocks.0.self_attn.q.alpha": torch.tensor(1.0)}, tmp_path)
-    add_lora(ours, file, 0.7)
+    add_lora(ours.transformer, file, 0.7)
     theirs.load_lora_weights(str(file), adapter_name="one")
     theirs.fuse_lora(lora_scale=0.7, adapter_names=["one"])
     theirs.unload_lora_weights()
@@ -448,19 +447,19 @@ def test_diffusers_own_way_gives_the_same_weights(tmp_path: Path):
 def test_a_lora_that_does_not_fit_changes_nothing(extra: dict[str, Tensor], reason: str, tmp_path: Path):
     pipeline = toy()
     with pytest.raises(CheckpointInvalid, match=reason):
-        add_lora(pipeline, saved({**ORIGINAL, **extra}, tmp_path), 1.0)
+        add_lora(pipeline.transformer, saved({**ORIGINAL, **extra}, tmp_path), 1.0)
     assert torch.equal(forward(pipeline.transformer), forward(toy().transformer))
 
 
 def test_a_file_that_is_no_lora(tmp_path: Path):
     with pytest.raises(WeightsUnavailable, match=r"no LoRA 'none\.safetensors'") as caught:
-        add_lora(toy(), tmp_path / "none.safetensors", 1.0)
+        add_lora(toy().transformer, tmp_path / "none.safetensors", 1.0)
     assert str(tmp_path) not in caught.value.detail
     (tmp_path / "bad.safetensors").write_bytes(b"not a checkpoint at all")
     with pytest.raises(CheckpointInvalid, match=r"'bad\.safetensors' is not a readable safetensors file"):
-        add_lora(toy(), tmp_path / "bad.safetensors", 1.0)
+        add_lora(toy().transformer, tmp_path / "bad.safetensors", 1.0)
     with pytest.raises(CheckpointInvalid, match="no place for an empty one"):
-        add_lora(toy(), saved({}, tmp_path), 1.0)
+        add_lora(toy().transformer, saved({}, tmp_path), 1.0)
 
 
 def test_a_scale_hidden_in_the_metadata(tmp_path: Path):
@@ -469,9 +468,9 @@ def test_a_scale_hidden_in_the_metadata(tmp_path: Path):
         file = saved(ORIGINAL, tmp_path, {"lora_adapter_metadata": adapter})
         if refused:
             with pytest.raises(CheckpointInvalid, match="scaled by its metadata"):
-                add_lora(toy(), file, 1.0)
+                add_lora(toy().transformer, file, 1.0)
         else:
-            add_lora(toy(), file, 1.0)
+            add_lora(toy().transformer, file, 1.0)
 
 
 @with_torchao
@@ -479,7 +478,7 @@ def test_a_lora_comes_before_float8(tmp_path: Path):
     pipeline = toy()
     accelerate(pipeline, Acceleration(fp8="weights"), CPU)
     with pytest.raises(GeneratorUnavailable, match="before the weights are made float8"):
-        add_lora(pipeline, saved(ORIGINAL, tmp_path), 1.0)
+        add_lora(pipeline.transformer, saved(ORIGINAL, tmp_path), 1.0)
 
 
 # Refusals
@@ -542,7 +541,7 @@ def with_capability(major: int, minor: int) -> Capabilities:
         ),
         (
             {"cache": "first-block", "context_parallel": 2},
-            H200.model_copy(update={"world_size": 2}),
+            H200,
             "cache: GPUs that share a video would not skip the same steps with first-block; choose mag or none.",
         ),
         (
@@ -578,19 +577,23 @@ def with_capability(major: int, minor: int) -> Capabilities:
             "choose none.",
         ),
         (
-            {"context_parallel": 16},
-            H200.model_copy(update={"world_size": 16}),
-            "context_parallel: 16 needs as many GPUs, and there are 8; choose 1.",
+            {"context_parallel": 8, "guidance_parallel": True},
+            H200,
+            "16 GPUs are to share a clip, from that of COW_DEVICE on, and there are 8.",
+        ),
+        (
+            {"guidance_parallel": True, "offload": "group"},
+            H200,
+            "offload: group is for one GPU, and 2 are to share a clip; choose none.",
         ),
         (
             {"context_parallel": 2},
-            H200,
-            "context_parallel: 2 needs as many processes, and there are 1; start them with "
-            "`torchrun --nproc-per-node 2`, or choose 1.",
+            BARE,
+            "context_parallel: 2 needs GPUs, and this device is the CPU; choose 1.",
         ),
         (
             {"context_parallel": 2, "attention": "_flash_3"},
-            H200.model_copy(update={"world_size": 2}),
+            H200,
             "context_parallel: attention '_flash_3' cannot be split among GPUs; choose one of native, _native_flash, "
             "_native_cudnn, flash, flash_hub, _flash_3_hub, sage, sage_hub.",
         ),
@@ -609,6 +612,7 @@ def test_what_a_machine_cannot_do_is_said_with_reason_and_remedy(
         {"attention": "sage", "compile": "regional", "fp8": "weights", **MAG, "offload": "group", "vae_tiling": True},
         {"offload": "sequential", "fp8": "weights"},
         {"offload": "model"},
+        {"guidance_parallel": True, "context_parallel": 4, "compile": "regional"},
     ],
 )
 def test_a_good_machine_can_do_it(options: dict[str, Any]):
@@ -636,13 +640,10 @@ def test_the_machine_is_seen_as_it_is(monkeypatch: pytest.MonkeyPatch):
     assert machine.device == "cpu"
     assert machine.compute_capability is None
     assert machine.memory > 1e8
-    assert machine.world_size == 1
     assert ("torchao" in machine.packages) == (find_spec("torchao") is not None)
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setenv("PATH", "")
-    monkeypatch.setenv("WORLD_SIZE", "4")
     assert not detect_capabilities(CPU).compiler
-    assert detect_capabilities(CPU).world_size == 4
 
 
 def test_an_old_package_counts_as_none(monkeypatch: pytest.MonkeyPatch):
@@ -660,45 +661,6 @@ def test_our_tables_are_those_of_diffusers():
     assert MINIMUM_VERSIONS["sageattention"] == attention_dispatch._REQUIRED_SAGE_VERSION
     assert MINIMUM_VERSIONS["xformers"] == attention_dispatch._REQUIRED_XFORMERS_VERSION
     assert {backend.package for backend in ATTENTION_BACKENDS.values()} <= {None, *MINIMUM_VERSIONS}
-
-
-# Several processes
-
-RANK = """
-import sys, torch
-sys.path.insert(0, sys.argv[1])
-import test_wan_acceleration as toy
-from cow_service.generators.wan import acceleration
-
-# diffusers takes the rank modulo the number of accelerators; the machine is described as one with two GPUs.
-torch.accelerator.device_count = lambda: 1
-acceleration.detect_capabilities = lambda device: toy.H200.model_copy(update={"world_size": 2})
-results = {}
-for name, options in (("none", {}), ("mag", toy.MAG)):
-    transformer = toy.accelerated(context_parallel=2, **options)
-    results[name] = toy.clip(transformer)
-torch.save(results, f"{sys.argv[2]}/{torch.distributed.get_rank()}.pt")
-torch.distributed.destroy_process_group()
-"""
-
-
-@pytest.mark.soak_only
-@pytest.mark.slow
-def test_two_processes_compute_what_one_does(tmp_path: Path):
-    """Over gloo: every rank holds the whole result, with and without a cache."""
-    (tmp_path / "rank.py").write_text(RANK)
-    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(tmp_path / "rank.py")]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    finished = subprocess.run(
-        [sys.executable, *command, str(Path(__file__).parent), str(tmp_path)],
-        capture_output=True, text=True, check=False, env=environment,
-    )  # fmt: skip
-    assert finished.returncode == 0, finished.stderr[-3000:]
-    for rank in range(2):
-        results = torch.load(tmp_path / f"{rank}.pt")
-        for name, options in (("none", {}), ("mag", MAG)):
-            for ours, theirs in zip(results[name], clip(accelerated(**options)), strict=True):
-                torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=0)
 
 
 @pytest.mark.slow

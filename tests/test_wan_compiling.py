@@ -58,7 +58,7 @@ def test_no_clip_waits_for_the_compiler(
     assert compiled == 2, "for one size, then for any"
     sizes = ClipSize(64, 112, 9), ClipSize(128, 64, 81), ClipSize(112, 64, 81), ClipSize(96, 80, 33)
     with cpu_threads(model.threads):  # as for a clip: compiled code holds for a number of threads
-        compile_for(model.pipeline, model.profile.sampling, sizes)
+        compile_for(model.pipeline, model.denoise, model.profile.sampling, sizes)
     assert graphs.frame_count == compiled
 
 

@@ -134,7 +134,7 @@ def test_progress_after_every_step(toys: Service) -> None:
 
 def test_a_step_is_told_when_the_device_has_done_it(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[str] = []
-    monkeypatch.setattr("cow_service.generators.wan.pipeline.wait_until_done", lambda device: heard.append("done"))
+    monkeypatch.setattr("cow_service.generators.wan.denoising.wait_until_done", lambda device: heard.append("done"))
     simulate(toys, lambda stage, done: heard.append("told") if stage == "generation" and 0 < done < 0.95 else None)
     assert heard == ["done", "told"] * 4
 
@@ -342,7 +342,7 @@ def kept_states(pipeline: WanTrackPipeline) -> int:
 def test_nothing_of_the_steps_is_kept_while_a_clip_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Service(Settings(data_dir=tmp_path, profile="fast", generator="tiny-ati")) as service:
         pipeline, held = pipeline_of(service), list[int]()
-        decode, step = pipeline.decode, "cow_service.generators.wan.pipeline.wait_until_done"
+        decode, step = pipeline.decode, "cow_service.generators.wan.denoising.wait_until_done"
         monkeypatch.setattr(step, lambda device: held.append(kept_states(pipeline)))
         monkeypatch.setattr(
             pipeline, "decode", lambda latents: (held.append(kept_states(pipeline)), decode(latents))[1]
@@ -365,7 +365,7 @@ class TestProfiles:
         assert pictures(found) == pictures(simulate(service, video=False))
 
     def test_one_that_there_is_not(self, tmp_path: Path) -> None:
-        with pytest.raises(GeneratorUnavailable, match=r"no profile 'warp'\. It has: exact, fast, turbo"):
+        with pytest.raises(GeneratorUnavailable, match=r"no profile 'warp'\. It has: exact, exact-2, fast, turbo"):
             simulate(Service(Settings(data_dir=tmp_path, profile="warp")))
 
     def test_what_this_machine_cannot_do_is_said_at_load(self, tmp_path: Path) -> None:

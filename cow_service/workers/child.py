@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 import psutil
 
@@ -28,6 +26,7 @@ from cow_service.jobs.stored_errors import error_as_json
 from cow_service.observability import context, tracing
 from cow_service.observability import logging as logs
 from cow_service.observability.gpus import gpu_memory
+from cow_service.processes import leave_decisions_to_the_parent
 from cow_service.requests import Stage
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -53,7 +52,6 @@ from cow_service.workers.messages import (
 HEARTBEAT_SECONDS = 1.0
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for a key checks whether it was canceled
 MIN_PROGRESS = 0.005  # of a stage, between two messages
-OOM_SCORE = "500"  # the system ends this process before the one that holds the jobs
 
 log = logging.getLogger("cow_service")
 
@@ -178,11 +176,7 @@ class WorkerProcess:
 
 def main(descriptor: int) -> None:
     """Works on the pipe of a file descriptor until it ends."""
-    # A terminal's Ctrl-C and a service manager's stop reach every process: the one that holds the jobs decides.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    with suppress(OSError):  # elsewhere than on Linux
-        Path("/proc/self/oom_score_adj").write_text(OOM_SCORE)
+    leave_decisions_to_the_parent()
     pipe: Connection[FromWorker, ToWorker] = Connection(descriptor)
     try:
         first = pipe.recv()

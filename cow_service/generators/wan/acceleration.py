@@ -1,9 +1,9 @@
 """Applies the acceleration of a profile to a loaded pipeline.
 
 The order of `accelerate` follows how the parts enclose each other: weights, attention, the compiled block, the cache
-that skips blocks, context parallelism around the cache, memory. A block compiled together with its cache hooks breaks
-its graph (first-block) or is not compiled at all (mag); a cache around context parallelism would compare a whole
-tensor with a shard.
+that skips blocks, memory; at last context parallelism around the cache, which `sharing` adds. A block compiled together
+with its cache hooks breaks its graph (first-block) or is not compiled at all (mag); a cache around context parallelism
+would compare a whole tensor with a shard.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any, cast
 
-import diffusers
 import torch
 from torch import nn
 
@@ -24,7 +23,7 @@ from cow_service.generators.wan.profiles import Acceleration
 
 def check_device(acceleration: Acceleration, device: torch.device) -> None:
     """Raises `GeneratorUnavailable` listing everything that the device cannot do. Nothing is loaded."""
-    with _translated(f"device: {device}"):
+    with translated(f"device: {device}"):
         sentences = refusals(acceleration, detect_capabilities(device))
     if sentences:
         raise GeneratorUnavailable(f"{' '.join(sentences)} Another profile may do (COW_PROFILE).")
@@ -37,20 +36,29 @@ def accelerate(pipeline: object, acceleration: Acceleration, device: torch.devic
     failed. Compilation happens in the first clip.
     """
     wanted, parts = acceleration, cast(Any, pipeline)
-    transformer = parts.transformer
-    check_device(acceleration, device)
-    steps: tuple[tuple[str, bool, Callable[[], object]], ...] = (
+    accelerate_transformer(parts.transformer, wanted, device)
+    _apply(
+        ("vae_tiling", wanted.vae_tiling, lambda: parts.vae.enable_tiling()),  # noqa: PLW0108 - there may be no VAE
+        (f"offload: {wanted.offload}", True, lambda: _place(parts, wanted.offload, device)),
+    )
+
+
+def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch.device) -> None:
+    """The same for a transformer without the other parts, which stays where it is."""
+    check_device(wanted, device)
+    _apply(
         (f"fp8: {wanted.fp8}", wanted.fp8 != "none", lambda: _quantise(transformer, wanted, device)),
         (f"attention: {wanted.attention}", True, lambda: transformer.set_attention_backend(wanted.attention)),
         ("compile: regional", wanted.compile != "none", lambda: _compile(transformer)),
         (f"cache: {wanted.cache}", wanted.cache != "none", lambda: _cache(transformer, wanted)),
-        ("context_parallel", wanted.context_parallel > 1, lambda: _shard(transformer, wanted.context_parallel, device)),
-        ("vae_tiling", wanted.vae_tiling, lambda: parts.vae.enable_tiling()),  # noqa: PLW0108 - there may be no VAE
-        (f"offload: {wanted.offload}", True, lambda: _place(parts, wanted.offload, device)),
     )
+
+
+def _apply(*steps: tuple[str, bool, Callable[[], object]]) -> None:
+    """Those that apply, in order; an error names the option."""
     for option, applies, apply in steps:
         if applies:
-            with _translated(option):
+            with translated(option):
                 apply()
 
 
@@ -110,16 +118,6 @@ def _cache(transformer: Any, wanted: Acceleration) -> None:
     transformer.enable_cache(config)
 
 
-def _shard(transformer: Any, gpus: int, device: torch.device) -> None:
-    if transformer.config.num_attention_heads % gpus:
-        raise ValueError(f"{transformer.config.num_attention_heads} attention heads cannot be split among {gpus} GPUs")
-    if device.type == "cuda":
-        torch.cuda.set_device(device)
-    if not torch.distributed.is_initialized():
-        torch.distributed.init_process_group()
-    transformer.enable_parallelism(config=cast(Any, diffusers).ContextParallelConfig(ulysses_degree=gpus))
-
-
 def _place(parts: Any, offload: str, device: torch.device) -> None:
     if offload == "none":
         parts.to(device)
@@ -148,7 +146,7 @@ def _offload_groups(parts: Any, device: torch.device) -> None:
 
 
 @contextmanager
-def _translated(option: str) -> Generator[None]:
+def translated(option: str) -> Generator[None]:
     """Turns any exception of a library into `GeneratorUnavailable` naming the option and the reason, without paths."""
     try:
         yield

@@ -73,10 +73,9 @@ class Capabilities(Record):
     name: str
     compute_capability: ComputeCapability | None = Field(default=None, description="Null without an NVIDIA GPU.")
     memory: int = Field(ge=0, description="Bytes, of the device.")
-    gpus: int = Field(ge=0, description="GPUs that PyTorch sees.")
+    gpus: int = Field(ge=0, description="GPUs that PyTorch sees, from this one on.")
     packages: tuple[str, ...] = Field(default=(), description="Installed in at least the minimum version.")
     compiler: bool = Field(description="A C++ compiler and Python's headers are installed.")
-    world_size: int = Field(default=1, ge=1, description="Processes that torchrun started.")
 
     @property
     def description(self) -> str:
@@ -98,10 +97,9 @@ def detect_capabilities(device: torch.device) -> Capabilities:
         name=gpu.name if gpu else platform.machine(),
         compute_capability=(gpu.major, gpu.minor) if gpu else None,
         memory=gpu.total_memory if gpu else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-        gpus=torch.cuda.device_count(),
+        gpus=max(0, torch.cuda.device_count() - (device.index or 0)),
         packages=tuple(name for name, least in MINIMUM_VERSIONS.items() if _is_installed(name, least)),
         compiler=_has_compiler(),
-        world_size=int(os.environ.get("WORLD_SIZE", "1")),
     )
 
 
@@ -182,14 +180,16 @@ def _offloading(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
 
 
 def _splitting(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
-    count = wanted.context_parallel
-    if count == 1:
+    if wanted.ranks == 1:
         return
-    if available.gpus < count:
-        yield f"context_parallel: {count} needs as many GPUs, and there are {available.gpus}; choose 1."
-    if available.world_size != count:
-        remedy = f"start them with `torchrun --nproc-per-node {count}`, or choose 1"
-        yield f"context_parallel: {count} needs as many processes, and there are {available.world_size}; {remedy}."
+    if available.device == "cuda" and available.gpus < wanted.ranks:
+        yield f"{wanted.ranks} GPUs are to share a clip, from that of COW_DEVICE on, and there are {available.gpus}."
+    if wanted.offload != "none":
+        yield f"offload: {wanted.offload} is for one GPU, and {wanted.ranks} are to share a clip; choose none."
+    if wanted.context_parallel == 1:
+        return
+    if available.device != "cuda":
+        yield f"context_parallel: {wanted.context_parallel} needs GPUs, and {available.description}; choose 1."
     if not ATTENTION_BACKENDS.get(wanted.attention, ATTENTION_BACKENDS["native"]).context_parallel:
         able = ", ".join(name for name, backend in ATTENTION_BACKENDS.items() if backend.context_parallel)
         yield f"context_parallel: attention '{wanted.attention}' cannot be split among GPUs; choose one of {able}."

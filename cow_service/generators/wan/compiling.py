@@ -15,13 +15,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from cow_service.generators.wan.pipeline import (
-    TEXT_LENGTH,
-    Conditioning,
-    WanTrackPipeline,
-    image_token_count,
-    latent_shape,
-)
+from cow_service.generators.wan.denoising import Conditioning, Denoise
+from cow_service.generators.wan.pipeline import TEXT_LENGTH, WanTrackPipeline, image_token_count, latent_shape
 from cow_service.generators.wan.sampling import Sampling
 
 FRAMES = (81, 17)  # of the two clips: the longest, which is the default of most requests, then any other
@@ -43,13 +38,16 @@ def keep_compiled_code(folder: Path) -> None:
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
 
 
-def compile_for(pipeline: WanTrackPipeline, sampling: Sampling, sizes: Iterable[ClipSize]) -> None:
-    """One denoising step for a clip of each size, with zeros in place of text, image and noise; logs what it takes."""
+def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling, sizes: Iterable[ClipSize]) -> None:
+    """One denoising step for a clip of each size, with zeros in place of text, image and noise; logs what it takes.
+
+    `denoise`: the pipeline's, or that of several processes.
+    """
     step = sampling.model_copy(update={"steps": 1})
     for size in sizes:
         begun = time.perf_counter()
         given = _zeros(pipeline, size, guided=step.guided)
-        pipeline.denoise(torch.zeros(latent_shape(*size)), given, step, lambda done, total: None)
+        denoise(torch.zeros(latent_shape(*size)), given, step, lambda done, total: None)
         took = time.perf_counter() - begun
         log.info("compiled for %d x %d px and %d frames in %.1f s", *size, took)
 

@@ -14,11 +14,13 @@ from cow_service.errors import FieldError, InvalidRequest
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.wan.compiling import FRAMES, ClipSize, compile_for
 from cow_service.generators.wan.conditioning import TrackConditioning
+from cow_service.generators.wan.denoising import Conditioning, Denoise
 from cow_service.generators.wan.embedding_cache import EmbeddingCache
 from cow_service.generators.wan.execution import exclusive_use, within_memory
 from cow_service.generators.wan.options import WanLimits, WanOptions
-from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, latent_shape
+from cow_service.generators.wan.pipeline import WanTrackPipeline, latent_shape
 from cow_service.generators.wan.profiles import Profile
+from cow_service.generators.wan.rank_group import RankGroup
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tracks import tracks_of
 from cow_service.records import GeneratorInfo
@@ -49,6 +51,7 @@ class LoadedModel:
     revisions: dict[str, str]  # of the other parts that were pulled
     weights_identity: str  # as `weights.lock.weights_identity`, taken before the weights were loaded
     pipeline: WanTrackPipeline
+    group: RankGroup | None  # of processes that denoise with this one
     device: torch.device
     profile_name: str
     profile: Profile
@@ -56,6 +59,11 @@ class LoadedModel:
     max_area: int  # px per frame
     negative_prompt: str
     threads: int | None  # CPU threads; None keeps PyTorch's own number
+
+    @property
+    def denoise(self) -> Denoise:
+        """Of this process, or of several."""
+        return (self.group or self.pipeline).denoise
 
     @property
     def fingerprint(self) -> str:
@@ -103,7 +111,7 @@ class WanGenerator(WanLimits):
             cpu_threads(model.threads),
             within_memory(model.device, self._embeddings.clear, f"A clip of {width} x {height}"),
         ):
-            compile_for(model.pipeline, model.profile.sampling, sizes)
+            compile_for(model.pipeline, model.denoise, model.profile.sampling, sizes)
 
     def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""
@@ -165,7 +173,7 @@ class WanGenerator(WanLimits):
             sampling = self._sampling(given)
             conditioning = self._conditioning(given, width, height, guided=sampling.guided)
             progress(0.0)
-            latents = pipeline.denoise(
+            latents = self._model.denoise(
                 noise, conditioning, sampling, lambda done, total: progress(DENOISING_SHARE * done / total)
             )
             return pipeline.decode(latents)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import logging
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import torch
+from diffusers import WanTransformer3DModel
+from torch import nn
 
 from cow_service.errors import GeneratorOutOfMemory, GeneratorUnavailable
 from cow_service.generators.wan import conditioning
-from cow_service.generators.wan.acceleration import accelerate, check_device
+from cow_service.generators.wan.acceleration import accelerate, accelerate_transformer, check_device, translated
 from cow_service.generators.wan.attention import with_attention
 from cow_service.generators.wan.checkpoints import checkpoint_files, load_transformer
 from cow_service.generators.wan.compiling import keep_compiled_code
@@ -21,6 +24,7 @@ from cow_service.generators.wan.lora import add_lora
 from cow_service.generators.wan.memory import check_memory
 from cow_service.generators.wan.pipeline import WanTrackPipeline
 from cow_service.generators.wan.profiles import Profile, profile_of
+from cow_service.generators.wan.rank_group import RankGroup
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
 from cow_service.weights.building import BUILD_LOCK
@@ -41,10 +45,6 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     manifest = load_manifests()[name]
     profile = profile_of(manifest, settings.profile)
     device = choose_device(settings.device, GeneratorUnavailable)
-    if profile.acceleration.context_parallel > 1:
-        raise GeneratorUnavailable(
-            "`context_parallel` needs several processes that make the same clip; a server is one. Set COW_PROFILE."
-        )
     check_device(profile.acceleration, device)
     own = settings.checkpoints.get(name)
     if own is not None:
@@ -53,12 +53,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     max_area = int(manifest.defaults["max_area"])
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
         profile = with_attention(profile, manifest.architecture, *clip_size(max_area, *USUAL_SIDES), device)
-        if manifest.sources:
-            pipeline = _from_weights(manifest, profile, settings, device)
-        else:
-            pipeline = make_tiny(manifest.architecture)
-        pipeline.set_progress_bar_config(disable=True)
-        accelerate(pipeline, profile.acceleration, device)
+        pipeline, group = _loaded(manifest, profile, settings, device)
     revisions = _revisions(manifest, profile, settings)
     repository = manifest.sources["transformer"].repository if manifest.sources else None
     generator = WanGenerator(
@@ -69,6 +64,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
             revisions=revisions,
             weights_identity=identity,
             pipeline=pipeline,
+            group=group,
             device=device,
             profile_name=settings.profile,
             profile=profile,
@@ -93,31 +89,81 @@ create_tiny_ati = partial(load, "tiny-ati", conditioning.ati)
 create_tiny_wan_move = partial(load, "tiny-wan-move", conditioning.wan_move)
 
 
-def _from_weights(manifest: Manifest, profile: Profile, settings: Settings, device: torch.device) -> WanTrackPipeline:
-    """The pipeline of the pulled weights, except for parts that come from the user's own checkpoint."""
-    own = settings.own_parts(manifest.name)
+def load_rank(name: str, profile: Profile, settings: Settings, device: torch.device) -> WanTransformer3DModel:
+    """The transformer alone, for one more process that shares the clips of a model: rank 0 has checked the weights.
 
-    def unverified(part: str) -> Path:
-        repository = manifest.sources[part].repository
-        return settings.checkpoints[manifest.name] if part in own else folder_of(settings.weights_dir, repository)
+    Raises as `load` does.
+    """
+    keep_compiled_code(settings.data_dir / "compiled")
+    manifest = load_manifests()[name]
+    with within_memory(device, lambda: None, f"'{name}' on {device}"):
+        if manifest.sources:
+            transformer = _transformer(manifest, profile, settings, device)
+        else:
+            transformer = make_tiny(manifest.architecture).transformer
+        accelerate_transformer(transformer, profile.acceleration, device)
+        cast(nn.Module, transformer).to(device)
+        return transformer
 
-    def folder(part: str) -> Path:
-        if part in own:
-            return settings.checkpoints[manifest.name]
-        return verify(manifest.sources[part], settings.weights_dir, manifest.name)
 
-    check_memory(manifest, settings.profile, unverified("transformer"), unverified("base"), device)
-    checkpoint, base = folder("transformer"), folder("base")
-    lora = profile.lora
-    lora_file = None if lora is None else folder(lora.source) / manifest.sources[lora.source].files[0]
+def _loaded(
+    manifest: Manifest, profile: Profile, settings: Settings, device: torch.device
+) -> tuple[WanTrackPipeline, RankGroup | None]:
+    """The pipeline on its device, and the processes that share its clips, which load at the same time."""
+    if manifest.sources:
+        _check_weights(manifest, profile, settings, device)
+    group = None if profile.acceleration.ranks == 1 else RankGroup(manifest.name, profile, settings, device)
+    try:
+        if manifest.sources:
+            transformer = _transformer(manifest, profile, settings, device)
+            dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
+            pipeline = assemble(transformer, _folder("base", manifest, settings), dtype, vae_dtype)
+        else:
+            pipeline = make_tiny(manifest.architecture)
+        pipeline.set_progress_bar_config(disable=True)
+        accelerate(pipeline, profile.acceleration, device)
+        if group is not None:
+            with translated(f"{profile.acceleration.ranks} GPUs"):
+                group.join(pipeline.transformer)
+    except BaseException:
+        if group is not None:
+            group.close()
+        raise
+    return pipeline, group
+
+
+def _check_weights(manifest: Manifest, profile: Profile, settings: Settings, device: torch.device) -> None:
+    """Raises for weights that cannot fit, before any is read, and for files that are not those that were pulled."""
+    transformer, base = (_folder(part, manifest, settings) for part in ("transformer", "base"))
+    check_memory(manifest, settings.profile, transformer, base, device)
+    parts = {"transformer", "base"} | ({profile.lora.source} if profile.lora is not None else set())
+    for part in sorted(parts - set(settings.own_parts(manifest.name))):
+        verify(manifest.sources[part], settings.weights_dir, manifest.name)
+
+
+def _folder(part: str, manifest: Manifest, settings: Settings) -> Path:
+    """Of a pulled part, or the user's own checkpoint."""
+    if part in settings.own_parts(manifest.name):
+        return settings.checkpoints[manifest.name]
+    return folder_of(settings.weights_dir, manifest.sources[part].repository)
+
+
+def _transformer(
+    manifest: Manifest, profile: Profile, settings: Settings, device: torch.device
+) -> WanTransformer3DModel:
+    """With its LoRA."""
     # With offloading or quantisation the device need not hold all unquantised weights at once.
     direct = profile.acceleration.offload == "none" and profile.acceleration.fp8 == "none"
-    dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
-    transformer = load_transformer(checkpoint, manifest.architecture, dtype, device if direct else torch.device("cpu"))
-    pipeline = assemble(transformer, base, dtype, vae_dtype)
-    if lora_file is not None and lora is not None:
-        add_lora(pipeline, lora_file, lora.scale)
-    return pipeline
+    transformer = load_transformer(
+        _folder("transformer", manifest, settings),
+        manifest.architecture,
+        getattr(torch, profile.dtype),
+        device if direct else torch.device("cpu"),
+    )
+    if profile.lora is not None:
+        file = _folder(profile.lora.source, manifest, settings) / manifest.sources[profile.lora.source].files[0]
+        add_lora(transformer, file, profile.lora.scale)
+    return transformer
 
 
 def _revisions(manifest: Manifest, profile: Profile, settings: Settings) -> dict[str, str]:

@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -70,13 +70,13 @@ class _Change:
 
 
 @torch.no_grad()
-def add_lora(pipeline: object, file: Path, scale: float) -> None:
-    """Adds `scale` times the LoRA in a safetensors file to the weights of the pipeline's transformer.
+def add_lora(transformer: nn.Module, file: Path, scale: float) -> None:
+    """Adds `scale` times the LoRA in a safetensors file to the weights of a transformer.
 
     Before `accelerate`: weights in float8 cannot be added to. Raises `CheckpointInvalid` for a file with a tensor that
     does not belong to the model or has another shape, before anything is changed; `WeightsUnavailable` without a file.
     """
-    parameters = dict(cast(nn.Module, cast(Any, pipeline).transformer).named_parameters())
+    parameters = dict(transformer.named_parameters())
     if any(type(parameter) is not nn.Parameter or parameter.is_meta for parameter in parameters.values()):
         raise GeneratorUnavailable("A LoRA must be added before the weights are made float8 or offloaded.")
     changes = _changes(_read(file), parameters, file.name)

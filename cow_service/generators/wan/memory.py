@@ -53,7 +53,7 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
     }[wanted.offload]
     through_host = wanted.offload != "none" or wanted.fp8 != "none"
     pinned = int(PINNED * stored["transformer"]) if wanted.offload == "group" else 0
-    return Need(held, whole + pinned if through_host else 0)
+    return Need(held, wanted.ranks * (whole + pinned) if through_host else 0)
 
 
 def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, device: torch.device) -> None:
@@ -96,7 +96,7 @@ def _runs(profile: Profile, device: torch.device) -> bool:
         check_device(profile.acceleration, device)
     except GeneratorUnavailable:
         return False
-    return profile.acceleration.context_parallel == 1
+    return True
 
 
 def _room(device: torch.device) -> int:

@@ -1,14 +1,12 @@
 """diffusers' image-to-video pipeline in three parts that can be timed, cached and canceled: encode, denoise, decode.
 
-The encoding methods and the models are those of the parent class. Added are a condition that differs between the
-guided and the unconditional pass, guidance over a window of steps, and a callback after every step.
+The encoding methods and the models are those of the parent class.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,14 +15,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from cow_service.generators.wan.acceleration import reset_cache
 from cow_service.generators.wan.checkpoints import TEXT_LENGTH
-from cow_service.generators.wan.execution import wait_until_done
+from cow_service.generators.wan.denoising import Conditioning, StepCallback, denoise
 from cow_service.generators.wan.sampling import Sampling
 
 LATENT_CHANNELS = 16
-
-StepCallback = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -33,17 +28,6 @@ class ImageEmbedding:
 
     embeds: Tensor  # [1, tokens, C] of the image encoder
     condition: Tensor  # [20, T, h, w] float32: 4 mask channels, 16 latent channels
-
-
-@dataclass(frozen=True)
-class Conditioning:
-    """All that conditions the denoising of one clip."""
-
-    prompt: Tensor  # [1, 512, C] text embeddings
-    negative_prompt: Tensor | None  # [1, 512, C]; None where no step is guided
-    image: Tensor  # [1, tokens, C] of the image encoder
-    condition: Tensor  # [20, T, h, w] of the guided pass
-    unconditional: Tensor  # [20, T, h, w] of the unconditional pass
 
 
 def compose(**parts: Any) -> WanTrackPipeline:
@@ -109,34 +93,9 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         )
         return ImageEmbedding(embeds, condition[0])
 
-    @torch.no_grad()
     def denoise(self, noise: Tensor, given: Conditioning, sampling: Sampling, on_step: StepCallback) -> Tensor:
-        """Latents [1, 16, T, h, w] from noise of that shape.
-
-        `on_step(done, total)` is called when the device has done a step, and may raise to cancel.
-        """
-        device = self._execution_device
-        dtype = cast(torch.dtype, self.transformer.dtype)  # found by a walk over all weights: once per clip
-        schedule = sampling.schedule(device)
-        latents = noise.to(device, torch.float32)
-        guided, unguided = (part.to(latents)[None] for part in (given.condition, given.unconditional))
-        image, prompt = given.image.to(dtype), given.prompt.to(dtype)
-        negative = None if given.negative_prompt is None else given.negative_prompt.to(dtype)
-        reset_cache(self.transformer, sampling.steps)
-        try:
-            for step, time in enumerate(schedule.timesteps):
-                states = torch.cat([latents, guided], dim=1).to(dtype)
-                velocity = self._velocity("cond", states, time, prompt, image)
-                if negative is not None and sampling.guides(step):
-                    states = torch.cat([latents, unguided], dim=1).to(dtype)
-                    plain = self._velocity("uncond", states, time, negative, image)
-                    velocity = plain + sampling.guidance_scale * (velocity - plain)
-                latents = schedule.step(velocity, time, latents, return_dict=False)[0]
-                wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
-                on_step(step + 1, sampling.steps)
-        finally:  # what was kept for the next step would lie in memory while the clip is decoded
-            reset_cache(self.transformer, sampling.steps)
-        return latents
+        """As `denoising.denoise`, in this process alone."""
+        return denoise(self.transformer, self._execution_device, noise, given, sampling, on_step)
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> NDArray[np.uint8]:
@@ -150,15 +109,3 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         video = vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
         pixels = (video.float() / 2 + 0.5).clamp(0, 1).mul(255).round().to(torch.uint8)
         return pixels.permute(1, 2, 3, 0).cpu().numpy()
-
-    def _velocity(self, branch: str, states: Tensor, time: Tensor, text: Tensor, image: Tensor) -> Tensor:
-        """The model's velocity [1, 16, T, h, w] in float32, so that guidance and solver lose nothing to bfloat16."""
-        transformer: Any = self.transformer
-        with transformer.cache_context(branch):
-            return transformer(
-                hidden_states=states,
-                timestep=time.expand(1),
-                encoder_hidden_states=text,
-                encoder_hidden_states_image=image,
-                return_dict=False,
-            )[0].float()

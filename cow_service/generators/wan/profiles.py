@@ -70,10 +70,20 @@ class Acceleration(Record):
     context_parallel: int = Field(
         default=1,
         ge=1,
-        description="GPUs among which the video's tokens are split in every layer (Ulysses); the same to rounding. As "
-        "many processes, started with torchrun, must all make the same clip. It must divide the number of attention "
-        "heads and that of tokens: latent frames x height / 16 x width / 16.",
+        description="GPUs among which the tokens of a pass are split in every layer (Ulysses); the same to rounding. "
+        "Each has a process of its own and all weights of the transformer. It must divide the number of attention "
+        "heads; where it divides the number of tokens (latent frames x height / 16 x width / 16) it is faster.",
     )
+    guidance_parallel: bool = Field(
+        default=False,
+        description="Twice as many GPUs, in two halves: one computes the guided pass of each step while the other one "
+        "computes the unconditional pass; the same frames in about half the time, where steps are guided.",
+    )
+
+    @property
+    def ranks(self) -> int:
+        """GPUs, and processes, that share a clip."""
+        return self.context_parallel * (2 if self.guidance_parallel else 1)
 
 
 class Lora(Record):

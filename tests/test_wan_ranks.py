@@ -1,0 +1,226 @@
+"""Several processes that share a clip: real ones over gloo, the real model at toy size, and what happens to each."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import torch
+from servers import BODY, Served, eventually
+from torch import Tensor
+
+from cow_service.errors import Canceled, CheckpointInvalid
+from cow_service.generators.wan import conditioning, loading
+from cow_service.generators.wan.acceleration import accelerate_transformer
+from cow_service.generators.wan.compiling import CONDITION_CHANNELS
+from cow_service.generators.wan.denoising import Conditioning, denoise
+from cow_service.generators.wan.generator import LoadedModel
+from cow_service.generators.wan.pipeline import latent_shape
+from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
+from cow_service.generators.wan.rank_group import MODULE, RankGroup
+from cow_service.generators.wan.sampling import Sampling
+from cow_service.generators.wan.sharing import Sharing
+from cow_service.generators.wan.tiny import make_tiny
+from cow_service.settings import Settings
+from cow_service.weights.manifests import load_manifests
+
+pytestmark = pytest.mark.slow
+
+CPU = torch.device("cpu")
+TINY = load_manifests()["tiny-ati"]
+NOISE = torch.randn(latent_shape(96, 64, 9), generator=torch.Generator().manual_seed(1))
+
+
+def model(folder: Path, profile: str) -> LoadedModel:
+    settings = Settings(data_dir=folder, device="cpu", profile=profile, warmup=False)
+    return loading.load("tiny-ati", conditioning.ati, settings)._model
+
+
+def group_of(loaded: LoadedModel) -> RankGroup:
+    assert loaded.group is not None
+    return loaded.group
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> LoadedModel:
+    return model(tmp_path_factory.mktemp("alone"), "exact")
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LoadedModel]:
+    loaded = model(tmp_path_factory.mktemp("shared"), "exact-2")
+    yield loaded
+    group_of(loaded).close()
+    torch.distributed.destroy_process_group()
+
+
+def given() -> Conditioning:
+    """Both passes differ in text and in condition."""
+    drawn = torch.Generator().manual_seed(2)
+    sizes: Any = TINY.architecture
+    texts = [torch.randn(1, 512, sizes["text_dim"], generator=drawn) for _ in range(2)]
+    conditions = [torch.randn(CONDITION_CHANNELS, *NOISE.shape[2:], generator=drawn) for _ in range(2)]
+    return Conditioning(*texts, torch.randn(1, 17, sizes["image_dim"], generator=drawn), *conditions)
+
+
+def latents(loaded: LoadedModel, on_step: Callable[[int, int], None] = lambda done, total: None, **how: Any) -> Tensor:
+    return loaded.denoise(NOISE, given(), loaded.profile.sampling.model_copy(update=how), on_step)
+
+
+@pytest.mark.parametrize(
+    "how", [{}, {"guidance_scale": 1.0}, {"guidance_window": (0.25, 0.75)}, {"solver": "euler", "steps": 3}]
+)
+def test_two_processes_make_the_same_clip(alone: LoadedModel, shared: LoadedModel, how: dict[str, Any]) -> None:
+    """In steps with guidance and without: also with the solver's state and the rank that has nothing to compute."""
+    passes: list[int] = []
+    handle = shared.pipeline.transformer.register_forward_hook(lambda *_: passes.append(1))
+    heard: list[int] = []
+    found = latents(shared, lambda done, total: heard.append(done), **how)
+    handle.remove()
+    assert torch.equal(found, latents(alone, **how))
+    assert heard == list(range(1, len(heard) + 1))
+    assert len(passes) == len(heard), "the unconditional passes were computed elsewhere"
+
+
+def test_a_clip_that_is_canceled_leaves_the_others_in_step(alone: LoadedModel, shared: LoadedModel) -> None:
+    def stop(done: int, total: int) -> None:
+        if done == 2:
+            raise Canceled("no more")
+
+    for _ in range(2):
+        with pytest.raises(Canceled):
+            latents(shared, stop)
+    assert torch.equal(latents(shared), latents(alone))
+
+
+def test_a_rank_that_cannot_load_says_why(tmp_path: Path) -> None:
+    profile = profile_of(TINY, "exact-2")
+    group = RankGroup("ati", profile, Settings(data_dir=tmp_path, weights_dir=tmp_path, device="cpu"), CPU)
+    with pytest.raises(CheckpointInvalid, match="There is no checkpoint"):
+        group.join(torch.nn.Linear(1, 1))
+    with pytest.raises(CheckpointInvalid, match="There is no checkpoint"):
+        group.denoise(NOISE, given(), profile.sampling, lambda done, total: None)
+
+
+# In a server
+
+SLOW_CLIP = {
+    **BODY,
+    "generator": "tiny-ati",
+    "num_frames": 17,
+    "generator_options": {"steps": 150},
+}
+
+
+def ranks_of(served: Served) -> list[psutil.Process]:
+    assert served.process is not None
+    below = psutil.Process(served.process.pid).children(recursive=True)
+    return [one for one in below if one.status() != psutil.STATUS_ZOMBIE and MODULE in one.cmdline()]
+
+
+def test_a_server_replaces_a_lost_rank_and_ends_them_all(tmp_path: Path) -> None:
+    with Served(tmp_path, COW_WORKERS="true", COW_GENERATOR="tiny-ati", COW_PROFILE="exact-2") as served:
+        job = served.submit(SLOW_CLIP)
+        eventually(lambda: bool(ranks_of(served)))
+        served.rendering(job["id"])
+        [first] = ranks_of(served)
+        first.kill()
+        ended = served.ended(job["id"])
+        assert ended["status"] == "succeeded", ended
+        [second] = ranks_of(served)
+        assert second.pid != first.pid
+        worker = second.parent()
+        assert worker is not None
+        worker.send_signal(signal.SIGKILL)
+        eventually(lambda: not second.is_running() or second.status() == psutil.STATUS_ZOMBIE)
+        again = served.http.post("/simulate", json={**SLOW_CLIP, "seed": 1, "generator_options": {"steps": 2}})
+        assert again.status_code == 200, again.text
+        assert again.json()["generator"]["options"]["guidance_parallel"] is True
+        [third] = ranks_of(served)
+    eventually(lambda: not third.is_running())
+
+
+# Context parallelism
+
+RANK = """
+import sys, torch
+sys.path.insert(0, sys.argv[1])
+import test_wan_ranks as toy
+
+# diffusers takes the rank modulo the number of accelerators.
+torch.accelerator.device_count = lambda: 1
+torch.save(toy.shared_by_ranks(sys.argv[2]), f"{sys.argv[2]}/{torch.distributed.get_rank()}.pt")
+torch.distributed.destroy_process_group()
+"""
+MAG = {"cache": "mag", "cache_threshold": 1e9, "mag_ratios": (1.0, 0.9, 0.9, 0.9)}
+SAMPLING = Sampling(steps=4, shift=5.0, guidance_scale=5.0)
+WAYS: dict[str, dict[str, Any]] = {"none": {}, "mag": MAG}
+SIZES = {"even": NOISE, "odd": torch.randn(latent_shape(80, 48, 5), generator=torch.Generator().manual_seed(3))}
+
+
+def clip_of(noise: Tensor, transformer: Any, **how: Any) -> Tensor:
+    full = given()
+    condition = torch.zeros(CONDITION_CHANNELS, *noise.shape[2:])
+    inputs = Conditioning(full.prompt, full.negative_prompt, full.image, condition, condition)
+    return denoise(transformer, CPU, noise, inputs, SAMPLING, lambda done, total: None, **how)
+
+
+def transformer_of(options: dict[str, Any]) -> Any:
+    transformer = make_tiny(TINY.architecture).transformer
+    accelerate_transformer(transformer, Acceleration(**options), CPU)
+    return transformer
+
+
+def shared_by_ranks(folder: str) -> dict[str, Tensor]:
+    """Each clip, on this rank of four: two for each pass, which split its tokens."""
+    wanted = Acceleration(context_parallel=2, guidance_parallel=True)
+    rank = int(os.environ["RANK"])
+    found: dict[str, Tensor] = {}
+    for way, options in WAYS.items():
+        transformer = transformer_of(options)
+        store = torch.distributed.FileStore(f"{folder}/store-{way}", wanted.ranks)
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+        sharing = Sharing(transformer, wanted, rank, CPU, store)
+        for size, noise in SIZES.items():
+            sharing.prepare(noise)
+            found[f"{way} {size}"] = clip_of(noise, transformer, share=sharing)
+    return found
+
+
+@pytest.mark.soak_only
+def test_four_processes_compute_what_one_does(tmp_path: Path) -> None:
+    """Over gloo: every rank holds the whole result, with and without a cache, for a number of tokens that is odd."""
+    (tmp_path / "rank.py").write_text(RANK)
+    command = [sys.executable, str(tmp_path / "rank.py"), str(Path(__file__).parent), str(tmp_path)]
+    ranks = [
+        subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1", "RANK": str(rank)}, stderr=subprocess.PIPE)
+        for rank in range(4)
+    ]
+    for rank in ranks:
+        _, said = rank.communicate(timeout=100)
+        assert rank.returncode == 0, said[-3000:]
+    for rank in range(4):
+        found = torch.load(tmp_path / f"{rank}.pt")
+        for way, options in WAYS.items():
+            for size, noise in SIZES.items():
+                wanted = clip_of(noise, transformer_of(options))
+                torch.testing.assert_close(found[f"{way} {size}"], wanted, atol=1e-4, rtol=0)
+
+
+def test_a_profile_says_how_many_gpus_it_takes() -> None:
+    ranks = {
+        name: {profile: profile_of(manifest, profile).acceleration.ranks for profile in manifest.profiles}
+        for name, manifest in load_manifests().items()
+        if manifest.architecture and manifest.role == "generator"
+    }
+    for name in ("ati", "wan-move"):
+        assert {profile: count for profile, count in ranks[name].items() if count > 1} == {"exact-2": 2, "exact-8": 8}
+    assert Profile.model_validate(TINY.profiles["exact-2"]).sampling == profile_of(TINY, "exact").sampling
