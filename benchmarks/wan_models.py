@@ -192,10 +192,7 @@ class Studio:
             self._film = film_tracks
         self.built = self._clock.now() - begun  # seconds
         self._passes.watch(cast(nn.Module, self.pipeline.transformer))
-        parts: Any = self.pipeline
-        parts.encode_prompt = self._clock.around("text encoder", parts.encode_prompt)
-        parts.encode_image = self._clock.around("image encoder", parts.encode_image)
-        parts.vae.encode = self._clock.around("VAE encode", parts.vae.encode)
+        time_parts(self.pipeline, self._clock)
 
     def clip(self, sampling: Sampling) -> Timing:
         """One clip; `other` is what no part has taken."""
@@ -209,6 +206,14 @@ class Studio:
         parts["other"] = total - sum(parts.values())
         steps = [after - before for before, after in pairwise(moments)]
         return Timing(parts, steps, total, len(passes.all), len(passes.computed))
+
+
+def time_parts(pipeline: object, clock: Clock) -> None:
+    """Has the encoders' time added to their parts from now on."""
+    parts: Any = pipeline
+    parts.encode_prompt = clock.around("text encoder", parts.encode_prompt)
+    parts.encode_image = clock.around("image encoder", parts.encode_image)
+    parts.vae.encode = clock.around("VAE encode", parts.vae.encode)
 
 
 def film_tracks(pipeline: WanTrackPipeline, case: Case, clock: Clock, sampling: Sampling) -> list[float]:

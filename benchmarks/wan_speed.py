@@ -9,8 +9,11 @@ whose medians are given; text and picture are encoded anew in each. `plain` is d
 First, a toy with the public implementation's weights is compared with its figures, in float32 and bfloat16, and every
 attention backend that the machine has is timed alone, at the shape of the clip.
 
-With `--budget`, clips have four steps, from which all of a profile's are computed, and what will not be done in time is
-left out; `--plan` says what would be run and what it is reckoned to take. The file has each row as soon as it is known.
+With `--budget` no profile is run: one build of the model is put into one form after the other, of which single passes
+are timed (eager, compiled, cached, float8, offloaded), the VAE's both ways in each precision and layout, the kernels of
+a pass, and one whole turbo clip; whole clips of the others are computed from these, and marked so. What will not be
+done in time is left out; `--plan` says what would be run and what it is reckoned to take, for an H100 where there is no
+GPU. The file has each row as soon as it is known.
 
 Floating-point operations are counted by formula (`pass_flops`), 135 PFLOP for 832x480x81 in 40 guided steps; those that
 a cache skipped are left out. Their share of the peak is that of bfloat16 matrix products measured here, whatever the
@@ -20,7 +23,6 @@ profile computes in. How many passes a cache skips depends on the weights: on ra
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 import os
 import platform
@@ -28,11 +30,10 @@ import resource
 import statistics
 import sys
 import time
-import traceback
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import accelerate
 import diffusers
@@ -45,34 +46,23 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from wan_flops import pass_flops
 from wan_golden import distances
 from wan_models import Case, Clock, Studio, Timing, do_without_ftfy
-from wan_plan import FIRST_SECONDS, Budget, missing_packages, reckoned_seconds, steps_within_budget
+from wan_plan import ASSUMED, ASSUMED_PEAK, FIRST_SECONDS, Budget, missing_packages
+from wan_result import Result, guarded, rounded
+from wan_rows import build_seconds, measure_rows, reckoned, refused, rows, totals
 from wan_table import PARTS, table
 
 from cow_service.errors import CowError, GeneratorUnavailable
-from cow_service.generators.wan.attention import shape_of, time_backends
+from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
 from cow_service.generators.wan.capabilities import ATTENTION_BACKENDS, detect_capabilities, refusals
-from cow_service.generators.wan.execution import within_memory
 from cow_service.generators.wan.pipeline import image_token_count
 from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
 from cow_service.generators.wan.tracks import nearest_lengths
-from cow_service.weights.device import choose_device, cpu_threads
+from cow_service.weights.device import choose_device
 from cow_service.weights.manifests import load_manifests
 
 PLAIN = "plain"
 WARM_UP_STEPS = 2
 MATMUL_SECONDS, MATMUL_TRIES = 0.2, 5  # the best try counts
-
-
-@dataclass(frozen=True)
-class Result:
-    """What one profile gave."""
-
-    name: str
-    status: Literal["measured", "refused", "failed", "skipped"]
-    reason: str | None = None
-    notes: tuple[str, ...] = ()
-    figures: dict[str, Any] = field(default_factory=dict)
-    seconds: float = 0.0  # that all of it took
 
 
 def matmul_peak(device: torch.device) -> float:
@@ -93,26 +83,16 @@ def measure(name: str, case: Case, peak: float) -> Result:
     """One profile, or `plain`; whatever goes wrong becomes its result, and the memory is free afterwards."""
     profile = measured_profile(name, case)
     sentences = refusals(profile.acceleration, detect_capabilities(case.device))
+    if profile.acceleration.ranks > 1:
+        sentences = (*sentences, "Several processes share its clips, and this is one.")
     if sentences:
         return Result(name, "refused", " ".join(sentences))
-    defaults = case.manifest.defaults
+    begun = time.monotonic()
     try:
-        with (
-            cpu_threads(int(defaults["threads"]) if "threads" in defaults else None),
-            within_memory(case.device, lambda: None, f"Profile '{name}'"),
-        ):
-            return Result(name, "measured", None, _notes(name, profile), _figures(name, profile, case, peak))
-    except CowError as error:
-        return Result(name, "failed", error.detail)
-    except Exception as error:  # noqa: BLE001 - the other profiles are measured all the same
-        traceback.print_exc()
-        traceback.clear_frames(error.__traceback__)  # they hold the model
-        return Result(name, "failed", f"{type(error).__name__}: {error}")
+        result = guarded(name, case, lambda: _figures(name, profile, case, peak), _notes(name, profile))
     finally:
         torch.compiler.reset()  # the next pipeline's layers would count as recompilations, which are limited
-        gc.collect()
-        if case.device.type == "cuda":
-            torch.cuda.empty_cache()
+    return replace(result, seconds=rounded(time.monotonic() - begun))
 
 
 def measured_profile(name: str, case: Case) -> Profile:
@@ -146,8 +126,8 @@ def _figures(name: str, profile: Profile, case: Case, peak: float) -> dict[str, 
         "passes_computed": timings[-1].computed,
         **_rates(timings, flops, peak),
         **_memory(case.device),
-        "build_s": _rounded(studio.built),
-        "warm_up_s": _rounded(warm_up),
+        "build_s": rounded(studio.built),
+        "warm_up_s": rounded(warm_up),
     }
 
 
@@ -160,11 +140,11 @@ def _seconds(timings: list[Timing], steps_of_profile: int) -> dict[str, Any]:
     computed = total + (ratio - 1) * parts["denoising"]
     return {
         "step_s": {
-            name: _rounded(of(steps)) for name, of in (("median", statistics.median), ("min", min), ("max", max))
+            name: rounded(of(steps)) for name, of in (("median", statistics.median), ("min", min), ("max", max))
         },
-        "parts_s": {part: _rounded(parts[part]) for part in PARTS if part in parts},
-        "total_s": _rounded(total),
-    } | ({} if ratio == 1 else {"computed": {"steps": steps_of_profile, "total_s": _rounded(computed)}})
+        "parts_s": {part: rounded(parts[part]) for part in PARTS if part in parts},
+        "total_s": rounded(total),
+    } | ({} if ratio == 1 else {"computed": {"steps": steps_of_profile, "total_s": rounded(computed)}})
 
 
 def _flops(profile: Profile, case: Case, timing: Timing, image_tokens: int) -> int:
@@ -177,104 +157,95 @@ def _flops(profile: Profile, case: Case, timing: Timing, image_tokens: int) -> i
 
 def _rates(timings: list[Timing], flops: int, peak: float) -> dict[str, float]:
     rate = flops / statistics.median(timing.parts["denoising"] for timing in timings)
-    return {"pflop": _rounded(flops / 1e15), "tflops": _rounded(rate / 1e12), "share_of_peak": _rounded(rate / peak)}
+    return {"pflop": rounded(flops / 1e15), "tflops": rounded(rate / 1e12), "share_of_peak": rounded(rate / peak)}
 
 
 def _memory(device: torch.device) -> dict[str, float]:
     """Largest so far, GB: on a GPU since the warm-up, else of the whole process."""
     if device.type == "cuda":
         allocated, reserved = torch.cuda.max_memory_allocated(device), torch.cuda.max_memory_reserved(device)
-        return {"peak_allocated_gb": _rounded(allocated / 1e9), "peak_reserved_gb": _rounded(reserved / 1e9)}
+        return {"peak_allocated_gb": rounded(allocated / 1e9), "peak_reserved_gb": rounded(reserved / 1e9)}
     kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {"peak_resident_gb": _rounded(kib * 1024 / 1e9)}
-
-
-def _rounded(value: float) -> float:
-    """To four digits."""
-    return float(f"{value:.4g}")
+    return {"peak_resident_gb": rounded(kib * 1024 / 1e9)}
 
 
 def survey(case: Case, names: Iterable[str], file: Path | None, budget: Budget | None = None) -> dict[str, Any]:
-    """Measures one after the other. What is there so far is in `file` whenever one is done."""
+    """Measures one after the other: profiles, or with a budget the rows. What is there so far is always in `file`."""
     peak = matmul_peak(case.device)
-    found = {**_surroundings(case), "matmul_bf16_tflops": _rounded(peak / 1e12), "results": []}
-    results: list[Result] = []
+    found = {**_surroundings(case), "matmul_bf16_tflops": rounded(peak / 1e12), "results": []}
 
-    def keep() -> None:
+    def keep(results: list[Result]) -> None:
+        print("  ".join(f"{one.name}: {one.status}" for one in results[-1:]), file=sys.stderr, flush=True)
+        found["results"] = [asdict(result) for result in results]
+        if budget is not None:
+            found["computed"] = totals(case, results)
         if file is not None:
             file.write_text(json.dumps(found, indent=2) + "\n")
 
-    print("golden figures ...", file=sys.stderr, flush=True)
     found["golden"] = {
-        name: {part: _rounded(value) for part, value in distances(case.device, getattr(torch, name)).items()}
+        name: {part: rounded(value) for part, value in distances(case.device, getattr(torch, name)).items()}
         for name in ("float32", "bfloat16")
     }
-    keep()
-    print("attention ...", file=sys.stderr, flush=True)
-    found["attention"] = measure_attention(case)
-    keep()
+    keep([])
+    timed = time_attention(case)
+    found["attention"] = [attention_figures(one, case) for one in timed]
+    keep([])
+    if budget is not None:
+        best = fastest(one for one in timed if ATTENTION_BACKENDS[one.name].in_auto)
+        measure_rows(case, peak, best, budget, keep)
+        return found
+    results: list[Result] = []
     for name in names:
-        print(f"{name} ...", file=sys.stderr, flush=True)
-        results.append(_measured_in_time(name, case, peak, budget))
-        found["results"] = [asdict(result) for result in _compared(results)]
-        keep()
+        results.append(measure(name, case, peak))
+        keep(_compared(results))
     return found
 
 
-def _measured_in_time(name: str, case: Case, peak: float, budget: Budget | None) -> Result:
-    """As `measure`, with the steps of a budget; skipped where it would not be done in time."""
-    begun, profile = time.monotonic(), measured_profile(name, case)
-    if budget is None:
-        return replace(measure(name, case, peak), seconds=_rounded(time.monotonic() - begun))
-    short = replace(case, steps=steps_within_budget(case, profile))
-    reckoned = reckoned_seconds(short, profile, peak, WARM_UP_STEPS)
-    expected, left = budget.expected(reckoned), budget.left
-    if expected > left:
-        return Result(name, "skipped", f"It would take {expected:.0f} s (reckoned), and {max(0, left):.0f} s are left.")
-    result, took = measure(name, short, peak), time.monotonic() - begun
-    if result.status == "measured":
-        budget.took(reckoned, took)
-    return replace(result, seconds=_rounded(took))
-
-
-def measure_attention(case: Case) -> list[dict[str, Any]]:
+def time_attention(case: Case) -> tuple[TimedBackend, ...]:
     """Each attention backend that this machine has, by itself, at the shape of the clip."""
     machine = detect_capabilities(case.device)
-    shape = shape_of(case.manifest.architecture, case.width, case.height, case.num_frames)
     names = [name for name in ATTENTION_BACKENDS if not refusals(Acceleration(attention=name), machine)]
     if case.device.type == "cuda":  # a matrix of tokens x tokens would not fit
         names.remove("_native_math")
     dtype = torch.bfloat16 if case.device.type == "cuda" else torch.float32
+    return time_backends(names, _attention_shape(case), dtype, case.device)
+
+
+def attention_figures(one: TimedBackend, case: Case) -> dict[str, Any]:
+    """As JSON."""
+    shape = _attention_shape(case)
     flop = 4 * shape.tokens**2 * shape.heads * shape.width
-    return [
-        {
-            "name": one.name,
-            "ms": None if one.seconds is None else _rounded(1000 * one.seconds),
-            "tflops": None if one.seconds is None else _rounded(flop / one.seconds / 1e12),
-            "error": None if one.error is None else _rounded(one.error),
-            "reason": one.reason,
-        }
-        for one in time_backends(names, shape, dtype, case.device)
-    ]
+    return {
+        "name": one.name,
+        "ms": None if one.seconds is None else rounded(1000 * one.seconds),
+        "tflops": None if one.seconds is None else rounded(flop / one.seconds / 1e12),
+        "error": None if one.error is None else rounded(one.error),
+        "reason": one.reason,
+    }
 
 
-def plan(case: Case, names: Iterable[str], budget: Budget | None) -> str:
-    """What would be run, in this order, and what it is reckoned to take."""
-    peak, machine, total, lines = matmul_peak(case.device), detect_capabilities(case.device), FIRST_SECONDS, list[str]()
-    for name in names:
-        profile = measured_profile(name, case)
-        if sentences := refusals(profile.acceleration, machine):
-            lines.append(f"{name}: refused. {' '.join(sentences)}")
-            continue
-        short = case if budget is None else replace(case, steps=steps_within_budget(case, profile))
-        seconds = reckoned_seconds(short, profile, peak, WARM_UP_STEPS)
+def _attention_shape(case: Case) -> AttentionShape:
+    return shape_of(case.manifest.architecture, case.width, case.height, case.num_frames)
+
+
+def plan(case: Case, budget: Budget | None) -> str:
+    """What a run within a budget would do, in this order, and what it is reckoned to take."""
+    is_here = case.toy or case.device.type == "cuda"
+    machine = detect_capabilities(case.device) if is_here else ASSUMED
+    peak = matmul_peak(case.device) if is_here else ASSUMED_PEAK
+    total = FIRST_SECONDS + build_seconds(case)
+    lines = [f"golden figures, attention, build: {total:.0f} s (reckoned)"]
+    for row in rows(case, "native"):
+        seconds, reason = reckoned(row, case, peak), refused(row, machine)
         left_out = budget is not None and total + seconds > budget.seconds
+        if reason:
+            lines.append(f"{row.name}: refused. {reason}")
+            continue
         total += 0 if left_out else seconds
-        steps = short.sampled(profile.sampling).steps
-        lines.append(f"{name}: {steps} steps, {seconds:.0f} s (reckoned)" + (", not within the budget" * left_out))
-    if missing := missing_packages(machine):
+        lines.append(f"{row.name}: {seconds:.0f} s (reckoned)" + (", not within the budget" * left_out))
+    if is_here and (missing := missing_packages(machine)):
         lines.append(f"Not installed here: {', '.join(missing)}.")
-    return "\n".join([f"In all {total:.0f} s (reckoned).", *lines])
+    return "\n".join([f"{machine.name}: in all {total:.0f} s (reckoned).", *lines])
 
 
 def _compared(results: list[Result]) -> list[Result]:
@@ -285,7 +256,7 @@ def _compared(results: list[Result]) -> list[Result]:
         own, added = result.figures, {}
         if plain is not None and own and result.name != PLAIN:
             clip, step = plain["total_s"] / own["total_s"], plain["step_s"]["median"] / own["step_s"]["median"]
-            added = {"times_as_fast_as_plain": {"clip": _rounded(clip), "step": _rounded(step)}}
+            added = {"times_as_fast_as_plain": {"clip": rounded(clip), "step": rounded(step)}}
         compared.append(replace(result, figures={**own, **added}))
     return compared
 
@@ -297,7 +268,7 @@ def _surroundings(case: Case) -> dict[str, Any]:
         "machine": {
             "device": machine.device,
             "name": machine.name,
-            "memory_gb": _rounded(machine.memory / 1e9),
+            "memory_gb": rounded(machine.memory / 1e9),
             "gpus": machine.gpus,
             "cores": os.cpu_count(),
             "packages": list(machine.packages),
@@ -330,7 +301,7 @@ def case_of(arguments: argparse.Namespace) -> Case:
     if name not in models:
         raise ValueError(f"There is no model '{name}'. There are: {', '.join(models)}.")
     toy = not models[name].sources
-    if device.type == "cpu" and not toy:
+    if device.type == "cpu" and not toy and not arguments.plan:
         raise ValueError(f"'{name}' at its real size needs a GPU, and there is none here. Take tiny-ati.")
     frames, width, height, runs = (17, 112, 64, 5) if toy else (81, 832, 480, 1)
     case = Case(
@@ -367,8 +338,8 @@ def main() -> int:
     parser.add_argument("--height", type=_count, help="px")
     parser.add_argument("--steps", type=_count, help="instead of the profile's own")
     parser.add_argument("--runs", type=_count, help="clips that count; by default 1, of a toy 5")
-    parser.add_argument("--budget", type=_count, help="seconds for all of it")
-    parser.add_argument("--plan", action="store_true", help="say what would be run, and run nothing")
+    parser.add_argument("--budget", type=_count, help="seconds for all of it: parts instead of profiles")
+    parser.add_argument("--plan", action="store_true", help="say what a run within a budget would do, and do nothing")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
     try:
@@ -383,7 +354,7 @@ def main() -> int:
         print("ftfy is not installed: texts are encoded without its clean-up, which takes no time.", file=sys.stderr)
     budget = None if arguments.budget is None else Budget(arguments.budget)
     if arguments.plan:
-        print(plan(case, dict.fromkeys(names), budget))
+        print(plan(case, budget))
         return 0
     found = survey(case, dict.fromkeys(names), arguments.json, budget)
     print(table(found))

@@ -10,9 +10,6 @@ PARTS = ("text encoder", "image encoder", "VAE encode", "condition", "denoising"
 def table(found: dict[str, Any]) -> str:
     """The figures, a column for each profile, and below them what has to be said in words."""
     machine, clip, versions = found["machine"], found["clip"], found["versions"]
-    measured = [result for result in found["results"] if result["figures"]]
-    rows = [["", *(result["name"] for result in measured)], *_rows([result["figures"] for result in measured])]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         f"{clip['model']}, {clip['size']} size, random weights: {clip['num_frames']} frames, {clip['width']} x "
         f"{clip['height']} px, {clip['tokens']} tokens. Clips per profile: {found['runs']}.",
@@ -26,11 +23,42 @@ def table(found: dict[str, Any]) -> str:
         ),
         *(f"attention {one['name']}: {_attention_words(one)}" for one in found["attention"]),
         "",
+        *(_row_lines(found) if "computed" in found else _profile_lines(found["results"])),
     ]
-    for first, *cells in rows:
-        shown = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-        lines.append("  ".join([first.ljust(widths[0]), *shown]).rstrip())
     return "\n".join([*lines, "", *_words(found["results"])]).rstrip()
+
+
+def _profile_lines(results: list[dict[str, Any]]) -> list[str]:
+    measured = [result for result in results if result["figures"]]
+    rows = [["", *(result["name"] for result in measured)], *_rows([result["figures"] for result in measured])]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join([first.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))])
+        for first, *cells in rows
+    ]
+
+
+def _row_lines(found: dict[str, Any]) -> list[str]:
+    """A line for each row that was measured, the kernels below it, and the clips that were computed."""
+    lines: list[str] = []
+    for result in found["results"]:
+        if result["figures"]:
+            shown = (f"{key} {_value(value)}" for key, value in result["figures"].items() if key != "kernels")
+            lines.append(f"{result['name']}: {', '.join(shown)}")
+            lines += [
+                f"    {one['share']:6.1%}  {one['ms']:9.4g} ms  {one['calls']:6d} x  {one['name']}"
+                for one in result["figures"].get("kernels", ())
+            ]
+    clips = (
+        f"{one['name']}, a clip of {one['steps']} steps: {one['total_s']:g} s (computed)" for one in found["computed"]
+    )
+    return [*lines, *clips]
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "(" + ", ".join(f"{key} {_value(each)}" for key, each in value.items()) + ")"
+    return " and ".join(f"{each:g}" for each in value) if isinstance(value, list) else f"{value:g}"
 
 
 def _attention_words(one: dict[str, Any]) -> str:
