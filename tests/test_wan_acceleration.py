@@ -329,6 +329,24 @@ def test_offloaded_parts_compute_the_same(offload: str, options: dict[str, Any],
         reset_cache(kept)
 
 
+def test_weights_are_pinned_one_by_one(monkeypatch: pytest.MonkeyPatch):
+    """Pinned memory needs a GPU, so copies stand for it: each is in its place before the next one is made."""
+    block: Any = toy().transformer.blocks[0]
+    weights, before = list(block.parameters()), [weight.clone() for weight in block.parameters()]
+    pinned: list[Tensor] = []
+
+    def pin_memory(tensor: Tensor) -> Tensor:
+        assert all(weight.data_ptr() == copy.data_ptr() for weight, copy in zip(weights, pinned, strict=False))
+        pinned.append(tensor.clone())
+        return pinned[-1]
+
+    monkeypatch.setattr(Tensor, "pin_memory", pin_memory)
+    subject.pin(block)
+    assert len(pinned) == len(weights)
+    assert [weight.data_ptr() for weight in block.parameters()] == [copy.data_ptr() for copy in pinned]
+    assert all(torch.equal(one, other) for one, other in zip(weights, before, strict=True))
+
+
 # LoRA
 
 

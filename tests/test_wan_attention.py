@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import logging
+import sys
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from diffusers.models import attention_dispatch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -91,6 +96,69 @@ def test_a_profile_names_what_was_chosen(monkeypatch: pytest.MonkeyPatch, caplog
     (told,) = caplog.messages
     assert told.startswith(f"attention: {found.attention}; native ")
     assert "_native_math" in told
+
+
+def test_the_next_start_chooses_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the second timing would say; another set of backends, or a damaged file, is timed anew."""
+    kept, timed = tmp_path / "data" / "attention.json", list[tuple[str, ...]]()
+
+    def time_them(names: tuple[str, ...], *_: object) -> tuple[TimedBackend, ...]:
+        timed.append(names)
+        return tuple(TimedBackend(name, 1.0 if len(timed) == 1 + i else 2.0, 0.0) for i, name in enumerate(names))
+
+    monkeypatch.setattr(attention, "time_backends", time_them)
+    auto = profile_of(TINY, "exact").model_copy(update={"acceleration": Acceleration(attention="auto")})
+
+    def chosen(*names: str) -> str:
+        monkeypatch.setattr(attention, "backends_for_auto", lambda *_: names)
+        return attention.with_attention(auto, TINY.architecture, 128, 64, CPU, kept).acceleration.attention
+
+    assert [chosen("native", "_native_math") for _ in range(3)] == ["native"] * 3
+    assert len(timed) == 1
+    assert chosen("native", "_native_math", "flash") == "_native_math"
+    assert chosen("native", "_native_math") == "native"
+    kept.write_text("{damaged")
+    assert chosen("native", "_native_math", "flash") == "flash"
+    assert len(timed) == 3
+    assert sorted(each.name for each in kept.parent.iterdir()) == ["attention.json"]
+
+
+def test_kernels_of_the_hub_are_fetched_beforehand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package `kernels` and the GPU are fakes; what diffusers does with them is its own."""
+    asked: list[str] = []
+
+    class Kernel:
+        flash_attn_func = staticmethod(lambda *_: None)
+
+        class flash_attn_interface:
+            _flash_attn_forward = _flash_attn_backward = staticmethod(lambda *_: None)
+
+    def get_kernel(repository: str, **_: object) -> type[Kernel]:
+        asked.append(repository)
+        if "attn3" not in repository:
+            raise OSError("no build of it for this version of torch\nat some length")
+        return Kernel
+
+    package: Any = ModuleType("kernels")
+    package.get_kernel, package.__spec__ = get_kernel, ModuleSpec("kernels", None)
+    monkeypatch.setitem(sys.modules, "kernels", package)
+    monkeypatch.setattr(attention_dispatch, "_CAN_USE_FLASH_ATTN_4", True, raising=False)
+    monkeypatch.setattr(attention_dispatch, "is_kernels_available", lambda: True)
+    monkeypatch.setattr(attention_dispatch, "is_kernels_version", lambda *_: True)
+    trusted = SimpleNamespace(trustedKernelPublisher=True)
+    monkeypatch.setattr(attention_dispatch, "get_organization_overview", lambda publisher: trusted)
+    monkeypatch.setattr(attention, "detect_capabilities", lambda device: gpu(9, 0, "kernels", "torchao", "triton"))
+    for config in attention_dispatch._HUB_KERNELS_REGISTRY.values():
+        for name in ("kernel_fn", "wrapped_forward_fn", "wrapped_backward_fn"):
+            monkeypatch.setattr(config, name, None)
+    profiles = (profile_of(ATI, name).acceleration for name in ATI.profiles)
+    fetched = attention.fetch_kernels(profiles, CPU)
+    assert fetched["_flash_3_hub"] is None
+    assert fetched["flash_hub"] == "OSError: no build of it for this version of torch"
+    assert "sage_hub" not in fetched, "no profile names it"
+    assert "kernels-community/flash-attn3" in asked
+    only = Acceleration(attention="sage_hub"), Acceleration(attention="native")
+    assert set(attention.fetch_kernels(only, CPU)) == {"sage_hub"}
 
 
 def test_the_shape_is_that_of_the_transformer() -> None:

@@ -73,6 +73,8 @@ def pull(
     for each in downloads:
         folder = folder_of(weights_dir, each.lock.repository)
         console.print(f"{each.lock.repository} at {each.lock.revision[:12]} is in {folder}")
+    for line in _fetched_kernels(manifest):
+        console.print(line)
 
 
 @app.command()
@@ -99,6 +101,26 @@ def check(name: Name, as_json: AsJson = False) -> None:
     if not complete:
         typer.echo(f"Run `cow models pull {name}`.", err=True)
         raise typer.Exit(1)
+
+
+def _fetched_kernels(manifest: Manifest) -> list[str]:
+    """What became of the attention kernels that a video model may use on this machine's GPU; each has a line."""
+    from importlib.util import find_spec  # noqa: PLC0415
+
+    if not manifest.architecture or manifest.missing_modules() or find_spec("kernels") is None:
+        return []
+    from cow_service.errors import GeneratorUnavailable  # noqa: PLC0415
+    from cow_service.generators.wan.attention import fetch_kernels  # noqa: PLC0415
+    from cow_service.generators.wan.profiles import profile_of  # noqa: PLC0415
+    from cow_service.settings import load_settings  # noqa: PLC0415
+    from cow_service.weights.device import choose_device  # noqa: PLC0415
+
+    device = choose_device(load_settings().device, GeneratorUnavailable)
+    fetched = fetch_kernels((profile_of(manifest, name).acceleration for name in manifest.profiles), device)
+    return [
+        f"Attention kernel {name}: {'fetched' if problem is None else f'not fetched, and not needed ({problem})'}"
+        for name, problem in fetched.items()
+    ]
 
 
 def _weights_dir() -> Path:

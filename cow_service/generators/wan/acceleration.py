@@ -139,10 +139,22 @@ def _offload_groups(parts: Any, device: torch.device) -> None:
             model.to(device)
         elif name == "transformer":
             streams = device.type == "cuda"
+            if streams:
+                for block in cast(Any, model).blocks:
+                    pin(block)
             # With `record_stream` the CPU does not wait for the copies of each block.
             apply_group_offloading(model, device, num_blocks_per_group=1, use_stream=streams, record_stream=streams)
         else:
             apply_group_offloading(model, device, offload_type="leaf_level")
+
+
+def pin(module: nn.Module) -> None:
+    """Puts weights into pinned memory, one by one: the memory of each is free again before the next one is pinned.
+
+    diffusers pins copies of all before it lets go of any; what is pinned already it takes as it is.
+    """
+    for tensor in (*module.parameters(), *module.buffers()):
+        tensor.data = tensor.data.pin_memory()
 
 
 @contextmanager

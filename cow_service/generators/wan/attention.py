@@ -5,22 +5,26 @@ It cannot be told beforehand: cuDNN's is the faster one on some GPUs and the slo
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import statistics
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import diffusers
 import torch
 from diffusers.models.attention_dispatch import attention_backend, dispatch_attention_fn
 from torch import Tensor
 
-from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities
+from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities, is_from_hub, refusals
 from cow_service.generators.wan.checkpoints import diffusers_config
 from cow_service.generators.wan.execution import has_failed, wait_until_done
 from cow_service.generators.wan.pipeline import token_count
-from cow_service.generators.wan.profiles import Profile
+from cow_service.generators.wan.profiles import Acceleration, Profile
 from cow_service.weights.device import is_out_of_memory
 
 NATIVE = "native"  # what the others are compared with
@@ -80,22 +84,70 @@ def fastest(timed: Iterable[TimedBackend]) -> str:
 
 
 def with_attention(
-    profile: Profile, architecture: Mapping[str, Any], width: int, height: int, device: torch.device
+    profile: Profile,
+    architecture: Mapping[str, Any],
+    width: int,
+    height: int,
+    device: torch.device,
+    kept: Path | None = None,
 ) -> Profile:
     """The profile with the backend that `attention: auto` comes to on this device; any other profile as it is.
 
-    `width`, `height`: px of a clip.
+    `width`, `height`: px of a clip. `kept`: file of earlier choices, so that another start of the same versions on the
+    same GPU does not choose another one, by which clips would not be found again.
     """
     wanted = profile.acceleration
     if wanted.attention != AUTO:
         return profile
-    names = backends_for_auto(wanted, detect_capabilities(device))
-    timed = () if len(names) < 2 else time_backends(
-        names, shape_of(architecture, width, height), getattr(torch, profile.dtype), device
-    )  # fmt: skip
-    chosen = fastest(timed)
-    log.info("attention: %s%s", chosen, "".join(f"; {_words(one)}" for one in timed))
+    machine, shape = detect_capabilities(device), shape_of(architecture, width, height)
+    names = backends_for_auto(wanted, machine)
+    situation = repr((machine.name, torch.__version__, diffusers.__version__, profile.dtype, tuple(shape), names))
+    before = _read(kept)
+    chosen = before.get(situation)
+    if chosen in names:
+        log.info("attention: %s, as was chosen before", chosen)
+    else:
+        timed = () if len(names) < 2 else time_backends(names, shape, getattr(torch, profile.dtype), device)
+        chosen = fastest(timed)
+        log.info("attention: %s%s", chosen, "".join(f"; {_words(one)}" for one in timed))
+        if kept is not None:
+            _write(kept, before | {situation: chosen})
     return profile.model_copy(update={"acceleration": wanted.model_copy(update={"attention": chosen})})
+
+
+def fetch_kernels(wanted: Iterable[Acceleration], device: torch.device) -> dict[str, str | None]:
+    """Downloads the attention kernels that such options may use here; by backend, why one could not be fetched."""
+    machine = detect_capabilities(device)
+    names = [
+        name
+        for each in wanted
+        for name in (backends_for_auto(each, machine) if each.attention == AUTO else (each.attention,))
+        if is_from_hub(name) and not refusals(each.model_copy(update={"attention": name}), machine)
+    ]
+    return {name: _fetched(name) for name in dict.fromkeys(names)}
+
+
+def _fetched(name: str) -> str | None:
+    try:
+        with attention_backend(name):
+            return None
+    except Exception as problem:  # noqa: BLE001 - of the hub, of the package kernels, or of the kernel's own code
+        return f"{type(problem).__name__}: {(str(problem).splitlines() or [''])[0]}"
+
+
+def _read(kept: Path | None) -> dict[str, str]:
+    try:
+        found: Any = {} if kept is None else json.loads(kept.read_text())
+    except (OSError, ValueError):  # there is none yet, or what is there is no use
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _write(kept: Path, choices: dict[str, str]) -> None:
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    part = kept.with_name(f"{kept.name}.{os.getpid()}")
+    part.write_text(json.dumps(choices, indent=2) + "\n")
+    part.replace(kept)
 
 
 def _timed(name: str, expected: Tensor, q: Tensor, k: Tensor, v: Tensor) -> TimedBackend:

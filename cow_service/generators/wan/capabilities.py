@@ -120,6 +120,12 @@ def backends_for_auto(acceleration: Acceleration, available: Capabilities) -> tu
     )
 
 
+def is_from_hub(name: str) -> bool:
+    """Whether diffusers downloads the kernel of an attention backend."""
+    backend = ATTENTION_BACKENDS.get(name)
+    return backend is not None and backend.package == "kernels"
+
+
 def _attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     name, backend = wanted.attention, ATTENTION_BACKENDS.get(wanted.attention)
     if name == AUTO:

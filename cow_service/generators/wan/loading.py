@@ -52,7 +52,8 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
     max_area = int(manifest.defaults["max_area"])
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
-        profile = with_attention(profile, manifest.architecture, *clip_size(max_area, *USUAL_SIDES), device)
+        kept = settings.data_dir / "attention.json"
+        profile = with_attention(profile, manifest.architecture, *clip_size(max_area, *USUAL_SIDES), device, kept)
         pipeline, group = _loaded(manifest, profile, settings, device)
     revisions = _revisions(manifest, profile, settings)
     repository = manifest.sources["transformer"].repository if manifest.sources else None

@@ -19,8 +19,8 @@ from cow_service.weights.manifests import Manifest
 BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
 FLOAT8 = 1
 BLOCKS_AT_ONCE = 2  # of the transformer's, with `offload: group`: one computes while the next one comes
-# Of blocks that are moved one by one: copies of all are pinned before the originals go, and PyTorch rounds every pinned
-# tensor up to a power of two. In the 14B model's blocks, 10 matrices of 52 MB take 67 MB each, and 2 of 142 MB 268 MB.
+# Of blocks that are moved one by one and pinned for it: PyTorch rounds every pinned tensor up to a power of two. In the
+# 14B model's blocks, 10 matrices of 52 MB take 67 MB each, and 2 of 142 MB 268 MB.
 PINNED = 1.5
 BASE_PARTS = ("text_encoder", "image_encoder", "vae")
 CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes or "max"
@@ -52,8 +52,8 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
         "sequential": 0,
     }[wanted.offload]
     through_host = wanted.offload != "none" or wanted.fp8 != "none"
-    pinned = int(PINNED * stored["transformer"]) if wanted.offload == "group" else 0
-    return Need(held, wanted.ranks * (whole + pinned) if through_host else 0)
+    more = int((PINNED - 1) * stored["transformer"]) if wanted.offload == "group" else 0
+    return Need(held, wanted.ranks * (whole + more) if through_host else 0)
 
 
 def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, device: torch.device) -> None:
