@@ -147,6 +147,10 @@ class Passes:
             self.computed.append(1)
 
         transformer.register_forward_pre_hook(passed)
+        if getattr(transformer, "_is_cached", False):  # by cache-dit, which calls the layers that it does not skip
+            last = cast(Any, transformer).blocks[-1]
+            last.forward = self._counting(last.forward)
+            return
         # A cache is a hook of diffusers' own, which calls the layer's original forward unless it skips it.
         registry = getattr(cast(Any, transformer).blocks[-1], "_diffusers_hook", None)
         references = [hook.fn_ref for hook in registry.hooks.values()] if registry else []
@@ -154,13 +158,14 @@ class Passes:
         if caching is None:
             transformer.register_forward_pre_hook(computed)
             return
-        original = caching.original_forward
+        caching.original_forward = self._counting(caching.original_forward)
 
+    def _counting(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def counted(*args: Any, **kwargs: Any) -> Any:
             self.computed.append(1)
             return original(*args, **kwargs)
 
-        caching.original_forward = counted
+        return counted
 
 
 @dataclass(frozen=True)

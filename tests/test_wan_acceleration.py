@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from torch import Tensor
 
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
 from cow_service.generators.wan import acceleration as subject
-from cow_service.generators.wan.acceleration import accelerate, reset_cache
+from cow_service.generators.wan.acceleration import accelerate
 from cow_service.generators.wan.capabilities import (
     ATTENTION_BACKENDS,
     MINIMUM_VERSIONS,
@@ -33,6 +34,7 @@ from cow_service.generators.wan.capabilities import (
 )
 from cow_service.generators.wan.lora import add_lora
 from cow_service.generators.wan.profiles import Acceleration
+from cow_service.generators.wan.step_caches import reset_cache
 
 CPU = torch.device("cpu")
 WIDTH = 24  # of the toy's hidden states
@@ -101,6 +103,7 @@ def counted(pipeline: WanImageToVideoPipeline) -> list[int]:
     counts = [0] * LAYERS
     for index, block in enumerate(pipeline.transformer.blocks):
 
+        @wraps(block.forward)  # cache-dit reads its signature
         def computed(*args: Any, _index: int = index, _forward: Any = block.forward, **kwargs: Any) -> Any:
             counts[_index] += 1
             return _forward(*args, **kwargs)
@@ -226,6 +229,61 @@ def test_a_pipeline_is_accelerated_once():
     accelerate(pipeline, Acceleration(**FIRST_BLOCK), CPU)
     with pytest.raises(GeneratorUnavailable, match=r"`cache: first-block` does not work here: .*already been enabled"):
         accelerate(pipeline, Acceleration(**FIRST_BLOCK), CPU)
+
+
+# DBCache, which counts passes: whole clips
+
+DB = {"cache": "dbcache", "cache_threshold": 1e9}
+with_cache_dit = pytest.mark.skipif(find_spec("cache_dit") is None, reason="cache-dit is not installed")
+
+
+def dbcached(pipeline: Any, steps: int, branches: int = 2, apart: float = 20.0) -> list[Tensor]:
+    """The passes of a clip; what is near in time is near in its inputs, as in a real one."""
+    reset_cache(pipeline.transformer, steps, branches)
+    found: list[Tensor] = []
+    for step in range(steps):
+        for branch in ("cond", "uncond")[:branches]:
+            seed = 1 if branch == "cond" else 2
+            found.append(forward(pipeline.transformer, seed, 1000.0 - apart * step, branch))
+    reset_cache(pipeline.transformer, steps, branches)
+    return found
+
+
+@with_cache_dit
+def test_dbcache_skips_blocks_within_its_limits_and_forgets_between_clips():
+    pipeline, plain = toy(), toy()
+    counts = counted(pipeline)
+    accelerate(pipeline, Acceleration(**DB), CPU)
+    for steps, branches, computed in ((10, 2, 8), (5, 1, 2), (10, 2, 8)):
+        counts[:] = [0] * LAYERS
+        found, wanted = dbcached(pipeline, steps, branches), dbcached(plain, steps, branches)
+        assert counts == [steps * branches, computed, computed], (steps, branches)
+        warm = -(-steps // 5) * branches
+        assert same(found[:warm], wanted[:warm]), "the first fifth"
+        assert not same(found[warm:], wanted[warm:])
+        assert all(error(ours, theirs) < 0.05 for ours, theirs in zip(found, wanted, strict=True)), "branches are apart"
+
+
+@with_cache_dit
+def test_dbcache_that_allows_no_change_is_exact():
+    exact = toy()
+    accelerate(exact, Acceleration(**{**DB, "cache_threshold": 0.0}), CPU)
+    assert same(dbcached(exact, 6), dbcached(toy(), 6))
+    with pytest.raises(GeneratorUnavailable, match="already been enabled"):
+        accelerate(exact, Acceleration(**DB), CPU)
+
+
+@with_cache_dit
+def test_what_is_extrapolated_is_nearer():
+    """A clip whose inputs change evenly: by TaylorSeer the skipped passes follow the change."""
+    wanted = dbcached(toy(), 10, 1, apart=0.05)
+    off: list[float] = []
+    for order in (0, 1):
+        pipeline = toy()
+        accelerate(pipeline, Acceleration(**DB, cache_taylor_order=order), CPU)
+        found = dbcached(pipeline, 10, 1, apart=0.05)
+        off.append(sum(error(ours, theirs) for ours, theirs in zip(found, wanted, strict=True)))
+    assert 0 < off[1] < off[0]
 
 
 # Compiled blocks
@@ -558,6 +616,17 @@ def with_capability(major: int, minor: int) -> Capabilities:
             "cache: mag needs `mag_ratios`, measured on these weights; give them, or choose first-block.",
         ),
         (
+            {"cache": "dbcache"},
+            without("cache-dit"),
+            "cache: dbcache needs the package cache-dit 1.5.0 or newer, which is not installed; install it, or choose "
+            "first-block.",
+        ),
+        (
+            {"cache": "dbcache", "guidance_parallel": True},
+            H200,
+            "cache: dbcache is for one GPU; choose mag or none.",
+        ),
+        (
             {"cache": "first-block", "context_parallel": 2},
             H200,
             "cache: GPUs that share a video would not skip the same steps with first-block; choose mag or none.",
@@ -683,7 +752,7 @@ def test_our_tables_are_those_of_diffusers():
 
 @pytest.mark.slow
 def test_nothing_optional_is_imported_before_it_is_needed():
-    suspects = ("torchao", "peft", "accelerate")
+    suspects = ("torchao", "peft", "accelerate", "cache_dit")
     code = f"import sys, {subject.__name__}; print(*[m for m in {suspects} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == []

@@ -18,6 +18,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from cow_service.generators.wan import acceleration
 from cow_service.generators.wan.checkpoints import load_transformer
 from cow_service.generators.wan.profiles import Profile
+from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.weights.manifests import load_manifests
 
@@ -305,6 +306,19 @@ def test_the_plan_says_what_would_be_run_and_runs_nothing(
     else:
         assert "group offload: refused. offload: group needs a GPU" in told
         assert "Not installed here: flash-attn>=2.6.3" in told
+
+
+@pytest.mark.parametrize("options", [{"cache": "first-block"}, {"cache": "dbcache"}])
+def test_passes_that_a_cache_skips_are_told_from_the_others(options: dict[str, Any]) -> None:
+    """With a threshold that skips whatever may be skipped: dbcache computes the first fifth, then one of four."""
+    profile = Profile(
+        summary="",
+        sampling=Sampling(steps=10, shift=5.0, guidance_scale=5.0),
+        dtype="float32",
+        acceleration=acceleration.Acceleration(cache_threshold=1e9, **options),
+    )
+    timing = wan_models.Studio(SMALLEST, profile).clip(profile.sampling)
+    assert (timing.passes, timing.computed) == (20, 2 if options["cache"] == "first-block" else 8)
 
 
 def with_profile(name: str, **options: Any) -> wan_models.Case:

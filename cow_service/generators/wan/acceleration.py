@@ -19,6 +19,7 @@ from torch import nn
 from cow_service.errors import CowError, GeneratorUnavailable
 from cow_service.generators.wan.capabilities import detect_capabilities, refusals
 from cow_service.generators.wan.profiles import Acceleration
+from cow_service.generators.wan.step_caches import enable_cache
 
 
 def check_device(acceleration: Acceleration, device: torch.device) -> None:
@@ -50,7 +51,7 @@ def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch
         (f"fp8: {wanted.fp8}", wanted.fp8 != "none", lambda: _quantise(transformer, wanted, device)),
         (f"attention: {wanted.attention}", True, lambda: transformer.set_attention_backend(wanted.attention)),
         ("compile: regional", wanted.compile != "none", lambda: _compile(transformer)),
-        (f"cache: {wanted.cache}", wanted.cache != "none", lambda: _cache(transformer, wanted)),
+        (f"cache: {wanted.cache}", wanted.cache != "none", lambda: enable_cache(transformer, wanted)),
     )
 
 
@@ -60,23 +61,6 @@ def _apply(*steps: tuple[str, bool, Callable[[], object]]) -> None:
         if applies:
             with translated(option):
                 apply()
-
-
-def reset_cache(transformer: object, steps: int | None = None) -> None:
-    """Clears the step cache. Call it before every clip, so that no residual of one clip enters the next.
-
-    `steps`: denoising steps of the coming clip, over which mag's ratios are interpolated; by default one step per
-    ratio. Run every forward pass in `transformer.cache_context("cond")` or `("uncond")`: each has its own state.
-    """
-    from diffusers.hooks.mag_cache import MagCacheConfig, nearest_interp  # noqa: PLC0415
-
-    model = cast(Any, transformer)
-    model._reset_stateful_cache()
-    config = model._cache_config
-    if isinstance(config, MagCacheConfig):  # the hooks of all blocks share this one object
-        ratios = cast(Any, config).measured
-        config.num_inference_steps = steps or len(ratios)
-        config.mag_ratios = nearest_interp(ratios, config.num_inference_steps)
 
 
 def _quantise(transformer: Any, wanted: Acceleration, device: torch.device) -> None:
@@ -103,19 +87,6 @@ def _compile(transformer: Any) -> None:
     # Not `compile_repeated_blocks`: that also compiles the wrappers around `forward`, where the cache hooks are.
     for block in transformer.blocks:
         block.forward = torch.compile(block.forward)
-
-
-def _cache(transformer: Any, wanted: Acceleration) -> None:
-    from diffusers.hooks.first_block_cache import FirstBlockCacheConfig  # noqa: PLC0415
-    from diffusers.hooks.mag_cache import MagCacheConfig  # noqa: PLC0415
-
-    if wanted.cache == "first-block":
-        config = FirstBlockCacheConfig(threshold=wanted.cache_threshold)
-    else:
-        ratios = torch.tensor(wanted.mag_ratios)
-        config = MagCacheConfig(threshold=wanted.cache_threshold, num_inference_steps=len(ratios), mag_ratios=ratios)
-        cast(Any, config).measured = ratios
-    transformer.enable_cache(config)
 
 
 def _place(parts: Any, offload: str, device: torch.device) -> None:

@@ -56,6 +56,7 @@ HUB: Mapping[str, str] = {"flash-attn": "flash_hub", "flash-attn-3": "_flash_3_h
 # Distributions and the minimum versions that diffusers accepts (a test compares them).
 MINIMUM_VERSIONS: Mapping[str, str] = {
     "accelerate": "0.17.0",
+    "cache-dit": "1.5.0",
     "flash-attn": "2.6.3",
     "flash-attn-3": "3.0.0",
     "kernels": "0.12.3",
@@ -159,6 +160,11 @@ def _compiling(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
 def _caching(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     if wanted.cache == "mag" and not wanted.mag_ratios:
         yield "cache: mag needs `mag_ratios`, measured on these weights; give them, or choose first-block."
+    if wanted.cache == "dbcache":
+        if "cache-dit" not in available.packages:
+            yield f"cache: dbcache needs {_package('cache-dit')}; install it, or choose first-block."
+        if wanted.ranks > 1:  # it counts passes, of which each GPU sees its own
+            yield "cache: dbcache is for one GPU; choose mag or none."
     if wanted.cache == "first-block" and wanted.context_parallel > 1:
         # Each GPU measures the change of its own shard; if only some skip, the others wait for their tensors forever.
         yield "cache: GPUs that share a video would not skip the same steps with first-block; choose mag or none."

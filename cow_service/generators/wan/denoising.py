@@ -13,9 +13,9 @@ from typing import Any, Literal, TypeAlias, cast
 import torch
 from torch import Tensor
 
-from cow_service.generators.wan.acceleration import reset_cache
 from cow_service.generators.wan.execution import wait_until_done
 from cow_service.generators.wan.sampling import Sampling
+from cow_service.generators.wan.step_caches import reset_cache
 
 Branch: TypeAlias = Literal["cond", "uncond"]  # the guided and the unconditional pass of a step
 StepCallback: TypeAlias = Callable[[int, int], None]
@@ -79,7 +79,8 @@ def denoise(
 
         return share(branch, compute, latents)
 
-    reset_cache(model, sampling.steps)
+    branches = 1 if negative is None else 2
+    reset_cache(model, sampling.steps, branches)
     try:
         for step, time in enumerate(schedule.timesteps):
             velocity = velocity_of("cond", guided, time, prompt)
@@ -90,5 +91,5 @@ def denoise(
             wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
             on_step(step + 1, sampling.steps)
     finally:  # what was kept for the next step would lie in memory while the clip is decoded
-        reset_cache(model, sampling.steps)
+        reset_cache(model, sampling.steps, branches)
     return latents

@@ -31,18 +31,27 @@ class Acceleration(Record):
         description="regional compiles the transformer's block once for all of its layers; the same to rounding. The "
         "first clips of new shapes wait for the compiler.",
     )
-    cache: Literal["none", "first-block", "mag"] = Field(
+    cache: Literal["none", "first-block", "mag", "dbcache"] = Field(
         default="none",
         description="Skips the transformer in steps that would change little, and so changes the frames. first-block "
         "runs the first layer of every step and skips the others if its output changed by less than `cache_threshold`. "
-        "mag decides by `mag_ratios` alone: never in the first fifth of the steps, never more than 3 in a row. Both "
-        "keep one to three copies of the hidden states per guidance branch. Of no use with few, distilled steps.",
+        "mag decides by `mag_ratios` alone: never in the first fifth of the steps, never more than 3 in a row. dbcache "
+        "(the package cache-dit) decides as first-block by a fifth of the layers, with the limits of mag, and can "
+        "extrapolate what it skips (`cache_taylor_order`). All keep one to three copies of the hidden states per "
+        "guidance branch, dbcache as many more as its order. Of no use with few, distilled steps.",
     )
     cache_threshold: float = Field(
         default=0.05,
         ge=0,
-        description="For first-block, relative change of the first layer's output; for mag, the error that may add up. "
-        "0 skips nothing; the larger, the faster and the worse.",
+        description="For first-block and dbcache, relative change of the first layers; for mag, the error that may add "
+        "up. 0 skips nothing; the larger, the faster and the worse.",
+    )
+    cache_taylor_order: int = Field(
+        default=0,
+        ge=0,
+        le=2,
+        description="For dbcache: 0 takes what was computed last for what is skipped, 1 and 2 extrapolate it from its "
+        "last values (TaylorSeer).",
     )
     mag_ratios: tuple[float, ...] = Field(
         default=(),
@@ -109,6 +118,8 @@ class Profile(Record):
     def _ratios_meet_their_steps(self) -> Profile:
         if self.acceleration.cache == "mag" and self.sampling.guidance_window[0] > 0:
             raise ValueError("`cache: mag` counts the steps of each branch: `guidance_window` must begin at 0")
+        if self.acceleration.cache == "dbcache" and self.sampling.guidance_window != (0, 1):
+            raise ValueError("`cache: dbcache` counts passes: `guidance_window` must be [0, 1]")
         return self
 
 
