@@ -335,6 +335,14 @@ def test_weights_become_float8_in_the_blocks_alone():
 
 
 @with_torchao
+def test_a_checkpoint_without_float8_has_none_to_keep():
+    with pytest.raises(
+        GeneratorUnavailable, match=r"`fp8: stored` does not work here: .*no weights in float8.*COW_CHECK"
+    ):
+        accelerate(toy(), Acceleration(fp8="stored"), CPU)
+
+
+@with_torchao
 @pytest.mark.parametrize("options", [FIRST_BLOCK, MAG])
 def test_a_cache_skips_float8_blocks_too(options: dict[str, Any]):
     exact = clip(accelerated(fp8="weights"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,15 @@ def test_fp8(tmp_path: Path, truth: dict[str, torch.Tensor]) -> None:
 
 def test_scaled_fp8(tmp_path: Path, truth: dict[str, torch.Tensor]) -> None:
     """Each fp8 matrix with the number that it is multiplied by: the values use the whole range of the type."""
+    held = scaled_float8()
+    found = loaded(single(tmp_path, held, PREFIX))
+    for name, tensor in truth.items():
+        assert (found[name] - tensor).abs().max() <= 0.07 * tensor.abs().max(), name
+    unscaled = {n: t for n, t in held.items() if "scale" not in n or n == "scaled_fp8"}
+    assert (loaded(single(tmp_path, unscaled))["blocks.0.attn1.to_q.weight"].abs().max() > 400).item()
+
+
+def scaled_float8() -> dict[str, torch.Tensor]:
     held: dict[str, torch.Tensor] = {"scaled_fp8": torch.zeros(2, dtype=torch.float8_e4m3fn)}
     for name, tensor in original_weights().items():
         if matrix(name, tensor):
@@ -97,11 +107,40 @@ def test_scaled_fp8(tmp_path: Path, truth: dict[str, torch.Tensor]) -> None:
             held[name.removesuffix("weight") + "scale_input"] = torch.ones(1)
         else:
             held[name] = tensor.half()
-    found = loaded(single(tmp_path, held, PREFIX))
-    for name, tensor in truth.items():
-        assert (found[name] - tensor).abs().max() <= 0.07 * tensor.abs().max(), name
-    unscaled = {n: t for n, t in held.items() if "scale" not in n or n == "scaled_fp8"}
-    assert (loaded(single(tmp_path, unscaled))["blocks.0.attn1.to_q.weight"].abs().max() > 400).item()
+    return held
+
+
+@pytest.mark.skipif(find_spec("torchao") is None, reason="torchao is not installed")
+@pytest.mark.parametrize("is_scaled", [True, False])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_float8_is_kept_where_asked(tmp_path: Path, is_scaled: bool, dtype: torch.dtype) -> None:
+    """It computes what the same checkpoint does in the model's precision, and takes half of bfloat16's memory."""
+    from torchao.quantization import Float8Tensor
+
+    held = scaled_float8()
+    if not is_scaled:
+        held = {n: t.to(torch.float8_e4m3fn if matrix(n, t) else torch.float16) for n, t in original_weights().items()}
+    file = single(tmp_path, held, PREFIX)
+    kept = load_transformer(file, ARCHITECTURE, dtype, CPU, keep_float8=True)
+    usual = load_transformer(file, ARCHITECTURE, dtype, CPU)
+    small = {name for name, weight in kept.named_parameters() if isinstance(weight, Float8Tensor)}
+    assert small == {name for name, weight in usual.named_parameters() if matrix(name, weight)}
+    assert all(kept.get_parameter(name).qdata.dtype == torch.float8_e4m3fn for name in small)
+    assert all(torch.equal(kept.get_parameter(n).dequantize(), usual.get_parameter(n)) for n in small), "value by value"
+    drawn = torch.Generator().manual_seed(1)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=drawn).to(dtype)
+
+    given = {
+        "hidden_states": random(1, 36, 2, 4, 4),
+        "timestep": torch.tensor([500.0]),
+        "encoder_hidden_states": random(1, 512, 16),
+        "encoder_hidden_states_image": random(1, 17, 1280),
+    }
+    with torch.no_grad():
+        ours, theirs = kept(**given).sample.float(), usual(**given).sample.float()
+    assert (ours - theirs).norm() / theirs.norm() < (1e-6 if dtype == torch.float32 else 0.01)
 
 
 def matrix(name: str, tensor: torch.Tensor) -> bool:

@@ -30,7 +30,14 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("profile", "device", "host"),
-    [("exact", 47.2, 0), ("turbo", 46.9, 0), ("fast", 30.8, 47.2), ("small", 2.1, 63.5), ("small-turbo", 1.9, 63.3)],
+    [
+        ("exact", 47.2, 0),
+        ("turbo", 46.9, 0),
+        ("fast", 30.8, 47.2),
+        ("small", 2.1, 63.5),
+        ("small-turbo", 1.9, 63.3),
+        ("small-float8", 16.4, 30.8),
+    ],
 )
 def test_what_the_published_weights_take(profile: str, device: float, host: float) -> None:
     need = need_of(profile_of(ATI, profile), ATI.parameters, 40)

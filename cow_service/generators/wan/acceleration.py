@@ -18,6 +18,7 @@ from torch import nn
 
 from cow_service.errors import CowError, GeneratorUnavailable
 from cow_service.generators.wan.capabilities import detect_capabilities, refusals
+from cow_service.generators.wan.float8 import check_float8
 from cow_service.generators.wan.profiles import Acceleration
 from cow_service.generators.wan.step_caches import enable_cache
 
@@ -48,7 +49,8 @@ def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch
     """The same for a transformer without the other parts, which stays where it is."""
     check_device(wanted, device)
     _apply(
-        (f"fp8: {wanted.fp8}", wanted.fp8 != "none", lambda: _quantise(transformer, wanted, device)),
+        (f"fp8: {wanted.fp8}", wanted.fp8 in {"weights", "dynamic"}, lambda: _quantise(transformer, wanted, device)),
+        ("fp8: stored", wanted.fp8 == "stored", lambda: check_float8(transformer)),
         (f"attention: {wanted.attention}", True, lambda: transformer.set_attention_backend(wanted.attention)),
         ("compile: regional", wanted.compile != "none", lambda: _compile(transformer)),
         (f"cache: {wanted.cache}", wanted.cache != "none", lambda: enable_cache(transformer, wanted)),

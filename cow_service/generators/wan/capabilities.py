@@ -178,8 +178,10 @@ def _float8(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     own, needed = available.compute_capability, f"compute capability {dotted(ADA)} or more"
     if wanted.fp8 == "dynamic" and (own or (0, 0)) < ADA:
         yield f"fp8: dynamic needs a GPU of {needed}, and {available.description}; choose none."
-    if wanted.fp8 == "weights" and wanted.compile != "none" and own and own < ADA:  # Triton has no float8 there
-        yield f"fp8: weights can only be compiled for {needed}, and {available.description}; choose `compile: none`."
+    held = wanted.fp8 in {"stored", "weights"}
+    if held and wanted.compile != "none" and own and own < ADA:  # Triton has no float8 there
+        remedy = "choose `compile: none`"
+        yield f"fp8: {wanted.fp8} can only be compiled for {needed}, and {available.description}; {remedy}."
 
 
 def _offloading(wanted: Acceleration, available: Capabilities) -> Iterator[str]:

@@ -23,13 +23,15 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from cow_service.errors import CheckpointInvalid
+from cow_service.generators.wan.float8 import held_in_float8
 from cow_service.weights.building import listed
 
 PREFIXES = ("model.diffusion_model.", "diffusion_model.")  # of names in one-file checkpoints
 SCALE = ".scale_weight"  # one number per fp8 weight: what it is multiplied by
 UNUSED = (".scale_input", "scaled_fp8")  # for fp8 arithmetic, and the marker that scales are there
 PICKLES = {".pth", ".pt", ".bin", ".ckpt", ".pkl", ".pickle"}
-FLOATING = {"F64", "F32", "F16", "BF16", "F8_E4M3", "F8_E5M2"}
+FLOAT8 = {"F8_E4M3", "F8_E5M2"}
+FLOATING = {"F64", "F32", "F16", "BF16", *FLOAT8}
 IMAGE_DIM = 1280  # of the image encoder, fixed in the original models
 IN_CHANNELS = 36  # noise, mask and image
 TEXT_LENGTH = 512  # tokens, fixed by the model
@@ -48,10 +50,11 @@ class _Entry:
 
 
 def load_transformer(
-    path: Path, architecture: Architecture, dtype: torch.dtype, device: torch.device
+    path: Path, architecture: Architecture, dtype: torch.dtype, device: torch.device, *, keep_float8: bool = False
 ) -> WanTransformer3DModel:
     """The transformer of a folder or file, in `dtype` (norms and time embedding stay float32), on `device`.
 
+    `keep_float8`: matrices of the blocks that the checkpoint has in float8 stay so, for torchao.
     `architecture` has the sizes of a file that comes without a `config.json`, named as in the original configuration.
     Raises `CheckpointInvalid` naming every file, name or shape that is wrong.
     """
@@ -60,7 +63,7 @@ def load_transformer(
     entries = _headers(files)
     model = _empty_model(config)
     sources = _match_names(entries, model.state_dict(), original)
-    _load_weights(model, sources, entries, dtype, device)
+    _load_weights(model, sources, entries, dtype, device, keep_float8)
     return model.eval().requires_grad_(False)
 
 
@@ -223,6 +226,7 @@ def _load_weights(
     entries: Mapping[str, _Entry],
     dtype: torch.dtype,
     device: torch.device,
+    keep_float8: bool,
 ) -> None:
     """Reads the weights, one at a time and file after file, straight to their device."""
     precise = tuple(model._keep_in_fp32_modules or ())  # pyright: ignore[reportPrivateUsage]
@@ -232,12 +236,15 @@ def _load_weights(
         try:
             with safe_open(file, framework="pt", device=str(device)) as opened:
                 for name, source in here:
-                    tensor = opened.get_tensor(entries[source].key)
-                    scale = source.removesuffix(".weight") + SCALE
-                    if source.endswith(".weight") and scale in entries:
-                        tensor = tensor.float() * _scale(entries[scale], device)
+                    entry, tensor = entries[source], opened.get_tensor(entries[source].key)
+                    key = source.removesuffix(".weight") + SCALE
+                    scale = _scale(entries[key], device) if source.endswith(".weight") and key in entries else None
+                    if keep_float8 and entry.dtype in FLOAT8 and len(entry.shape) == 2 and name.startswith("blocks."):
+                        state[name] = held_in_float8(tensor, scale, dtype)
+                        continue
                     keep = any(part in precise for part in name.split("."))
-                    state[name] = tensor.to(torch.float32 if keep else dtype)
+                    exact = tensor if scale is None else tensor.float() * scale
+                    state[name] = exact.to(torch.float32 if keep else dtype)
         except (SafetensorError, OSError) as error:
             raise CheckpointInvalid(f"{file.name} is damaged ({_reason(error)}). Download it again.") from error
     model.load_state_dict(state, strict=True, assign=True)

@@ -154,12 +154,14 @@ def _transformer(
 ) -> WanTransformer3DModel:
     """With its LoRA."""
     # With offloading or quantisation the device need not hold all unquantised weights at once.
-    direct = profile.acceleration.offload == "none" and profile.acceleration.fp8 == "none"
+    fp8 = profile.acceleration.fp8
+    direct = profile.acceleration.offload == "none" and fp8 in {"none", "stored"}
     transformer = load_transformer(
         _folder("transformer", manifest, settings),
         manifest.architecture,
         getattr(torch, profile.dtype),
         device if direct else torch.device("cpu"),
+        keep_float8=fp8 == "stored",
     )
     if profile.lora is not None:
         file = _folder(profile.lora.source, manifest, settings) / manifest.sources[profile.lora.source].files[0]

@@ -51,7 +51,9 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
         "group": stored["vae"] + BLOCKS_AT_ONCE * stored["transformer"] // blocks,
         "sequential": 0,
     }[wanted.offload]
-    through_host = wanted.offload != "none" or wanted.fp8 != "none"
+    through_host = wanted.offload != "none" or wanted.fp8 in {"weights", "dynamic"}
+    if wanted.fp8 == "stored":
+        whole = sum(stored.values())
     more = int((PINNED - 1) * stored["transformer"]) if wanted.offload == "group" else 0
     return Need(held, wanted.ranks * (whole + more) if through_host else 0)
 

@@ -58,11 +58,12 @@ class Acceleration(Record):
         description="For mag: by how much the model's residual grows from each step to the next, measured on these "
         "weights. They are spread over the steps of a clip.",
     )
-    fp8: Literal["none", "weights", "dynamic"] = Field(
+    fp8: Literal["none", "stored", "weights", "dynamic"] = Field(
         default="none",
         description="Stores the linear layers of the transformer's blocks as float8, half of bfloat16's memory; norms, "
-        "embeddings and the last layer stay as they are. Both change the frames slightly. weights computes in the "
-        "model's precision, and is slower than none; dynamic also computes in float8, and is faster where compiled.",
+        "embeddings and the last layer stay as they are. stored keeps the float8 of a checkpoint that has it, value by "
+        "value; weights and dynamic round, and so change the frames slightly. stored and weights compute in the "
+        "model's precision, slower than none; dynamic also computes in float8, and is faster where compiled.",
     )
     offload: Literal["none", "model", "group", "sequential"] = Field(
         default="none",
