@@ -9,7 +9,7 @@ would compare a whole tensor with a shard.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -23,12 +23,20 @@ from cow_service.generators.wan.profiles import Acceleration
 from cow_service.generators.wan.step_caches import enable_cache
 
 
-def check_device(acceleration: Acceleration, device: torch.device) -> None:
-    """Raises `GeneratorUnavailable` listing everything that the device cannot do. Nothing is loaded."""
+def check_device(
+    acceleration: Acceleration, device: torch.device, others: Mapping[str, Acceleration] | None = None
+) -> None:
+    """Raises `GeneratorUnavailable` listing everything that the device cannot do. Nothing is loaded.
+
+    `others`: those of the model's profiles, of which the error names the ones that the device can run.
+    """
     with translated(f"device: {device}"):
-        sentences = refusals(acceleration, detect_capabilities(device))
+        machine = detect_capabilities(device)
+    sentences = refusals(acceleration, machine)
     if sentences:
-        raise GeneratorUnavailable(f"{' '.join(sentences)} Another profile may do (COW_PROFILE).")
+        able = ", ".join(name for name, each in (others or {}).items() if not refusals(each, machine))
+        remedy = f"This machine can run: {able}" if able else "Another profile may do"
+        raise GeneratorUnavailable(f"{' '.join(sentences)} {remedy} (COW_PROFILE).")
 
 
 def accelerate(pipeline: object, acceleration: Acceleration, device: torch.device) -> None:

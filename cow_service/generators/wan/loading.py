@@ -45,7 +45,9 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     manifest = load_manifests()[name]
     profile = profile_of(manifest, settings.profile)
     device = choose_device(settings.device, GeneratorUnavailable)
-    check_device(profile.acceleration, device)
+    check_device(
+        profile.acceleration, device, {each: profile_of(manifest, each).acceleration for each in manifest.profiles}
+    )
     own = settings.checkpoints.get(name)
     if own is not None:
         checkpoint_files(own)
