@@ -56,6 +56,7 @@ from cow_service.generators.wan.attention import AttentionShape, TimedBackend, f
 from cow_service.generators.wan.capabilities import ATTENTION_BACKENDS, detect_capabilities, refusals
 from cow_service.generators.wan.pipeline import image_token_count
 from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
+from cow_service.generators.wan.step_caches import FIRST_LAYERS
 from cow_service.generators.wan.tracks import nearest_lengths
 from cow_service.weights.device import choose_device
 from cow_service.weights.manifests import load_manifests
@@ -150,7 +151,8 @@ def _seconds(timings: list[Timing], steps_of_profile: int) -> dict[str, Any]:
 def _flops(profile: Profile, case: Case, timing: Timing, image_tokens: int) -> int:
     """Of one clip's denoising; of a pass that the cache skipped, only what is computed before it decides."""
     size = case.manifest.architecture, case.num_frames, case.width, case.height, image_tokens
-    looked_at = 1 if profile.acceleration.cache == "first-block" else 0
+    layers = int(case.manifest.architecture["num_layers"])
+    looked_at = {"first-block": 1, "dbcache": max(1, layers // FIRST_LAYERS)}.get(profile.acceleration.cache, 0)
     skipped = timing.passes - timing.computed
     return timing.computed * pass_flops(*size) + skipped * pass_flops(*size, layers=looked_at)
 

@@ -5,6 +5,7 @@ Graphics cards are described, never needed: what only they can do is tested as a
 
 from __future__ import annotations
 
+import gc
 import json
 import subprocess
 import sys
@@ -271,6 +272,23 @@ def test_dbcache_that_allows_no_change_is_exact():
     assert same(dbcached(exact, 6), dbcached(toy(), 6))
     with pytest.raises(GeneratorUnavailable, match="already been enabled"):
         accelerate(exact, Acceleration(**DB), CPU)
+
+
+@with_cache_dit
+@pytest.mark.parametrize("order", [0, 1])
+def test_dbcache_keeps_nothing_between_clips(order: int):
+    def kept() -> int:
+        gc.collect()
+        # By `type`: `isinstance` asks for `__class__`, at which some objects warn.
+        tensors = (each for each in gc.get_objects() if issubclass(type(each), Tensor))
+        held = (each for each in tensors if type(each) is not torch.nn.Parameter)
+        return sum(each.numel() for each in held if each.shape[-1:] == (WIDTH,))
+
+    pipeline = toy()
+    accelerate(pipeline, Acceleration(**DB, cache_taylor_order=order), CPU)
+    before = kept()
+    dbcached(pipeline, 10)
+    assert kept() == before
 
 
 @with_cache_dit

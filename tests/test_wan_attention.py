@@ -117,10 +117,25 @@ def test_the_next_start_chooses_the_same(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(timed) == 1
     assert chosen("native", "_native_math", "flash") == "_native_math"
     assert chosen("native", "_native_math") == "native"
+    monkeypatch.setattr(attention, "_fetched", lambda name: "offline" if name == "native" else None)
+    chosen("native", "_native_math")
+    assert len(timed) == 3, "what cannot be fetched any more is chosen anew"
+    monkeypatch.setattr(attention, "_fetched", lambda name: None)
     kept.write_text("{damaged")
-    assert chosen("native", "_native_math", "flash") == "flash"
-    assert len(timed) == 3
+    chosen("native", "_native_math", "flash")
+    assert len(timed) == 4
     assert sorted(each.name for each in kept.parent.iterdir()) == ["attention.json"]
+
+
+def test_a_choice_is_kept_only_where_all_were_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kernel that could not be fetched this time may be there the next time."""
+    timed = (TimedBackend("native", 1.0, 0.0), TimedBackend("_native_math", None, None, "offline"))
+    monkeypatch.setattr(attention, "time_backends", lambda *_: timed)
+    monkeypatch.setattr(attention, "backends_for_auto", lambda *_: ("native", "_native_math"))
+    auto = profile_of(TINY, "exact").model_copy(update={"acceleration": Acceleration(attention="auto")})
+    found = attention.with_attention(auto, TINY.architecture, 128, 64, CPU, tmp_path / "kept.json")
+    assert found.acceleration.attention == "native"
+    assert not (tmp_path / "kept.json").exists()
 
 
 def test_kernels_of_the_hub_are_fetched_beforehand(monkeypatch: pytest.MonkeyPatch) -> None:

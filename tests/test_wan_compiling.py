@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -60,6 +61,38 @@ def test_no_clip_waits_for_the_compiler(
     with cpu_threads(model.threads):  # as for a clip: compiled code holds for a number of threads
         compile_for(model.pipeline, model.denoise, model.profile.sampling, sizes)
     assert graphs.frame_count == compiled
+
+
+@pytest.mark.slow
+def test_the_usual_size_runs_its_own_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Also after code for any size, which would fit: it is compiled for more than is needed, and slower."""
+    ran: list[int] = []
+    compiled: list[int] = []
+
+    def backend(graph: torch.fx.GraphModule, _: object) -> Any:
+        number = len(compiled)
+        compiled.append(number)
+
+        def run(*args: Any) -> Any:
+            ran.append(number)
+            return graph(*args)
+
+        return run
+
+    compiler = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda function: compiler(function, backend=backend))
+    able = detect_capabilities(torch.device("cpu")).model_copy(update={"compiler": True})
+    monkeypatch.setattr(acceleration, "detect_capabilities", lambda device: able)
+    monkeypatch.setattr(loading, "profile_of", lambda manifest, name: COMPILED)
+    torch._dynamo.reset()
+    model = loaded(tmp_path, warmup=True)._model
+    assert compiled == [0, 1]
+    for size, number in ((ClipSize(112, 64, 81), 0), (ClipSize(112, 64, 9), 1), (ClipSize(112, 64, 81), 0)):
+        ran.clear()
+        with cpu_threads(model.threads):
+            compile_for(model.pipeline, model.denoise, model.profile.sampling, [size])
+        assert set(ran) == {number}
+    torch._dynamo.reset()
 
 
 def test_it_can_be_left_to_the_first_clip(graphs: CompileCounter, tmp_path: Path) -> None:

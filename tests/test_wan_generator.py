@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -337,6 +338,22 @@ def kept_states(pipeline: WanTrackPipeline) -> int:
     registries = [getattr(module, "_diffusers_hook", None) for module in pipeline.transformer.modules()]
     hooks = [hook for registry in registries if registry is not None for hook in registry.hooks.values()]
     return sum(len(hook.state_manager._state_cache) for hook in hooks if hasattr(hook, "state_manager"))
+
+
+def test_parts_that_are_moved_one_by_one_leave_before_the_steps(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last encoder would stay on the GPU beside the transformer: its hook only knows the part before it."""
+    made = toys.generators.get("tiny-ati")
+    assert isinstance(made, WanGenerator)
+    pipeline, heard = pipeline_of(toys), list[str]()
+    acceleration = made._model.profile.acceleration.model_copy(update={"offload": "model"})
+    profile = made._model.profile.model_copy(update={"acceleration": acceleration})
+    monkeypatch.setattr(made, "_model", replace(made._model, profile=profile))
+    denoise, encode = pipeline.denoise, pipeline.encode_prompt
+    monkeypatch.setattr(pipeline, "maybe_free_model_hooks", lambda: heard.append("freed"))
+    monkeypatch.setattr(pipeline, "denoise", lambda *args: (heard.append("steps"), denoise(*args))[1])
+    monkeypatch.setattr(pipeline, "encode_prompt", lambda **args: (heard.append("text"), encode(**args))[1])
+    simulate(toys, video=False, generator_options={"prompt": "a text that was never encoded"})
+    assert heard == ["text", "freed", "steps", "freed"]
 
 
 def test_nothing_of_the_steps_is_kept_while_a_clip_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

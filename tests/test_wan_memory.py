@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan import memory
@@ -73,6 +74,24 @@ def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint: Path, m
     monkeypatch.setattr(memory, "_host", lambda: need["portable"].device - 1)
     with pytest.raises(GeneratorUnavailable, match="of this machine's memory"):
         check_memory(ATI, "portable", checkpoint, checkpoint, torch.device("cpu"))
+
+
+def test_float8_is_kept_only_where_there_is_some(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Told before anything is read, and no such profile is recommended."""
+    monkeypatch.setattr(memory, "check_device", lambda wanted, device: None)
+    monkeypatch.setattr(memory, "_room", lambda device: 10**12)
+    with pytest.raises(GeneratorUnavailable, match=r"'small-float8' keeps the float8 .* has none.*COW_CHECKPOINTS"):
+        check_memory(ATI, "small-float8", checkpoint, checkpoint, GPU)
+    monkeypatch.setattr(memory, "_room", lambda device: 20_000)
+    with pytest.raises(GeneratorUnavailable) as caught:
+        check_memory(ATI, "exact", checkpoint, checkpoint, GPU)
+    assert "small-float8" not in caught.value.detail
+    weights = load_file(next((checkpoint / "transformer").glob("*.safetensors")))
+    save_file({name: each.to(torch.float8_e4m3fn) for name, each in weights.items()}, tmp_path / "one.safetensors")
+    monkeypatch.setattr(memory, "_room", lambda device: 10**12)
+    check_memory(ATI, "small-float8", tmp_path / "one.safetensors", checkpoint, GPU)
 
 
 def test_what_cannot_be_read_is_left_to_loading(checkpoint: Path, tmp_path: Path) -> None:

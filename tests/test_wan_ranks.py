@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,14 @@ import torch
 from servers import BODY, Served, eventually
 from torch import Tensor
 
-from cow_service.errors import Canceled, CheckpointInvalid
+from cow_service.errors import (
+    Canceled,
+    CheckpointInvalid,
+    DeviceFailed,
+    GeneratorOutOfMemory,
+    GeneratorUnavailable,
+    WorkerEnded,
+)
 from cow_service.generators.wan import conditioning, loading
 from cow_service.generators.wan.acceleration import accelerate_transformer
 from cow_service.generators.wan.compiling import CONDITION_CHANNELS
@@ -58,7 +66,6 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LoadedModel]:
     loaded = model(tmp_path_factory.mktemp("shared"), "exact-2")
     yield loaded
     group_of(loaded).close()
-    torch.distributed.destroy_process_group()
 
 
 def given() -> Conditioning:
@@ -109,6 +116,64 @@ def test_a_rank_that_cannot_load_says_why(tmp_path: Path) -> None:
         group.denoise(NOISE, given(), profile.sampling, lambda done, total: None)
 
 
+def broken(folder: Path, alone: LoadedModel, on_step: Callable[[LoadedModel], None]) -> tuple[Exception, float]:
+    """What a clip raises in whose second step something happens, and the seconds until then. A new group goes on."""
+    loaded = model(folder, "exact-2")
+    begun = time.monotonic()
+    with pytest.raises(Exception) as caught:  # noqa: PT011
+        latents(loaded, lambda done, total: on_step(loaded) if done == 2 else None)
+    took = time.monotonic() - begun
+    with pytest.raises(DeviceFailed, match="share clips do so no more"):  # by which a worker is replaced
+        latents(loaded)
+    assert not torch.distributed.is_initialized()
+    again = model(folder, "exact-2")
+    assert torch.equal(latents(again), latents(alone))
+    with pytest.raises(GeneratorUnavailable, match="another model of this process"):
+        model(folder, "exact-2")
+    group_of(again).close()
+    return caught.value, took
+
+
+def process_of(loaded: LoadedModel) -> subprocess.Popen[bytes]:
+    return group_of(loaded)._ranks[0]._spawned.process
+
+
+def test_a_rank_that_has_no_memory_says_so_once(alone: LoadedModel, shared: LoadedModel, tmp_path: Path) -> None:
+    def run_out(loaded: LoadedModel) -> None:
+        group_of(loaded)._ranks[0].error = GeneratorOutOfMemory("A share of a clip does not fit.")
+        process_of(loaded).kill()
+
+    group_of(shared).close()  # one at a time in a process
+    error, took = broken(tmp_path, alone, run_out)
+    assert isinstance(error, GeneratorOutOfMemory)
+    assert took < 20
+
+
+def test_an_error_of_rank_0_stays_its_own(alone: LoadedModel, tmp_path: Path) -> None:
+    def fail(loaded: LoadedModel) -> None:
+        def forward(*_: object) -> None:
+            raise RuntimeError("a fault of the code")
+
+        loaded.pipeline.transformer.register_forward_pre_hook(forward)
+
+    error, _ = broken(tmp_path, alone, fail)
+    assert str(error) == "a fault of the code"
+
+
+def test_a_rank_that_dies_before_it_is_met_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    met = RankGroup._met
+
+    def lost(group: RankGroup, transformer: object) -> Any:
+        group._ranks[0]._spawned.process.kill()
+        return met(group, transformer)
+
+    monkeypatch.setattr(RankGroup, "_met", lost)
+    begun = time.monotonic()
+    with pytest.raises(WorkerEnded, match="process of one of them ended"):
+        model(tmp_path, "exact-2")
+    assert time.monotonic() - begun < 60
+
+
 # In a server
 
 SLOW_CLIP = {
@@ -125,7 +190,8 @@ def ranks_of(served: Served) -> list[psutil.Process]:
     return [one for one in below if one.status() != psutil.STATUS_ZOMBIE and MODULE in one.cmdline()]
 
 
-def test_a_server_replaces_a_lost_rank_and_ends_them_all(tmp_path: Path) -> None:
+@pytest.mark.timeout(300)  # it loads the model twice, in two processes each
+def test_a_server_replaces_a_lost_rank_and_ends_it_with_its_worker(tmp_path: Path) -> None:
     with Served(tmp_path, COW_WORKERS="true", COW_GENERATOR="tiny-ati", COW_PROFILE="exact-2") as served:
         job = served.submit(SLOW_CLIP)
         eventually(lambda: bool(ranks_of(served)))
@@ -140,11 +206,16 @@ def test_a_server_replaces_a_lost_rank_and_ends_them_all(tmp_path: Path) -> None
         assert worker is not None
         worker.send_signal(signal.SIGKILL)
         eventually(lambda: not second.is_running() or second.status() == psutil.STATUS_ZOMBIE)
-        again = served.http.post("/simulate", json={**SLOW_CLIP, "seed": 1, "generator_options": {"steps": 2}})
-        assert again.status_code == 200, again.text
-        assert again.json()["generator"]["options"]["guidance_parallel"] is True
-        [third] = ranks_of(served)
-    eventually(lambda: not third.is_running())
+
+
+def test_no_rank_outlives_its_server(tmp_path: Path) -> None:
+    with Served(tmp_path, COW_GENERATOR="tiny-ati", COW_PROFILE="exact-2") as served:  # without workers
+        quick = {**SLOW_CLIP, "generator_options": {"steps": 2}}
+        answer = served.http.post("/simulate", json=quick)
+        assert answer.status_code == 200, answer.text
+        assert answer.json()["generator"]["options"]["guidance_parallel"] is True
+        [rank] = ranks_of(served)
+    eventually(lambda: not rank.is_running() or rank.status() == psutil.STATUS_ZOMBIE)
 
 
 # Context parallelism

@@ -223,6 +223,7 @@ class TestABudget:
         assert shares == sorted(shares, reverse=True)
         assert 0.3 < sum(shares) <= 1.001
         assert any("mm" in one["name"] for one in found["kernels"])
+        assert not [one["name"] for one in found["kernels"] if "##" in one["name"]]
 
     def test_whole_clips_are_computed_and_said_to_be(self, parts: Whole) -> None:
         clips = {one["name"]: one for one in parts.found["computed"]}
@@ -246,8 +247,12 @@ def test_a_form_is_left_as_it_was_found() -> None:
 
     before, plain = answer(), wan_bench.Acceleration(attention="native")
     bench.put(plain)
+    last, calls = bench._transformer.blocks[-1], list[int]()
+    handle = last.attn1.register_forward_pre_hook(lambda *_: calls.append(1))
     found = bench.cached()
+    handle.remove()
     assert found["at_skip_s"] > 0
+    assert len(calls) == 2 + 1, "both passes where nothing is skipped, then the first one"
     assert not bench._transformer.is_cache_enabled
     assert torch.equal(answer(), before)
     for dtype in (torch.bfloat16, torch.float32):

@@ -94,6 +94,9 @@ def _quantise(transformer: Any, wanted: Acceleration, device: torch.device) -> N
 
 
 def _compile(transformer: Any) -> None:
+    # Code that was compiled for one size is looked for before that for any size, which would fit as well and is slower:
+    # by default the newest comes first.
+    cast(Any, torch)._C._dynamo.eval_frame._set_lru_cache(False)
     # Not `compile_repeated_blocks`: that also compiles the wrappers around `forward`, where the cache hooks are.
     for block in transformer.blocks:
         block.forward = torch.compile(block.forward)
@@ -135,7 +138,11 @@ def pin(module: nn.Module) -> None:
     diffusers pins copies of all before it lets go of any; what is pinned already it takes as it is.
     """
     for tensor in (*module.parameters(), *module.buffers()):
-        tensor.data = tensor.data.pin_memory()
+        if names := getattr(type(tensor), "tensor_data_names", ()):  # torchao's, which are made of others
+            for name in names:
+                setattr(tensor, name, getattr(tensor, name).pin_memory())
+        else:
+            tensor.data = tensor.data.pin_memory()
 
 
 @contextmanager

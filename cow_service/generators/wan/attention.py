@@ -104,13 +104,13 @@ def with_attention(
     situation = repr((machine.name, torch.__version__, diffusers.__version__, profile.dtype, tuple(shape), names))
     before = _read(kept)
     chosen = before.get(situation)
-    if chosen in names:
+    if chosen in names and _fetched(chosen) is None:
         log.info("attention: %s, as was chosen before", chosen)
     else:
         timed = () if len(names) < 2 else time_backends(names, shape, getattr(torch, profile.dtype), device)
         chosen = fastest(timed)
         log.info("attention: %s%s", chosen, "".join(f"; {_words(one)}" for one in timed))
-        if kept is not None:
+        if kept is not None and all(one.seconds is not None for one in timed):  # else one may be there the next time
             _write(kept, before | {situation: chosen})
     return profile.model_copy(update={"acceleration": wanted.model_copy(update={"attention": chosen})})
 

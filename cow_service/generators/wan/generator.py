@@ -113,6 +113,11 @@ class WanGenerator(WanLimits):
         ):
             compile_for(model.pipeline, model.denoise, model.profile.sampling, sizes)
 
+    def close(self) -> None:
+        """Ends the processes that share its clips."""
+        if self._model.group is not None:
+            self._model.group.close()
+
     def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""
         model, options, sampling = self._model, _options(given), self._sampling(given)
@@ -164,7 +169,7 @@ class WanGenerator(WanLimits):
 
     def _video(self, given: GeneratorInput, width: int, height: int, progress: Callable[[float], None]) -> Image:
         """All frames [F, height, width, 3]."""
-        pipeline, num_frames = self._model.pipeline, given.trajectory.num_frames
+        model, pipeline, num_frames = self._model, self._model.pipeline, given.trajectory.num_frames
         # Drawn on the CPU: a seed gives the same noise whatever the device.
         random = torch.Generator().manual_seed(given.seed)
         noise = torch.randn(latent_shape(width, height, num_frames), generator=random)
@@ -172,8 +177,10 @@ class WanGenerator(WanLimits):
         try:
             sampling = self._sampling(given)
             conditioning = self._conditioning(given, width, height, guided=sampling.guided)
+            if model.profile.acceleration.offload == "model":  # else the last encoder stays beside the transformer
+                pipeline.maybe_free_model_hooks()
             progress(0.0)
-            latents = self._model.denoise(
+            latents = model.denoise(
                 noise, conditioning, sampling, lambda done, total: progress(DENOISING_SHARE * done / total)
             )
             return pipeline.decode(latents)

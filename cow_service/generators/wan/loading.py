@@ -9,7 +9,7 @@ from typing import cast
 
 import torch
 from diffusers import WanTransformer3DModel
-from torch import nn
+from torch import distributed, nn
 
 from cow_service.errors import GeneratorOutOfMemory, GeneratorUnavailable
 from cow_service.generators.wan import conditioning
@@ -45,10 +45,11 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     manifest = load_manifests()[name]
     profile = profile_of(manifest, settings.profile)
     device = choose_device(settings.device, GeneratorUnavailable)
-    check_device(
-        profile.acceleration, device, {each: profile_of(manifest, each).acceleration for each in manifest.profiles}
-    )
     own = settings.checkpoints.get(name)
+    others = {each: profile_of(manifest, each).acceleration for each in manifest.profiles}
+    if own is None:  # what is pulled is not in float8
+        others = {each: other for each, other in others.items() if other.fp8 != "stored"}
+    check_device(profile.acceleration, device, others)
     if own is not None:
         checkpoint_files(own)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
@@ -81,7 +82,12 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
         try:
             generator.compile()
         except GeneratorOutOfMemory as error:  # shorter clips may fit
+            if group is not None:  # which has ended
+                raise
             log.warning("not compiled beforehand: %s", error.detail)
+        except BaseException:
+            generator.close()
+            raise
     return generator
 
 
@@ -115,6 +121,10 @@ def _loaded(
     """The pipeline on its device, and the processes that share its clips, which load at the same time."""
     if manifest.sources:
         _check_weights(manifest, profile, settings, device)
+    if profile.acceleration.ranks > 1 and distributed.is_initialized():
+        raise GeneratorUnavailable(
+            f"'{manifest.name}': another model of this process shares the GPUs. Use one of them."
+        )
     group = None if profile.acceleration.ranks == 1 else RankGroup(manifest.name, profile, settings, device)
     try:
         if manifest.sources:

@@ -12,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable
 from cow_service.generators.wan.acceleration import check_device
+from cow_service.generators.wan.checkpoints import FLOAT8 as FLOAT8_DTYPES
 from cow_service.generators.wan.checkpoints import checkpoint_files
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
 from cow_service.weights.manifests import Manifest
@@ -66,6 +67,12 @@ def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, de
     parameters = _parameters(checkpoint, base)
     if parameters is None:
         return
+    has_float8 = any(dtype in FLOAT8_DTYPES for dtype in _dtypes(checkpoint_files(checkpoint)[1]))
+    if profile_of(manifest, name).acceleration.fp8 == "stored" and not has_float8:
+        raise GeneratorUnavailable(
+            f"The profile '{name}' keeps the float8 of a checkpoint, and that of '{manifest.name}' has none: give one "
+            "that does (COW_CHECKPOINTS), or set COW_PROFILE."
+        )
     blocks = int(manifest.architecture["num_layers"])
     room = _room(device), _host()
     need = need_of(profile_of(manifest, name), parameters, blocks)
@@ -77,6 +84,7 @@ def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, de
         for other in manifest.profiles
         if _short(need_of(profile_of(manifest, other), parameters, blocks), room, device) is None
         and _runs(profile_of(manifest, other), device)
+        and (has_float8 or profile_of(manifest, other).acceleration.fp8 != "stored")
     ]
     remedy = f"Of its profiles fit: {', '.join(fitting)} (COW_PROFILE)." if fitting else "None of its profiles fits."
     raise GeneratorUnavailable(f"The weights of '{manifest.name}' with the profile '{name}' take {short}. {remedy}")
@@ -121,6 +129,14 @@ def _parameters(checkpoint: Path, base: Path) -> dict[str, int] | None:
     except (CheckpointInvalid, SafetensorError, OSError):
         return None
     return counts if all(counts.values()) else None
+
+
+def _dtypes(files: Iterable[Path]) -> set[str]:
+    found: set[str] = set()
+    for file in files:
+        with safe_open(file, framework="pt") as held:
+            found |= {held.get_slice(name).get_dtype() for name in held.keys()}  # noqa: SIM118
+    return found
 
 
 def _count(files: Iterable[Path]) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, distributed
 
-from cow_service.errors import CowError, DeviceFailed, GeneratorOutOfMemory, InternalError, kinds
+from cow_service.errors import CowError, DeviceFailed, GeneratorOutOfMemory, InternalError, WorkerEnded, kinds
 from cow_service.generators.wan.denoising import Conditioning, StepCallback, denoise
 from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.rank_messages import Array, Failed, FromRank, Join, Load, Share, ToRank
@@ -20,6 +20,7 @@ from cow_service.settings import Settings
 from cow_service.weights.device import is_out_of_memory
 
 MODULE = "cow_service.generators.wan.rank"
+POLL_SECONDS = 0.2  # how often the ranks that are met are looked after
 NOTICE_SECONDS = 2.0  # in which the end of a process is noticed, once another one has failed because of it
 
 
@@ -35,21 +36,34 @@ class RankGroup:
         self._sharing: Sharing | None = None
         self._transformer: object = None
         self._is_over = False
+        self._first_error: CowError | None = None
         self._ranks = [_Rank(number, device, self._ended) for number in range(1, self._wanted.ranks)]
         for rank in self._ranks:
             rank.send(Load(rank.number, str(rank.device), name, profile, settings))
 
     def join(self, transformer: object) -> None:
-        """Meets them, once all have loaded. Raises the `CowError` for which one has not."""
+        """Meets them, once all have loaded. Raises the `CowError` for which one has not, or cannot be met."""
         for rank in self._ranks:
             rank.loaded.wait()
         self._check()
-        count = self._wanted.ranks
-        store = distributed.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False)
-        for rank in self._ranks:
-            rank.send(Join(store.port))
         self._transformer = transformer
-        self._sharing = Sharing(transformer, self._wanted, 0, self._device, store)
+        met, errors = threading.Event(), list[BaseException]()
+
+        def meet() -> None:
+            try:
+                self._sharing = self._met(transformer)
+            except BaseException as error:  # noqa: BLE001 - raised below
+                errors.append(error)
+            finally:
+                met.set()
+
+        # Whoever waits for another rank there hears nothing of its end, for minutes or for ever.
+        threading.Thread(target=meet, name="cow-ranks-meet", daemon=True).start()
+        while not met.wait(POLL_SECONDS):
+            self._check()
+        if errors:
+            self._check()
+            raise errors[0]
 
     def denoise(self, noise: Tensor, given: Conditioning, sampling: Sampling, on_step: StepCallback) -> Tensor:
         """As `denoising.denoise`, with all ranks. Raises `DeviceFailed` where one of them was lost."""
@@ -75,39 +89,59 @@ class RankGroup:
         except BaseException as error:
             if stopped:  # between two steps: every rank knows
                 raise
-            self._is_over = True
-            if is_out_of_memory(error) or not isinstance(error, RuntimeError):
+            if is_out_of_memory(error) or not isinstance(error, Exception):
+                self.close()
                 raise
             for rank in self._ranks:  # an error of a connection may be heard before the end of what was connected
                 rank.has_ended.wait(NOTICE_SECONDS / len(self._ranks))
-            raise self._failure() from error
+            lost = self._lost()
+            self.close()
+            if lost is None:  # the error is this process's own
+                raise
+            raise (lost if isinstance(lost, GeneratorOutOfMemory) else _failure(lost)) from error
 
     def close(self) -> None:
-        """Ends the processes."""
+        """Ends the processes. No more clips are shared."""
         self._is_over = True
         for rank in self._ranks:
             rank.end()
+        if self._sharing is not None:
+            self._sharing.leave()
+
+    def _met(self, transformer: object) -> Sharing:
+        count = self._wanted.ranks
+        store = distributed.TCPStore(HOST, 0, count, is_master=True, wait_for_workers=False)
+        for rank in self._ranks:
+            rank.send(Join(store.port))
+        return Sharing(transformer, self._wanted, 0, self._device, store)
 
     def _ended(self) -> None:
         if not self._is_over and self._sharing is not None:
-            self._sharing.abort()
+            self._sharing.leave()
 
     def _check(self) -> None:
-        if self._is_over or any(rank.has_ended.is_set() for rank in self._ranks):
-            raise self._failure()
-
-    def _failure(self) -> CowError:
-        """Why no clip can be shared: the error with which a rank ended, or that one did."""
+        lost = self._lost()
+        if lost is None and not self._is_over:
+            return
         self.close()
+        raise lost if lost is not None and self._sharing is None else _failure(lost)
+
+    def _lost(self) -> CowError | None:
+        """For what a rank has ended; None where none has, but by `close`."""
+        if self._is_over or not any(rank.has_ended.is_set() for rank in self._ranks):
+            return self._first_error
         errors = [rank.error for rank in self._ranks if rank.error is not None]
-        kept = next((error for error in errors if not isinstance(error, InternalError)), None)
-        if kept is not None and (self._sharing is None or isinstance(kept, GeneratorOutOfMemory)):
-            return kept
-        reason = kept.detail if kept is not None else "the process of one of them ended."
-        return DeviceFailed(
-            f"The GPUs that share clips do so no more: {reason} A worker process is replaced, with those of its GPUs, "
-            "and the job tried again; without workers (COW_WORKERS=false) restart the server."
-        )
+        unknown = WorkerEnded("The process of one of them ended.")
+        self._first_error = next((error for error in errors if not isinstance(error, InternalError)), unknown)
+        return self._first_error
+
+
+def _failure(lost: CowError | None) -> DeviceFailed:
+    reason = "A clip ended in the middle of a step." if lost is None else lost.detail
+    return DeviceFailed(
+        f"The GPUs that share clips do so no more. {reason} A worker process is replaced, with those of its GPUs, and "
+        "the job tried again; without workers (COW_WORKERS=false) restart the server."
+    )
 
 
 class _Rank:

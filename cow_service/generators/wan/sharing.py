@@ -7,6 +7,8 @@ of a half, or all, split the tokens of each pass in every layer (Ulysses, by dif
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Callable
 from datetime import timedelta
 from typing import Any, cast
@@ -14,6 +16,7 @@ from typing import Any, cast
 import diffusers
 import torch
 from torch import Tensor, distributed
+from torch.distributed import distributed_c10d
 from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
 
 from cow_service.generators.wan.denoising import Branch
@@ -33,6 +36,9 @@ class Sharing:
         """Joins the other ranks: every one has to, at the same time. `store` is where they meet."""
         self._transformer: Any = transformer
         self._wanted, self._rank, self._device = wanted, rank, device
+        self._leaving = threading.Lock()
+        os.environ.setdefault("TORCH_NCCL_ASYNC_ERROR_HANDLING", "0")  # else NCCL's watchdog may end this process
+        self._use_device()
         distributed.init_process_group(
             "nccl" if device.type == "cuda" else "gloo",
             store=store,
@@ -45,6 +51,7 @@ class Sharing:
 
     def prepare(self, noise: Tensor) -> None:
         """Before each clip, of which `noise` [1, 16, T, h, w] has the size: any number of tokens can be split."""
+        self._use_device()
         if self._context is not None:
             tokens = noise[0, 0].numel() // PATCH
             # Parts of different lengths have to tell each other how long they are, in every layer.
@@ -70,11 +77,16 @@ class Sharing:
         distributed.broadcast(said, src=0)
         return bool(said.item())
 
-    @staticmethod
-    def abort() -> None:
+    def leave(self) -> None:
         """Ends whatever waits for another rank, from any thread. The ranks cannot share a clip any more."""
-        if distributed.is_initialized():
-            cast(Any, distributed.group.WORLD).abort()
+        with self._leaving:
+            if distributed.is_initialized():
+                distributed_c10d._abort_process_group()  # pyright: ignore[reportPrivateUsage] - of all subgroups, too
+
+    def _use_device(self) -> None:
+        """Of this thread: diffusers makes some tensors on the current device."""
+        if self._device.type == "cuda":
+            torch.cuda.set_device(self._device)
 
     def _split_context(self) -> Any:
         halves = 2 if self._wanted.guidance_parallel else 1

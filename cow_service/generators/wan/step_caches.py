@@ -67,7 +67,10 @@ def _enable_dbcache(transformer: Any, wanted: Acceleration) -> None:
         enable_separate_cfg=True,
     )
     order = wanted.cache_taylor_order
-    calibrator = cache_dit.TaylorSeerCalibratorConfig(taylorseer_order=order) if order else None
+    calibrator = (
+        # The text is the same in every step.
+        cache_dit.TaylorSeerCalibratorConfig(taylorseer_order=order, enable_encoder_calibrator=False) if order else None
+    )
     cache_dit.enable_cache(transformer, cache_config=config, calibrator_config=calibrator)
 
 
@@ -84,3 +87,5 @@ def _reset_dbcache(transformer: Any, steps: int | None, branches: int) -> None:
         enable_separate_cfg=branches == 2,
     )
     cache_dit.refresh_context(transformer, cache_config=changed)
+    for name in transformer._context_names:  # else the old one would be held until the next pass
+        transformer._context_manager.set_context(name)
