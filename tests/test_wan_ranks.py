@@ -169,7 +169,7 @@ def test_a_rank_that_dies_before_it_is_met_is_noticed(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(RankGroup, "_met", lost)
     begun = time.monotonic()
-    with pytest.raises(WorkerEnded, match="process of one of them ended"):
+    with pytest.raises(WorkerEnded, match="process of one of the GPUs ended"):
         model(tmp_path, "exact-2")
     assert time.monotonic() - begun < 60
 

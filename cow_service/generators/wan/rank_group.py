@@ -131,7 +131,7 @@ class RankGroup:
         if self._is_over or not any(rank.has_ended.is_set() for rank in self._ranks):
             return self._first_error
         errors = [rank.error for rank in self._ranks if rank.error is not None]
-        unknown = WorkerEnded("The process of one of them ended.")
+        unknown = WorkerEnded("The process of one of the GPUs ended.")
         self._first_error = next((error for error in errors if not isinstance(error, InternalError)), unknown)
         return self._first_error
 
