@@ -54,7 +54,7 @@ def rows(case: Case, best: str) -> tuple[Row, ...]:
     return (
         Row("eager", Bench.passes, eager, 2),
         Row("cuDNN", Bench.passes, Acceleration(attention="_native_cudnn"), 2),
-        Row("compiled", Bench.compiled, compiled, 3 + 2 * small, 2 * COMPILE_SECONDS),
+        Row("compiled", Bench.compiled, compiled, 4 + 2 * small, 2 * COMPILE_SECONDS),
         Row("kernels", Bench.kernels, compiled, 2, 5),
         Row("turbo clip", partial(Bench.clip, profile="turbo"), compiled, turbo, OTHER_SECONDS),
         *(Row(f"VAE {name}", partial(Bench.vae, dtype=dtype), None, 0, VAE_SECONDS) for name, dtype in both),

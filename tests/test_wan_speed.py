@@ -205,6 +205,7 @@ class TestABudget:
         assert [name for name in status if name != "build"] == [row.name for row in wan_rows.rows(SMALLEST, "native")]
         compiled = parts.figures("compiled")
         assert len(compiled["pass_s"]) == 2, "the second pass, and the first size again"
+        assert compiled["any_size_tflops"] > 0
         assert (
             min(compiled["cold_s"], compiled["second_size_cold_s"], compiled["second_size_s"], *compiled["pass_s"]) > 0
         )
