@@ -116,22 +116,15 @@ def test_a_rank_that_cannot_load_says_why(tmp_path: Path) -> None:
         group.denoise(NOISE, given(), profile.sampling, lambda done, total: None)
 
 
-def broken(folder: Path, alone: LoadedModel, on_step: Callable[[LoadedModel], None]) -> tuple[Exception, float]:
-    """What a clip raises in whose second step something happens, and the seconds until then. A new group goes on."""
+def broken(folder: Path, on_step: Callable[[LoadedModel], None]) -> Exception:
+    """What a clip raises in whose second step something happens. The clips after it say that a worker is replaced."""
     loaded = model(folder, "exact-2")
-    begun = time.monotonic()
     with pytest.raises(Exception) as caught:  # noqa: PT011
         latents(loaded, lambda done, total: on_step(loaded) if done == 2 else None)
-    took = time.monotonic() - begun
-    with pytest.raises(DeviceFailed, match="share clips do so no more"):  # by which a worker is replaced
+    with pytest.raises(DeviceFailed, match="share clips do so no more"):
         latents(loaded)
     assert not torch.distributed.is_initialized()
-    again = model(folder, "exact-2")
-    assert torch.equal(latents(again), latents(alone))
-    with pytest.raises(GeneratorUnavailable, match="another model of this process"):
-        model(folder, "exact-2")
-    group_of(again).close()
-    return caught.value, took
+    return caught.value
 
 
 def process_of(loaded: LoadedModel) -> subprocess.Popen[bytes]:
@@ -144,20 +137,24 @@ def test_a_rank_that_has_no_memory_says_so_once(alone: LoadedModel, shared: Load
         process_of(loaded).kill()
 
     group_of(shared).close()  # one at a time in a process
-    error, took = broken(tmp_path, alone, run_out)
-    assert isinstance(error, GeneratorOutOfMemory)
-    assert took < 20
+    begun = time.monotonic()
+    assert isinstance(broken(tmp_path, run_out), GeneratorOutOfMemory)
+    assert time.monotonic() - begun < 60, "far less than ranks wait for each other"
+    again = model(tmp_path, "exact-2")
+    assert torch.equal(latents(again), latents(alone))
+    with pytest.raises(GeneratorUnavailable, match="another model of this process"):
+        model(tmp_path, "exact-2")
+    group_of(again).close()
 
 
-def test_an_error_of_rank_0_stays_its_own(alone: LoadedModel, tmp_path: Path) -> None:
+def test_an_error_of_rank_0_stays_its_own(tmp_path: Path) -> None:
     def fail(loaded: LoadedModel) -> None:
         def forward(*_: object) -> None:
             raise RuntimeError("a fault of the code")
 
         loaded.pipeline.transformer.register_forward_pre_hook(forward)
 
-    error, _ = broken(tmp_path, alone, fail)
-    assert str(error) == "a fault of the code"
+    assert str(broken(tmp_path, fail)) == "a fault of the code"
 
 
 def test_a_rank_that_dies_before_it_is_met_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,20 +199,11 @@ def test_a_server_replaces_a_lost_rank_and_ends_it_with_its_worker(tmp_path: Pat
         assert ended["status"] == "succeeded", ended
         [second] = ranks_of(served)
         assert second.pid != first.pid
+        assert ended["result"]["generator"]["options"]["guidance_parallel"] is True
         worker = second.parent()
         assert worker is not None
         worker.send_signal(signal.SIGKILL)
         eventually(lambda: not second.is_running() or second.status() == psutil.STATUS_ZOMBIE)
-
-
-def test_no_rank_outlives_its_server(tmp_path: Path) -> None:
-    with Served(tmp_path, COW_GENERATOR="tiny-ati", COW_PROFILE="exact-2") as served:  # without workers
-        quick = {**SLOW_CLIP, "generator_options": {"steps": 2}}
-        answer = served.http.post("/simulate", json=quick)
-        assert answer.status_code == 200, answer.text
-        assert answer.json()["generator"]["options"]["guidance_parallel"] is True
-        [rank] = ranks_of(served)
-    eventually(lambda: not rank.is_running() or rank.status() == psutil.STATUS_ZOMBIE)
 
 
 # Context parallelism
