@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import EXAMPLES, ROOT
+from conftest import EXAMPLES, ROOT, SCALE
 from truth_mllm import TruthMllm, truth_mllm
 
 from cow_service.evals.items import Item
@@ -28,6 +28,7 @@ from cow_service.evals.runs import Run, read_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(420)]
 SAMPLE = ROOT / "cow-scenes" / "sample"
+KILLS = 1 if SCALE == 1 else 3
 ALL_ARMS = (
     *("never", "always", "auto", "best-of-2", "placebo-still"),
     *("placebo-direction", "encounters", "frames-only", "oracle"),
@@ -172,14 +173,15 @@ def test_a_finished_run_asks_nothing_more_and_says_the_same(done: Done) -> None:
     assert "another seed (0, not 7)" in other.stderr
 
 
-def test_killed_at_three_moments_no_reply_is_asked_for_twice(tmp_path: Path, items: list[Item]) -> None:
+@pytest.mark.soak
+def test_killed_no_reply_is_asked_for_twice(tmp_path: Path, items: list[Item]) -> None:
     draws = random.Random(18)
     arguments = ("--arm", "never,always", "--repeats", "3", "--limit", "8")
     with truth_mllm(items) as whole:
         evaluated(SAMPLE, tmp_path / "whole", *arguments, mllm=whole)
     kills: list[float] = []
     with truth_mllm(items, seconds=0.15) as mllm:
-        for _ in range(3):
+        for _ in range(KILLS):
             wanted = len(mllm.done) + draws.randint(9, 14)
             process = subprocess.Popen(
                 command(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm),
