@@ -92,7 +92,8 @@ class Bench:
         assert before is not None
         for name, threshold in (("at_cost", 0.0), ("at_skip", 1e9)):
             self.put(before.model_copy(update={"cache": "first-block", "cache_threshold": threshold}))
-            found |= {f"{name}_s": self.passes()["pass_s"][1], **self._peaks()}
+            found[f"{name}_s"] = self.passes()["pass_s"][1]
+            found |= {f"{name}_{peak}": value for peak, value in self._peaks().items()}
         self.put(before)
         return found
 

@@ -97,21 +97,28 @@ def measure_rows(case: Case, peak: float, best: str, budget: Budget, keep: Calla
     """Runs what there is time for; `keep` is given all results so far whenever there is one more."""
     results: list[Result] = []
     machine = detect_capabilities(case.device)
-    bench: Bench | None = None
+    benches: list[Bench] = []  # one, once it is built
+
+    def build() -> dict[str, Any]:
+        benches.append(Bench(case, peak))
+        return {"build_s": rounded(benches[0].built)}
+
     for row in rows(case, best):
         begun = time.monotonic()
         expected, left = budget.expected(reckoned(row, case, peak)), budget.left
         if reason := refused(row, machine):
             result = Result(row.name, "refused", reason)
-        elif expected + (build_seconds(case) if bench is None else 0) > left:
+        elif expected + (0 if benches else build_seconds(case)) > left:
             late = f"It would take {expected:.0f} s (reckoned), and {max(0, left):.0f} s are left."
             result = Result(row.name, "skipped", late)
         else:
-            if bench is None:
-                bench = Bench(case, peak)
-                results.append(Result("build", "measured", figures={"build_s": rounded(bench.built)}))
+            if not benches:
+                results.append(guarded("build", case, build))
                 begun = time.monotonic()
-            result = _measured(row, bench)
+            if not benches:  # none of the rows can be measured
+                keep(results)
+                return
+            result = _measured(row, benches[0])
             took = time.monotonic() - begun
             if result.status == "measured":
                 budget.took(reckoned(row, case, peak), took)

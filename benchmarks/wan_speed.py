@@ -344,6 +344,9 @@ def main() -> int:
     parser.add_argument("--plan", action="store_true", help="say what a run within a budget would do, and do nothing")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
+    of_profiles = [name for name in ("profile", "against", "steps", "runs") if getattr(arguments, name) is not None]
+    if of_profiles and (arguments.budget is not None or arguments.plan):
+        parser.error(f"--{of_profiles[0]} is about the clips of profiles, of which --budget and --plan run none")
     try:
         case = case_of(arguments)
         names = list(arguments.profile or case.manifest.profiles) + [PLAIN] * (arguments.against == PLAIN)

@@ -61,11 +61,26 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> LoadedModel:
     return model(tmp_path_factory.mktemp("alone"), "exact")
 
 
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LoadedModel]:
-    loaded = model(tmp_path_factory.mktemp("shared"), "exact-2")
-    yield loaded
-    group_of(loaded).close()
+_shared: list[LoadedModel] = []  # the one of the fixture: a process has one group at a time
+
+
+def close_shared() -> None:
+    while _shared:
+        group_of(_shared.pop()).close()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _closed_afterwards() -> Iterator[None]:
+    yield
+    close_shared()
+
+
+@pytest.fixture
+def shared(tmp_path_factory: pytest.TempPathFactory) -> LoadedModel:
+    """Made once, and again after a test that had a group of its own."""
+    if not _shared:
+        _shared.append(model(tmp_path_factory.mktemp("shared"), "exact-2"))
+    return _shared[0]
 
 
 def given() -> Conditioning:
@@ -118,6 +133,7 @@ def test_a_rank_that_cannot_load_says_why(tmp_path: Path) -> None:
 
 def broken(folder: Path, on_step: Callable[[LoadedModel], None]) -> Exception:
     """What a clip raises in whose second step something happens. The clips after it say that a worker is replaced."""
+    close_shared()
     loaded = model(folder, "exact-2")
     with pytest.raises(Exception) as caught:  # noqa: PT011
         latents(loaded, lambda done, total: on_step(loaded) if done == 2 else None)
@@ -131,12 +147,11 @@ def process_of(loaded: LoadedModel) -> subprocess.Popen[bytes]:
     return group_of(loaded)._ranks[0]._spawned.process
 
 
-def test_a_rank_that_has_no_memory_says_so_once(alone: LoadedModel, shared: LoadedModel, tmp_path: Path) -> None:
+def test_a_rank_that_has_no_memory_says_so_once(alone: LoadedModel, tmp_path: Path) -> None:
     def run_out(loaded: LoadedModel) -> None:
         group_of(loaded)._ranks[0].error = GeneratorOutOfMemory("A share of a clip does not fit.")
         process_of(loaded).kill()
 
-    group_of(shared).close()  # one at a time in a process
     begun = time.monotonic()
     assert isinstance(broken(tmp_path, run_out), GeneratorOutOfMemory)
     assert time.monotonic() - begun < 60, "far less than ranks wait for each other"
@@ -164,6 +179,7 @@ def test_a_rank_that_dies_before_it_is_met_is_noticed(tmp_path: Path, monkeypatc
         group._ranks[0]._spawned.process.kill()
         return met(group, transformer)
 
+    close_shared()
     monkeypatch.setattr(RankGroup, "_met", lost)
     begun = time.monotonic()
     with pytest.raises(WorkerEnded, match="process of one of the GPUs ended"):

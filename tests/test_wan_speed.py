@@ -283,6 +283,29 @@ def test_a_budget_leaves_out_what_would_not_be_done_in_time(
     assert "VAE float32: skipped. It would take" in wan_speed.table(found)
 
 
+def test_a_model_that_does_not_fit_is_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real allocation that no machine can serve: what was measured before it is kept."""
+    monkeypatch.setattr(wan_bench, "build", lambda *_: torch.empty(2**50, dtype=torch.float64))
+    file = tmp_path / "found.json"
+    found = wan_speed.survey(SMALLEST, [], file, wan_plan.Budget(1000))
+    kept = json.loads(file.read_text())
+    assert kept["golden"] == found["golden"]
+    assert [(each["name"], each["status"]) for each in kept["results"]] == [("build", "failed")]
+    assert "'build' does not fit into memory" in kept["results"][0]["reason"]
+    assert "build: failed. 'build' does not fit" in wan_speed.table(found)
+
+
+@pytest.mark.parametrize("more", [["--profile", "exact"], ["--steps", "4"], ["--against", "plain"], ["--runs", "2"]])
+def test_what_a_budget_would_not_heed_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], more: list[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["wan_speed.py", "--budget", "60", *more])
+    with pytest.raises(SystemExit) as ended:
+        wan_speed.main()
+    assert ended.value.code == 2
+    assert f"{more[0]} is about the clips of profiles" in capsys.readouterr().err
+
+
 def test_what_is_reckoned_grows_with_the_clip() -> None:
     short, whole = (
         [wan_rows.reckoned(row, replace(SMALLEST, manifest=ATI, num_frames=frames, width=832, height=480), 7e14)

@@ -81,8 +81,9 @@ class RankGroup:
                 raise
             sharing.tell(go_on=True)
 
+        clip = _shared(noise, given, sampling)
         for rank in self._ranks:
-            rank.send(_shared(noise, given, sampling))
+            rank.send(clip)
         try:
             sharing.prepare(noise)
             return denoise(self._transformer, self._device, noise, given, sampling, told, sharing)
