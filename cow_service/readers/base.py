@@ -13,14 +13,17 @@ from pydantic import Field
 
 from cow_service.records import (
     AnswerOption,
+    Asked,
     BBox,
     Cue,
     Grounding,
     Intervention,
+    InterventionKind,
     LocatedObject,
     MetresPerPixel,
     MotionKind,
     ObjectPrior,
+    PlaceRelation,
     Point,
     ReaderInfo,
     Record,
@@ -127,6 +130,25 @@ class MotionHints(Record):
 
 
 @dataclass(frozen=True)
+class NamedChange:
+    """An intervention whose objects are names that are still to be located."""
+
+    kind: InterventionKind
+    object: str
+    relation: PlaceRelation | None = None
+    targets: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class QuestionReading:
+    """What the words of a question say, without a look at the image and without a model."""
+
+    asked: Asked | None = None  # null where the reader cannot tell from the words alone
+    changes: tuple[NamedChange, ...] = ()  # what is taken away or put somewhere
+    trail_named: bool = False  # the question speaks of a trail
+
+
+@dataclass(frozen=True)
 class GroundingReading:
     """What a reader says of stage 1. The stage adds the point and the mask."""
 
@@ -138,6 +160,7 @@ class GroundingReading:
     interventions: tuple[Intervention, ...] = ()
     hints: MotionHints | None = None
     prior: ObjectPrior | None = None  # of the mover
+    asked: Asked | None = None  # what the question wants to know; null where the reader cannot say
 
 
 @dataclass(frozen=True)
@@ -200,6 +223,10 @@ class Reader(Protocol):
 
         Where not, its answers are samples: none is handed to two requests. Readers without this method are sampled.
         """
+        ...
+
+    def read_question(self, question: str) -> QuestionReading:
+        """What the words alone say, for requests that give the place of what moves: no image, no call of a model."""
         ...
 
     def ground(self, given: ReaderInput) -> GroundingReading:

@@ -9,7 +9,16 @@ from dataclasses import replace
 from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import AnswerReading, GroundingReading, Imagined, MotionHints, MotionReading, ReaderInput
+from cow_service.readers.base import (
+    AnswerReading,
+    GroundingReading,
+    Imagined,
+    MotionHints,
+    MotionReading,
+    NamedChange,
+    QuestionReading,
+    ReaderInput,
+)
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
 from cow_service.readers.embedded.doubts import noun_warnings
@@ -58,6 +67,20 @@ class EmbeddedReader:
         """Always: rules draw no random numbers."""
         return True
 
+    def read_question(self, question: str) -> QuestionReading:
+        """What the grammar reads."""
+        read = parse(question)
+        changes = (
+            NamedChange(
+                kind=change.kind,
+                object=change.object.text,
+                relation=change.relation,
+                targets=tuple(target.text for target in change.targets),
+            )
+            for change in read.interventions
+        )
+        return QuestionReading(read_asked(read), tuple(changes), read.motion.trail is not None)
+
     def ground(self, given: ReaderInput) -> GroundingReading:
         """The region that fits the mover's words. Raises `CannotGround` where none or several do."""
         scene, question = given.scene, parse(given.question)
@@ -90,6 +113,7 @@ class EmbeddedReader:
             others=others,
             warnings=(*assumed, *missing, *doubts),
             interventions=(*removed, *placed),
+            asked=read_asked(question),
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:

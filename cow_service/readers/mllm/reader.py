@@ -19,6 +19,7 @@ from cow_service.readers.base import (
     MotionHints,
     MotionReading,
     Quantity,
+    QuestionReading,
     ReaderInput,
 )
 from cow_service.readers.chat import ChatTurn, Upstream
@@ -98,6 +99,10 @@ class MllmReader:
     async def chat(self, body: dict[str, Any]) -> ChatTurn:
         """The reply to a chat of OpenAI's protocol, through pydantic-ai. Raises `InvalidRequest`, `MllmUnavailable`."""
         return await self._client.chat(body)
+
+    def read_question(self, question: str) -> QuestionReading:
+        """Nothing: it takes a call of the model, which `ground` makes."""
+        return QuestionReading()
 
     def ground(self, given: ReaderInput) -> GroundingReading:
         """Two calls: what moves, in words; then where it is and, in the same call, which way it moves.
