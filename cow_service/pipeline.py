@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cow_service.errors import Canceled, CowError, DeviceFailed, InvalidRequest, MllmUnavailable, ReaderUnavailable
-from cow_service.readers.question.choices import choices_source, read_choices
+from cow_service.readers.options import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.answering import answer_question

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from cow_service.media.images import encode_png
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.answers import answer_from, choose_option
-from cow_service.readers.question.choices import (
+from cow_service.readers.options import (
     choices_source,
     not_sure_option,
     option_saying,

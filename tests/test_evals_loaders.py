@@ -28,7 +28,7 @@ from cow_service.evals.loaders.collecting import Collected
 from cow_service.evals.pictures import Pictures
 from cow_service.evals.replies import order_of
 from cow_service.evals.wording import appended_wording, listed_wording
-from cow_service.readers.question.listed_options import split_options
+from cow_service.readers.options import split_options
 
 SAMPLE = ROOT / "cow-scenes" / "sample"
 ASKED = "If it moves forward, will it hit the vase? Answer by (A) Yes, (B) No or (C) Not sure."

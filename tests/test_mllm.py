@@ -38,7 +38,7 @@ from cow_service.readers.mllm.identify import read_identified
 from cow_service.readers.mllm.locate import read_located
 from cow_service.readers.mllm.models import manifest_for, resolve_model
 from cow_service.readers.mllm.replies import ReplyError, values_in
-from cow_service.readers.question.choices import read_choices
+from cow_service.readers.options import read_choices
 from cow_service.records import Grounding
 from cow_service.service import Service
 from cow_service.settings import Settings

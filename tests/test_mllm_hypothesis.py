@@ -10,8 +10,8 @@ import pytest
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.answer import answer_calls
 from cow_service.readers.mllm.hypothesis import pictures
+from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt
-from cow_service.readers.question.choices import read_choices
 from cow_service.records import Intervention, LocatedObject, Simulation
 
 SHA = "0" * 64

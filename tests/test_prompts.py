@@ -11,8 +11,8 @@ from jinja2.exceptions import SecurityError
 
 from cow_service.readers.mllm import answer, identify, locate, scale
 from cow_service.readers.mllm.coordinates import CoordinateFrame
+from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt, parse_prompt
-from cow_service.readers.question.choices import read_choices
 from cow_service.readers.question.wording import direction_words, motion_sentence
 from cow_service.records import MotionKind, Vector
 from cow_service.weights.manifests import Coordinates

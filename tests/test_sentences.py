@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from cow_service.readers.base import Quantity
 from cow_service.readers.embedded.motions import quantities
+from cow_service.readers.options import split_options
 from cow_service.readers.question import lexicon
-from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.sentences import Question, parse, parse_noun_phrase
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"

@@ -20,7 +20,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from cow_service.evals.items import Item
-from cow_service.readers.question.listed_options import split_options
+from cow_service.readers.options import split_options
 
 TOKENS = {"prompt_tokens": 400, "completion_tokens": 20, "total_tokens": 420}
 

@@ -12,7 +12,7 @@ from cow_service.evals.imagination import NO_USAGE, Look
 from cow_service.evals.items import Item, question_text
 from cow_service.evals.observations import Observation
 from cow_service.evals.replies import in_data_order, read_as_paper, read_reply, shown_options
-from cow_service.readers.question.choices import plain
+from cow_service.readers.options import plain
 from cow_service.records import AnswerOption, Usage
 
 BETWEEN_REPLIES = "\n\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cow_service.readers.question.listed_options import split_options
+from cow_service.readers.options import split_options
 from cow_service.records import AnswerOption
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"

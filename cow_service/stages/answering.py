@@ -10,7 +10,7 @@ from cow_service.errors import MllmBadReply
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode_own
 from cow_service.readers.base import AnswerReading, Imagined, Reader, ReaderInput
-from cow_service.readers.question.choices import read_choices
+from cow_service.readers.options import read_choices
 from cow_service.records import AnswerOption, Grounding, Simulation, Verdict
 from cow_service.requests import AnswerRequest
 from cow_service.stages.results import FirstAnswers, StageResult, Verdicts

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.outcome import Query
-from cow_service.readers.question.choices import plain
+from cow_service.readers.options import plain
 from cow_service.readers.question.kinds import kind_of
 from cow_service.readers.question.options_said import may_name
 from cow_service.readers.question.shapes import is_cube, is_vehicle, shape_of

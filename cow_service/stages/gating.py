@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from cow_service.errors import MllmBadReply
-from cow_service.readers.question.choices import read_choices
+from cow_service.readers.options import read_choices
 from cow_service.records import Gate, GateReason
 from cow_service.requests import AnswerRequest
 from cow_service.stages.answering import ask

@@ -10,7 +10,7 @@ from typing import Any
 
 from cow_service.api.openai.parsing import ParsedChat
 from cow_service.api.openai.records import ChatChoice, ChatDelta, ChatProgress, ChatReply, ChatUsage, ChunkChoice
-from cow_service.readers.question.reply_forms import Reply, reply_text
+from cow_service.readers.options import Reply, reply_text
 from cow_service.records import Job
 
 NOT_SURE = "Not sure"

@@ -13,7 +13,7 @@ from cow_service.errors import CowError
 from cow_service.evals.items import TASKS, UNKNOWN_LEVEL, Item, Task
 from cow_service.evals.pictures import Pictures
 from cow_service.evals.wording import LETTERS, Wording, appended_wording, listed_wording
-from cow_service.readers.question.choices import not_sure_option, option_saying
+from cow_service.readers.options import not_sure_option, option_saying
 from cow_service.records import AnswerOption
 
 _LETTER = re.compile(r"^\s*[(\[]?\s*([A-Za-z])\s*[)\].:]?\s*$")

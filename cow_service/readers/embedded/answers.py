@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from cow_service.readers.base import AnswerReading
+from cow_service.readers.options import not_sure_option, says_not_sure
 from cow_service.readers.question.accounting import Unread
-from cow_service.readers.question.choices import not_sure_option, says_not_sure
 from cow_service.readers.question.numbers_said import count_of, seconds_of, spans
 from cow_service.readers.question.options_said import may_name, names_none, names_several, says_it_happens
 from cow_service.readers.question.phrases import ObjectPhrase

@@ -21,7 +21,7 @@ from cow_service.readers.mllm.replies import (
     without_thinking,
 )
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
-from cow_service.readers.question.choices import not_sure_option, option_saying, plain, question_without, says_not_sure
+from cow_service.readers.options import not_sure_option, option_saying, plain, question_without, says_not_sure
 from cow_service.records import AnswerOption
 
 MAX_ANSWER = 400  # characters of an open answer

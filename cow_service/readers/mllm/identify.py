@@ -24,7 +24,7 @@ from cow_service.readers.mllm.replies import (
     without_thinking,
 )
 from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
-from cow_service.readers.question.choices import plain
+from cow_service.readers.options import plain
 from cow_service.records import MotionKind
 
 MAX_OBJECT = 120  # characters

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import dropwhile
 
+from cow_service.readers.options import plain
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.choices import plain
 from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at
 from cow_service.readers.question.sentences import Question
 from cow_service.readers.question.words import Word, plain_words

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
+from cow_service.readers.options import plain
 from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.choices import plain
 from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.readers.question.sentences import parse_noun_phrase
 from cow_service.records import Asked

@@ -12,6 +12,7 @@ from functools import lru_cache
 from itertools import pairwise
 
 from cow_service.readers.base import Quantity
+from cow_service.readers.options import split_options
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.chunks import items
 from cow_service.readers.question.clauses import (
@@ -23,7 +24,6 @@ from cow_service.readers.question.clauses import (
     read_clauses,
 )
 from cow_service.readers.question.interventions import InterventionWords, implied_placing, split_interventions
-from cow_service.readers.question.listed_options import split_options
 from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
 from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.openings import without_openings

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from cow_service.readers.options import plain
 from cow_service.readers.prompts import load_prompt
-from cow_service.readers.question.choices import plain
 from cow_service.records import MotionKind, Vector
 
 MAX_OBJECT = 200  # characters
