@@ -27,20 +27,16 @@ from typing import Any
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.camera_fit import CameraFit, fit_shadow, prior
+from cow_service.physics.camera import CameraFit, FloorCamera, fit_shadow, prior
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.engine import run_worlds
+from cow_service.physics.engine import RigidShape, run_worlds
 from cow_service.physics.events import find_events
-from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.outcome import SURE
-from cow_service.physics.rigid import RigidShape
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
-from cow_service.stages.motion import THROW_DEPTH_DEVIATION
-from cow_service.stages.quantities import SPEED_DEVIATIONS, throw_speed
-from cow_service.vision.masks import CroppedMask
+from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, throw_speed
+from cow_service.vision.masks import CroppedMask, Floats
 from cow_service.vision.shadows import Shadow
-from cow_service.vision.types import Floats
 
 WIDTH, HEIGHT = 832, 480  # px
 RADIUS = 0.15  # m, of the ball

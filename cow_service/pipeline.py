@@ -6,12 +6,11 @@ from cow_service.errors import Canceled, CowError, DeviceFailed, InvalidRequest,
 from cow_service.readers.options import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
-from cow_service.stages.answering import answer_question
-from cow_service.stages.gating import ask_first, gate_of
+from cow_service.stages.answering import answer_question, ask_first, gate_of
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground, use_stored_masks
+from cow_service.stages.keys import FirstAnswers, Verdicts
 from cow_service.stages.motion import read_motion
-from cow_service.stages.results import FirstAnswers, Verdicts
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
 

@@ -21,9 +21,8 @@ from cow_service.errors import (
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifact_stores import open_artifact_store
 from cow_service.media.artifacts import Patience, media_type_of, try_once
-from cow_service.media.data_urls import decode_data_url
-from cow_service.media.images import DecodedImage, decode
-from cow_service.net.images import ImageUrls
+from cow_service.media.images import DecodedImage, decode, decode_data_url
+from cow_service.net.egress import ImageUrls
 from cow_service.observability.metrics import Metrics
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader
@@ -32,9 +31,18 @@ from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulatio
 from cow_service.registry import Registry
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, PlaceRequest, SimulateRequest
 from cow_service.settings import Settings, SettingsError
-from cow_service.stages.checks import check_request
-from cow_service.stages.run import Backends, Progress, Run, Step, compute_directly, ignore_progress, now, priority_of
-from cow_service.vision.seen_images import SeenImages
+from cow_service.stages.run import (
+    Backends,
+    Progress,
+    Run,
+    Step,
+    check_request,
+    compute_directly,
+    ignore_progress,
+    now,
+    priority_of,
+)
+from cow_service.vision.scene import SeenImages
 from cow_service.weights.lock import ready
 from cow_service.weights.manifests import find_manifest, load_manifests
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.physics.camera_fit import CameraFit
+from cow_service.physics.camera import CameraFit
 
 Floats = NDArray[np.float64]
 Box = tuple[float, float, float, float]

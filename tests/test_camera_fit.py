@@ -9,7 +9,7 @@ import pytest
 from conftest import SCALE
 from floors import TrueCamera
 
-from cow_service.physics.camera_fit import MEASUREMENT_SIGMA, fit_shadow, prior
+from cow_service.physics.camera import MEASUREMENT_SIGMA, fit_shadow, prior
 from cow_service.records import BBox
 from cow_service.vision.shadows import Shadow
 

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from worlds import rigid
 
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.chains import set_off
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.engine import Meeting, WorldRun
-from cow_service.physics.events import WorldEvents, encounters, find_world_events
+from cow_service.physics.events import WorldEvents, encounters, find_world_events, set_off
 from cow_service.physics.outcome import Query, answers_of, decide
 from cow_service.physics.world import WorldInput, Worlds, run_world
 from cow_service.readers.question.facts import facts_of

@@ -21,8 +21,8 @@ from mllm_server import MllmServer
 from openai import AsyncOpenAI, OpenAI
 from servers import BODY, PATIENCE, QUESTION, Served, data_url, eventually, picture, problem, slow
 
-from cow_service.api.middleware.keys import hash_of, new_key
-from cow_service.api.openai.models import answerers
+from cow_service.api.middleware.access import hash_of, new_key
+from cow_service.api.openai.records import answerers
 from cow_service.records import Answer
 from cow_service.service import Service
 from cow_service.settings import Settings

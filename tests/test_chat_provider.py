@@ -20,7 +20,7 @@ from pydantic_ai.exceptions import UserError
 from pydantic_ai.models.test import TestModel
 from servers import BODY, QUESTION, data_url, picture, problem
 
-from cow_service.api.openai.splicing import as_json, spliced
+from cow_service.api.openai.chats import as_json, spliced
 from cow_service.errors import InvalidRequest
 from cow_service.readers.chat import Upstream
 from cow_service.readers.mllm.chat import prepare_chat

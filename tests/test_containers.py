@@ -12,12 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import energy, rigid
 
-from cow_service.physics.carrying import Put
-from cow_service.physics.containers import BOX_SIDES, ROUND_SIDES, Hollow, hollow_of
 from cow_service.physics.draws import COLUMN, likeliest
-from cow_service.physics.engine import WorldRun, run_worlds
-from cow_service.physics.placement import classify
-from cow_service.physics.rigid import RigidShape
+from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, hollow_of, run_worlds
+from cow_service.physics.placement import Put, classify
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.openings import SeenOpening, measure_opening
 

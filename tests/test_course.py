@@ -14,13 +14,12 @@ from runs import run_of
 from worlds import RADIUS, rigid
 
 from cow_service.errors import InvalidRequest
-from cow_service.physics.course import Course, Leg, course_of
-from cow_service.physics.engine import WorldRun, run_worlds
-from cow_service.physics.rigid import RigidShape
+from cow_service.physics.ballistic import Course, Leg, course_of
+from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
 from cow_service.readers.base import MotionReading, Quantity
 from cow_service.records import Grounding, LocatedObject, MetresPerPixel, Motion
+from cow_service.stages.keys import StageResult
 from cow_service.stages.motion import read_motion
-from cow_service.stages.results import StageResult
 from cow_service.stages.trajectory import trajectory_of
 
 FPS = 16.0

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import MAX_SIDE, CutoutGenerator, CutoutOptions
-from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.camera import FloorCamera
 from cow_service.records import Grounding, LocatedObject, Motion, Trajectory
 from cow_service.vision.inpainting import exemplar_inpaint
 from cow_service.vision.scene import Scene

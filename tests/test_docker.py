@@ -29,8 +29,7 @@ from cow_service.cli.main import app
 from cow_service.jobs.engine import HANDOVER_SECONDS
 from cow_service.server import CLOSE_SECONDS
 from cow_service.settings import Settings, load_settings
-from cow_service.weights.manifests import load_manifests
-from cow_service.weights.resources import EXAMPLES
+from cow_service.weights.manifests import EXAMPLES, load_manifests
 
 DOCKER = ROOT / "docker"
 IMAGES = {"cow:cpu": DOCKER / "cpu.Dockerfile", "cow:cuda": DOCKER / "cuda.Dockerfile"}

@@ -23,9 +23,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.errors import ImageUrlNotAllowed, ImageUrlUnreachable
-from cow_service.net.egress import TRANSLATED, Egress, EgressError, NotAllowed, Unreachable, _translated, look_up
+from cow_service.net.egress import (
+    TRANSLATED,
+    Egress,
+    EgressError,
+    ImageUrls,
+    NotAllowed,
+    Unreachable,
+    _translated,
+    look_up,
+)
 from cow_service.net.hosts import HostList, host_name, is_public
-from cow_service.net.images import ImageUrls
 from cow_service.settings import Settings, SettingsError, load_settings
 
 MOST = 100_000  # bytes

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds import RADIUS, G, energy, mass, rigid, spin_at_start, turned
 
-from cow_service.physics.engine import FLOOR_FRICTION, FLOOR_RESTITUTION, WorldRun, run_worlds
-from cow_service.physics.rigid import RigidShape
+from cow_service.physics.engine import FLOOR_FRICTION, FLOOR_RESTITUTION, RigidShape, WorldRun, run_worlds
 
 FPS = 16.0
 BESIDE = rigid(position=(0.0, RADIUS, 5.0))  # out of the way

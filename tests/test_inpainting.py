@@ -8,7 +8,7 @@ from drawn import ball, floor
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.vision.discs import as_disc
+from cow_service.vision.completion import as_disc
 from cow_service.vision.inpainting import erase_drawing, fill_hole, push_pull
 
 

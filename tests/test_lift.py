@@ -13,9 +13,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera_fit import prior
+from cow_service.physics.camera import FloorCamera, prior
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.floor_camera import FloorCamera
 from cow_service.physics.lift import BOX_SIDE, Cameras, above, in_the_air
 from cow_service.physics.placing import place
 from cow_service.physics.projection import seen_paths

@@ -35,7 +35,7 @@ from PIL import Image
 from servers import SLOW_GENERATOR, data_url, eventually, picture
 
 from cow_service import __version__
-from cow_service.api.middleware.keys import hash_of, new_key
+from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.client import AsyncClient, CowError
 from cow_service.client.errors import CannotGround
 from cow_service.errors import FieldError, InvalidRequest, Unauthorized

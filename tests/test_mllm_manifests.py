@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from cow_service.weights.manifests import Manifest, load_families, load_manifests
-from cow_service.weights.resources import FAMILIES, MANIFESTS
+from cow_service.weights.manifests import FAMILIES, MANIFESTS, Manifest, load_families, load_manifests
 
 ALL = {name: manifest for name, manifest in load_manifests().items() if manifest.role == "mllm"}
 # One without a name under which it is served is a toy, made from nothing.

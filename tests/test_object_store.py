@@ -15,7 +15,7 @@ import object_store
 import pytest
 from servers import BODY, IMAGE, PATIENCE, Served, eventually, problem, slow
 
-from cow_service.api.middleware.keys import hash_of, new_key
+from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.client import Client
 from cow_service.client.errors import ServerUnreachable
 

@@ -8,8 +8,7 @@ from drawn import floor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cow_service.media.labels import Label, draw_labels
-from cow_service.media.overlay import ENCOUNTERS, OUTLINE, PATH, PUSHED, draw_overlay
+from cow_service.media.overlay import ENCOUNTERS, OUTLINE, PATH, PUSHED, Label, draw_labels, draw_overlay
 from cow_service.records import Grounding, Motion, Trajectory
 
 MOTION = Motion.model_validate(

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from servers import ASYNC, BODY, PATIENCE, TERMINAL, Served, data_url, events_of, eventually, picture, problem, slow
 
-from cow_service.api.middleware.keys import hash_of, new_key
+from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.media.images import encode_png
 
 pytestmark = pytest.mark.slow

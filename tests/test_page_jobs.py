@@ -15,7 +15,7 @@ from drawn import ball, block, clutter, floor, png_bytes
 from playwright.sync_api import Page, expect
 from servers import BODY, QUESTION, Served, data_url, eventually, picture, slow
 
-from cow_service.api.middleware.keys import hash_of, new_key
+from cow_service.api.middleware.access import hash_of, new_key
 
 UNREAD = "If the unicorn moves to the right, will it hit the blue cube?"
 UNREADABLE = data_url(png_bytes(clutter(200, 150)))

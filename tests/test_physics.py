@@ -9,11 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.physics.anchors import points_inside, spread_anchors
-from cow_service.physics.ballistic import FreePath, ballistic_path, given_path
+from cow_service.physics.ballistic import GRAVITY, FreePath, ballistic_path, given_path, roll_out
 from cow_service.physics.camera import Camera, depth_motion
-from cow_service.physics.dynamics import GRAVITY, roll_out
-from cow_service.physics.sweeping import swept
+from cow_service.physics.projection import points_inside, spread_anchors, swept
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Path
 from cow_service.requests import TrajectoryRequest
 from cow_service.vision.masks import CroppedMask

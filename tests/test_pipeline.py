@@ -16,7 +16,7 @@ from PIL import Image
 from servers import BODY
 
 from cow_service.errors import ArtifactNotFound, ImageUrlNotAllowed, InvalidRequest
-from cow_service.media.data_urls import decode_data_url
+from cow_service.media.images import decode_data_url
 from cow_service.pipeline import simulate
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest

@@ -16,17 +16,15 @@ from cow_service.errors import CannotGround, CowError
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, create
 from cow_service.media.images import decode_own
-from cow_service.physics.carrying import Put
 from cow_service.physics.draws import ensemble
-from cow_service.physics.engine import run_worlds
-from cow_service.physics.rigid import RigidShape
-from cow_service.physics.settling import settle
+from cow_service.physics.engine import RigidShape, run_worlds
+from cow_service.physics.placement import Put, settle
 from cow_service.records import Clip, Trajectory
 from cow_service.settings import Settings
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
+from cow_service.stages.keys import StageResult
 from cow_service.stages.motion import read_motion
-from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
 from cow_service.vision.openings import SeenOpening

@@ -23,7 +23,7 @@ from engines import running_engine
 from postgres import postgres_server
 from servers import Served, Worker, eventually, problem, slow
 
-from cow_service.api.middleware.keys import hash_of
+from cow_service.api.middleware.access import hash_of
 from cow_service.jobs.overview import Overview
 from cow_service.jobs.process_table import ProcessTable
 from cow_service.records import ProcessInfo, WorkerInfo, WorkerJob

@@ -15,8 +15,7 @@ from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt, parse_prompt
 from cow_service.readers.question.wording import direction_words, motion_sentence
 from cow_service.records import MotionKind, Vector
-from cow_service.weights.manifests import Coordinates
-from cow_service.weights.resources import PROMPTS
+from cow_service.weights.manifests import PROMPTS, Coordinates
 
 HEAD = "---\nversion: 1\ninputs: [name]\n---\n"
 

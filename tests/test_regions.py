@@ -10,7 +10,7 @@ from drawn import Image, ball, block, floor, jpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.vision.colours import colour_name, colour_names
+from cow_service.vision.contrast import colour_name, colour_names
 from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.regions import find_regions
 from cow_service.vision.scene import Scene

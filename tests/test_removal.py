@@ -25,12 +25,10 @@ from cow_service.records import Asked, Clip, Frame, Grounding, MetresPerPixel, M
 from cow_service.settings import Settings
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
-from cow_service.stages.imagining import imagine
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
-from cow_service.stages.trajectory import compute_trajectory
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.types import Image
+from cow_service.stages.trajectory import compute_trajectory, imagine
+from cow_service.vision.masks import CroppedMask, Image
 
 RED, BLUE, GREEN = (200, 30, 30), (40, 60, 200), (40, 160, 60)
 MOVER, GOAL, BETWEEN = (80, 210, 130, 260), (480, 196, 550, 274), (280, 200, 350, 272)

@@ -39,8 +39,8 @@ from cow_service.records import Answer, Usage
 from cow_service.requests import AnswerRequest, Stage
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.stages.gating import gate_of
-from cow_service.stages.results import FirstAnswers
+from cow_service.stages.answering import gate_of
+from cow_service.stages.keys import FirstAnswers
 
 REPEATS = 40 if SCALE == 1 else 200
 IMAGE = data_url(png_bytes(ball(floor(96, 64), (30, 40), 8, (210, 20, 20))))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from cow_service.weights import resources
-from cow_service.weights.resources import MANIFESTS, PROMPTS
+from cow_service.weights import manifests as resources
+from cow_service.weights.manifests import MANIFESTS, PROMPTS
 
 ROOT = Path(__file__).parents[1]
 

@@ -14,8 +14,7 @@ from fastapi import FastAPI, Request
 from typer.testing import CliRunner
 
 from cow_service.api.app import create_app
-from cow_service.api.middleware.keys import KeyRing, hash_of, new_key
-from cow_service.api.middleware.rate_limit import Buckets, address_of
+from cow_service.api.middleware.access import Buckets, KeyRing, address_of, hash_of, new_key
 from cow_service.cli.main import app as cow
 from cow_service.jobs.engine import JobEngine
 from cow_service.service import Service

@@ -12,8 +12,7 @@ from cow_service.pipeline import simulate
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Simulation
 from cow_service.vision import scene as scenes
-from cow_service.vision.scene import Scene
-from cow_service.vision.seen_images import MOST_IMAGES, SeenImages
+from cow_service.vision.scene import MOST_IMAGES, Scene, SeenImages
 
 BALL, BOX = (160, 250), (420, 220, 480, 280)
 PICTURE = block(ball(floor(), BALL, 30, (200, 40, 40)), BOX, (40, 60, 200))

@@ -12,7 +12,7 @@ import pytest
 from postgres import postgres_server
 from servers import ASYNC, PATIENCE, TERMINAL, Served, eventually, problem, slow
 
-from cow_service.api.middleware.keys import hash_of, new_key
+from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.state import OpenJob
 from cow_service.service import Service

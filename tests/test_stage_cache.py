@@ -16,8 +16,7 @@ from cow_service.media.disk_artifacts import DiskArtifacts
 from cow_service.observability.metrics import Metrics
 from cow_service.records import MetresPerPixel, Motion
 from cow_service.settings import Settings
-from cow_service.stages.keys import StageKey
-from cow_service.stages.results import StageResult
+from cow_service.stages.keys import StageKey, StageResult
 
 SHARED, OWN = StageKey("a" * 64), StageKey("b" * 64, shareable=False)
 

@@ -21,8 +21,7 @@ from cow_service.stages.keys import KEY_FIELDS, key_of
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import trajectory_of
 from cow_service.vision.masks import CroppedMask
-from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.scene import Scene
+from cow_service.vision.scene import Obstacle, Scene
 
 RED = (200, 30, 30)
 

@@ -24,11 +24,11 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.types import Message
 
 from cow_service.api.app import create_app
-from cow_service.api.middleware.keys import hash_of
-from cow_service.api.middleware.origins import Origins
+from cow_service.api.middleware.access import Origins, hash_of
 from cow_service.jobs.engine import JobEngine
-from cow_service.observability import context, tracing
+from cow_service.observability import logging as context
 from cow_service.observability import logging as logs
+from cow_service.observability import tracing
 from cow_service.observability.metrics import Metrics
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError

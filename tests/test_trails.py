@@ -14,15 +14,14 @@ from hypothesis import strategies as st
 from runs import run_of
 
 from cow_service.errors import CannotReadDirection
-from cow_service.physics.camera_fit import prior
-from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.camera import FloorCamera, prior
 from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_direction
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.vision.circles import Edges
-from cow_service.vision.ghost_shadows import without_ghost_shadows
 from cow_service.vision.scene import Scene
+from cow_service.vision.trail_removal import without_ghost_shadows
 from cow_service.vision.trails import Position, Trail, TrailEnd, find_trails, trail_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

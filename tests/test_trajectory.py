@@ -16,10 +16,8 @@ from cow_service.records import Grounding, LocatedObject, ObjectPrior, Trajector
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import compute_trajectory, trajectory_of
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.scene import Scene
-from cow_service.vision.types import Image
+from cow_service.vision.masks import CroppedMask, Image
+from cow_service.vision.scene import Obstacle, Scene
 
 RED, BLUE, GREEN = (200, 30, 30), (40, 60, 200), (40, 160, 60)
 MOVER = {"object": "red ball", "bbox": (80, 210, 130, 260)}

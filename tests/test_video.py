@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.errors import InternalError, StorageUnavailable
-from cow_service.media.video import write_mp4
-from cow_service.media.yuv import YuvFrames
+from cow_service.media.video import YuvFrames, write_mp4
 
 
 def scene(index: int, width: int = 96, height: int = 64) -> np.ndarray:

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.physics.engine import WorldRun
-from cow_service.physics.rigid import RigidShape
+from cow_service.physics.engine import RigidShape, WorldRun
 
 Floats = NDArray[np.float64]
 RADIUS = 0.15  # m

@@ -1,32 +1,115 @@
-"""The HTTP application: routes, problems and limits around one service."""
+"""The HTTP application: routes, middleware and the OpenAPI document around one service."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator
+import logging
+from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
+from typing import Any
 
 from anyio import to_thread
 from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from starlette.types import ASGIApp
 
 from cow_service import __version__
+from cow_service.api.middleware.access import PROBES, ApiKeys, KeyRing, Origins, RateLimit, cors, is_loopback
+from cow_service.api.middleware.access_log import AccessLog, Correlation
 from cow_service.api.middleware.body_limit import BodyLimit
-from cow_service.api.middleware.order import LayeredApp, install_layers
-from cow_service.api.openai.completing import Completer
-from cow_service.api.openai.errors import ChatProblems
-from cow_service.api.openai.routes import chat_routes
-from cow_service.api.openapi import contract
+from cow_service.api.openai.routes import Completer, chat_routes, document_chat
+from cow_service.api.openai.stream import ChatProblems
 from cow_service.api.page import page_routes
-from cow_service.api.problems import install_problem_handlers
-from cow_service.api.routes.artifacts import artifact_routes
-from cow_service.api.routes.docs import docs_routes
-from cow_service.api.routes.downloads import download_routes
-from cow_service.api.routes.health import health_routes
+from cow_service.api.problems import documented, install_problem_handlers
+from cow_service.api.routes.artifacts import artifact_routes, download_routes
+from cow_service.api.routes.health import docs_routes, health_routes
 from cow_service.api.routes.jobs import job_routes
 from cow_service.api.routes.simulate import simulate_routes
 from cow_service.api.submission import Submitter
+from cow_service.errors import OriginNotAllowed, RateLimited, Unauthorized
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.observability import tracing
+from cow_service.observability.metrics import Metrics
+from cow_service.records import Problem
+from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.settings import Settings
+
+DROPPED = ("HTTPValidationError", "ValidationError")  # the framework's error shapes, which no operation returns
+
+
+def contract(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document of an app, made once: with request bodies, problems and what the middleware answers."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        for model in (Problem, SimulateRequest, AnswerRequest):
+            schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(schema.pop("$defs", {}))
+            schemas[model.__name__] = schema
+        for operations in document["paths"].values():
+            for operation in operations.values():
+                if "application/json" in operation["responses"].get("422", {}).get("content", {}):
+                    del operation["responses"]["422"]  # the framework's own; ours are problems
+        _document_middleware(document)
+        document_chat(document)
+        for name in DROPPED:
+            schemas.pop(name, None)
+        document["components"]["schemas"] = dict(sorted(schemas.items()))
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+def _document_middleware(document: dict[str, Any]) -> None:
+    """Adds the API key, and what the middleware may answer, to each operation."""
+    scheme = {"type": "http", "scheme": "bearer", "description": "Needed where the server has COW_API_KEYS."}
+    document["components"]["securitySchemes"] = {"key": scheme}
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            probe = path in PROBES
+            operation["security"] = [] if probe else [{"key": []}, {}]
+            refusals = (OriginNotAllowed,) if probe else (Unauthorized, OriginNotAllowed, RateLimited)
+            responses = operation["responses"]
+            for status, response in documented(*refusals).items():
+                known = responses.setdefault(str(status), response)
+                if known is not response:
+                    known["description"] += ", " + response["description"]
+            operation["responses"] = dict(sorted(responses.items()))
+
+
+log = logging.getLogger("cow_service")
+
+
+class LayeredApp(FastAPI):
+    """FastAPI with layers around its own, which see also what its handler of unforeseen errors answers."""
+
+    surround: Callable[[ASGIApp], ASGIApp] | None = None
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """The framework's layers, and ours around them."""
+        stack = super().build_middleware_stack()
+        return stack if self.surround is None else self.surround(stack)
+
+
+def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> None:
+    """Puts all layers but the body's limit around the routes of an app that is being made."""
+    keys = KeyRing(settings.api_keys)
+    if settings.rate_limit is not None:
+        app.add_middleware(RateLimit, per_minute=settings.rate_limit)
+    app.add_middleware(ApiKeys, keys=keys, count_failures=settings.rate_limit is not None)
+
+    def surround(stack: ASGIApp) -> ASGIApp:
+        stack = cors(stack, settings.cors_origins)
+        stack = Origins(stack, settings.cors_origins, only_local=not keys and is_loopback(settings.host))
+        return Correlation(AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"]))
+
+    app.surround = surround
+
+
+def warn_if_open(settings: Settings) -> None:
+    """Logs a warning where anybody who reaches the server can use it."""
+    if not settings.api_keys and not is_loopback(settings.host):
+        log.warning("COW_API_KEYS is not set: whoever reaches %s can use this server.", settings.host)
+
 
 SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out."
 

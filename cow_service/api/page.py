@@ -17,7 +17,7 @@ from PIL import Image
 
 from cow_service.errors import NotFound
 from cow_service.media.artifacts import ArtifactStore
-from cow_service.weights.resources import EXAMPLES
+from cow_service.weights.manifests import EXAMPLES
 
 MEDIA_TYPES = {
     ".css": "text/css; charset=utf-8",

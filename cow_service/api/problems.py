@@ -25,7 +25,7 @@ from cow_service.errors import (
     shortened,
     unforeseen,
 )
-from cow_service.requests.faults import SHOWN_CHARACTERS, field_errors
+from cow_service.requests.values import SHOWN_CHARACTERS, field_errors
 
 MEDIA_TYPE = "application/problem+json"
 

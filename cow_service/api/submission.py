@@ -15,15 +15,14 @@ from fastapi import Request, Response
 
 from cow_service.api.body import Body, parse, receive
 from cow_service.api.middleware.body_limit import release_body
-from cow_service.api.minimal import minimal_result
-from cow_service.api.preferences import MINIMAL_APPLIED, Preferences, preferences_of
+from cow_service.api.preferences import MINIMAL_APPLIED, Preferences, minimal_result, preferences_of
 from cow_service.errors import Canceled, CowError, JobNotFound, StorageUnavailable
 from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.state import JobState
 from cow_service.media.images import DecodedImage
-from cow_service.observability import context
+from cow_service.observability import logging as context
 from cow_service.records import TERMINAL, JobKind
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import is_url

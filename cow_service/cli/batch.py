@@ -179,7 +179,7 @@ def _check(question: Question, kind: JobKind) -> None:
     from pydantic import ValidationError  # noqa: PLC0415
 
     from cow_service.requests import AnswerRequest, SimulateRequest  # noqa: PLC0415
-    from cow_service.requests.faults import field_errors  # noqa: PLC0415
+    from cow_service.requests.values import field_errors  # noqa: PLC0415
 
     model = AnswerRequest if kind == "answer" else SimulateRequest
     image = dict(question.image) if isinstance(question.image, Mapping) else "data:"

@@ -27,7 +27,7 @@ from cow_service.errors import InvalidRequest
 from cow_service.media.images import DecodedImage
 from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
-from cow_service.requests.faults import field_errors
+from cow_service.requests.values import field_errors
 from cow_service.service import Service
 
 Body = TypeVar("Body", bound=SimulateRequest)

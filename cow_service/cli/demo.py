@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 from importlib.resources import as_file
 from pathlib import Path
 
-from cow_service.weights.resources import EXAMPLES
+from cow_service.weights.manifests import EXAMPLES
 
 QUESTION = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
 

@@ -23,7 +23,7 @@ def new(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Whose key it is; logs and limits go by it.")],
 ) -> None:
     """Create a key for NAME, and print the setting with which the server accepts it. Nothing is stored."""
-    from cow_service.api.middleware.keys import hash_of, new_key  # noqa: PLC0415
+    from cow_service.api.middleware.access import hash_of, new_key  # noqa: PLC0415
     from cow_service.settings import KEY_NAME, load_settings  # noqa: PLC0415
 
     if not re.fullmatch(KEY_NAME, name):

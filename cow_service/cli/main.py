@@ -175,7 +175,7 @@ def serve(
         pool = WorkerPool(settings, service.metrics) if settings.workers and settings.role == "all" else None
         if pool is not None:
             pool.start()  # its processes start while the server is imported
-        from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
+        from cow_service.api.app import warn_if_open  # noqa: PLC0415
         from cow_service.server import run_server  # noqa: PLC0415
 
     warn_if_open(settings)

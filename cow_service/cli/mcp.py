@@ -65,8 +65,8 @@ def mcp(
         logging.getLogger(logs.ACCESS).setLevel(logging.WARNING)
         run_stdio(backend_for(for_its_owner(settings), url))
         return
-    from cow_service.api.middleware.order import warn_if_open  # noqa: PLC0415
-    from cow_service.api.middleware.origins import is_loopback  # noqa: PLC0415
+    from cow_service.api.app import warn_if_open  # noqa: PLC0415
+    from cow_service.api.middleware.access import is_loopback  # noqa: PLC0415
 
     if not url:
         warn_if_open(settings)

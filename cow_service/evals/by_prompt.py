@@ -15,8 +15,8 @@ from cow_service.evals.imagination import Imagination, Look
 from cow_service.evals.pictures import Pictures
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Usage, Verdict
-from cow_service.stages.gating import gate_of
-from cow_service.stages.results import FirstAnswers
+from cow_service.stages.answering import gate_of
+from cow_service.stages.keys import FirstAnswers
 
 GATE_VOTES = 3
 GATE_THRESHOLD = 1.0

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from cow_service.records import GeneratorInfo, Grounding, Motion, Trajectory
-from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.scene import Scene
+from cow_service.vision.scene import Obstacle, Scene
 
 
 @dataclass(frozen=True)

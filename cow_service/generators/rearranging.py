@@ -12,10 +12,9 @@ from cow_service.generators.cutout.composition import Compositor
 from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions
 from cow_service.generators.removal import at_full_size
 from cow_service.media.images import fit_within
-from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.camera import FloorCamera
 from cow_service.records import Body, Path, Point, Trajectory
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.types import Image
+from cow_service.vision.masks import CroppedMask, Image
 
 
 def put_elsewhere(trajectory: Trajectory, factual: Trajectory) -> tuple[int, ...]:

@@ -15,8 +15,7 @@ from cow_service.generators.cutout.layers import MAX_SIDE, without_bodies
 from cow_service.generators.cutout.measuring import take_shadows
 from cow_service.media.images import fit_within
 from cow_service.records import Path, Trajectory
-from cow_service.vision.masks import CroppedMask, hull, resized_mask
-from cow_service.vision.types import Image, Mask
+from cow_service.vision.masks import CroppedMask, Image, Mask, hull, resized_mask
 
 AWAY = 1e6  # px: where the path of what is taken away ends
 CHANGED = 3  # grey levels: what differs less is as it was

@@ -9,7 +9,7 @@ import psutil
 from cow_service.jobs.computing import Outcome, Work, WorkerState, compute
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.stage_cache import KeyLocks
-from cow_service.observability.gpus import gpu_memory
+from cow_service.observability.metrics import gpu_memory
 
 
 class InProcess:

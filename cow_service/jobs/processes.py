@@ -20,7 +20,7 @@ from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.overview import Overview
 from cow_service.jobs.process_table import ProcessTable
 from cow_service.jobs.queues import known_queues
-from cow_service.observability.timestamps import rfc3339
+from cow_service.observability.logging import rfc3339
 from cow_service.records import ProcessInfo, ProcessRole, WorkerInfo, WorkerJob
 
 TELL_SECONDS = 2.0  # between two rows

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from cow_service.records import AcceptedRequest, JobKind, Record
 from cow_service.requests import AnswerRequest, Priority, SimulateRequest
-from cow_service.stages.results import digest_of
+from cow_service.stages.keys import digest_of
 
 
 class JobSpec(Record):

@@ -16,8 +16,7 @@ from cow_service.jobs.kept_apart import without
 from cow_service.jobs.outages import Outages
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.requests import Stage
-from cow_service.stages.keys import StageKey
-from cow_service.stages.results import RESULT_TYPES, StageResult, digest_of
+from cow_service.stages.keys import RESULT_TYPES, StageKey, StageResult, digest_of
 
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for another one's result checks whether it was canceled
 

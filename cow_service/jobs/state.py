@@ -16,7 +16,7 @@ from cow_service.errors import CowError, FieldError, InternalError, InvalidReque
 from cow_service.jobs.active import ActiveJobs, At, share_done
 from cow_service.jobs.database import database_errors
 from cow_service.jobs.queues import LIGHT
-from cow_service.observability.timestamps import rfc3339
+from cow_service.observability.logging import rfc3339
 from cow_service.records import Answer, Job, JobKind, JobPage, JobStatus, Problem, Simulation
 from cow_service.requests import Priority
 

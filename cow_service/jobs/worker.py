@@ -18,7 +18,8 @@ from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.jobs.outages import Outages
 from cow_service.jobs.spec import JobSpec
 from cow_service.jobs.webhooks import Webhooks
-from cow_service.observability import context, tracing
+from cow_service.observability import logging as context
+from cow_service.observability import tracing
 from cow_service.requests import Stage
 
 POLL_SECONDS, MAX_POLLS = 0.1, 100  # until the database has the end of a webhook's job

@@ -50,7 +50,7 @@ async def _exit_on_signal(close: Callable[[], Awaitable[None]]) -> None:
 
 def run_http(backend: Backend, settings: Settings, *, names: Sequence[str] = ()) -> None:
     """Serves at `settings.host` and `port`, until a signal ends it; `names` are further allowed host names."""
-    from cow_service.api.middleware.origins import is_loopback  # noqa: PLC0415
+    from cow_service.api.middleware.access import is_loopback  # noqa: PLC0415
 
     # Another name is that of a proxy, and nothing is known of the callers of a proxy.
     connect = with_own_keys(backend.connect, everybody=bool(names) or not is_loopback(settings.host))

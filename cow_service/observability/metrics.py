@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable, Iterable, Mapping
 
 from prometheus_client import (
@@ -16,8 +17,24 @@ from prometheus_client import (
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from cow_service.observability.gpus import gpu_memory
-from cow_service.records import WorkerInfo
+from cow_service.records import GpuMemory, WorkerInfo
+
+
+def gpu_memory() -> tuple[GpuMemory, ...]:
+    """Of each GPU, where this process already uses them: asking starts neither PyTorch nor CUDA."""
+    cuda = getattr(sys.modules.get("torch"), "cuda", None)
+    if cuda is None or not cuda.is_available() or not cuda.is_initialized():
+        return ()
+    return tuple(
+        GpuMemory(
+            device=f"cuda:{index}",
+            allocated_mb=cuda.memory_allocated(index) / 1e6,
+            reserved_mb=cuda.memory_reserved(index) / 1e6,
+            total_mb=cuda.get_device_properties(index).total_memory / 1e6,
+        )
+        for index in range(cuda.device_count())
+    )
+
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _REQUEST_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600)  # seconds

@@ -24,7 +24,7 @@ from opentelemetry.trace import (
 )
 
 from cow_service import __version__
-from cow_service.observability import context
+from cow_service.observability import logging as context
 from cow_service.settings import SettingsError
 
 if TYPE_CHECKING:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.types import Floats
+from cow_service.records import BBox, CameraEstimate, CameraSource
+from cow_service.vision.masks import Floats
+from cow_service.vision.shadows import Shadow
 
-FOCAL_WIDTHS = 1.0  # focal length in image widths: a horizontal field of view of 53 degrees
-PITCH = math.radians(30)  # how far the camera looks down on a floor, for motion towards or away from it
-NEAREST = 0.08  # of the first depth: closer than this the object has passed the camera
+FREE_PITCH = math.radians(30)  # how far the camera looks down on a floor, for motion towards or away from it
+NEAREST_FREE = 0.08  # of the first depth: closer than this the object has passed the camera
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,9 @@ class Camera:
     def project(self, positions: Floats) -> tuple[Floats, Floats]:
         """Image points [F, 2] (px) and apparent sizes [F] (1 at the first depth) of positions [F, 3] (m).
 
-        Positions nearer than `NEAREST` are projected as if they were there: behind the camera there is no image.
+        Positions nearer than `NEAREST_FREE` are projected as if they were there: behind the camera there is no image.
         """
-        z = np.maximum(positions[:, 2], NEAREST * self.depth)
+        z = np.maximum(positions[:, 2], NEAREST_FREE * self.depth)
         points = positions[:, :2] * (self.focal / z)[:, None] + np.array([self.width / 2, self.height / 2])
         return points, self.depth / z
 
@@ -54,9 +56,202 @@ class Camera:
 
 def has_passed(depths: Floats, first: float) -> NDArray[np.bool_]:
     """Which of the depths [F] of an object are so small, against its first one, that the camera has been passed."""
-    return depths <= NEAREST * first
+    return depths <= NEAREST_FREE * first
 
 
 def depth_motion(sense: float) -> tuple[tuple[float, float], float]:
     """Image direction and `Motion.depth` of what moves on the floor straight away (+1) or towards (-1) the camera."""
-    return (0.0, -1.0 if sense > 0 else 1.0), math.copysign(math.cos(PITCH), sense)
+    return (0.0, -1.0 if sense > 0 else 1.0), math.copysign(math.cos(FREE_PITCH), sense)
+
+
+NEAREST = 1e-3  # of the camera's height: depths below it project as if they were there
+HORIZON = 0.02  # sine of the angle below the horizon from which a ray meets the floor at a sane distance
+
+
+@dataclass(frozen=True)
+class FloorCamera:
+    """Focal length (px), pitch and roll (radians), height above the floor (m) and the image's size (px)."""
+
+    width: int
+    height_px: int
+    focal: float
+    pitch: float  # positive: it looks down
+    roll: float  # positive: the vertical leans to the left in the image
+    height: float
+
+    @staticmethod
+    def of(estimate: CameraEstimate, width: int, height_px: int) -> FloorCamera:
+        """The camera of a record, for an image of a size in px."""
+        pitch, roll = math.radians(estimate.pitch), math.radians(estimate.roll)
+        return FloorCamera(width, height_px, estimate.focal, pitch, roll, estimate.height)
+
+    @cached_property
+    def axes(self) -> Floats:
+        """Rows: right, up and ahead over the floor [3, 3], unit vectors in the frame of the camera."""
+        return axes_of(np.array([self.pitch]), np.array([self.roll]))[0]
+
+    @property
+    def right(self) -> Floats:
+        """Unit vector [3] over the floor."""
+        return self.axes[0]
+
+    @property
+    def up(self) -> Floats:
+        """Unit vector [3]."""
+        return self.axes[1]
+
+    @property
+    def ahead(self) -> Floats:
+        """Unit vector [3] over the floor, away from the camera."""
+        return self.axes[2]
+
+    def rays(self, points: Floats) -> Floats:
+        """Rays [N, 3] of depth 1 through image points [N, 2] (px)."""
+        across = (points - np.array([self.width / 2, self.height_px / 2])) / self.focal
+        return np.column_stack([across, np.ones(len(points))])
+
+    def project(self, positions: Floats) -> Floats:
+        """Image points [N, 2] (px) of positions [N, 3] (m)."""
+        z = np.maximum(positions[:, 2:], NEAREST * self.height)
+        return positions[:, :2] * self.focal / z + np.array([self.width / 2, self.height_px / 2])
+
+    def above_floor(self, positions: Floats) -> Floats:
+        """Heights [N] (m) of positions [N, 3]."""
+        return positions @ self.up + self.height
+
+    def floor_points(self, points: Floats) -> Floats:
+        """Positions [N, 3] (m) on the floor under image points [N, 2] (px); nan at and above the horizon."""
+        rays = self.rays(points)
+        sink = -rays @ self.up
+        length = np.linalg.norm(rays, axis=1)
+        depth = np.where(sink > HORIZON * length, self.height / np.where(sink > 0, sink, 1.0), np.nan)
+        return rays * depth[:, None]
+
+    def to_floor(self, positions: Floats) -> Floats:
+        """Coordinates [N, 3] (m) right, above the floor and ahead, of positions [N, 3] in the frame of the camera."""
+        return positions @ self.axes.T + np.array([0.0, self.height, 0.0])
+
+    def from_floor(self, coordinates: Floats) -> Floats:
+        """Positions [N, 3] (m) in the frame of the camera, of coordinates [N, 3] right, above the floor and ahead."""
+        return (coordinates - np.array([0.0, self.height, 0.0])) @ self.axes
+
+
+def axes_of(pitch: Floats, roll: Floats) -> Floats:
+    """Unit vectors right, up and ahead over the floor [K, 3, 3] in the frames of cameras, from radians [K] each."""
+    sine, cosine, zero = np.sin(pitch), np.cos(pitch), np.zeros(len(pitch))
+    s, c = np.sin(roll), np.cos(roll)
+    # A roll turns the image about the optical axis: up leans to the left where it is positive.
+    right = np.stack([c, -s, zero], axis=1)
+    up = np.stack([-s * cosine, -c * cosine, -sine], axis=1)
+    ahead = np.stack([-s * sine, -c * sine, cosine], axis=1)
+    return np.stack([right, up, ahead], axis=1)
+
+
+FOCAL_WIDTHS = 1.0  # focal length in image widths: a horizontal field of view of 53 degrees
+PITCH, PITCH_SIGMA = math.radians(28), math.radians(8)
+FOCAL_SIGMA = 0.1  # of its natural logarithm
+ROLL_SIGMA = math.radians(1.0)
+HEIGHT_RADII, HEIGHT_SIGMA = 5.0, 0.6  # above the floor of what is in the air, in its radii; of the logarithm
+SLANT = (0.0, 0.1)  # of the light: right and ahead, per unit of height
+SLANT_SIGMA = (0.5, 0.45)
+# Of the measurements: centre in radii of the ball, log of width and height, correlation.
+MEASUREMENT_SIGMA = (0.05, 0.05, 0.06, 0.08, 0.05)
+MAX_COST = 12.0  # squared deviations of the measurements in all: a patch that fits worse is not the ball's shadow
+GOOD_COST = 5.0  # a worse fit than this widens the deviations
+LOWEST, HIGHEST = np.array([0.05, -0.7, 0.0, -1.5, -1.5]), np.array([1.4, 0.7, 3.7, 1.5, 1.5])
+MAX_ITERATIONS = 20
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """Pitch (rad), log focal length (image widths), log height (radii), slant right and ahead: mean and covariance."""
+
+    mean: Floats  # [5]
+    covariance: Floats  # [5, 5]
+    roll: float  # radians
+    roll_sigma: float
+    source: CameraSource
+
+
+def prior(roll: float = 0.0) -> CameraFit:
+    """What is known of the camera before anything is measured."""
+    return CameraFit(*_prior(), roll, ROLL_SIGMA, "prior")
+
+
+def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, int]) -> CameraFit | None:
+    """The camera by the shadow of a ball in a box of an image of a size (width, height), px.
+
+    None where no likely camera and light would make that shadow of a ball in the air.
+    """
+    model = _ShadowModel.of(ball, size, start.roll)
+    precision = np.linalg.inv(start.covariance)
+    root = np.linalg.cholesky(precision).T
+    seen = np.array([*shadow.centre, *shadow.spread])
+
+    def residuals(parameters: Floats) -> Floats:
+        made = _features(model.shadow(parameters), model.radius)
+        measured = (made - _features(seen, model.radius)) / np.array(MEASUREMENT_SIGMA)
+        return np.concatenate([measured, root @ (parameters - start.mean)])
+
+    parameters = start.mean.copy()
+    drop = (shadow.centre[1] - (ball[1] + ball[3]) / 2) / model.radius / math.cos(parameters[0])
+    parameters[2] = math.log(max(drop, 1.2))
+    slopes = np.zeros((10, 5))
+    for _ in range(MAX_ITERATIONS):
+        now = residuals(parameters)
+        slopes = np.stack([(residuals(parameters + step) - now) / 1e-5 for step in 1e-5 * np.eye(5)], axis=1)
+        move = np.clip(np.linalg.lstsq(slopes, -now, rcond=None)[0], -0.3, 0.3)
+        parameters = np.clip(parameters + move, LOWEST, HIGHEST)
+        if float(np.abs(move).max()) < 1e-4:
+            break
+    cost = float((residuals(parameters)[:5] ** 2).sum())
+    if cost > MAX_COST:
+        return None
+    covariance = np.asarray(np.linalg.inv(slopes.T @ slopes), np.float64) * max(1.0, cost / GOOD_COST)
+    return CameraFit(parameters, covariance, start.roll, start.roll_sigma, "shadow")
+
+
+def _prior() -> tuple[Floats, Floats]:
+    mean = np.array([PITCH, math.log(FOCAL_WIDTHS), math.log(HEIGHT_RADII), *SLANT])
+    sigma = np.array([PITCH_SIGMA, FOCAL_SIGMA, HEIGHT_SIGMA, *SLANT_SIGMA])
+    return mean, np.diag(sigma**2)
+
+
+@dataclass(frozen=True)
+class _ShadowModel:
+    """A ball seen by a pinhole camera, lengths in radii of the ball: x right, y down, z ahead."""
+
+    across: Floats  # [2]: its centre from the middle of the image, in its radii
+    radius: float  # px
+    width: float  # px, of the image
+    middle: Floats  # [2] px
+    roll: float  # radians
+
+    @staticmethod
+    def of(bbox: BBox, size: tuple[int, int], roll: float) -> _ShadowModel:
+        radius, middle = (bbox[2] - bbox[0] + bbox[3] - bbox[1]) / 4, np.array(size) / 2
+        centre = np.array([bbox[0] + bbox[2], bbox[1] + bbox[3]]) / 2
+        return _ShadowModel((centre - middle) / radius, radius, float(size[0]), middle, roll)
+
+    def shadow(self, parameters: Floats) -> Floats:
+        """Centre [2] and spread [3] (px, px^2) of the shadow that such a camera, height and light make."""
+        pitch, log_focal, log_height, sideways, away = parameters
+        focal, height = math.exp(log_focal) * self.width, math.exp(log_height)
+        right, up, ahead = axes_of(np.array([pitch]), np.array([self.roll]))[0]
+        ball = np.array([*self.across, focal / self.radius])
+        centre = ball + height * (sideways * right + away * ahead - up)
+        slant = np.array([sideways, away])
+        # A ball's shadow has the matrix 1 + slant slant^T: as wide as the ball, drawn out along the light.
+        stretch = np.eye(2) + np.outer(slant, slant) / (1 + np.sqrt(1 + slant @ slant))
+        turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ stretch
+        points = centre + rim[:, :1] * right + rim[:, 1:] * ahead
+        image = focal * points[:, :2] / np.maximum(points[:, 2:], 1e-3) + self.middle
+        spread = np.cov(image.T, bias=True) / 2
+        return np.array([*image.mean(axis=0), spread[0, 0], spread[1, 1], spread[0, 1]])
+
+
+def _features(shadow: Floats, radius: float) -> Floats:
+    """A shadow's centre in radii, log half width and half height, and correlation."""
+    x, y, xx, yy, xy = shadow
+    return np.array([x / radius, y / radius, np.log(xx) / 2, np.log(yy) / 2, xy / np.sqrt(xx * yy)])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from rapier3d import (
@@ -26,16 +26,107 @@ from rapier3d import (
     Vec3,
 )
 
-from cow_service.physics.containers import (
-    BOX_SIDES,
-    floor_radius,
-    floor_thickness,
-    relative_density,
-    wall_segments,
-)
-from cow_service.physics.dynamics import GRAVITY
-from cow_service.physics.rigid import RigidShape
-from cow_service.vision.types import Floats, Mask
+from cow_service.physics.ballistic import GRAVITY, Course
+from cow_service.physics.draws import COLUMN
+from cow_service.records import Shape
+from cow_service.vision.masks import Floats, Mask
+from cow_service.vision.openings import SeenOpening
+
+ROUND_SIDES = 16  # wall segments of a round container: the opening is wider by at most 2% at their joints
+BOX_SIDES = 4
+THINNEST = 0.03  # of the half width: a thinner wall would let fast things through
+LEAST_OPENING = 0.3  # of the half width
+FLOOR_SHARE = 0.08  # of the height: how thick the floor of a container is
+NARROWEST = 0.3  # of the opening: its floor
+
+
+@dataclass(frozen=True)
+class Hollow:
+    """The space inside a body. Its outer sizes are those of the body, at its rim."""
+
+    opening: float  # m: inner radius at the rim; of a box half the inner side
+    bottom: float  # m: the same at the floor
+    depth: float  # m: from the rim down to the floor
+    sides: int = ROUND_SIDES
+
+
+def hollow_of(seen: SeenOpening, half_width: float, half_height: float, row: Floats) -> Hollow:
+    """The space inside a body of outer half width and height (m), as a draw [P] has the width of the opening."""
+    drawn = seen.inner * math.exp(seen.deviation * float(row[COLUMN["opening"]]))
+    opening = half_width * min(max(drawn, LEAST_OPENING), 1 - THINNEST)
+    wall = half_width - opening
+    bottom = min(opening, max(NARROWEST * opening, seen.bottom * half_width - wall))
+    sides = BOX_SIDES if seen.square else ROUND_SIDES
+    return Hollow(opening, bottom, 2 * half_height * (1 - FLOOR_SHARE), sides)
+
+
+def wall_segments(hollow: Hollow, half_width: float, half_height: float) -> list[Floats]:
+    """The corners [8, 3] of each convex segment of the wall, which stands on the floor of the container."""
+    turn = math.pi / hollow.sides
+    angles = turn + 2 * turn * np.arange(hollow.sides + 1)
+    circle = np.stack([np.cos(angles), np.zeros_like(angles), np.sin(angles)], axis=1)
+    around = np.asarray(circle / math.cos(turn), np.float64)
+    levels = ((half_width, hollow.opening, half_height), (floor_radius(hollow, half_width), hollow.bottom, 0.0))
+    corners: list[Floats] = []
+    for outer, inner, height in levels:
+        level = np.array([0.0, height if height else half_height - hollow.depth, 0.0])
+        corners += [around * outer + level, around * inner + level]
+    return [np.concatenate([ring[i : i + 2] for ring in corners]) for i in range(hollow.sides)]
+
+
+def floor_radius(hollow: Hollow, half_width: float) -> float:
+    """Outer radius (m) of the floor of a container, or half its side."""
+    return hollow.bottom + half_width - hollow.opening
+
+
+def floor_thickness(hollow: Hollow, half_height: float) -> float:
+    """Metres."""
+    return 2 * half_height - hollow.depth
+
+
+def relative_density(hollow: Hollow, half_width: float, half_height: float) -> float:
+    """The density with which a container is as heavy as a solid body of its outline would be with a density of 1.
+
+    Things that hold others are made of heavier stuff than balls and blocks of their size; the thickness of their walls
+    is not seen, and must not decide what tips them.
+    """
+    low, high = floor_radius(hollow, half_width), half_width
+    outline = 2 * half_height * (low**2 + low * high + high**2) / 3
+    space = hollow.depth * (hollow.bottom**2 + hollow.bottom * hollow.opening + hollow.opening**2) / 3
+    return outline / max(outline - space, 0.02 * outline)
+
+
+RESTS = 0.3  # of the lower body's half height: how far apart the ends of two bodies may be that stand on each other
+
+
+@dataclass(frozen=True)
+class RigidShape:
+    """A body of one world at its start. Of a pair that touches, restitution and friction are the products."""
+
+    shape: Shape
+    half_width: float  # m: the radius of a sphere, cylinder or cone, half the length of a box
+    half_depth: float  # m: half the breadth of a box, else the half width
+    half_height: float  # m: of a sphere, its radius
+    position: tuple[float, float, float]  # of its centre
+    yaw: float = 0.0  # radians about the vertical
+    turn: tuple[float, float, float, float] | None = None  # quaternion x, y, z, w, where it is not turned by yaw alone
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s
+    density: float = 1.0  # against that of the others
+    friction: float = 0.5
+    restitution: float = 0.5
+    starts: bool = False  # it is set in motion or let go; what is not sleeps until it is touched
+    glides: bool = False  # keeps its velocity, without friction, until it meets another body
+    falls: bool = True  # gravity acts on it
+    ghost: bool = False  # passes through everything; what it meets is told all the same
+    course: Course | None = None  # of what glides: its legs, and where it stops
+    hollow: Hollow | None = None  # it is an open container
+    follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
+
+    def stands_on(self, other: RigidShape) -> bool:
+        """Whether its lower end is, at the start, about where the upper end of another body is."""
+        low, top = self.position[1] - self.half_height, other.position[1] + other.half_height
+        return abs(low - top) < RESTS * min(self.half_height, other.half_height)
+
 
 ENGINE_SIZE = 0.15  # m inside the engine: half the width of the first body of the first world
 SPACING = 24.0  # m inside the engine, between worlds

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cow_service.physics.world import Worlds
-from cow_service.vision.types import Floats, Mask
+from cow_service.records import Path
+from cow_service.vision.masks import CroppedMask, Floats, Mask, scaled_size
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion x, y, z, w
 MOST_LEAN = np.radians(25)
@@ -111,3 +115,158 @@ def turned(turns: Floats, vector: Floats) -> Floats:
     axis, w = turns[:, :3], turns[:, 3:]
     across = np.cross(axis, vector)
     return vector + 2 * (w * across + np.cross(axis, across))
+
+
+Indices = NDArray[np.int64]
+
+SAMPLES = 96  # points of a silhouette that are looked up in the other
+CHUNK = 2048  # draws and frames at a time, to bound the memory
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares [K, F] of another body that the subject covers, and of the subject that the other body covers."""
+
+    covers: Floats
+    covered: Floats
+
+
+def shares(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path: SeenPaths) -> Shares:
+    """By the silhouettes of the image; what is nearer covers what is farther."""
+    covers, covered = np.zeros(path.depth.shape), np.zeros(path.depth.shape)
+    seen = ~path.passed & ~other_path.passed
+    meet = _boxes_meet(subject, path, other, other_path) & seen
+    nearer = path.depth < other_path.depth
+    _fill(covers, meet & nearer, subject, path, other, other_path)
+    _fill(covered, meet & ~nearer, other, other_path, subject, path)
+    return Shares(covers, covered)
+
+
+def _fill(
+    found: Floats, where: Mask, front: CroppedMask, front_path: SeenPaths, back: CroppedMask, back_path: SeenPaths
+) -> None:
+    """Writes the share of the body at the back that the one in front covers, in some draws and frames [K, F]."""
+    draws, frames = np.nonzero(where)
+    if not len(draws):
+        return
+    points = _sample(back)
+    for start in range(0, len(draws), CHUNK):
+        k, f = draws[start : start + CHUNK], frames[start : start + CHUNK]
+        there = _moved(points, back_path, k, f)
+        found[k, f] = _inside(front, _moved_back(there, front_path, k, f))
+
+
+def _moved(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:
+    """Points [S, 2] of the image, where a path has them [N, S, 2] in draws and frames [N]."""
+    first, now, scale = path.seen[k], path.points[k, f], path.scale[k, f][:, None, None]
+    return now[:, None] + (points[None] - first[:, None]) * scale
+
+
+def _moved_back(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:
+    """Where points [N, S, 2] of draws and frames [N] were at the first frame."""
+    first, now, scale = path.seen[k], path.points[k, f], path.scale[k, f][:, None, None]
+    return first[:, None] + (points - now[:, None]) / scale
+
+
+def _boxes_meet(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path: SeenPaths) -> Mask:
+    """[K, F]: the boxes of the moved silhouettes meet."""
+    (low, high), (other_low, other_high) = _corners(subject, path), _corners(other, other_path)
+    return np.all((low < other_high) & (high > other_low), axis=2)
+
+
+def _corners(mask: CroppedMask, path: SeenPaths) -> tuple[Floats, Floats]:
+    """Upper left and lower right corners [K, F, 2] of the box of a moved silhouette."""
+    x0, y0, x1, y1 = mask.bbox
+    low, high = (
+        path.points + (np.array(corner) - path.seen[:, None]) * path.scale[..., None] for corner in ((x0, y0), (x1, y1))
+    )
+    return low, high
+
+
+def _sample(mask: CroppedMask) -> Floats:
+    """Points [S, 2] (px) spread evenly over a mask."""
+    rows, columns = np.nonzero(mask.patch)
+    if not len(rows):
+        return np.array([[mask.columns.start + 0.5, mask.rows.start + 0.5]])
+    # Every n-th pixel of a raster lines up in columns; a golden-ratio sequence does not.
+    order = np.argsort(np.modf(np.arange(len(rows)) * 0.6180339887498949)[0])[:SAMPLES]
+    return np.stack([columns[order] + mask.columns.start + 0.5, rows[order] + mask.rows.start + 0.5], axis=1)
+
+
+def _inside(mask: CroppedMask, points: Floats) -> Floats:
+    """Share [N] of points [N, S, 2] (px) that lie in a mask."""
+    height, width = mask.patch.shape
+    x = np.floor(points[..., 0]).astype(np.int64) - mask.columns.start
+    y = np.floor(points[..., 1]).astype(np.int64) - mask.rows.start
+    seen = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    found = mask.patch[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] & seen
+    return np.asarray(found.mean(axis=1), np.float64)
+
+
+WORKING_SIDE = 320  # px: paths are swept at this size
+
+
+def swept(masks: Sequence[CroppedMask], starts: Sequence[Floats], paths: Sequence[Path]) -> Mask:
+    """Mask [H, W] of every place that bodies cover on their paths: those of `masks`, first at `starts` [2] (px)."""
+    height, width = masks[0].shape
+    factor = min(1.0, WORKING_SIDE / max(height, width))
+    size = scaled_size(width, height, factor)
+    canvas = np.zeros((size[1], size[0]), np.uint8)
+    for mask, start, path in zip(masks, starts, paths, strict=True):
+        contours, _ = cv2.findContours(mask.patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        if not contours:
+            continue
+        outline = np.asarray(max(contours, key=len)[:, 0], np.float64) - start
+        outline += np.array([mask.columns.start, mask.rows.start])
+        for point, scale in zip(path.points, path.scale, strict=True):
+            moved = (np.array(point) + scale * outline) * factor
+            if np.all(np.abs(moved) < 4 * max(size)):
+                cv2.fillPoly(canvas, [np.round(moved).astype(np.int32)], 1)
+    return cv2.resize(canvas, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+ANCHORS = 8
+TRACKS = 5
+GRID = 14  # candidates along the longer side
+CLEARANCE = 0.02  # of the shorter side, kept between an anchor and what may move
+
+
+def spread_anchors(movable: Mask, count: int = ANCHORS) -> tuple[tuple[float, float], ...]:
+    """At most `count` points (px), far from each other, off a mask [H, W] of everything that may move."""
+    height, width = movable.shape
+    side = 2 * max(2, int(CLEARANCE * min(height, width))) + 1
+    blocked = cv2.dilate(movable.astype(np.uint8), np.ones((side, side), np.uint8))
+    step = max(height, width) / GRID
+    xs = np.arange(step / 2, width, step)
+    ys = np.arange(step / 2, height, step)
+    grid = np.array([(x, y) for y in ys for x in xs if not blocked[int(y), int(x)]]).reshape(-1, 2)
+    chosen = _farthest(grid, np.array([0.0, 0.0]), count)
+    return tuple((float(x), float(y)) for x, y in chosen)
+
+
+def points_inside(
+    mask: CroppedMask, centre: tuple[float, float], count: int = TRACKS
+) -> tuple[tuple[float, float], ...]:
+    """The centre and points inside a mask away from its rim (px), spread out; at least one point."""
+    if not mask.area:
+        return (centre,)
+    deep = cv2.distanceTransform(np.pad(mask.patch, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    rows, columns = np.nonzero(deep >= 0.35 * deep.max())
+    candidates = np.stack([columns + mask.columns.start + 0.5, rows + mask.rows.start + 0.5], axis=1)
+    start = candidates[int(np.linalg.norm(candidates - np.array(centre), axis=1).argmin())]
+    return tuple((float(x), float(y)) for x, y in [start, *_farthest(candidates, start, count - 1)])
+
+
+def _farthest(candidates: Floats, start: Floats, count: int) -> list[Floats]:
+    """Up to `count` candidates [N, 2], each as far as can be from `start` and from those before it."""
+    chosen: list[Floats] = []
+    if not len(candidates):
+        return chosen
+    gap = np.linalg.norm(candidates - start, axis=1)
+    for _ in range(count):
+        best = int(gap.argmax())
+        if gap[best] < 1.0:
+            break
+        chosen.append(candidates[best])
+        gap = np.minimum(gap, np.linalg.norm(candidates - candidates[best], axis=1))
+    return chosen

@@ -10,19 +10,28 @@ from typing import Any
 
 import numpy as np
 
+from cow_service.physics.ballistic import course_of
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.camera_fit import CameraFit
-from cow_service.physics.carrying import Put, arc, carried, frames_carried, frames_to_run, height_over, let_go
-from cow_service.physics.course import course_of
+from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import WorldRun, run_worlds
+from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
 from cow_service.physics.lift import BOX_SIDE, FARTHEST, Cameras, Placed
-from cow_service.physics.placement import Placements, classify
+from cow_service.physics.placement import (
+    Placements,
+    Put,
+    arc,
+    carried,
+    classify,
+    frames_carried,
+    frames_to_run,
+    height_over,
+    let_go,
+    settle,
+    standing_on,
+)
 from cow_service.physics.placing import VEHICLE_WIDTH, PlacedScene, flies, place, speed_factors
-from cow_service.physics.rigid import RigidShape
-from cow_service.physics.settling import settle, standing_on
 from cow_service.records import FALLING_KINDS, Motion
-from cow_service.vision.types import Floats, Mask
+from cow_service.vision.masks import Floats, Mask
 
 FRICTION, FRICTION_SIGMA = 0.5, 0.3  # of a body; one standard deviation of the logarithm
 RESTITUTION, RESTITUTION_SIGMA = 0.5, 0.15

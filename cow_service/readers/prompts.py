@@ -14,7 +14,7 @@ from jinja2 import StrictUndefined, Template
 from jinja2.meta import find_undeclared_variables
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from cow_service.weights.resources import PROMPTS
+from cow_service.weights.manifests import PROMPTS
 
 FIELDS = {"version": int, "inputs": list}
 _FENCE = "---"

@@ -4,11 +4,6 @@ Coordinates are pixels of the upright input image, x right, y down, (0, 0) the i
 Times are seconds from the first frame. Records hold no pixels and do no I/O: bytes are named by their SHA-256.
 """
 
-from cow_service.records.asked import (
-    Asked,
-    AskedForm,
-    AskedRelation,
-)
 from cow_service.records.base import (
     Artifact,
     BBox,
@@ -42,17 +37,8 @@ from cow_service.records.motion import (
     Source,
     Until,
 )
-from cow_service.records.processes import (
-    GpuMemory,
-    ProcessInfo,
-    ProcessRole,
-    QueueInfo,
-    Unserved,
-    WorkerInfo,
-    WorkerJob,
-    Workers,
-)
 from cow_service.records.results import (
+    VIDEO_FILE,
     Answer,
     AnswerOption,
     Clip,
@@ -69,20 +55,32 @@ from cow_service.records.results import (
     Usage,
     Verdict,
     Video,
+    artifacts_of,
+    documents_of,
 )
-from cow_service.records.saved import VIDEO_FILE, artifacts_of, documents_of
 from cow_service.records.service import (
     TERMINAL,
     AcceptedRequest,
     BackendInfo,
+    GpuMemory,
     Job,
     JobKind,
     JobPage,
     JobStatus,
     Models,
+    ProcessInfo,
+    ProcessRole,
+    QueueInfo,
+    Unserved,
+    WorkerInfo,
+    WorkerJob,
+    Workers,
 )
 from cow_service.records.world import (
     MEETINGS,
+    Asked,
+    AskedForm,
+    AskedRelation,
     Body,
     CameraDeviations,
     CameraEstimate,

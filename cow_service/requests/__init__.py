@@ -1,6 +1,5 @@
 """What a caller may ask: the bodies of `POST /simulate` and `POST /answer`. Checked once, here, then trusted."""
 
-from cow_service.requests.interventions import InterventionRequest
 from cow_service.requests.motion import (
     CameraRequest,
     MotionRequest,
@@ -8,7 +7,7 @@ from cow_service.requests.motion import (
     OtherMotionRequest,
     TrajectoryRequest,
 )
-from cow_service.requests.places import GroundingRequest, ObjectRequest, PlaceRequest
+from cow_service.requests.places import GroundingRequest, InterventionRequest, ObjectRequest, PlaceRequest
 from cow_service.requests.simulation import (
     PRIORITIES,
     AnswerRequest,

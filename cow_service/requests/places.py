@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, field_validator, model_validator
 
-from cow_service.records import BBox, ObjectRole, Record, Shape
+from cow_service.records import BBox, InterventionKind, ObjectRole, PlaceRelation, Record, Shape
 from cow_service.requests.values import Finite, MaskRef, Words
 
 MAX_OBJECTS = 64
@@ -53,3 +53,26 @@ class ObjectRequest(PlaceRequest):
 
     object: ObjectWords
     role: ObjectRole = Field(default="target", description="target: the question asks about it; obstacle: it is there.")
+
+
+class InterventionRequest(Record):
+    """A change of the scene before anything moves. Its objects are named as in `objects`, or in words to look for."""
+
+    kind: InterventionKind
+    object: ObjectWords
+    relation: PlaceRelation | None = Field(default=None, description="Of `place`: how it is put to the `targets`.")
+    targets: tuple[ObjectWords, ...] = Field(
+        default=(), max_length=2, description="Of `place`: what it is put into, onto or beside; two for `between`."
+    )
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> InterventionRequest:
+        if self.kind == "remove" and (self.relation is not None or self.targets):
+            raise ValueError("`remove` takes an `object` alone; `relation` and `targets` belong to `place`")
+        if self.kind == "place":
+            wanted = 2 if self.relation == "between" else 1
+            if self.relation is None or len(self.targets) != wanted:
+                raise ValueError(f"`place` needs a `relation` and {wanted} of `targets`")
+            if len({" ".join(name.lower().split()) for name in (self.object, *self.targets)}) <= wanted:
+                raise ValueError("`object` and `targets` must be different things")
+        return self

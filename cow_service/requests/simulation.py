@@ -9,9 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, field_validator
 
 from cow_service.records import AnswerOption, FramePolicy, Law, Record
-from cow_service.requests.interventions import InterventionRequest
 from cow_service.requests.motion import CameraRequest, MotionRequest, TrajectoryRequest
-from cow_service.requests.places import MAX_OBJECTS, GroundingRequest, ObjectRequest
+from cow_service.requests.places import MAX_OBJECTS, GroundingRequest, InterventionRequest, ObjectRequest
 from cow_service.requests.values import Finite, Flag, ImageRef, MaskRef, Name, Whole, Words, writable
 
 MAX_FRAMES = 481

@@ -4,30 +4,62 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import replace
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.rearranging import with_put
 from cow_service.generators.removal import without_removed
 from cow_service.media.artifacts import ArtifactWriter
-from cow_service.media.images import encode_jpeg, fit_within
+from cow_service.media.images import encode_jpeg, encode_png, fit_within
 from cow_service.media.overlay import Replaced, draw_overlay
-from cow_service.records import BBox, Clip, Grounding, Motion, PlacedBefore, Trajectory, Video
+from cow_service.records import BBox, Clip, Frame, Grounding, Motion, PlacedBefore, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.bodies import obstacles_of
-from cow_service.stages.frames import EncodedFrame, stored
-from cow_service.stages.results import StageResult
+from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
-from cow_service.vision.types import Mask
+from cow_service.vision.masks import Image, Mask
+
+
+@dataclass(frozen=True)
+class EncodedFrame:
+    """A frame of the clip, and its PNG once that is made."""
+
+    index: int
+    time: float  # s
+    width: int  # px
+    height: int
+    png: Future[bytes]
+
+    @staticmethod
+    def of(pixels: Image, index: int, fps: float, max_side: int | None, encoder: Executor) -> EncodedFrame:
+        """Of an image [H, W, 3] that its maker may change afterwards."""
+        fitting = fit_within(pixels, max_side)
+        picture = pixels.copy() if fitting is pixels else fitting
+        height, width = picture.shape[:2]
+        return EncodedFrame(index, index / fps, width, height, encoder.submit(encode_png, picture))
+
+
+def stored(frames: Sequence[EncodedFrame], artifacts: ArtifactWriter) -> tuple[Frame, ...]:
+    """Waits for the PNGs and stores them."""
+    kept = [artifacts.put(frame.png.result(), "image/png") for frame in frames]
+    return tuple(
+        Frame(
+            index=frame.index,
+            time=frame.time,
+            url=artifact.url,
+            sha256=artifact.sha256,
+            width=frame.width,
+            height=frame.height,
+        )
+        for frame, artifact in zip(frames, kept, strict=True)
+    )
+
 
 OVERLAY_SIDE = 1280  # px, at most
 MIN_GAP = 0.2  # s between a contact and another chosen frame: closer ones show the same
-
-Image = NDArray[np.uint8]
 
 
 def choose_frames(wanted: FramesRequest, trajectory: Trajectory) -> tuple[int, ...]:

@@ -3,22 +3,288 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
-from cow_service.errors import FieldError, InvalidRequest
-from cow_service.media.images import decode_own, encode_png
+from cow_service.errors import (
+    ArtifactNotFound,
+    CannotGround,
+    FieldError,
+    ImageTooLarge,
+    ImageTypeUnsupported,
+    ImageUnreadable,
+    InvalidRequest,
+    field_of,
+)
+from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.images import decode, decode_own, encode_png
 from cow_service.readers.base import GroundingReading
+from cow_service.readers.question.sentences import parse
 from cow_service.readers.question.wording import same_name
-from cow_service.records import Artifact, BBox, Grounding, LocatedObject, Point, Source
-from cow_service.requests import GroundingRequest, SimulateRequest
-from cow_service.stages.interventions import locate_interventions, stated_changes, without_removed
-from cow_service.stages.places import place_of, prior_of
-from cow_service.stages.results import StageResult
+from cow_service.readers.remedies import GIVE_OBJECT
+from cow_service.records import (
+    Artifact,
+    BBox,
+    Estimate,
+    Grounding,
+    Intervention,
+    LocatedObject,
+    ObjectPrior,
+    Point,
+    Source,
+)
+from cow_service.requests import (
+    GroundingRequest,
+    ImageArtifact,
+    InterventionRequest,
+    MaskRef,
+    PlaceRequest,
+    SimulateRequest,
+)
+from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
-from cow_service.vision.masks import iou
+from cow_service.vision.masks import CroppedMask, Mask, bbox_of, iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
-from cow_service.vision.types import Mask
+from cow_service.vision.scene import Scene
+from cow_service.vision.segmentation import cut_quality
+
+
+def locate_interventions(
+    wanted: Sequence[InterventionRequest],
+    read: Sequence[Intervention],
+    mover: LocatedObject,
+    given: Sequence[LocatedObject],
+    seen: Sequence[LocatedObject],
+) -> tuple[Intervention, ...]:
+    """Those of the request, then those of the reader that are not among them.
+
+    The objects of a request's interventions are looked for by name, first among the objects `given` with it, then
+    among those `seen` by the reader. Raises `InvalidRequest` for an object that is not there, for what is done twice,
+    for a thing that is put to itself, and for the mover taken away; `CannotGround` where the reader says so.
+    """
+    places = (*given, *seen, mover)
+    found: list[Intervention] = []
+    for index, request in enumerate(wanted):
+        pointer = f"/interventions/{index}"
+        located = Intervention(
+            kind=request.kind,
+            object=_named(request.object, places, f"{pointer}/object"),
+            relation=request.relation,
+            targets=tuple(_named(name, places, f"{pointer}/targets/{at}") for at, name in enumerate(request.targets)),
+        )
+        fault = _fault(located, mover, found)
+        if fault is not None:
+            raise InvalidRequest(f"`interventions.{index}`: {fault}", errors=(FieldError(pointer, fault),))
+        found.append(located)
+    for each in read:
+        if any(_same_change(each, other) for other in found):
+            continue
+        fault = _fault(each, mover, found)
+        if fault is not None:
+            raise CannotGround(f"{fault} Ask of another object, or state the change as `interventions`.")
+        found.append(each)
+    return tuple(found)
+
+
+def stated_changes(question: str, places: Sequence[LocatedObject]) -> tuple[Intervention, ...]:
+    """The changes that a question names, where no reader looks for their objects: they must be among those given.
+
+    Raises `InvalidRequest` for one that is not.
+    """
+
+    def named(words: str) -> LocatedObject:
+        found = next((place for place in places if same_name(place.object, words)), None)
+        if found is None:
+            detail = f"the question changes '{words}', and with `grounding` given nobody looks for it"
+            raise InvalidRequest(f"`objects`: {detail}. {GIVE_OBJECT}", errors=(FieldError("/objects", detail),))
+        return found
+
+    return tuple(
+        Intervention(
+            kind=change.kind,
+            object=named(change.object.text),
+            relation=change.relation,
+            targets=tuple(named(target.text) for target in change.targets),
+        )
+        for change in parse(question).interventions
+    )
+
+
+def without_removed(
+    others: Sequence[LocatedObject], interventions: Sequence[Intervention]
+) -> tuple[LocatedObject, ...]:
+    """The objects that are not taken away."""
+    removed = [each.object.bbox for each in interventions if each.kind == "remove"]
+    return tuple(other for other in others if not _is_among(other.bbox, removed))
+
+
+def _named(words: str, places: Sequence[LocatedObject], pointer: str) -> LocatedObject:
+    """The object of a name, whatever its letters' case, its spaces and its article. Raises `InvalidRequest`."""
+    found = next((place for place in places if same_name(place.object, words)), None)
+    if found is not None:
+        return found
+    known = ", ".join(f"'{place.object}'" for place in places)
+    detail = f"there is no '{words}' among the objects of the scene, which are {known}"
+    raise InvalidRequest(
+        f"`{pointer[1:].replace('/', '.')}`: {detail}. {GIVE_OBJECT}",
+        errors=(FieldError(pointer, detail),),
+    )
+
+
+def _fault(each: Intervention, mover: LocatedObject, before: Sequence[Intervention]) -> str | None:
+    """Why a change cannot be made, as a sentence."""
+    name, place = each.object.object, each.object.bbox
+    taken = [other.object.bbox for other in before if other.kind == "remove"]
+    put = [other for other in before if other.kind == "place"]
+    if each.kind == "remove":
+        used = [thing.bbox for other in put for thing in (other.object, *other.targets)]
+        faults = {
+            f"'{name}' is what moves: it cannot be taken away.": _is_among(place, [mover.bbox]),
+            f"'{name}' is taken away twice: name each object once.": _is_among(place, taken),
+            f"'{name}' is put somewhere, or something is put to it: it cannot be taken away.": _is_among(place, used),
+        }
+    else:
+        targets = [target.bbox for target in each.targets]
+        relation = (each.relation or "to").replace("-", " ")
+        gone = [thing.object for thing in (each.object, *each.targets) if _is_among(thing.bbox, taken)]
+        faults = {
+            f"'{name}' cannot be put {relation} itself.": _is_among(place, targets),
+            f"'{name}' is put somewhere twice: name each object once.": _is_among(
+                place, [other.object.bbox for other in put]
+            ),
+            f"'{gone[0] if gone else ''}' is taken away: it cannot be put, nor anything to it.": bool(gone),
+        }
+    return next((fault for fault, holds in faults.items() if holds), None)
+
+
+def _is_among(bbox: BBox, boxes: Sequence[BBox]) -> bool:
+    return any(_same(bbox, other) for other in boxes)
+
+
+def _same_change(a: Intervention, b: Intervention) -> bool:
+    pairs = zip((a.object, *a.targets), (b.object, *b.targets), strict=False)
+    alike = a.kind == b.kind and a.relation == b.relation and len(a.targets) == len(b.targets)
+    return alike and all(_same(one.bbox, other.bbox) for one, other in pairs)
+
+
+def _same(a: BBox, b: BBox) -> bool:
+    return iou(a, b) >= SAME_OBJECT_IOU
+
+
+WHITE = 128  # grey level from which a pixel of a mask is the object's
+MAX_MASK_SHARE = 0.95  # of the image: more is no object, but an image without a mask
+# What is cut out around a point is taken for an object from here on. Objects of scenes with known truth have an area
+# of 0.009 and more; of their good cuts one in twenty has less on edges, most tufts of fur or grass have.
+LEAST_AREA = 0.0025  # of the square of the image's shorter side
+LEAST_ON_EDGE = 0.75  # of the outline
+LEAST_SOLIDITY = 0.5
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an object is."""
+
+    bbox: BBox  # px, inside the image
+    has_mask: bool  # its outline does not follow from its box: the scene holds it, and it has to be stored
+    warnings: tuple[str, ...] = ()
+
+
+def place_of(
+    scene: Scene, given: PlaceRequest, artifacts: ArtifactStore, pointer: str, *, may_guess: bool = False
+) -> Place:
+    """The place of an object; the scene knows its silhouette afterwards. `pointer` is the JSON Pointer to `given`.
+
+    Raises `InvalidRequest` for a place outside the image and for a mask that is none of this image, and `CannotGround`
+    where what can be cut out around a point is no object, unless `may_guess`.
+    """
+    if given.mask is not None:
+        mask = _read_mask(scene, given.mask, artifacts, f"{pointer}/mask")
+        bbox, cropped = bbox_of(mask), CroppedMask.of(mask)
+        scene.preset_mask(bbox, cropped.full)
+        return Place(bbox, has_mask=True)
+    if given.point is not None:
+        return _around(scene, given.point, pointer, may_guess=may_guess)
+    x0, y0, x1, y1 = given.bbox or (0.0, 0.0, 0.0, 0.0)
+    clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
+    if clipped[2] - clipped[0] < 2 or clipped[3] - clipped[1] < 2:
+        raise _outside(f"{pointer}/bbox", [x0, y0, x1, y1], scene)
+    return Place(clipped, has_mask=False)
+
+
+def prior_of(given: PlaceRequest) -> ObjectPrior | None:
+    """What a request says of an object beside its place, taken as exact."""
+    if given.shape is None and given.size is None and given.stands_on is None:
+        return None
+    size = None if given.size is None else Estimate(value=given.size, deviation=0.0)
+    return ObjectPrior(shape=given.shape, size=size, stands_on=given.stands_on)
+
+
+def _around(scene: Scene, point: Point, pointer: str, *, may_guess: bool) -> Place:
+    """The object at a point, with a warning where its outline had to be guessed. Raises as `place_of` does."""
+    x, y = point
+    if not (0 <= x < scene.width and 0 <= y < scene.height):
+        raise _outside(f"{pointer}/point", [x, y], scene)
+    bbox = scene.bbox_at(point)
+    if scene.region_of(bbox) is not None:
+        return Place(bbox, has_mask=False)
+    field = field_of(pointer)
+    fault = None if may_guess else _fault_of_cut(scene, bbox)
+    if fault is not None:
+        detail = f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {fault}"
+        raise CannotGround(
+            f"{detail}. Give its box as `{field}.bbox`, or its outline as `{field}.mask`.",
+            errors=(FieldError(f"{pointer}/point", detail),),
+        )
+    box = ", ".join(f"{value:.0f}" for value in bbox)
+    warning = f"The object around the point was guessed to be [{box}]; `{field}.bbox` says it for certain."
+    return Place(bbox, has_mask=True, warnings=(warning,))
+
+
+def _fault_of_cut(scene: Scene, bbox: BBox) -> str | None:
+    """Why what was cut out is no object, in words."""
+    quality = cut_quality(scene.clean, scene.silhouette(bbox))
+    if quality.area < LEAST_AREA:
+        return f"what lies there is only {bbox[2] - bbox[0]:.0f} x {bbox[3] - bbox[1]:.0f} px large"
+    if quality.on_edge < LEAST_ON_EDGE:
+        return f"only {quality.on_edge:.0%} of the outline of what lies there can be seen"
+    if quality.solidity < LEAST_SOLIDITY:
+        return "what lies there is ragged, and looks like a part of something"
+    return None
+
+
+def _read_mask(scene: Scene, given: MaskRef, artifacts: ArtifactStore, pointer: str) -> Mask:
+    """The mask [H, W] of the image that a request names. Raises `InvalidRequest`."""
+    assert isinstance(given, ImageArtifact), "the masks of a request are kept before its stages run"
+    try:
+        picture = decode(artifacts.read(given.artifact), max_megapixels=scene.width * scene.height / 1e6)
+    except (ArtifactNotFound, ImageTooLarge, ImageTypeUnsupported, ImageUnreadable) as error:
+        raise mask_error(f"cannot be read: {error.detail}", pointer) from error
+    width, height = picture.info.width, picture.info.height
+    if (width, height) != (scene.width, scene.height):
+        size = f"{scene.width} x {scene.height} px"
+        raise mask_error(f"has {width} x {height} px where the upright image has {size}", pointer)
+    mask = picture.pixels.min(axis=2) >= WHITE
+    share = float(mask.mean())
+    if not share:
+        raise mask_error("is empty: no pixel is white", pointer)
+    if share > MAX_MASK_SHARE:
+        raise mask_error(f"covers {share:.0%} of the image: white, or transparent, is the object alone", pointer)
+    return mask
+
+
+def mask_error(fault: str, pointer: str) -> InvalidRequest:
+    """What is wrong with the mask of a request."""
+    field = field_of(pointer)
+    return InvalidRequest(
+        f"`{field}` {fault}. Give a PNG of the upright image's size, white where the object is and black elsewhere.",
+        errors=(FieldError(pointer, fault),),
+    )
+
+
+def _outside(pointer: str, value: list[float], scene: Scene) -> InvalidRequest:
+    detail = f"{value} lies outside the upright image of {scene.width} x {scene.height} px."
+    return InvalidRequest(f"{detail} Give pixels, x right and y down.", errors=(FieldError(pointer, detail),))
+
 
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
@@ -138,10 +404,6 @@ def _check_new(bbox: BBox, boxes: Sequence[BBox], index: int) -> None:
         raise InvalidRequest(
             f"`objects.{index}` {detail}: give each object once.", errors=(FieldError(f"/objects/{index}", detail),)
         )
-
-
-def _same(a: BBox, b: BBox) -> bool:
-    return iou(a, b) >= SAME_OBJECT_IOU
 
 
 def _centre(bbox: BBox) -> Point:

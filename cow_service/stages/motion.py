@@ -3,29 +3,193 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from cow_service.physics.dynamics import DEFAULT_SCENE_WIDTH, GRAVITY
-from cow_service.readers.base import MotionHints, MotionReading, Quantity
-from cow_service.readers.question.wording import direction_words, motion_sentence
+from cow_service.errors import FieldError, InvalidRequest
+from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
+from cow_service.physics.trail_fit import fit_throw, straight_direction
+from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
+from cow_service.readers.question.wording import bare_name, direction_words, motion_sentence, same_name
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
+    AlsoMoving,
+    BBox,
     Grounding,
     Law,
+    LocatedObject,
     MetresPerPixel,
     Motion,
+    MotionKind,
+    MotionStep,
     Source,
     Vector,
 )
-from cow_service.requests import MotionRequest, SimulateRequest, TrajectoryRequest
-from cow_service.stages.legs import also_moving, given_others, other_words, step_of, step_reading, unit
+from cow_service.requests import (
+    CameraRequest,
+    MotionRequest,
+    MotionStepRequest,
+    OtherMotionRequest,
+    SimulateRequest,
+    TrajectoryRequest,
+)
+from cow_service.stages.bodies import camera_of
+from cow_service.stages.keys import StageResult
 from cow_service.stages.placing import placed_mover, placing_sentence
-from cow_service.stages.quantities import Measures
-from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
-from cow_service.stages.trails import along_trail
+from cow_service.vision.scene import Scene
+from cow_service.vision.trails import Trail, trail_of
+
+THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
+SPEED_DEVIATIONS: dict[MotionKind, float] = {"linear": 0.25, "projectile": 0.28}  # of the logarithm of a default speed
+SPEED_FACTORS: dict[SpeedWord, float] = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
+SCALE_DEVIATION = 0.25  # of the logarithm of metres per pixel, where nobody gave them
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What turns numbers with units into pixels."""
+
+    image_width: int  # px
+    scale: MetresPerPixel
+    law: Law
+
+    def pixels(self, quantity: Quantity) -> float:
+        """px, or px/s."""
+        match quantity.unit:
+            case "px" | "px/s":
+                return quantity.value
+            case "m" | "m/s":
+                return quantity.value / self.scale.value
+            case "widths" | "widths/s":
+                return quantity.value * self.image_width
+
+    def speed(self, kind: MotionKind, bbox: BBox, said: SpeedWord | Quantity | None) -> float:
+        """px/s of an object in a box; 0 for kinds of motion that have no speed."""
+        if kind not in DIRECTED_KINDS:
+            return 0.0
+        if isinstance(said, Quantity):
+            return self.pixels(said)
+        thrown = kind == "projectile" and self.law == "contact"
+        usual = throw_speed(bbox, self.scale) if thrown else DEFAULT_SPEED * self.image_width
+        return usual if said is None else SPEED_FACTORS[said] * usual
+
+    def speed_deviation(self, kind: MotionKind, said: SpeedWord | Quantity | None) -> float:
+        """Of the speed's natural logarithm: 0 for a number in pixels, else that of what is assumed."""
+        if not isinstance(said, Quantity):
+            return SPEED_DEVIATIONS.get(kind, 0.0)
+        assumed = said.unit == "m/s" and self.scale.source == "default"
+        return SCALE_DEVIATION if assumed else 0.0
+
+
+def throw_speed(bbox: BBox, scale: MetresPerPixel) -> float:
+    """px/s of a throw whose speed nobody gave: v^2 / (g R) as of a toy of radius 0.15 m thrown at 1.8 m/s.
+
+    How far it gets in the image, in its own radii, does then not depend on the scale, which is uncertain.
+    """
+    x0, y0, x1, y1 = bbox
+    radius = (x1 - x0 + y1 - y0) / 4  # px
+    return math.sqrt(THROW_SPEED**2 / (GRAVITY * THROW_RADIUS) * (GRAVITY / scale.value) * radius)
+
+
+def unit(vector: Vector) -> Vector:
+    """A vector of length 1."""
+    length = math.hypot(*vector)
+    return vector[0] / length, vector[1] / length
+
+
+def step_reading(step: MotionStepRequest) -> StepReading:
+    """A leg that a request gives."""
+    distance = None if step.distance is None else Quantity(step.distance, "px")
+    return StepReading(step.direction, step.depth, distance, step.duration)
+
+
+def step_of(step: StepReading, measures: Measures) -> MotionStep:
+    """A leg in pixels."""
+    distance = None if step.distance is None else measures.pixels(step.distance)
+    return MotionStep(direction=unit(step.direction), depth=step.depth, distance=distance, duration=step.duration)
+
+
+def given_others(given: Sequence[OtherMotionRequest], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
+    """Other movers of a request. Raises `InvalidRequest` for one that was not located."""
+    return tuple(_given_other(index, each, grounding) for index, each in enumerate(given))
+
+
+def _given_other(index: int, given: OtherMotionRequest, grounding: Grounding) -> OtherMotionReading:
+    speed = None if given.speed is None else Quantity(given.speed, "px/s")
+    located = _located(index, given.object, grounding)
+    return OtherMotionReading(located, given.stated_kind, given.direction, given.depth, speed)
+
+
+def _located(index: int, name: str, grounding: Grounding) -> LocatedObject:
+    found = [other for other in grounding.others if same_name(other.object, name)]
+    if len(found) != 1:
+        seen = ", ".join(f"'{other.object}'" for other in grounding.others) or "none"
+        detail = f"'{name}' names {len(found)} of the located objects ({seen})"
+        raise InvalidRequest(
+            f"`motion.others.{index}.object`: {detail}: give it in `objects` under this name.",
+            errors=(FieldError(f"/motion/others/{index}/object", detail),),
+        )
+    return found[0]
+
+
+def also_moving(other: OtherMotionReading, measures: Measures) -> AlsoMoving:
+    """Another mover in pixels."""
+    moves = other.kind in DIRECTED_KINDS
+    return AlsoMoving(
+        object=other.object,
+        kind=other.kind,
+        direction=unit(other.direction) if moves and other.direction is not None else None,
+        depth=other.depth if moves else 0.0,
+        speed=measures.speed(other.kind, other.object.bbox, other.speed),
+        speed_deviation=measures.speed_deviation(other.kind, other.speed),
+    )
+
+
+def other_words(other: OtherMotionReading) -> str:
+    """What another mover does, such as "car moves to the left"."""
+    verb = {"projectile": "is thrown", "fall": "falls", "static": "stays where it is"}.get(other.kind, "moves")
+    way = "" if other.kind in ("fall", "static") else direction_words(other.direction, other.depth)
+    return " ".join([bare_name(other.object.object), verb, way]).rstrip()
+
+
+def along_trail(
+    scene: Scene, grounding: Grounding, motion: Motion, camera: CameraRequest | None, speed_given: bool
+) -> Motion:
+    """A motion read from a trail, with what the trail at the mover measures; others unchanged."""
+    trail = trail_of(scene.trails, grounding.bbox) if motion.cue == "trail" else None
+    if trail is None:
+        return motion
+    motion = motion.model_copy(update={"trail": tuple(position.centre for position in trail.older)})
+    if motion.kind == "projectile":
+        return _thrown(scene, grounding, motion, trail, camera, speed_given)
+    if motion.kind == "linear":
+        return motion.model_copy(update={"direction": straight_direction(trail.positions)})
+    return motion
+
+
+def _thrown(
+    scene: Scene, grounding: Grounding, motion: Motion, trail: Trail, camera: CameraRequest | None, speed_given: bool
+) -> Motion:
+    """Speed, direction and depth of the throw at the present position, with their deviations."""
+    fit = camera_of(scene, motion, camera, grounding.bbox, fixed_focal=False)
+    throw = fit_throw(trail.positions, fit, (scene.width, scene.height))
+    if throw is None:
+        return motion
+    measured: dict[str, object] = {
+        "direction": throw.direction,
+        "depth": math.sin(math.radians(throw.turn)),
+        "depth_deviation": min(throw.turn_deviation, 90.0),
+    }
+    if not speed_given:
+        x0, y0, x1, y1 = grounding.bbox
+        radius = (x1 - x0 + y1 - y0) / 4  # px
+        measured["speed"] = math.sqrt(throw.froude * GRAVITY * radius / motion.metres_per_pixel.value)
+        measured["speed_deviation"] = min(throw.speed_deviation, 3.0)
+    return motion.model_copy(update=measured)
+
 
 THROW_DEPTH_DEVIATION = 15.0  # degrees: words and arrows tell a throw's heading in the image alone
 _GLIDING_ONLY = ("distance", "duration", "until", "steps")  # what only a motion along a line can have

@@ -11,15 +11,14 @@ import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.carrying import Put
-from cow_service.physics.placement import Placements
+from cow_service.physics.placement import Placements, Put
 from cow_service.physics.world import WorldInput, Worlds
 from cow_service.readers.question.hollow import container_form
 from cow_service.readers.question.placement_facts import cannot_stay, place_words
 from cow_service.readers.question.wording import bare_name
 from cow_service.records import BBox, Grounding, Intervention, LocatedObject, Motion, PlacedBefore, Placement
 from cow_service.stages.bodies import is_mover
-from cow_service.stages.shown import visible_share
+from cow_service.stages.paths import visible_share
 from cow_service.vision.masks import iou
 from cow_service.vision.openings import SeenOpening, measure_opening
 from cow_service.vision.regions import SAME_OBJECT_IOU

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cow_service.physics.anchors import spread_anchors
 from cow_service.physics.ballistic import FreePath, ballistic_path, given_path, latest, sampled
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera import Camera
-from cow_service.physics.events import encounters
-from cow_service.physics.floor_camera import FloorCamera
-from cow_service.physics.outcome import Query
+from cow_service.physics.camera import Camera, FloorCamera
+from cow_service.physics.draws import ensemble, likeliest
+from cow_service.physics.events import WorldEvents, encounters, find_world_events
+from cow_service.physics.outcome import KIND_OF, Decided, Query, answers_of, decide, decide_change
 from cow_service.physics.placing import flies
-from cow_service.physics.sweeping import swept
-from cow_service.physics.world import Led, WorldInput, Worlds
+from cow_service.physics.projection import spread_anchors, swept
+from cow_service.physics.world import Led, WorldInput, Worlds, run_world
+from cow_service.readers.question.both_worlds import facts_of_both
+from cow_service.readers.question.facts import facts_of
 from cow_service.readers.question.relations import read_asked
 from cow_service.readers.question.sentences import parse
-from cow_service.records import Asked, Grounding, Motion, Path, Trajectory
+from cow_service.records import Asked, Grounding, Intervention, Motion, Outcome, Path, Trajectory
 from cow_service.requests import SimulateRequest, TrajectoryRequest
-from cow_service.stages.bodies import obstacles_of, query_of, seen_bodies
-from cow_service.stages.camera import camera_of
-from cow_service.stages.imagining import Imagined, imagine
-from cow_service.stages.outcomes import can_tell, with_outcomes
+from cow_service.stages.bodies import camera_of, obstacles_of, query_of, seen_bodies
+from cow_service.stages.keys import StageResult
 from cow_service.stages.paths import (
     body_records,
     camera_record,
@@ -32,8 +33,10 @@ from cow_service.stages.paths import (
     moving_until,
     pairs,
     path_records,
+    shown_bodies,
     start_of,
     tracks,
+    was_put,
     with_times,
 )
 from cow_service.stages.placing import (
@@ -45,13 +48,186 @@ from cow_service.stages.placing import (
     put_of,
     tapered,
 )
-from cow_service.stages.results import StageResult
 from cow_service.stages.run import Run
-from cow_service.stages.shown import shown_bodies, was_put
 from cow_service.stages.warnings import warnings_of
-from cow_service.vision.obstacles import Obstacle
-from cow_service.vision.scene import Scene
-from cow_service.vision.types import Floats
+from cow_service.vision.masks import Floats
+from cow_service.vision.scene import Obstacle, Scene
+
+EVERY = 2  # frames between those that are recorded of the ensemble
+TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does
+
+
+@dataclass(frozen=True)
+class Ran:
+    """Worlds with what happens in them."""
+
+    worlds: Worlds
+    events: WorldEvents
+
+
+@dataclass(frozen=True)
+class Imagined:
+    """The world that is shown, and what an ensemble around it says."""
+
+    given: WorldInput
+    shown: Worlds
+    events: WorldEvents  # of the shown world
+    around: Worlds | None  # the ensemble's
+    around_events: WorldEvents | None
+    query: Query | None
+    decided: Decided | None  # null where nothing is asked, or there is no ensemble
+
+
+def imagine(world: WorldInput, query: Query | None, size: int) -> tuple[Imagined, ...]:
+    """Runs the likeliest world and an ensemble of `size` worlds around it; where something is changed first, also
+    the world as it is, with the same draws, as the second.
+
+    What is shown must not contradict what is answered: where an answer is sure and the likeliest world differs from
+    it, the likeliest world of those that agree is shown.
+    """
+    given = (world, world.as_it_is()) if world.is_changed else (world,)
+    queries = [query if len(given) == 1 else _as_it_is(query, place) for place in range(len(given))]
+    if size == 0:
+        shown = [_run(each, likeliest()) for each in given]
+        return tuple(
+            Imagined(each, ran.worlds, ran.events, None, None, asked, None)
+            for each, ran, asked in zip(given, shown, queries, strict=True)
+        )
+    rows = ensemble(size)
+    # Side by side: the engine's steps, half of the time, are not held up by the interpreter's lock.
+    with ThreadPoolExecutor(1) as beside:
+        likely = beside.submit(lambda: [_run(each, likeliest()) for each in given])
+        around = [_run(each, rows, EVERY) for each in given]
+        shown = likely.result()
+    decided = _decided(queries, around, rows)
+    if query is not None and any(each is not None and each.sure for each in decided):
+        shown = _agreeing(given, query, decided, rows, around, shown)
+    return tuple(
+        Imagined(each, one.worlds, one.events, many.worlds, many.events, asked, said)
+        for each, one, many, asked, said in zip(given, shown, around, queries, decided, strict=True)
+    )
+
+
+def _as_it_is(query: Query | None, place: int) -> Query | None:
+    """What is asked of the world as it is, the second, where a change is asked about: what it is that would change."""
+    if query is None or place == 0 or query.asked.form != "changes":
+        return query
+    form = "what-happens" if query.target is None else "whether"
+    return replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
+
+
+def _decided(queries: Sequence[Query | None], around: Sequence[Ran], rows: Floats) -> list[Decided | None]:
+    found: list[Decided | None] = []
+    for query, ran in zip(queries, around, strict=True):
+        if query is None:
+            found.append(None)
+        elif query.asked.form != "changes":
+            found.append(decide(query, ran.events, rows))
+        else:
+            found.append(decide_change(query, ran.events, around[1].events, rows) if len(around) > 1 else None)
+    return found
+
+
+def _agreeing(
+    given: Sequence[WorldInput],
+    query: Query,
+    decided: Sequence[Decided | None],
+    rows: Floats,
+    around: Sequence[Ran],
+    shown: list[Ran],
+) -> list[Ran]:
+    """The likeliest world, with its counterpart, that shows what most of the ensemble does."""
+    sure = [each is not None and each.sure for each in decided]
+    found = _verdicts(query, sure, around)
+    wanted = tuple(Counter(column).most_common(1)[0][0] for column in zip(*found, strict=True))
+    if _verdicts(query, sure, shown)[0] == wanted:
+        return shown
+    nearest = np.argsort(np.linalg.norm(rows, axis=1))
+    for row in [int(k) for k in nearest if found[k] == wanted][:TRIES]:
+        tried = [_run(each, rows[row : row + 1]) for each in given]
+        if _verdicts(query, sure, tried)[0] == wanted:
+            return tried
+    return shown
+
+
+def _verdicts(query: Query, sure: Sequence[bool], ran: Sequence[Ran]) -> list[tuple[int, ...]]:
+    """Per draw, the answers that are sure: of each world, or whether they differ where that is asked. Then whether
+    each thing stays where it is put before."""
+    answers = [answers_of(query, each.events) for each in ran]
+    if query.asked.form == "changes":
+        told = [[int(one != other) for one, other in zip(*answers, strict=True)]]
+    else:
+        told = [each for each, is_sure in zip(answers, sure, strict=True) if is_sure]
+    stays = [placements.stays.astype(int).tolist() for placements in ran[0].worlds.before]
+    return list(zip(*told, *stays, strict=True))
+
+
+def _run(world: WorldInput, draws: Floats, every: int = 1) -> Ran:
+    worlds = run_world(world, draws, every)
+    return Ran(worlds, find_world_events(worlds, world.bodies, world.fps, draws, world.size))
+
+
+BY_ENCOUNTERS = (*KIND_OF, "tips", "moves", "leaves", "lands")  # relations that encounters and paths decide
+
+
+def can_tell(query: Query, present: int, placed: bool, on_floor: bool) -> bool:
+    """Whether worlds can decide what is asked; what is taken away does nothing. `present` bodies are left; `placed`
+    says whether something is put somewhere, `on_floor` whether what acts stands on the floor: it cannot land there."""
+    by_paths = query.asked.relation in BY_ENCOUNTERS or (placed and query.asked.relation == "inside")
+    return by_paths and query.subject < present and not (on_floor and query.asked.relation == "lands")
+
+
+def with_outcomes(
+    trajectories: Sequence[Trajectory],
+    imagined: Sequence[Imagined],
+    asked: Asked | None,
+    query: Query | None,
+    grounding: Grounding,
+    changes: Sequence[Intervention],
+) -> list[Trajectory]:
+    """The trajectories with their outcomes and, in the first, the facts of them all in a sentence."""
+    if asked is None:
+        return list(trajectories)
+    told: list[Trajectory] = []
+    for trajectory, each in zip(trajectories, imagined, strict=True):
+        bodies = (*each.given.bodies, *each.given.taken)
+        asked_here = asked if each.query is None else each.query.asked
+        outcome = _outcome(asked_here, query, bodies, each.decided)
+        told.append(_with_facts(trajectory.model_copy(update={"outcome": outcome}), grounding))
+    if len(told) > 1:
+        told[0] = _with(told[0], facts_of_both(changes, grounding.object, *told))
+    return told
+
+
+def _outcome(asked: Asked, query: Query | None, bodies: Sequence[SeenBody], decided: Decided | None) -> Outcome:
+    """Without a probability where the worlds cannot tell."""
+    name = None if query is None or query.target is None else bodies[query.target].name
+    subject = None if query is None or not query.subject else bodies[query.subject].name
+    if decided is None:
+        return Outcome(asked=asked, subject=subject, object=name, sure=False, robust=False)
+    return Outcome(
+        asked=asked,
+        subject=subject,
+        object=name,
+        probability=decided.probability,
+        first=None if decided.first is None else bodies[decided.first].name,
+        count=decided.count,
+        time=decided.time,
+        time_band=decided.time_band,
+        sure=decided.sure,
+        robust=decided.robust,
+        depends_on=decided.depends_on,
+    )
+
+
+def _with_facts(trajectory: Trajectory, grounding: Grounding) -> Trajectory:
+    return _with(trajectory, facts_of(grounding.object, trajectory))
+
+
+def _with(trajectory: Trajectory, facts: str) -> Trajectory:
+    assert trajectory.outcome is not None
+    return trajectory.model_copy(update={"outcome": trajectory.outcome.model_copy(update={"facts": facts})})
+
 
 _OWN = ("kind", "direction", "depth", "speed", "speed_deviation")  # of each mover
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
-from cow_service.vision.masks import scaled
-from cow_service.vision.types import Floats, Floats32, Image, Mask
+from cow_service.vision.masks import Floats, Floats32, Image, Mask, scaled
 
 WORKING_SIDE = 512  # px: images are searched at this size
 EDGE = 1.0, 2.2  # Lab units per px, and times the median gradient; the larger counts

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import scaled_size, window_of
-from cow_service.vision.types import Floats32, Image, Mask
+from cow_service.vision.masks import Floats32, Image, Mask, scaled_size, window_of
 
 INPAINT_RADIUS = 4  # px
 WIDE = 0.6  # of the hole's size: so far around it exemplars are looked for

@@ -2,26 +2,78 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from threading import Lock
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 
 from cow_service.records import BBox, LocatedObject
-from cow_service.vision.arrows import Arrow, find_arrows
-from cow_service.vision.boxes import DrawnBox, find_boxes
-from cow_service.vision.ghost_shadows import without_ghost_shadows
-from cow_service.vision.ghosts import without_ghosts
+from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import bbox_of
-from cow_service.vision.obstacles import Obstacle, find_obstacles
-from cow_service.vision.regions import Region, disc_region, find_regions, region_of
+from cow_service.vision.masks import CroppedMask, Image, Mask, bbox_of, iou, without_holes
+from cow_service.vision.regions import SAME_OBJECT_IOU, Region, disc_region, find_regions, region_of
 from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
+from cow_service.vision.trail_removal import without_ghost_shadows, without_ghosts
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
-from cow_service.vision.types import Image, Mask
+
+OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
+DOUBTFUL = 0.75  # confidence below which the same holds of a small region that touches another obstacle
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Another object of the image."""
+
+    name: str
+    bbox: BBox
+    mask: CroppedMask
+    confidence: float = 1.0  # 0..1: how sure it is that it is there as one thing with this mask; 1 for what is given
+
+
+def find_obstacles(
+    regions: Sequence[Region], silhouette: Callable[[BBox], Mask], mover: BBox, named: Sequence[LocatedObject]
+) -> tuple[Obstacle, ...]:
+    """Everything but the mover: first what the question names, by that name, then other regions, by their colour.
+
+    `silhouette` gives the mask [H, W] of the object in a box; of known regions their own mask, which is cheaper, is
+    taken, unless a mask was given.
+    """
+    body = silhouette(mover)
+    body_area, whole = np.count_nonzero(body), without_holes(body)
+    near = cv2.dilate(body.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    obstacles: list[Obstacle] = []
+    for other in named:
+        if iou(other.bbox, mover) < SAME_OBJECT_IOU:
+            region = None if other.mask is not None else region_of(regions, other.bbox)
+            mask = CroppedMask.of(silhouette(other.bbox)) if region is None else region.mask
+            found = region is not None and region.bbox == other.bbox  # here, not by the request or another reader
+            confidence = region.confidence if region is not None and found else 1.0
+            obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
+    for region in regions:
+        area = region.mask.area
+        if iou(region.bbox, mover) >= SAME_OBJECT_IOU or region.mask.shared_with(whole) > 0.5 * area:
+            continue
+        if area < OWN_SHARE * body_area and region.mask.shared_with(near):
+            continue
+        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU or _is_part(region, other) for other in obstacles):
+            continue
+        obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
+    return tuple(obstacles)
+
+
+def _is_part(region: Region, other: Obstacle) -> bool:
+    """Whether a doubtful region is the shadow or a part of a larger obstacle that it touches."""
+    if region.confidence >= DOUBTFUL or region.mask.area >= OWN_SHARE * other.mask.area:
+        return False
+    near = cv2.dilate(other.mask.full().astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    return bool(region.mask.shared_with(near))
+
 
 Found = TypeVar("Found")
 Measured = dict[str, Any]
@@ -212,3 +264,35 @@ class Scene:
         bbox = bbox_of(mask)
         self._masks[bbox] = mask
         return bbox
+
+
+MOST_IMAGES = 8
+ImageKey = tuple[str | None, str]
+"""Whose image it is, so that nobody learns by the time it takes what others ask about; and its SHA-256."""
+MOST_PIXELS = 13_000_000  # of all of them together: each holds some bytes per pixel
+
+
+class SeenImages:
+    """The measurements of images, the latest used last. Safe to use from several threads."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._kept: OrderedDict[ImageKey, tuple[int, Measured]] = OrderedDict()
+
+    def recall(self, key: ImageKey, scene: Scene) -> None:
+        """Gives a scene what is known of its image."""
+        with self._lock:
+            found = self._kept.get(key)
+            if found is None:
+                return
+            self._kept.move_to_end(key)
+        scene.take(found[1])
+
+    def keep(self, key: ImageKey, scene: Scene) -> None:
+        """Keeps what a scene has measured of its image."""
+        measured = scene.measured()
+        with self._lock:
+            self._kept[key] = scene.width * scene.height, measured
+            self._kept.move_to_end(key)
+            while len(self._kept) > MOST_IMAGES or sum(pixels for pixels, _ in self._kept.values()) > MOST_PIXELS:
+                self._kept.popitem(last=False)

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import scaled
-from cow_service.vision.types import Floats32, Image, Mask
+from cow_service.vision.masks import Floats32, Image, Mask, scaled
 
 WORKING_SIDE = 896  # px: longer images are searched at this size
 THIN = 41  # px: side of the median window; narrower structures stand out from it

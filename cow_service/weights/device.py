@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from threading import Lock
 
 import torch
 
@@ -47,3 +48,14 @@ def is_out_of_memory(error: BaseException) -> bool:
     if getattr(error, "error_code", None) == CUDA_ERROR_MEMORY_ALLOCATION:  # torch.AcceleratorError
         return True
     return isinstance(error, RuntimeError) and any(text in str(error) for text in OUT_OF_MEMORY_TEXTS)
+
+
+# Seeds, and what libraries patch while they initialise, are global to the process: two models built at once, be they of
+# a reader and of a generator, would mix up their weights.
+BUILD_LOCK = Lock()
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """The first `most` names, and how many more there are; for error messages."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

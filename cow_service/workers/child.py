@@ -23,9 +23,10 @@ from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
 from cow_service.jobs.stage_cache import HoldKey as HoldKeyOf
 from cow_service.jobs.stored_errors import error_as_json
-from cow_service.observability import context, tracing
+from cow_service.observability import logging as context
 from cow_service.observability import logging as logs
-from cow_service.observability.gpus import gpu_memory
+from cow_service.observability import tracing
+from cow_service.observability.metrics import gpu_memory
 from cow_service.processes import leave_decisions_to_the_parent
 from cow_service.requests import Stage
 from cow_service.service import Service

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import logging
 import re
+import secrets
 import time
 from collections.abc import Callable, Iterable
 from urllib.parse import quote
 
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.routing import compile_path
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cow_service.api.problems import respond
 from cow_service.errors import unforeseen
+from cow_service.observability import logging as context
 from cow_service.observability import tracing
 from cow_service.observability.metrics import Metrics
 
@@ -106,3 +109,37 @@ class AccessLog:
 def _shown(scope: Scope) -> str:
     """The path without its query, percent-encoded: nothing in it can end a line of a log."""
     return quote(scope["path"][:MAX_PATH], safe="/:@!$&'()*+,;=~")
+
+
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}", re.ASCII)
+
+
+class Correlation:
+    """ASGI middleware, the outermost: X-Request-Id, traceparent and X-Content-Type-Options on every response.
+
+    A caller's own X-Request-Id is kept where it is harmless in a log, and its trace goes on where it is valid.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Passes a request on within its ids."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        given = headers.get("x-request-id", "")
+        request_id = given if _REQUEST_ID.fullmatch(given) else secrets.token_hex(16)
+        with tracing.request_span(scope["method"], headers.get("traceparent")), context.bound(request=request_id):
+            traceparent = context.traceparent() or ""
+
+            async def tagged(message: Message) -> None:
+                if message["type"] == "http.response.start":
+                    response = MutableHeaders(scope=message)
+                    response["X-Request-Id"] = request_id
+                    response["traceparent"] = traceparent
+                    response["X-Content-Type-Options"] = "nosniff"
+                await send(message)
+
+            await self.app(scope, receive, tagged)

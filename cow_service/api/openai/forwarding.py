@@ -13,7 +13,7 @@ from typing import Any, cast
 import httpx
 
 from cow_service import __version__
-from cow_service.api.openai.splicing import as_json
+from cow_service.api.openai.chats import as_json
 from cow_service.errors import CowError, MllmBadReply, MllmUnavailable, shortened
 from cow_service.readers.chat import Upstream
 from cow_service.settings import Settings

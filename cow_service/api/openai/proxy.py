@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Iterator
 from contextlib import AsyncExitStack, aclosing, suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -12,23 +13,199 @@ from typing import Any, cast
 
 from anyio import to_thread
 from fastapi import Request
+from pydantic import ValidationError
 
-from cow_service.api.openai.chats import EXTENSION, Chat
-from cow_service.api.openai.completions import chunks_of
+from cow_service import errors
+from cow_service.api.openai.chats import (
+    EXTENSION,
+    Chat,
+    ImagePart,
+    as_json,
+    images_of,
+    other_parts,
+    role_of,
+    spliced,
+    texts_of,
+    wrong,
+)
 from cow_service.api.openai.forwarding import Events, Forwarder, Whole
-from cow_service.api.openai.frames import frame_parts
-from cow_service.api.openai.imagining import NotImagined, WhatIf, what_if
-from cow_service.api.openai.models import WITHOUT, Answerer
-from cow_service.api.openai.records import ChatImagination
-from cow_service.api.openai.replies import Chunks
-from cow_service.api.openai.splicing import as_json, spliced
+from cow_service.api.openai.parsing import Chunks
+from cow_service.api.openai.records import WITHOUT, Answerer, ChatImagination
 from cow_service.api.openai.stream import DONE, Streamed, event_of, follow_job
 from cow_service.api.preferences import Preferences, preferences_of
+from cow_service.api.problems import invalid
 from cow_service.api.submission import Submission, Submitter, disconnected, owner_of
-from cow_service.errors import Canceled, CowError, InvalidRequest, MllmBadReply
+from cow_service.errors import Canceled, CowError, FieldError, InvalidRequest, MllmBadReply
 from cow_service.jobs.engine import new_job_id
+from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.images import decode_own, encode_png
+from cow_service.readers.base import Imagined
 from cow_service.readers.chat import ChatReader
-from cow_service.records import Simulation
+from cow_service.readers.mllm.hypothesis import hypothesis, pictures
+from cow_service.readers.prompts import load_prompt
+from cow_service.records import Simulation, Usage
+from cow_service.requests import SimulateRequest
+
+NOTE = "imagined-frames"  # name in prompts/
+
+
+@dataclass(frozen=True)
+class FrameParts:
+    """What is added to a message: a text and images, as parts of OpenAI's protocol."""
+
+    parts: tuple[dict[str, Any], ...]
+    prompts: dict[str, int]
+
+
+def frame_parts(simulation: Simulation, artifacts: ArtifactStore, detail: str | None) -> FrameParts:
+    """The note and the frames of a simulation; of two worlds, a named strip of each. CPU work.
+
+    `detail` is that of the caller's own image, so that all images are seen alike. Raises `ArtifactNotFound`.
+    """
+    pngs = [artifacts.read(frame.sha256) for frame in simulation.frames]
+    factual = [artifacts.read(frame.sha256) for frame in simulation.factual_frames]
+    frames: tuple[Any, ...] = ()
+    if factual:
+        frames = tuple(decode_own(png) for png in pngs)
+    imagined = Imagined(simulation, frames, tuple(decode_own(png) for png in factual))
+    if factual:
+        pngs = [encode_png(picture) for picture in pictures(imagined)]
+    prompt, told = load_prompt(NOTE), hypothesis(imagined)
+    note = prompt.render(**{name: told[name] for name in prompt.inputs})
+    shown = {} if detail is None else {"detail": detail}
+    images = [{"type": "image_url", "image_url": {"url": _data_url(png), **shown}} for png in pngs]
+    return FrameParts(({"type": "text", "text": note}, *images), {prompt.name: prompt.version})
+
+
+def _data_url(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+FIELDS_OF_CHAT = ("image", "question")  # of a `SimulateRequest`: from messages
+OF_ANSWERS = {  # fields of an `AnswerRequest`, and what does the same for a chat
+    "votes": "the MLLM replies once: ask with `n`, or again",
+    "baseline": "ask the model of the same name with :no-imagination",
+    "imagine": "is said by `model`",
+    "options": "the MLLM reads them in the messages",
+}
+# Why something cannot be imagined from a chat that the MLLM may still answer. Other errors are faults of the server, or
+# of what the caller told COW itself: those are not passed over, or a figure would be that of another condition.
+PASSED_OVER = (
+    errors.InvalidRequest, errors.CannotGround, errors.CannotReadDirection, errors.MllmBadReply, errors.ImageTooLarge,
+    errors.ImageUnreadable, errors.ImageTypeUnsupported, errors.ImageUrlNotAllowed, errors.ImageUrlUnreachable,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class NotImagined:
+    """Why nothing is imagined; see `ChatImagination`."""
+
+    reason: str
+    detail: str
+    usage: Usage = field(default_factory=Usage)  # of what was tried
+
+
+@dataclass(frozen=True)
+class WhatIf:
+    """A simulation that a chat asks for."""
+
+    request: SimulateRequest
+    message: int  # place of the message whose question it is: frames are added to it
+    image: ImagePart
+    given: frozenset[str]  # fields of `cow` in the request
+
+    def why_not(self, error: CowError) -> NotImagined | None:
+        """Why nothing was imagined, where the chat goes on without; None where the error is the caller's to hear."""
+        told = self.located(error)
+        own = any(self._is_given(field.pointer) for field in told.errors)
+        if own or not isinstance(error, PASSED_OVER):
+            return None
+        return NotImagined(error.code, error.detail, Usage.model_validate(error.usage or {}))
+
+    def located(self, error: CowError) -> CowError:
+        """An error of the simulation, pointing into the chat."""
+        fields = tuple(FieldError(self._pointer(field.pointer), field.detail) for field in error.errors)
+        told = type(error)(error.detail, errors=fields, headers=error.headers)
+        told.usage = error.usage
+        return told
+
+    def _is_given(self, pointer: str) -> bool:
+        """Whether that is a field of `cow`, and one that the caller gave."""
+        steps = pointer.split("/")[1:3]
+        return steps[:1] == [EXTENSION] and not self.given.isdisjoint(steps[1:])
+
+    def _pointer(self, pointer: str) -> str:
+        head = "/".join(pointer.split("/")[:2])
+        own = {"": "", "/image": self.image.url_pointer, "/question": f"/messages/{self.message}/content"}
+        return own.get(head, f"/{EXTENSION}{pointer}")
+
+
+def what_if(chat: Chat) -> WhatIf | NotImagined:
+    """What the chat asks to be imagined. Raises `InvalidRequest` for fields of `cow` that cannot be used."""
+    messages = chat.messages()
+    asked = max((place for place, each in enumerate(messages) if role_of(each) == "user"), default=-1)
+    question = "\n".join(texts_of(messages[asked])) if asked >= 0 else ""
+    images = list({image.url: image for image in reversed(list(images_of(messages)))}.values())
+    others = sorted({kind for _, kind in other_parts(messages)})
+    _check_cow(chat)
+    if others:
+        return NotImagined("other-parts", f"The messages hold parts that COW does not read: {', '.join(others)}.")
+    if len(images) > 1:
+        return NotImagined("several-images", f"A what-if question is about one image; there are {len(images)}.")
+    if not images:
+        return NotImagined("no-image", "There is no image in the messages.")
+    if not question.strip():
+        return NotImagined("no-question", "The last user message has no text.")
+    try:
+        fields = {"video": False, **chat.cow, "question": question, "image": images[0].reference}
+        return WhatIf(SimulateRequest.model_validate(fields), asked, images[0], frozenset(chat.cow))
+    except ValidationError as error:
+        told = invalid(error)
+        return NotImagined(told.code, told.detail)
+
+
+def _check_cow(chat: Chat) -> None:
+    """Raises `InvalidRequest` for what COW itself is told and cannot do."""
+    for name in chat.cow:
+        if name in FIELDS_OF_CHAT:
+            raise wrong(f"/{EXTENSION}/{name}", "is said by `messages`; leave it out")
+        if name in OF_ANSWERS:
+            raise wrong(f"/{EXTENSION}/{name}", f"leave it out: {OF_ANSWERS[name]}")
+    try:
+        SimulateRequest.model_validate({**chat.cow, "question": "?", "image": "data:"})
+    except ValidationError as error:
+        raise invalid(error, lambda pointer: f"/{EXTENSION}{pointer}") from error
+
+
+HEAD = ("id", "created", "model", "system_fingerprint", "service_tier")
+
+
+def chunks_of(completion: dict[str, Any], request: dict[str, Any]) -> Iterator[str]:
+    """The chunks as JSON: `cow`, each choice's message, each choice's end, and usage where the request wants it.
+
+    An error is its only chunk.
+    """
+    if "error" in completion:
+        yield as_json({"error": completion["error"]})
+        return
+    head = {name: completion[name] for name in HEAD if name in completion} | {"object": "chat.completion.chunk"}
+    empty = {"index": 0, "delta": {}, "finish_reason": None}
+    if EXTENSION in completion:
+        yield as_json(head | {"choices": [empty], EXTENSION: completion[EXTENSION]})
+    choices = cast("list[dict[str, Any]]", completion.get("choices") or [])
+    for place, choice in enumerate(choices):
+        at = {"index": choice.get("index", place)}
+        message = {name: value for name, value in choice.get("message", {}).items() if value is not None}
+        calls = message.get("tool_calls", ())
+        if calls:
+            message["tool_calls"] = [{"index": number, **call} for number, call in enumerate(calls)]
+        first = {**at, "delta": message, "finish_reason": None, "logprobs": choice.get("logprobs")}
+        yield as_json(head | {"choices": [first]})
+        yield as_json(head | {"choices": [{**at, "delta": {}, "finish_reason": choice.get("finish_reason")}]})
+    options = request.get("stream_options")
+    if isinstance(options, dict) and options.get("include_usage") and "usage" in completion:
+        yield as_json(head | {"choices": [], "usage": completion["usage"]})
+
 
 BY_NAME = NotImagined("no-imagination", f"The model's name ends with {WITHOUT}.")
 UNUSED = f"`{EXTENSION}` was not used: the model's name says that nothing is imagined."

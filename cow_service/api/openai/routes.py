@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any
 
+from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode
 
 from cow_service import errors
 from cow_service.api.body import read_object
-from cow_service.api.openai.chats import EXTENSION, chat_of, read_chat
-from cow_service.api.openai.completing import Completer
-from cow_service.api.openai.errors import ROOT, document_problems
-from cow_service.api.openai.models import answerer, usable
-from cow_service.api.openai.parsing import FIELDS_OF_CHAT
+from cow_service.api.openai.chats import EXTENSION, Chat, ChatRequest, ResponsesRequest, as_json, chat_of, read_chat
+from cow_service.api.openai.forwarding import Whole
+from cow_service.api.openai.parsing import FIELDS_OF_CHAT, ChatAnswer, ParsedChat, parse_chat
+from cow_service.api.openai.proxy import Proxy, preferences_without_key
 from cow_service.api.openai.records import (
     ChatChunk,
     ChatCompletion,
@@ -27,18 +28,63 @@ from cow_service.api.openai.records import (
     MllmCompletion,
     ResponseReply,
     UpstreamError,
+    answerer,
+    usable,
 )
-from cow_service.api.openai.requests import ChatRequest, ResponsesRequest
-from cow_service.api.openai.responses_reply import response_of
-from cow_service.api.openai.responses_request import chat_fields
-from cow_service.api.openai.responses_stream import as_response
-from cow_service.api.openai.splicing import as_json
-from cow_service.api.openai.stream import EventsResponse, Streamed
+from cow_service.api.openai.responses import as_response, chat_fields, response_of
+from cow_service.api.openai.stream import ROOT, EventsResponse, Streamed, answer_events, document_problems
 from cow_service.api.problems import documented
 from cow_service.api.routes.simulate import ACCEPTED, FAILURES, PREFERENCES
-from cow_service.api.submission import Submitter, json_response
-from cow_service.errors import BodyTypeUnsupported, shortened
+from cow_service.api.submission import Submission, Submitter, json_response
+from cow_service.errors import BodyTypeUnsupported, CowError, shortened
 from cow_service.requests import AnswerRequest
+
+
+class Completer:
+    """Completes chats on an engine."""
+
+    def __init__(self, submitter: Submitter) -> None:
+        self._submitter = submitter
+        self._service = submitter.engine.service
+        self._proxy = Proxy(submitter)
+
+    async def close(self) -> None:
+        """Closes connections."""
+        await self._proxy.close()
+
+    async def complete(self, request: Request, chat: Chat, *, stored: bool = True) -> Whole | Streamed | Response:
+        """The reply; a response where the caller takes the job instead, which needs `stored`.
+
+        Raises `ModelNotFound`, `InvalidRequest`, and what the MLLM or the job fails with.
+        """
+        who = answerer(self._service, chat.model)
+        reader = await to_thread.run_sync(self._service.chat_reader, who.reader)
+        if reader is not None:
+            return await self._proxy.complete(request, chat, who, reader)
+        submission = self._submitter.submission(request, "answer")
+        if not stored:
+            submission = replace(submission, prefer=preferences_without_key(request))
+        parsed = await self._submitter.in_thread(partial(parse_chat, chat, who))
+        try:
+            return await self._answered(request, submission, parsed)
+        except CowError as error:
+            raise parsed.pointers.translate_error(error) from error
+
+    async def _answered(
+        self, request: Request, submission: Submission, chat: ParsedChat
+    ) -> Whole | Streamed | Response:
+        """The reply of a job. Errors point into its `AnswerRequest`."""
+        submitter = self._submitter
+        if chat.stream:
+            created_at = await submitter.submit(submission, chat.request, None)
+            events = answer_events(submitter, submission, chat, created_at)
+            left = partial(submitter.leave, submission, created_at)
+            return Streamed(events, chat.pointers.translate_error, left)
+        result = await submitter.result(request, submission, chat.request, None)
+        if result is None:
+            return await submitter.accepted(submission)
+        return Whole(await to_thread.run_sync(lambda: ChatAnswer.parse(chat, result).completion()))
+
 
 SHOWN_CHARACTERS = 80  # of what the caller sent
 ANSWER_FIELDS = "ChatExtension"  # the schema of `cow` in a request

@@ -11,8 +11,7 @@ from pydantic import AwareDatetime
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from cow_service import errors
-from cow_service.api.minimal import minimal_job
-from cow_service.api.preferences import MINIMAL_APPLIED, preferences_of
+from cow_service.api.preferences import MINIMAL_APPLIED, minimal_job, preferences_of
 from cow_service.api.problems import documented
 from cow_service.api.routes.simulate import RETURN
 from cow_service.api.submission import json_response, owner_of

@@ -13,8 +13,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.ground import Ground, Placed
 from cow_service.generators.cutout.sprites import MARGIN, Window, soft
 from cow_service.records import FALLING_KINDS, BBox, Path
-from cow_service.vision.masks import hull, resized_mask, window_of
-from cow_service.vision.types import Floats, Floats32, Mask
+from cow_service.vision.masks import Floats, Floats32, Mask, hull, resized_mask, window_of
 
 UNMOVED = 0.3  # px
 

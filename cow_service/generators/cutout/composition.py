@@ -13,7 +13,7 @@ from cow_service.generators.cutout.bodies import MovingBody, StillBody
 from cow_service.generators.cutout.layers import Layers, take_apart
 from cow_service.generators.cutout.sprites import Sprite, Window, moved
 from cow_service.physics.camera import has_passed
-from cow_service.vision.types import Floats, Floats32, Image
+from cow_service.vision.masks import Floats, Floats32, Image
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from cow_service.generators.cutout.bodies import MovingBody, StillBody
 from cow_service.generators.cutout.ground import Ground, Placed
 from cow_service.generators.cutout.sprites import Sprite, cut
 from cow_service.records import BBox
-from cow_service.vision.masks import CroppedMask, iou
+from cow_service.vision.masks import CroppedMask, Image, Mask, iou
 from cow_service.vision.openings import SeenOpening, measure_opening
-from cow_service.vision.types import Image, Mask
 
 AROUND = 1.5  # of its half width: what is lower than that far from a container's middle may be in it
 DEEPER = 0.02  # of the container's height: so far below the rim something is in it

@@ -10,8 +10,7 @@ from cow_service.generators.cutout.composition import Compositor
 from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.masks import scaled_size
-from cow_service.vision.types import Image
+from cow_service.vision.masks import Image, scaled_size
 
 __all__ = ["MAX_SIDE", "CutoutGenerator", "CutoutOptions", "create"]
 

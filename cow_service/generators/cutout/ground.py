@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from cow_service.generators.base import GeneratorInput
-from cow_service.physics.floor_camera import NEAREST, FloorCamera
+from cow_service.physics.camera import NEAREST, FloorCamera
 from cow_service.records import BBox, Body
-from cow_service.vision.types import Floats
+from cow_service.vision.masks import Floats
 
 TOUCHING = 0.25  # of the smaller height: how deep one body may seem to stand in the one beneath it
 

@@ -18,8 +18,7 @@ from cow_service.generators.cutout.shadows import Shadow
 from cow_service.generators.cutout.sprites import Sprite, cut
 from cow_service.media.images import fit_within
 from cow_service.vision.inpainting import fill_hole
-from cow_service.vision.masks import hull, resized_mask, window_of
-from cow_service.vision.types import Image, Mask
+from cow_service.vision.masks import Image, Mask, hull, resized_mask, window_of
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
 HOLE_GROWTH = 0.03  # of the object's size: the rim, mixed with the background, is inpainted too

@@ -31,9 +31,8 @@ from cow_service.generators.cutout.shadows import (
 )
 from cow_service.generators.cutout.sprites import clipped
 from cow_service.records import Vector
-from cow_service.vision.masks import bbox_of
+from cow_service.vision.masks import Floats, Image, Mask, bbox_of
 from cow_service.vision.shadows import find_shadow
-from cow_service.vision.types import Floats, Image, Mask
 
 DEEP = 0.55  # share of light: with more taken away, noise is all that dividing brings back
 LEAST_SPREAD, TEXTURE = 0.02, 2.5  # of the lightness, deviations of the texture: so far a lit floor's colours spread

@@ -18,7 +18,7 @@ from cow_service.generators.cutout.ground import Ground, Surface
 from cow_service.generators.cutout.shade import Shade, drawn, reach
 from cow_service.generators.cutout.sprites import Window, clipped
 from cow_service.records import Path, Vector
-from cow_service.vision.types import Floats, Floats32
+from cow_service.vision.masks import Floats, Floats32
 
 FADED = 0.6  # of its height: a standing thing that has risen so far has no contact shadow any more
 SKY, SHARPNESS = 1.5, 2.0  # so much of the power of that share is lost: light also comes in from beside

@@ -10,8 +10,7 @@ import numpy as np
 
 from cow_service.records.motion import Shape
 from cow_service.vision.inpainting import push_pull
-from cow_service.vision.masks import turning, window_of
-from cow_service.vision.types import Floats, Floats32, Image, Mask
+from cow_service.vision.masks import Floats, Floats32, Image, Mask, turning, window_of
 
 EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge
 MARGIN = 4  # px around the mask that the soft edge takes

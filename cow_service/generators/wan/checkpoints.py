@@ -24,7 +24,7 @@ from torch import Tensor
 
 from cow_service.errors import CheckpointInvalid
 from cow_service.generators.wan.float8 import held_in_float8
-from cow_service.weights.building import listed
+from cow_service.weights.device import listed
 
 PREFIXES = ("model.diffusion_model.", "diffusion_model.")  # of names in one-file checkpoints
 SCALE = ".scale_weight"  # one number per fp8 weight: what it is multiplied by

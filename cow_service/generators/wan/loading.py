@@ -27,8 +27,7 @@ from cow_service.generators.wan.profiles import Profile, profile_of
 from cow_service.generators.wan.rank_group import RankGroup
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
-from cow_service.weights.building import BUILD_LOCK
-from cow_service.weights.device import choose_device
+from cow_service.weights.device import BUILD_LOCK, choose_device
 from cow_service.weights.lock import folder_of, read_lock, verify, weights_identity
 from cow_service.weights.manifests import Manifest, load_manifests
 

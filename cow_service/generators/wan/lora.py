@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
 from cow_service.generators.wan.checkpoints import diffusers_names
-from cow_service.weights.building import listed
+from cow_service.weights.device import listed
 
 PREFIXES = ("base_model.model.", "model.", "diffusion_model.", "transformer.")
 # How a tensor's name ends, which part of its layer's change it is, and the parameter of the layer that it changes.

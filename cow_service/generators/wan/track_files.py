@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cow_service.errors import InvalidRequest
 from cow_service.generators.wan.tracks import FILE_SAMPLES, MAX_FRAMES, Tracks, from_ati_file, to_ati_file
-from cow_service.vision.types import Floats32
+from cow_service.vision.masks import Floats32
 
 ARRAY = "array"  # its name in the .npz file
 VISIBILITY = "-visibility"  # between the name of Wan-Move's file of positions and its suffix

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cow_service.physics.camera_fit import FOCAL_WIDTHS
-from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.camera import FOCAL_WIDTHS, FloorCamera
 from cow_service.readers.embedded.vehicle_model import DARK, OTHER, PAINT, Labels, VehicleModel
 from cow_service.records import BBox, Vector
-from cow_service.vision.masks import bbox_of, resized_mask, scaled, without_holes
-from cow_service.vision.types import Floats, Floats32, Image, Mask
+from cow_service.vision.masks import Floats, Floats32, Image, Mask, bbox_of, resized_mask, scaled, without_holes
 
 WORKING_SIDE = 80  # px: the vehicle is compared at this size
 PITCHES = tuple(math.radians(degrees) for degrees in (20, 28, 36))  # cameras that are tried

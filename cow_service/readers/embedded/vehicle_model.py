@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.physics.floor_camera import FloorCamera
+from cow_service.physics.camera import FloorCamera
 from cow_service.records import BBox
-from cow_service.vision.types import Floats
+from cow_service.vision.masks import Floats
 
 PAINT, DARK, OTHER = 1, 2, 3  # labels of pixels, 0 beside it: the body's colour, tyres, and glass and lamps
 Labels = NDArray[np.uint8]

@@ -23,8 +23,7 @@ from cow_service.readers.local.tiny import make_tiny
 from cow_service.readers.mllm.models import mllm_manifests
 from cow_service.records import Record
 from cow_service.settings import Settings
-from cow_service.weights.building import BUILD_LOCK, listed
-from cow_service.weights.device import choose_device, is_out_of_memory
+from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed
 from cow_service.weights.lock import verify
 from cow_service.weights.manifests import Manifest
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.media.strips import named_strip
+from cow_service.media.overlay import named_strip
 from cow_service.readers.base import Imagined
 from cow_service.readers.question.placement_facts import state_words
 from cow_service.records import MEETINGS, AskedRelation, Doubt, Encounter, Outcome, Simulation, Trajectory

@@ -55,7 +55,7 @@ from cow_service.records import (
     Source,
 )
 from cow_service.settings import Settings
-from cow_service.weights.resources import PROMPTS
+from cow_service.weights.manifests import PROMPTS
 
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else

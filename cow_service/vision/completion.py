@@ -1,0 +1,374 @@
+"""Completes balls: a region is a disc if its outline lies on one circle and the circle on the strongest edges there.
+
+By colour alone, a ball's region lacks its highlight and includes its contact shadow; the circle does neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.records import BBox
+from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, EDGE_THRESHOLDS, View
+from cow_service.vision.masks import Floats, Floats32, Mask, outline_of, window_of
+
+TRIES = 120  # circles through three points of the outline
+NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
+ON_CIRCLE = 0.5  # share of the outline
+ON_BOTH = 1.17  # sum of that share and of the share of the rays from the middle whose strongest edge is the circle
+WHOLE, LEAST_ARC = 0.85, 0.25  # less of the outline than the first: so much of the circle must lie on edges in one run
+BEYOND_IMAGE = 0.85  # share of those rays for a circle that the image's border cuts
+RAY = (-0.3, 0.2)  # of the radius: how far inside and outside the circle a ray is searched
+RAY_ERROR = (1.0, 0.03)  # px, and of the radius: how near the circle its strongest edge must lie; the larger counts
+ON_EDGES = 0.8  # share of the circle
+FILLED, SPILLED = 0.72, 0.14  # share of the disc that the region fills; share of the region outside it
+CAP_FILLED, CAP_RAYS = 0.55, 0.9  # the same share where so many rays are strongest on the circle: a ball's lit cap
+BLED = 2.5  # px by which compression may have spread a colour beyond its outline
+SAMPLES = 72  # points tried on the circle
+LEAST_RADIUS = 5.0  # px
+
+
+def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.0) -> Mask | None:
+    """The disc [h, w] that a part is, or None. `edges` [h, w] are gradients, edges above `edge_threshold`.
+
+    A part that ends before the edges, by up to `grow` px, gives the disc that reaches to the strongest.
+    """
+    contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = np.asarray(max(contours, key=len)[:, 0], np.float64)
+    if len(outline) < 20:
+        return None
+    circle = _best_circle(outline)
+    if circle is None:
+        return None
+    x, y, radius, on_circle = circle
+    radius = _radius_on_edges(edges, x, y, radius, grow)
+    height, width = part.shape
+    angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)
+    columns, rows = np.round(x + radius * np.cos(angles)).astype(int), np.round(y + radius * np.sin(angles)).astype(int)
+    seen = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    strong = cv2.dilate((edges > edge_threshold).astype(np.uint8), np.ones((3, 3), np.uint8))
+    if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < ON_EDGES:
+        return None
+    rays = _strongest_on(edges, x, y, radius)
+    sharpest = rays[seen].mean()
+    if on_circle < WHOLE and _longest_arc(rays) < LEAST_ARC:
+        return None
+    if on_circle + sharpest < ON_BOTH or (not seen.all() and sharpest < BEYOND_IMAGE):
+        return None
+    ys, xs = np.mgrid[:height, :width]
+    disc = np.hypot(xs - x, ys - y) <= radius + 0.5
+    both = (disc & part).sum()
+    filled = CAP_FILLED if sharpest > CAP_RAYS else FILLED
+    return disc if both > filled * disc.sum() and both > (1 - SPILLED) * part.sum() else None
+
+
+def _radius_on_edges(edges: Floats32, x: float, y: float, radius: float, grow: float) -> float:
+    """The radius (px) of the circle with the strongest median edge: `BLED` smaller at most, or `grow` larger."""
+    angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)[:, None]
+    radii = radius + np.arange(-BLED, max(0.5, grow) + 0.01, 0.5)[None]
+    columns, rows = x + np.cos(angles) * radii, y + np.sin(angles) * radii
+    values = np.asarray(cv2.remap(edges, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR))
+    return float(radii[0, int(np.median(values, axis=0).argmax())])
+
+
+def _strongest_on(edges: Floats32, x: float, y: float, radius: float) -> Mask:
+    """For each of the `SAMPLES` rays from the middle of a circle, whether the strongest edge near it lies on it.
+
+    On a ball's rays nothing is stronger than its outline; a circle around a cube or mug meets edges elsewhere.
+    """
+    angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)[:, None]
+    offsets = np.arange(RAY[0] * radius, RAY[1] * radius + 0.01, 0.5)[None]
+    columns, rows = x + np.cos(angles) * (radius + offsets), y + np.sin(angles) * (radius + offsets)
+    values = cv2.remap(edges, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)
+    strongest = np.abs(offsets[0][np.asarray(values).argmax(axis=1)])
+    return strongest < max(RAY_ERROR[0], RAY_ERROR[1] * radius)
+
+
+def _longest_arc(rays: Mask) -> float:
+    """Share of the circle that the longest run of rays takes, gaps of one ray closed: a polygon has many short runs."""
+    twice = np.concatenate([rays, rays])
+    closed = twice | (np.roll(twice, 1) & np.roll(twice, -1))
+    longest = length = 0
+    for on in closed:
+        length = length + 1 if on else 0
+        longest = max(longest, length)
+    return min(1.0, longest / len(rays))
+
+
+def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
+    """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None where too few do."""
+    rng = np.random.default_rng(0)  # the same outline must give the same circle
+    circles = _circles_through(outline[rng.integers(0, len(outline), (TRIES, 3))])
+    reach = float(np.ptp(outline, axis=0).max())
+    circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] >= LEAST_RADIUS) & (circles[:, 2] <= reach)]
+    if not len(circles):
+        return None
+    gaps = np.linalg.norm(outline[None] - circles[:, None, :2], axis=2) - circles[:, 2:]
+    close = np.abs(gaps) < NEAR
+    best = int(close.sum(axis=1).argmax())
+    if close[best].mean() < ON_CIRCLE:
+        return None
+    chosen = outline[close[best]]
+    terms = np.column_stack([2 * chosen, np.ones(len(chosen))])  # x^2 + y^2 = 2ax + 2by + c, least squares
+    a, b, c = np.linalg.lstsq(terms, (chosen**2).sum(axis=1), rcond=None)[0]
+    return float(a), float(b), float(np.sqrt(max(c + a * a + b * b, 0.0))), float(close[best].mean())
+
+
+def _circles_through(triples: Floats) -> Floats:
+    """Circles [T, 3] (x, y, radius) through triples of points [T, 3, 2]; not finite where they lie on a line."""
+    a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
+    ab, ac = b - a, c - a
+    doubled = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    ab2, ac2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = (ac[:, 1] * ab2 - ab[:, 1] * ac2) / doubled
+        y = (ab[:, 0] * ac2 - ac[:, 0] * ab2) / doubled
+    return np.column_stack([a[:, 0] + x, a[:, 1] + y, np.hypot(x, y)])
+
+
+NECK_FLAT = 0.45  # of its width: a mouth seen from above is no higher
+OVERLAP = 0.6  # of the narrower one's width, that lies below the mouth
+MOST_GAP = 1.2  # of the mouth's width: the neck is no longer
+NECK_OFF_MIDDLE = 0.3  # of the mouth's width, by which the body's middle may lie beside it
+SHOULDER = 0.15  # of the body's height: the rows at which the neck ends
+NECK_STEP = 1.0  # Lab units between the neck and the floor beside it, in the mean: no floor is seen between the two
+
+
+def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
+    """The mask [h, w] of the neck between a mouth and a body [h, w]; None where they are no one thing's.
+
+    `lab` [h, w, 3] is the image in CIE Lab.
+    """
+    upper, lower = window_of(mouth), window_of(body)
+    if upper is None or lower is None:
+        return None
+    (rows, columns), (below, across) = upper, lower
+    width, gap = columns.stop - columns.start, below.start - rows.stop
+    shared = min(columns.stop, across.stop) - max(columns.start, across.start)
+    aside = abs(columns.start + columns.stop - across.start - across.stop) / 2
+    if rows.stop - rows.start > NECK_FLAT * width or not 0 < gap <= MOST_GAP * width:
+        return None
+    if shared < OVERLAP * min(width, across.stop - across.start) or aside > NECK_OFF_MIDDLE * width:
+        return None
+    shoulder = below.start + max(1, round(SHOULDER * (below.stop - below.start)))
+    neck = _hull(mouth, body[:shoulder]) & ~mouth & ~body
+    ends = np.nonzero(neck.any(axis=0))[0]
+    beside = np.zeros(neck.shape, bool)
+    beside[rows.stop : below.start, max(0, int(ends[0]) - width // 2) : int(ends[-1]) + width // 2] = True
+    beside &= cv2.dilate((neck | mouth | body).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+    inner = cv2.erode(neck.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    if not beside.any() or not inner.any():
+        return None
+    return neck if np.linalg.norm(lab[inner].mean(axis=0) - lab[beside].mean(axis=0)) > NECK_STEP else None
+
+
+def _hull(mouth: Mask, shoulder: Mask) -> Mask:
+    """The convex hull [h, w] of a mouth [h, w] and of the upper rows of a body."""
+    points = [np.argwhere(mask)[:, ::-1] for mask in (mouth, shoulder)]
+    hull = np.zeros(mouth.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(points).astype(np.int32)), 1)
+    return hull > 0
+
+
+WEIGHTS = np.array([1.0, 0.5, 0.5], np.float32)  # of L, a and b in a step: compression spreads colour, not lightness
+STEP, CLEAR_STEP = 2.0, 4.0  # Lab units from both sides: of every pixel, and in the median
+BLUR = 0.25  # of the largest steps: less is the blur of an edge
+SIDE = 0.5  # of the object's width: how far away the sides are looked at, and the width of what is searched
+LEAST_SIDE = 5  # px at the working size
+UPPER_ROWS = 0.15  # of the object's height: where its middle is taken
+OFF_MIDDLE = 0.15  # of the object's width, by which it may stand beside that middle
+SUNK = 0.25  # of the object's height: so far below the object's upper end its foot may lie
+LEAST_HEIGHT, MOST_HEIGHT = 3, 0.6  # px at the working size: less is blur; of the object's height: more is no part
+SHARP = 0.6  # share of its outline that lies on edges
+SHADE_HUE = 2.5  # Lab units in the a*b* plane: more is another colour, not a shadow
+DARK, SHADE_DEPTH = 20, 0.65  # the percentile of its lightness that counts, and of the sides' lightness: less is black
+
+
+def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | None:
+    """The mask [h, w] of what stands on a part [h, w] that is not empty, or None. `taken` [h, w] are other objects.
+
+    `lab` [h, w, 3] is the image in CIE Lab, `edges` [h, w] is set on its edges.
+    """
+    rows, columns = window_of(part) or (slice(0, 1), slice(0, 1))
+    width, height = columns.stop - columns.start, rows.stop - rows.start
+    upper = np.nonzero(part[rows.start : rows.start + max(2, round(UPPER_ROWS * height))].any(axis=0))[0]
+    middle = (float(upper[0]) + float(upper[-1])) / 2
+    side = max(LEAST_SIDE, round(SIDE * width))
+    left, right = round(middle - side / 2), round(middle + side / 2) + 1
+    top, bottom = max(0, rows.start - round(MOST_HEIGHT * height)), rows.start + max(2, round(SUNK * height))
+    above = rows.start - top
+    if left < side or right + side > part.shape[1] or above < LEAST_HEIGHT:
+        return None
+    strip, *sides = (np.s_[top:bottom, left + shift : right + shift] for shift in (0, -side, side))
+    steps = np.min([np.linalg.norm((lab[strip] - lab[beside]) * WEIGHTS, axis=2) for beside in sides], axis=0)
+    free = [~(part[area] | taken[area]) for area in (strip, *sides)]
+    differs = (steps > STEP) & np.all(free, axis=0)
+    if differs.any():
+        differs &= steps > BLUR * np.percentile(steps[differs], 90)
+    if not differs[above - LEAST_HEIGHT : above].any():
+        return None
+    found = _joined(differs, part[strip])
+    seen = _above_rim(found[:above])
+    if seen is None or abs(float(np.nonzero(seen)[1].mean()) + left - middle) > OFF_MIDDLE * width:
+        return None
+    found &= cv2.dilate(np.any(seen, axis=0, keepdims=True).astype(np.uint8), np.ones((1, 3), np.uint8)) > 0
+    if np.median(steps[found]) < CLEAR_STEP:
+        return None
+    colours = [lab[area][: len(seen)][seen] for area in (strip, *sides)]
+    if _is_shadow(*colours) or np.mean(edges[strip][outline_of(found)]) < SHARP:
+        return None
+    whole = np.zeros(part.shape, bool)
+    whole[strip] = found
+    return whole
+
+
+def _joined(differs: Mask, part: Mask) -> Mask:
+    """What of the pixels that differ [n, m] is joined to the part [n, m]."""
+    body = cv2.dilate(part.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    _, labels = cv2.connectedComponents((differs | body).astype(np.uint8), connectivity=8)
+    joined = np.unique(labels[part])
+    return differs & np.isin(labels, joined[joined > 0])
+
+
+def _above_rim(found: Mask) -> Mask | None:
+    """The rows above the object's rim of what is found [n, m] above its upper end; None where it goes on or is low.
+
+    The rim, which may cross the whole strip, is low itself.
+    """
+    rim = np.nonzero(found[:, 0] | found[:, -1])[0]
+    seen = found[: int(rim[0])] if len(rim) else found
+    rows = np.nonzero(seen.any(axis=1))[0]
+    if not len(rows) or rows[0] == 0 or len(found) - len(seen) > LEAST_HEIGHT:
+        return None
+    return seen if len(found) - int(rows[0]) >= LEAST_HEIGHT else None
+
+
+def _is_shadow(seen: Floats32, *sides: Floats32) -> bool:
+    """Whether Lab colours [N, 3] are those of the sides [N, 3], all three darkened by the same share."""
+    floor = np.median(np.concatenate(sides), axis=0)
+    lightness, *hue = np.median(seen, axis=0)
+    share = float(lightness) / max(1.0, float(floor[0]))
+    darkest = float(np.percentile(seen[:, 0], DARK)) / max(1.0, float(floor[0]))
+    return share < 1 and darkest > SHADE_DEPTH and float(np.hypot(*(hue - share * floor[1:]))) < SHADE_HUE
+
+
+INSIDE = 0.8  # of a dark part's box that lies in the thing's, grown by `BESIDE` and by `LOW`
+BESIDE = 0.08  # of the thing's height
+LOW = 0.22  # of the thing's height: so far from its lower end the dark part ends at most
+FLAT = 1.5  # width of a dark part over its height, at least
+
+
+def is_underside(part: BBox, thing: BBox) -> bool:
+    """Whether the box [x0, y0, x1, y1] of a dark part lies at the lower end of a thing's, not before or beside it."""
+    height = thing[3] - thing[1]
+    width = min(part[2], thing[2] + BESIDE * height) - max(part[0], thing[0] - BESIDE * height)
+    inside = width * (min(part[3], thing[3] + LOW * height) - max(part[1], thing[1]))
+    low = abs(part[3] - thing[3]) <= LOW * height and part[1] + part[3] > thing[1] + thing[3]
+    wide, high = part[2] - part[0], part[3] - part[1]
+    return low and width > 0 and wide >= FLAT * high and inside >= INSIDE * wide * high
+
+
+BRIGHT_REACH = 1.6  # Lab lightness above the surroundings: another lit face
+LEAST_TOP, LEAST_WHITE = 20, 60  # px: a bright top, and one that is surely of something white
+LEAST_FACE_SIDE = 12  # px
+MAX_SIDE, MAX_RATIO = 0.1, 12  # of the image, and of the top's area: one shaded side
+HANGS = 0.7  # of a side's width that lies below the top
+SHARP_TOP = 0.7  # of a top's outline that lies on edges: with less it is a shine on the floor
+WEAK_EDGES = (0.45, 1.8)  # as `EDGE_THRESHOLDS`: the sides of something surely white stand out by as little
+
+_KERNEL = np.ones((3, 3), np.uint8)
+_Box = tuple[int, int, int, int]  # x, y, width, height
+
+
+class _Tops:
+    """Bright patches, by their label."""
+
+    def __init__(self, view: View, white: Mask) -> None:
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
+        self.white = white
+        self.labels = np.asarray(labels, np.int32)
+        self.boxes: list[_Box] = [(int(x), int(y), int(w), int(h)) for x, y, w, h in stats[:, :4]]
+        self.areas = [int(area) for area in stats[:, 4]]
+        self._near_edges = (
+            cv2.dilate((view.edges > view.edge_threshold).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        )
+        self._chroma = view.chroma
+
+    def is_sharp(self, top: int) -> bool:
+        """Whether its outline lies on edges."""
+        x, y, w, h = self.boxes[top]
+        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
+        return float(np.mean(self._near_edges[around][outline_of(self.labels[around] == top)])) > SHARP_TOP
+
+    def surely_white(self) -> frozenset[int]:
+        """Those that have no colour of their own and a sharp outline."""
+        tops = [top for top, area in enumerate(self.areas) if top and area >= LEAST_WHITE]
+        return frozenset(top for top in tops if self._is_neutral(top) and self.is_sharp(top))
+
+    def _is_neutral(self, top: int) -> bool:
+        x, y, w, h = self.boxes[top]
+        window = slice(y, y + h), slice(x, x + w)
+        return float(np.median(self._chroma[window][self.labels[window] == top])) < CHROMA_STEP
+
+
+def white_sides(view: View, core: Mask) -> Mask:
+    """Patches enclosed by edges at a bright neutral top: the other faces of something white, lit or in shade.
+
+    `core` [h, w] are the pixels that are surely of an object.
+    """
+    neutral = (view.chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
+    tops = _Tops(view, core & (view.bright > BRIGHT_STEP) & neutral)
+    sides = _lit_fronts(view, tops)
+    white = tops.surely_white()
+    for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if white else [])):
+        weak = thresholds == WEAK_EDGES
+        for near, patch, box in _enclosed(view, *thresholds):
+            if weak and float(np.median(view.chroma[near][patch > 0])) > CHROMA_STEP:
+                continue
+            touched = set(np.unique(tops.labels[near][cv2.dilate(patch, _KERNEL, iterations=4) > 0]).tolist()) - {0}
+            lit = len(touched) > 0 and float(np.median(view.bright[near][patch > 0])) > BRIGHT_REACH
+            if any(_belongs(tops, top, box, int(patch.sum()), lit) for top in (touched & white if weak else touched)):
+                sides[near] |= cv2.dilate(patch, _KERNEL, iterations=2) > 0
+    return sides
+
+
+def _enclosed(view: View, floor: float, factor: float) -> Iterator[tuple[tuple[slice, slice], NDArray[np.uint8], _Box]]:
+    """Patches between edges that do not reach the image's border: where they lie, their mask there, and their box."""
+    height, width = view.edges.shape
+    edge_threshold = max(floor, factor * view.median_edge)
+    edges = cv2.morphologyEx((view.edges > edge_threshold).astype(np.uint8), cv2.MORPH_CLOSE, _KERNEL)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
+    for i in range(1, count):
+        x, y, w, h, area = (int(v) for v in stats[i])
+        if area < LEAST_FACE_SIDE or area > MAX_SIDE * height * width:
+            continue
+        if x == 0 or y == 0 or x + w == width or y + h == height:
+            continue
+        near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
+        yield near, (labels[near] == i).astype(np.uint8), (x, y, w, h)
+
+
+def _belongs(tops: _Tops, top: int, side: _Box, area: int, lit: bool) -> bool:
+    """Whether a side is a top's: small beside it, and lit or right below it."""
+    x, y, w, _ = side
+    tx, ty, tw, _ = tops.boxes[top]
+    overlap = min(x + w, tx + tw + 3) - max(x, tx - 3)
+    hangs = overlap > HANGS * w and y >= ty
+    return tops.areas[top] >= LEAST_TOP and area < MAX_RATIO * tops.areas[top] and (lit or hangs)
+
+
+def _lit_fronts(view: View, tops: _Tops) -> Mask:
+    """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide."""
+    lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | tops.white
+    fronts = np.zeros(lit.shape, bool)
+    for top, (x, y, w, h) in enumerate(tops.boxes):
+        if top == 0 or tops.areas[top] < LEAST_TOP or not 0.2 * w < h < 0.8 * w or not tops.is_sharp(top):
+            continue
+        window = slice(y, y + h + w), slice(x, x + w)
+        _, blobs = cv2.connectedComponents(lit[window].astype(np.uint8), connectivity=4)
+        joined = np.unique(blobs[tops.labels[window] == top])
+        fronts[window] |= np.isin(blobs, joined[joined > 0])
+    return fronts
