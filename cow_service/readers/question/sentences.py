@@ -12,7 +12,7 @@ from functools import lru_cache
 from itertools import pairwise
 
 from cow_service.readers.base import Quantity
-from cow_service.readers.options import split_options, without_reply_form
+from cow_service.readers.options import split_options
 from cow_service.readers.question import lexicon as lex
 from cow_service.readers.question.chunks import items
 from cow_service.readers.question.clauses import (
@@ -29,6 +29,7 @@ from cow_service.readers.question.ones import with_nouns
 from cow_service.readers.question.openings import without_openings
 from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at, tokens
 from cow_service.readers.question.places_said import with_places
+from cow_service.readers.question.reply_forms import without_reply_form
 from cow_service.readers.question.tables import with_tables
 from cow_service.readers.question.trail_words import TrailWords, split_trail
 from cow_service.readers.question.typing_errors import without_typing_errors
