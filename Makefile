@@ -13,13 +13,13 @@ demo: $(VENV)/.base ## run the main job on an example
 serve: $(VENV)/.base ## start the server on 127.0.0.1:8000
 	$(BIN)/cow serve
 
-test: $(VENV)/.test ## all tests, slow ones included; of long tables of cases a twelfth
+test: $(VENV)/.test ## every test but those marked soak_only; of long tables every twelfth case
 	$(PYTEST)
 
-test-fast: $(VENV)/.test ## the tests that take seconds
+test-fast: $(VENV)/.test ## of `make test` those not marked slow
 	$(PYTEST) -m "not slow"
 
-soak: $(VENV)/.test ## all tests and all cases, those of crashes, fuzz and states ten times as long, and public harnesses
+soak: $(VENV)/.test ## every test with every case; crash, fuzz and state tests ten times as long; public harnesses
 	$(PYTEST) tests/test_inspect.py tests/test_docs.py
 	COW_TEST_SCALE=10 $(PYTEST)
 	$(MAKE) -C cow-scenes test

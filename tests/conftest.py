@@ -39,6 +39,8 @@ if TYPE_CHECKING:  # other tests do not need a browser
 
 # How much the crash, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
 SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
+# On a machine that has other work to do, everything takes longer: time limits grow with its load when the tests begin.
+SLOWNESS = min(max(os.getloadavg()[0] / (os.cpu_count() or 1), 1.0), 6.0)
 settings.register_profile("cow", deadline=None, derandomize=True, database=None, max_examples=12 * SCALE)
 settings.load_profile("cow")
 
@@ -89,12 +91,30 @@ def all_scenes() -> list[Path]:
 LONG_TABLE = 8  # cases of one test; of longer ones every twelfth is run, all of them in `make soak`
 
 
+def is_thinned_out(config: pytest.Config) -> bool:
+    """Whether this run leaves cases out. What is chosen by name is run whole, with all its cases."""
+    return SCALE == 1 and config.args == config.getini("testpaths") and not config.option.keyword
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest-timeout reads the option
+def pytest_configure(config: pytest.Config) -> None:
+    if config.option.timeout is None:
+        config.option.timeout = float(config.getini("timeout")) * SLOWNESS
+
+
+def pytest_report_header(config: pytest.Config) -> str:
+    cases = "every twelfth case of long tables, no soak_only tests" if is_thinned_out(config) else "all cases"
+    return f"cow: {cases}; crash, fuzz and state tests x{SCALE}; time limits x{SLOWNESS:.1f}"
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    chosen = config.args != config.getini("testpaths") or config.option.keyword or config.option.markexpr
-    if SCALE == 1 and not chosen:  # what is chosen by name is run whole
+    if is_thinned_out(config):
         thin_out(config, items)
     for item in items:
+        limit = item.get_closest_marker("timeout")
+        if limit is not None:
+            item.add_marker(pytest.mark.timeout(limit.args[0] * SLOWNESS), append=False)
         if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
             item.add_marker(pytest.mark.soak)
     items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
@@ -177,7 +197,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture
 def http(server: Server) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=server.address, timeout=110) as client:
+    with httpx.Client(base_url=server.address, timeout=110 * SLOWNESS) as client:
         yield client
 
 
