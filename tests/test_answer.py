@@ -16,6 +16,9 @@ from hypothesis import strategies as st
 from cow_service.media.images import encode_png
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.answers import answer_from, choose_option
+from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
+from cow_service.readers.embedded.english.options_said import count_of, says_it_happens, seconds_of
+from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.options import (
     choices_source,
     not_sure_option,
@@ -23,10 +26,6 @@ from cow_service.readers.options import (
     read_choices,
     says_not_sure,
 )
-from cow_service.readers.question.numbers_said import count_of, seconds_of
-from cow_service.readers.question.options_said import says_it_happens
-from cow_service.readers.question.relations import read_alternatives, read_asked
-from cow_service.readers.question.sentences import parse
 from cow_service.records import Answer, Asked, Outcome
 from cow_service.requests import AnswerRequest, OptionRequest
 from cow_service.service import Service

@@ -9,9 +9,9 @@ from drawn import ball, block, floor, jpeg
 
 from cow_service.errors import CannotGround
 from cow_service.readers.base import ReaderInput
+from cow_service.readers.embedded.english.asked import read_asked
+from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.readers.question.relations import read_asked
-from cow_service.readers.question.sentences import parse
 from cow_service.records import LocatedObject
 from cow_service.vision.scene import Scene
 

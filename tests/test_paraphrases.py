@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from cow_service.readers.question.relations import read_asked
-from cow_service.readers.question.sentences import parse
+from cow_service.readers.embedded.english.asked import read_asked
+from cow_service.readers.embedded.english.questions import parse
 
 MOVES = "If the red ball rolls to the left, "
 SAME = """

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cow_service.readers.embedded.english.asked import read_asked
+from cow_service.readers.embedded.english.prompts import without_reply_form
+from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.options import Reply, reply_text
-from cow_service.readers.question.relations import read_asked
-from cow_service.readers.question.reply_forms import without_reply_form
-from cow_service.readers.question.sentences import parse
 
 LETTER = Reply("A", "Yes", "The ball meets the mug.", "question-letters")
 LISTED = Reply("A", "Yes", "The ball meets the mug.", "question-list")

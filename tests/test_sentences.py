@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cow_service.readers.base import Quantity
+from cow_service.readers.embedded.english import lexicon
+from cow_service.readers.embedded.english.questions import Question, parse, parse_noun_phrase
 from cow_service.readers.embedded.motions import quantities
 from cow_service.readers.options import split_options
-from cow_service.readers.question import lexicon
-from cow_service.readers.question.sentences import Question, parse, parse_noun_phrase
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 SLIGHT, DIAGONAL = math.sin(math.pi / 8), math.sqrt(0.5)

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.embedded.answers import answer_from
+from cow_service.readers.embedded.english.asked import read_asked, unread
+from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.readers.question.relations import read_asked, unread
-from cow_service.readers.question.sentences import parse
 from cow_service.records import Asked, Grounding
 from cow_service.vision.scene import Scene
 

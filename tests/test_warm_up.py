@@ -21,7 +21,7 @@ from pathlib import Path
 from cow_service.settings import Settings
 from cow_service.warm_up import warm_up
 warm_up(Settings(data_dir=Path(sys.argv[1])))
-from cow_service.readers.question import parsing
+from cow_service.readers.embedded.english import grammar as parsing
 print(parsing._grammar.cache_info().currsize, *(f"cow_service.{name}" in sys.modules for name in (
     "readers.embedded.reader", "generators.cutout.composition", "media.video")))
 """

@@ -11,10 +11,9 @@ import numpy as np
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit, fit_shadow, prior
 from cow_service.physics.outcome import Query
+from cow_service.readers.embedded.english.nouns import is_cube, is_vehicle, kind_of, shape_of
+from cow_service.readers.embedded.english.options_said import may_name
 from cow_service.readers.options import plain
-from cow_service.readers.question.kinds import kind_of
-from cow_service.readers.question.options_said import may_name
-from cow_service.readers.question.shapes import is_cube, is_vehicle, shape_of
 from cow_service.records import Asked, BBox, Grounding, LocatedObject, Motion, Shape
 from cow_service.requests import CameraRequest
 from cow_service.vision.masks import CroppedMask, iou

@@ -19,7 +19,7 @@ from cow_service.errors import (
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode, decode_own, encode_png
 from cow_service.readers.base import GroundingReading
-from cow_service.readers.question.sentences import parse
+from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.question.wording import same_name
 from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import (

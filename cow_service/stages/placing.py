@@ -13,7 +13,7 @@ from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.placement import Placements, Put
 from cow_service.physics.world import WorldInput, Worlds
-from cow_service.readers.question.hollow import container_form
+from cow_service.readers.embedded.english.nouns import container_form
 from cow_service.readers.question.placement_facts import cannot_stay, place_words
 from cow_service.readers.question.wording import bare_name
 from cow_service.records import BBox, Grounding, Intervention, LocatedObject, Motion, PlacedBefore, Placement

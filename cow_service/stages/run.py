@@ -20,7 +20,7 @@ from cow_service.media.artifacts import ArtifactStore, Patience, try_once
 from cow_service.media.images import DecodedImage
 from cow_service.observability.logging import rfc3339
 from cow_service.readers.base import CallLog, MotionHints, Reader, ReaderInput
-from cow_service.readers.question.sentences import parse
+from cow_service.readers.embedded.english.questions import parse
 from cow_service.records import BBox, Cue, Grounding, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of

@@ -18,10 +18,10 @@ from cow_service.physics.outcome import KIND_OF, Decided, Query, answers_of, dec
 from cow_service.physics.placing import flies
 from cow_service.physics.projection import spread_anchors, swept
 from cow_service.physics.world import Led, WorldInput, Worlds, run_world
+from cow_service.readers.embedded.english.asked import read_asked
+from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.question.both_worlds import facts_of_both
 from cow_service.readers.question.facts import facts_of
-from cow_service.readers.question.relations import read_asked
-from cow_service.readers.question.sentences import parse
 from cow_service.records import Asked, Grounding, Intervention, Motion, Outcome, Path, Trajectory
 from cow_service.requests import SimulateRequest, TrajectoryRequest
 from cow_service.stages.bodies import camera_of, obstacles_of, query_of, seen_bodies

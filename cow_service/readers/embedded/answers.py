@@ -9,12 +9,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from cow_service.readers.base import AnswerReading
+from cow_service.readers.embedded.english.asked import Unread
+from cow_service.readers.embedded.english.options_said import (
+    count_of,
+    may_name,
+    names_none,
+    names_several,
+    says_it_happens,
+    seconds_of,
+    spans,
+)
+from cow_service.readers.embedded.english.questions import parse_noun_phrase
+from cow_service.readers.embedded.english.tokens import ObjectPhrase
 from cow_service.readers.options import not_sure_option, says_not_sure
-from cow_service.readers.question.accounting import Unread
-from cow_service.readers.question.numbers_said import count_of, seconds_of, spans
-from cow_service.readers.question.options_said import may_name, names_none, names_several, says_it_happens
-from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.sentences import parse_noun_phrase
 from cow_service.records import AnswerOption, Asked, Doubt, Outcome
 
 HAPPENS = 0.5  # probability from which what is asked happens

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from cow_service.readers.embedded.english.tokens import ObjectPhrase
 from cow_service.readers.embedded.naming import is_known
 from cow_service.readers.embedded.outlines import contradicts
-from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.records import BBox
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from cow_service.errors import CannotGround
+from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
+from cow_service.readers.embedded.english.nouns import Kind, kind_of
+from cow_service.readers.embedded.english.options_said import may_name
+from cow_service.readers.embedded.english.questions import Question
+from cow_service.readers.embedded.english.tokens import ObjectPhrase
 from cow_service.readers.embedded.matching import describe, match_all, match_some
-from cow_service.readers.question.kinds import Kind, kind_of
-from cow_service.readers.question.options_said import may_name
-from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.relations import read_alternatives, read_asked
-from cow_service.readers.question.sentences import Question
 from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.masks import iou

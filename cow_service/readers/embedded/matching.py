@@ -9,10 +9,10 @@ import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.readers.embedded.english.noun_phrases import TABLES
+from cow_service.readers.embedded.english.tokens import ObjectPhrase
 from cow_service.readers.embedded.naming import CLEARLY_WORSE, IMPOSSIBLE, is_clear, is_poor, log_ratios
 from cow_service.readers.embedded.singling import at_place, singled_out
-from cow_service.readers.question.phrases import ObjectPhrase
-from cow_service.readers.question.tables import TABLES
 from cow_service.records import BBox
 from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene

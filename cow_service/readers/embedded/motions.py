@@ -9,8 +9,8 @@ from typing import TypedDict, TypeVar
 from cow_service.errors import CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import OtherMotionReading, Quantity, SpeedWord, StepReading
-from cow_service.readers.question.motion_words import OtherWords, StepWords
-from cow_service.readers.question.phrases import QuantityWords
+from cow_service.readers.embedded.english.motion import OtherWords, StepWords
+from cow_service.readers.embedded.english.tokens import QuantityWords
 from cow_service.readers.remedies import GIVE_DIRECTION
 from cow_service.records import DIRECTED_KINDS, BBox, Grounding, Until, Vector
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from cow_service.readers.embedded.english.lexicon import words
+from cow_service.readers.embedded.english.tokens import ObjectPhrase
 from cow_service.readers.embedded.outlines import form_of, is_cut, log_ratio
-from cow_service.readers.question.lexicon import words
-from cow_service.readers.question.phrases import ObjectPhrase
 from cow_service.vision.regions import Region
 
 CLEARLY_WORSE = 2.5  # log ratio: what is so much less likely than the best, twelve times, is not meant

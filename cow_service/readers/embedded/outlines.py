@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from cow_service.readers.question.lexicon import words
+from cow_service.readers.embedded.english.lexicon import words
 from cow_service.vision.masks import Mask, hull
 from cow_service.vision.regions import Region
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from cow_service.readers.question.phrases import ObjectPhrase
+from cow_service.readers.embedded.english.tokens import ObjectPhrase
 from cow_service.vision.regions import Region
 
 CLEAR = 0.25  # of the mean size of the regions: so far ahead of the next one in place

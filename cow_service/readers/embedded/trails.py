@@ -5,10 +5,10 @@ from __future__ import annotations
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading
+from cow_service.readers.embedded.english.interventions import TrailWords
+from cow_service.readers.embedded.english.motion import MotionWords
+from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.matching import best_matches, describe, match_one
-from cow_service.readers.question.motion_words import MotionWords
-from cow_service.readers.question.sentences import Question
-from cow_service.readers.question.trail_words import TrailWords
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import FALLING_KINDS, BBox, Grounding
 from cow_service.vision.scene import Scene

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from cow_service.readers.base import MotionReading
-from cow_service.readers.question.motion_words import ArrowSense
+from cow_service.readers.embedded.english.motion import ArrowSense
 from cow_service.records import BBox, Vector
 from cow_service.vision.arrow_choice import arrow_at
 from cow_service.vision.masks import iou

@@ -23,6 +23,7 @@ from cow_service.readers.base import (
     ReaderInput,
 )
 from cow_service.readers.chat import ChatTurn, Upstream
+from cow_service.readers.embedded.english.questions import parse, parse_noun_phrase
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.changes import located_changes, names_of
 from cow_service.readers.mllm.checks import box_warnings, follow_arrow
@@ -40,7 +41,6 @@ from cow_service.readers.mllm.priors import HEADING_DEVIATION, SPEED_DEVIATION
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.mllm.scale import Scaled, scale_call
 from cow_service.readers.mllm.upstream import upstream_of
-from cow_service.readers.question.sentences import parse, parse_noun_phrase
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,

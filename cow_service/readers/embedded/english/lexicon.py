@@ -27,7 +27,7 @@ class Verb:
 
 
 TABLES: dict[str, dict[str, str]] = tomllib.loads(
-    files("cow_service.readers.question").joinpath("lexicon.toml").read_text(encoding="utf-8")
+    files("cow_service.readers.embedded.english").joinpath("lexicon.toml").read_text(encoding="utf-8")
 )
 SETS = {name: words(text) for table in ("sets", "verbs", "of_verbs") for name, text in TABLES[table].items()}
 

@@ -12,10 +12,8 @@ from functools import lru_cache
 from itertools import pairwise
 
 from cow_service.readers.base import Quantity
-from cow_service.readers.options import split_options
-from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.chunks import items
-from cow_service.readers.question.clauses import (
+from cow_service.readers.embedded.english import lexicon as lex
+from cow_service.readers.embedded.english.clauses import (
     Clauses,
     MotionCandidate,
     clause_end,
@@ -23,16 +21,24 @@ from cow_service.readers.question.clauses import (
     is_vague,
     read_clauses,
 )
-from cow_service.readers.question.interventions import InterventionWords, implied_placing, split_interventions
-from cow_service.readers.question.motion_words import MotionWords, OtherWords, arrow_statement, read_motion, with_front
-from cow_service.readers.question.ones import with_nouns
-from cow_service.readers.question.openings import without_openings
-from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at, tokens
-from cow_service.readers.question.places_said import with_places
-from cow_service.readers.question.reply_forms import without_reply_form
-from cow_service.readers.question.tables import with_tables
-from cow_service.readers.question.trail_words import TrailWords, split_trail
-from cow_service.readers.question.typing_errors import without_typing_errors
+from cow_service.readers.embedded.english.interventions import (
+    InterventionWords,
+    TrailWords,
+    implied_placing,
+    split_interventions,
+    split_trail,
+)
+from cow_service.readers.embedded.english.motion import (
+    MotionWords,
+    OtherWords,
+    arrow_statement,
+    read_motion,
+    with_front,
+)
+from cow_service.readers.embedded.english.noun_phrases import items, with_nouns, with_places, with_tables
+from cow_service.readers.embedded.english.prompts import without_openings, without_reply_form, without_typing_errors
+from cow_service.readers.embedded.english.tokens import Item, ObjectPhrase, key_at, phrase_at, tokens
+from cow_service.readers.options import split_options
 from cow_service.records import MotionKind
 
 MAX_WORDS = 240  # of a question that are read

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.phrases import Item, ObjectPhrase, key_at, phrase_at
-from cow_service.readers.question.words import ARROWS
+from cow_service.readers.embedded.english import lexicon as lex
+from cow_service.readers.embedded.english.tokens import ARROWS, Item, ObjectPhrase, key_at, phrase_at
 from cow_service.records import MotionKind
 
 SENTENCE_END = frozenset(".?!;:")

@@ -12,11 +12,10 @@ from typing import Literal
 
 from lark import Token, Tree
 
-from cow_service.readers.question import lexicon as lex
-from cow_service.readers.question.parsing import read_from
-from cow_service.readers.question.phrases import Item, ObjectPhrase, QuantityWords, key_at
-from cow_service.readers.question.trail_words import TrailWords
-from cow_service.readers.question.words import ARROWS, words_of
+from cow_service.readers.embedded.english import lexicon as lex
+from cow_service.readers.embedded.english.grammar import read_from
+from cow_service.readers.embedded.english.interventions import TrailWords
+from cow_service.readers.embedded.english.tokens import ARROWS, Item, ObjectPhrase, QuantityWords, key_at, words_of
 from cow_service.records import MotionKind, Vector
 
 ArrowSense = Literal["along", "against"]

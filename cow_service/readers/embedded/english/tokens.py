@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from cow_service.readers.base import Quantity, SpeedWord
-from cow_service.readers.question import lexicon as lex
+from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.records import Until
 
 QUANTITY = "~"
@@ -135,3 +135,61 @@ def object_phrase(text: str, keys: tuple[str, ...]) -> ObjectPhrase:
         inside_box=any(key in lex.MARKED for key in content[:-1]),
         number=_number(keys, nouns[-1] if head.isdecimal() and nouns else head),
     )
+
+
+_SAME: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(["be", "is", "are", "was", "were", "been", "am", "'s"], ("be",)),
+    **dict.fromkeys(["get", "gets", "got", "gotten"], ("get",)),
+    **dict.fromkeys(["has", "had"], ("have",)),
+    "being": ("be", "-ing"), "getting": ("get", "-ing"), "having": ("have", "-ing"), "making": ("make", "-ing"),
+    "makes": ("make",), "made": ("make",), "elapses": ("elapse",), "longer": ("long", "-er"),
+    "n't": ("not",), "cannot": ("can", "not"), "wo": ("will",), "ca": ("can",),
+}  # fmt: skip
+ARROWS = frozenset(["arrow", "arrowhead"])
+PRONOUNS = frozenset(["it", "itself", "they", "them", "he", "she"])
+
+
+@dataclass(frozen=True)
+class Word:
+    """A token: `kind` is the terminal of a noun phrase or a pronoun, empty for a word; `at`, its place in the items."""
+
+    kind: str
+    text: str
+    at: int
+
+
+def words_of(found: Sequence[Item]) -> list[Word]:
+    """The tokens of some items."""
+    return [word for at in range(len(found)) for word in words_at(found, at)]
+
+
+def words_at(found: Sequence[Item], at: int) -> list[Word]:
+    """The tokens of one item."""
+    item = found[at]
+    if item.phrase is None:
+        return plain_words([item.key], at)
+    if _is_words(item, item.phrase):
+        return plain_words(item.words, at)
+    return [Word("AGENT" if item.phrase.head in lex.AGENTS else "NP", item.phrase.text, at)]
+
+
+def plain_words(keys: Sequence[str], at: int) -> list[Word]:
+    """Lower case words at a place as tokens: the base form of a verb, its ending "-ing" apart."""
+    return [Word("PRONOUN" if key in PRONOUNS else "", text, at) for key in keys for text in _base_forms(key)]
+
+
+def _is_words(item: Item, phrase: ObjectPhrase) -> bool:
+    """Whether a noun phrase names no object: a place, the trail, or an adjective alone as in "the last of which"."""
+    if phrase.head in ARROWS:
+        return True
+    if phrase.as_thing or phrase.colour is not None or phrase.number is not None or phrase.inside_box:
+        return False
+    content = [word for word in item.words if word not in lex.DETERMINERS]
+    return phrase.head in lex.NO_THINGS or all(word == "one" or lex.is_modifier(word) for word in content)
+
+
+def _base_forms(word: str) -> tuple[str, ...]:
+    verb = lex.VERBS.get(word)
+    if verb is None or word in _SAME:
+        return _SAME.get(word, (word,))
+    return (verb.lemma, "-ing") if verb.form == "ing" else (verb.lemma,)

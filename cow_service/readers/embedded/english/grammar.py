@@ -19,8 +19,7 @@ from lark.lexer import Lexer
 from lark.parsers.earley import Item as EarleyItem
 from lark.parsers.earley_forest import ForestToParseTree
 
-from cow_service.readers.question.phrases import Item
-from cow_service.readers.question.words import Word, words_at
+from cow_service.readers.embedded.english.tokens import Item, Word, words_at
 
 STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial", "place", "opening", "premise"]
 MAX_WORDS = 48  # of one parse: its work may grow with the cube of their number
@@ -46,7 +45,7 @@ class _Grammar:
     """The grammar's Earley parser, which looks one word ahead, and which of its terminals each word may be."""
 
     def __init__(self) -> None:
-        text = files("cow_service.readers.question").joinpath("grammar.lark").read_text(encoding="utf-8")
+        text = files("cow_service.readers.embedded.english").joinpath("grammar.lark").read_text(encoding="utf-8")
         lark = Lark(text, parser="earley", lexer=_NoLexer, start=STARTS, maybe_placeholders=False)
         self.terminals: dict[str, set[str]] = {}
         for terminal in lark.terminals:

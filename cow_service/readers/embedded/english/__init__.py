@@ -1,0 +1,1 @@
+"""The English of the embedded reader: what a question says, as records, by a grammar and word lists."""
