@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import time
-from pathlib import Path
 
 import pytest
+from conftest import all_scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,7 +17,6 @@ from cow_service.readers.embedded.english.questions import Question, parse, pars
 from cow_service.readers.embedded.motions import quantities
 from cow_service.readers.options import split_options
 
-SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 SLIGHT, DIAGONAL = math.sin(math.pi / 8), math.sqrt(0.5)
 DIRECTIONS = {
     "left": (-1.0, 0.0),
@@ -378,10 +377,9 @@ def test_verb_is_in_its_base_form() -> None:
     assert parse("If the ball is thrown up, will it hit the lamp?").motion.verb == "throw"
 
 
-@pytest.mark.skipif(not SCENES.is_dir(), reason="the shared scenes are not here")
 def test_scenes() -> None:
-    for file in sorted(SCENES.glob("*/meta.json")):
-        meta = json.loads(file.read_text())
+    for folder in all_scenes():
+        meta = json.loads((folder / "meta.json").read_text())
         question = parse(meta["question"])
         assert question.mover is not None
         assert (question.mover.text, question.motion.kind) == (meta["object"], meta["motion"]), meta["question"]

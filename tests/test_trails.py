@@ -25,7 +25,7 @@ from cow_service.vision.trail_removal import without_ghost_shadows
 from cow_service.vision.trails import Position, Trail, TrailEnd, find_trails, trail_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-SHARED = Path(__file__).parents[2] / "shared" / "scenes_wide"
+RENDERED = Path(__file__).parent / "data" / "rendered_trail.jpg"  # four positions of one ball
 ORANGE, GREEN, PURPLE = (220, 120, 30), (40, 160, 60), (120, 50, 160)
 PLACES = thrown_past((300, 110), (36, -2), 12, 4)  # the oldest first
 QUESTION = "If the orange ball flies on along the trail of positions that is shown{}, will it hit the green cube?"
@@ -207,9 +207,8 @@ def throw_seen(rng: np.random.Generator) -> tuple[list[Position], float, tuple[f
     return positions, math.log(speed / math.sqrt(gravity)), (float(direction[0]), float(direction[1])), turn
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="the rendered scenes are not at hand")
 def test_a_rendered_trail() -> None:
-    image = np.ascontiguousarray(cv2.imread(str(SHARED / "scene_04500" / "image.jpg"))[..., ::-1])
+    image = np.ascontiguousarray(cv2.imread(str(RENDERED))[..., ::-1])
     found = trail_of(Scene(image).trails, (182.8, 16.9, 261.6, 95.7))
     assert found is not None
     assert len(found.positions) == 4
