@@ -8,6 +8,7 @@ import time
 from functools import cache
 from pathlib import Path
 
+from conftest import SLOWNESS
 from fastapi import FastAPI
 
 from cow_service.api.app import create_app
@@ -42,7 +43,7 @@ def app_for(service: Service) -> FastAPI:
     return create_app(engine, closing=False)
 
 
-def end_jobs(engine: JobEngine, seconds: float = 30.0) -> None:
+def end_jobs(engine: JobEngine, seconds: float = 30.0 * SLOWNESS) -> None:
     """Cancels the jobs that an earlier test left behind, and waits until nobody works on them.
 
     Else they would go on with the next test's service, and ask its multimodal LLM about another image.

@@ -16,10 +16,11 @@ from typing import Any, TypeVar
 
 import httpx
 import psutil
+from conftest import SLOWNESS
 from drawn import ball, block, floor, png_bytes
 
 SLOW_GENERATOR = Path(__file__).resolve().parents[1] / "benchmarks" / "slow_generator"
-PATIENCE = 60.0  # seconds for anything that must come about
+TIME_LIMIT = 60.0 * SLOWNESS  # seconds for anything that must come about
 TERMINAL = ("succeeded", "failed", "canceled")
 ASYNC = {"Prefer": "respond-async"}
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
@@ -102,7 +103,7 @@ class Served:
             return found and found[1]
 
         self.http.close()  # to a server that ended by itself
-        self.http = httpx.Client(base_url=eventually(address), timeout=PATIENCE)
+        self.http = httpx.Client(base_url=eventually(address), timeout=TIME_LIMIT)
         # One that only takes requests is ready once a worker is.
         probe = "/livez" if self._environment.get("COW_ROLE") == "api" else "/readyz"
         eventually(lambda: self.http.get(probe).status_code == 200)
@@ -125,7 +126,7 @@ class Served:
         """Ends it in peace; returns its exit code."""
         assert self.process is not None
         self.ask_to_stop()
-        code = self.process.wait(PATIENCE)
+        code = self.process.wait(TIME_LIMIT)
         self.http.close()
         return code
 
@@ -211,14 +212,14 @@ class Worker:
         return sum(sum(one.cpu_times()[:2]) for one in self.processes())
 
 
-def eventually(look: Callable[[], Value | None], patience: float = PATIENCE) -> Value:
+def eventually(look: Callable[[], Value | None], within: float = TIME_LIMIT) -> Value:
     """What `look` finds, asked again and again until it finds something."""
-    until = time.monotonic() + patience
+    until = time.monotonic() + within
     while True:
         found = look()
         if found:
             return found
-        assert time.monotonic() < until, f"not within {patience:g} s"
+        assert time.monotonic() < until, f"not within {within:g} s"
         time.sleep(0.02)
 
 

@@ -388,7 +388,7 @@ def test_a_batch_without_a_folder_that_is_left_ends_its_jobs(tmp_path: Path) -> 
             outcomes = client.map(items, kind="simulate", concurrency=4)
             next(outcomes)
             outcomes.close()  # as `break` and the end of the function do
-            eventually(ended, patience=20)
+            eventually(ended, within=20)
 
         async def left() -> None:
             async with (
@@ -399,7 +399,7 @@ def test_a_batch_without_a_folder_that_is_left_ends_its_jobs(tmp_path: Path) -> 
                     break
 
         asyncio.run(left())
-        eventually(ended, patience=20)
+        eventually(ended, within=20)
 
 
 def test_pictures_that_cannot_be_saved_lose_no_answer(tmp_path: Path, server: Server) -> None:
@@ -591,7 +591,7 @@ def test_a_long_batch_that_is_killed_three_times(fast: Served, tmp_path: Path) -
 
     for moment in moments:
         with subprocess.Popen([*COMMAND, str(path), "-o", str(out), "--url", url], stderr=subprocess.PIPE) as process:
-            eventually(lambda: count() >= moment or process.poll() is not None, patience=300)  # noqa: B023
+            eventually(lambda: count() >= moment or process.poll() is not None, within=300)  # noqa: B023
             assert process.poll() is None, process.stderr and process.stderr.read()
             process.kill()
     finished = count()

@@ -431,7 +431,7 @@ def test_a_caller_who_leaves_a_stream(served: Served, chat: Any, key: str | None
         served.until(job, "canceled")
         return
     with pytest.raises(AssertionError):
-        eventually(lambda: served.job(job)["status"] != "running", patience=1)
+        eventually(lambda: served.job(job)["status"] != "running", within=1)
     with ThreadPoolExecutor(1) as pool:  # whoever comes back hears the rest
         again = pool.submit(lambda: chunks_of(chat, extra_headers=headers, **slowly(21)))
         served.http.post(f"/jobs/{job}/cancel")
