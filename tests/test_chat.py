@@ -19,7 +19,7 @@ import pytest
 from conftest import example
 from mllm_server import MllmServer
 from openai import AsyncOpenAI, OpenAI
-from servers import BODY, PATIENCE, QUESTION, Served, data_url, eventually, picture, problem, slow
+from servers import BODY, QUESTION, TIME_LIMIT, Served, data_url, eventually, picture, problem, slow
 
 from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.api.openai.records import answerers
@@ -484,5 +484,5 @@ def test_a_server_that_stops_says_so_in_the_stream(tmp_path: Path) -> None:
             list(stream)
         assert caught.value.code == "shutting-down"
         assert one.process is not None
-        one.process.wait(PATIENCE)
+        one.process.wait(TIME_LIMIT)
         assert "Traceback" not in one.log()

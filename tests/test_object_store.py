@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import httpx
 import object_store
 import pytest
-from servers import BODY, IMAGE, PATIENCE, Served, eventually, problem, slow
+from servers import BODY, IMAGE, TIME_LIMIT, Served, eventually, problem, slow
 
 from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.client import Client
@@ -84,7 +84,7 @@ def test_callers_are_sent_to_the_store(served, objects, keys):
 def test_the_sdk_follows_and_keeps_its_key_to_itself(served, objects, keys):
     requests: list[httpx.Request] = []
     hooks = {"request": [requests.append]}
-    with httpx.Client(event_hooks=hooks, timeout=PATIENCE) as http:
+    with httpx.Client(event_hooks=hooks, timeout=TIME_LIMIT) as http:
         client = Client(str(served.http.base_url), api_key=keys["alice"], http_client=http)
         sha256 = simulated(served, BODY)["frames"][0]["sha256"]
         assert hashlib.sha256(client.artifact(sha256)).hexdigest() == sha256
@@ -173,7 +173,7 @@ def test_a_server_that_may_not_use_the_store_says_so_and_ends(objects, tmp_path)
     command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", "0"]
     place = {"COW_DATA_DIR": str(tmp_path), "COW_ARTIFACTS": "s3://no-such-bucket/cow"}
     ended = subprocess.run(
-        command, env=objects.environment | place, capture_output=True, text=True, timeout=PATIENCE, check=False
+        command, env=objects.environment | place, capture_output=True, text=True, timeout=TIME_LIMIT, check=False
     )
     assert ended.returncode != 0
     assert "there is no such bucket" in ended.stderr
@@ -183,6 +183,6 @@ def test_a_server_that_may_not_use_the_store_says_so_and_ends(objects, tmp_path)
 def test_servers_of_one_database_have_one_store(served, objects, tmp_path):
     settings = {"COW_ARTIFACTS": objects.url + "/elsewhere", "COW_DATA_DIR": str(served.data), **objects.environment}
     command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", "0"]
-    ended = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    ended = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=TIME_LIMIT, check=False)
     assert ended.returncode != 0
     assert f"have their images in {objects.url}" in ended.stderr.replace("\n", " ")

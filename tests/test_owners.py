@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from servers import ASYNC, BODY, PATIENCE, TERMINAL, Served, data_url, events_of, eventually, picture, problem, slow
+from servers import ASYNC, BODY, TERMINAL, TIME_LIMIT, Served, data_url, events_of, eventually, picture, problem, slow
 
 from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.media.images import encode_png
@@ -57,7 +57,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Caller, C
     hashes = json.dumps({name: hash_of(key) for name, key in keys.items()})
     with Served(tmp_path_factory.mktemp("owners"), COW_API_KEYS=hashes) as one:
         clients = [
-            httpx.Client(base_url=one.http.base_url, timeout=PATIENCE, headers={"Authorization": f"Bearer {key}"})
+            httpx.Client(base_url=one.http.base_url, timeout=TIME_LIMIT, headers={"Authorization": f"Bearer {key}"})
             for key in keys.values()
         ]
         yield Caller(clients[0]), Caller(clients[1])
@@ -231,7 +231,7 @@ def test_a_flood_of_one_key_holds_up_no_other(tmp_path_factory: pytest.TempPathF
     }
     with ExitStack() as stack:
         one = stack.enter_context(Served(tmp_path_factory.mktemp("flood"), **own))
-        clients = [httpx.Client(base_url=one.http.base_url, timeout=PATIENCE) for _ in keys]
+        clients = [httpx.Client(base_url=one.http.base_url, timeout=TIME_LIMIT) for _ in keys]
         for client, key in zip(clients, keys.values(), strict=True):
             stack.enter_context(client).headers["Authorization"] = f"Bearer {key}"
         alice, bob = map(Caller, clients)

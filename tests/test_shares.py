@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 from postgres import postgres_server
-from servers import ASYNC, PATIENCE, TERMINAL, Served, eventually, problem, slow
+from servers import ASYNC, TERMINAL, TIME_LIMIT, Served, eventually, problem, slow
 
 from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.jobs.open_jobs import OpenJobs
@@ -28,7 +28,7 @@ class Caller:
 
     def __init__(self, served: Served, key: str) -> None:
         headers = {"Authorization": f"Bearer {key}"}
-        self.http = httpx.Client(base_url=served.http.base_url, timeout=PATIENCE, headers=headers)
+        self.http = httpx.Client(base_url=served.http.base_url, timeout=TIME_LIMIT, headers=headers)
 
     def submit(self, body: dict[str, Any]) -> str:
         response = self.http.post("/simulate", json=body, headers=ASYNC)

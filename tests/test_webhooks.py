@@ -22,7 +22,7 @@ from dbos import DBOS
 from engines import app_for, running_engine
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from servers import ASYNC, BODY, PATIENCE, SLOW_GENERATOR, events_of, eventually, problem, slow
+from servers import ASYNC, BODY, SLOW_GENERATOR, TIME_LIMIT, events_of, eventually, problem, slow
 
 from cow_service.jobs import webhooks
 from cow_service.net.egress import Egress
@@ -146,7 +146,7 @@ def all_done(job: str) -> None:
 def verify(message: Message) -> None:
     """As https://www.standardwebhooks.com says, symmetric."""
     headers = message.headers
-    assert abs(int(headers["webhook-timestamp"]) - time.time()) < PATIENCE
+    assert abs(int(headers["webhook-timestamp"]) - time.time()) < TIME_LIMIT
     signed = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + message.body
     wanted = base64.b64encode(hmac.digest(SECRET, signed, hashlib.sha256)).decode()
     signatures = headers["webhook-signature"].split(" ")
