@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cow_service.generators.base import GeneratorInput
-from cow_service.generators.rearranging import with_put
-from cow_service.generators.removal import without_removed
+from cow_service.generators.interventions import with_put, without_removed
 from cow_service.media.artifacts import ArtifactWriter
 from cow_service.media.images import encode_jpeg, encode_png, fit_within
 from cow_service.media.overlay import Replaced, draw_overlay

@@ -3,14 +3,126 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cmp_to_key
+
+import cv2
+import numpy as np
 
 from cow_service import __version__
 from cow_service.generators.base import GeneratorInput
-from cow_service.generators.cutout.composition import Compositor
-from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions
+from cow_service.generators.cutout.bodies import MovingBody, Sprite, StillBody, Window, moved
+from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, Layers, take_apart
+from cow_service.physics.camera import has_passed
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.masks import Image, scaled_size
+from cow_service.vision.masks import Floats, Floats32, Image, scaled_size
+
+
+@dataclass(frozen=True)
+class Compositor:
+    """The layers of a scene, and what several frames need of them."""
+
+    layers: Layers
+
+    @staticmethod
+    def of(given: GeneratorInput) -> Compositor:
+        """For the frames of one clip."""
+        return Compositor(take_apart(given))
+
+    def frame(self, index: int) -> Image:
+        """The clip frame [h, w, 3] of an index."""
+        layers = self.layers
+        if all(body.is_unmoved(index) for body in layers.moving):
+            return layers.image.copy()
+        frame = layers.background.copy()
+        size = frame.shape[1], frame.shape[0]
+        for shadow in layers.shadows:
+            for drawn in shadow.at(index, size):
+                window = frame[drawn.window]
+                left = 1 - drawn.dark * self._seen(drawn.surface, drawn.window)
+                window[:] = cv2.multiply(window, left, dtype=cv2.CV_8U)
+        for body, sprite in self._far_to_near(index):
+            self._draw(frame, body, sprite, index)
+            for container in layers.containers:
+                if container.moving is not None and container.sprite is not None and container.covers(body, index):
+                    self._draw(frame, container.moving, container.sprite, index)
+        return frame
+
+    def _seen(self, surface: int | None, window: Window) -> Floats32 | float:
+        """Where in a window a surface is seen, 0..1 [a, b, 3]: the floor between still bodies, or the top of one."""
+        others = [other for other in self.layers.still if surface in (None, other.index) and _overlap(window, other)]
+        if not others:
+            return 1.0 if surface is None else 0.0
+        rows, columns = window
+        seen = np.ones((rows.stop - rows.start, columns.stop - columns.start), np.float32)
+        for other in others:
+            _hide(seen, window, other)
+        return _three(seen if surface is None else 1 - seen)
+
+    def _far_to_near(self, index: int) -> list[tuple[MovingBody, Sprite]]:
+        """The bodies before the camera at a frame, in the order in which they are drawn."""
+        there: list[tuple[MovingBody, Sprite]] = []
+        for body, sprite in zip(self.layers.moving, self.layers.sprites, strict=True):
+            depths: Floats = np.array([body.path.states[0][2], body.path.states[index][2]])
+            if not has_passed(depths, depths[0])[1]:
+                there.append((body, sprite))
+        eye = self.layers.eye
+
+        def order(a: tuple[MovingBody, Sprite], b: tuple[MovingBody, Sprite]) -> int:
+            for one, other, sign in ((a[0], b[0], 1), (b[0], a[0], -1)):
+                if any(each.index == other.path.body and each.takes(one, index) for each in self.layers.containers):
+                    return sign  # the container first, then what is in it
+            return 1 if a[0].placed(index).in_front_of(b[0].placed(index), eye) else -1
+
+        return sorted(there, key=cmp_to_key(order)) if len(there) > 1 else there
+
+    def _draw(self, frame: Image, body: MovingBody, sprite: Sprite, index: int) -> None:
+        path = body.path
+        point = self.layers.factor * np.array(path.points[index])
+        rotation = path.rotation[index] if path.rotation else 0.0
+        found = moved(sprite, point, path.scale[index], rotation, (frame.shape[1], frame.shape[0]))
+        if found is None:
+            return
+        window, pixels = found
+        for other in self._before(body, index):
+            if _overlap(window, other):
+                _hide(pixels, window, other)
+        shown = frame[window]
+        mixed = cv2.multiply(shown, _three(1 - pixels[..., 3]), dtype=cv2.CV_32F) + pixels[..., :3]
+        shown[:] = cv2.convertScaleAbs(mixed)
+
+    def _before(self, body: MovingBody, index: int) -> list[StillBody]:
+        """What hides a body at a frame: of the container that it goes into, the front wall alone."""
+        placed = body.placed(index)
+        hiding = [other for other in self.layers.still if not placed.in_front_of(other.placed, self.layers.eye)]
+        for container in self.layers.containers:
+            if container.takes(body, index):
+                hiding = [other for other in hiding if other.index != container.index]
+                if container.moving is None and container.covers(body, index):
+                    hiding.append(container.front)
+        return hiding
+
+
+def _three(values: Floats32) -> Floats32:
+    """Values [a, b] for each of three colours."""
+    return np.asarray(cv2.merge((values, values, values)), np.float32)
+
+
+def _overlap(window: Window, other: StillBody) -> bool:
+    there = other.alpha[0]
+    return all(a.start < b.stop and b.start < a.stop for a, b in zip(window, there, strict=True))
+
+
+def _hide(pixels: Floats32, window: Window, other: StillBody) -> None:
+    """Takes away the part of a window's values [a, b] or [a, b, 4] that another body covers."""
+    there, alpha = other.alpha
+    both = [slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(window, there, strict=True)]
+    inner = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, window, strict=True))
+    covered = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, there, strict=True))
+    left = 1 - alpha[covered]
+    pixels[inner] *= left if pixels.ndim == 2 else left[..., None]
+
 
 __all__ = ["MAX_SIDE", "CutoutGenerator", "CutoutOptions", "create"]
 
