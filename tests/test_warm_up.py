@@ -23,7 +23,7 @@ from cow_service.warm_up import warm_up
 warm_up(Settings(data_dir=Path(sys.argv[1])))
 from cow_service.readers.embedded.english import grammar as parsing
 print(parsing._grammar.cache_info().currsize, *(f"cow_service.{name}" in sys.modules for name in (
-    "readers.embedded.reader", "generators.cutout.composition", "media.video")))
+    "readers.embedded.reader", "generators.cutout.generator", "media.video")))
 """
 
 

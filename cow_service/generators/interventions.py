@@ -1,4 +1,7 @@
-"""Puts things elsewhere in a scene before anything is generated: they leave their places, and are drawn at new ones."""
+"""Interventions on the image, before anything is generated: things are taken out of it, or put elsewhere in it.
+
+What is taken away leaves its place with its shadow, and what it hid is completed. What is put elsewhere is drawn there.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,13 @@ import cv2
 import numpy as np
 
 from cow_service.generators.base import GeneratorInput
-from cow_service.generators.cutout.bodies import Ground, MovingBody, Placed, StillBody, moving_body, still_bodies
-from cow_service.generators.cutout.generator import Compositor
-from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, without_bodies
+from cow_service.generators.cutout.bodies import Extent, Ground, StillBody, moving_bodies, still_bodies
+from cow_service.generators.cutout.generator import compose
+from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, take_apart, without_bodies
 from cow_service.generators.cutout.shadows import take_shadows
 from cow_service.media.images import fit_within
 from cow_service.physics.camera import FloorCamera
-from cow_service.records import Body, Path, Point, Trajectory
+from cow_service.records import BBox, Body, Path, Point, Trajectory
 from cow_service.vision.masks import CroppedMask, Image, Mask, hull, resized_mask
 
 AWAY = 1e6  # px: where the path of what is taken away ends
@@ -34,22 +37,29 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
     size = clean.shape[1], clean.shape[0]
     leaving = _leaving(as_it_is, removed)
     ground = Ground.of(leaving, size[0] / scene.width)
-    moving = tuple(moving_body(leaving, path, size, ground) for path in leaving.trajectory.paths)
-    still = (*still_bodies(leaving, moving, size, ground), _mover(leaving, moving, size, ground))
+    moving = moving_bodies(leaving, size, ground)
+    mover = as_it_is.grounding.bbox
+    whole = resized_mask(scene.silhouette(mover), size)
+    seen = whole & ~np.logical_or.reduce([body.mask for body in moving])
+    extent = Extent(mover, False) if ground is None else ground.extent(0, mover)
+    still = (*still_bodies(leaving, moving, size, ground), StillBody(0, seen, extent, whole))
     eye = 0.0 if ground is None else ground.camera.height
-    lit = take_shadows(leaving, clean, moving, still, ground, size[0] / scene.width)
-    erased = without_bodies(lit, moving, still, eye, resized_mask(scene.cues, size))
+    unshaded = take_shadows(leaving, clean, moving, still, ground, size[0] / scene.width)
+    erased = without_bodies(unshaded, moving, still, eye, resized_mask(scene.cues, size))
     image = at_full_size(scene.clean, clean, erased)
     drawn = np.where(scene.cues[..., None], scene.image, image)
     gone = np.logical_or.reduce([as_it_is.obstacles[index - 1].mask.full() for index in removed])
-    behind = {each.index for each in still if _is_behind(each, moving, eye)}
+    behind = {
+        each.index
+        for each in still
+        if any((each.outline & one.mask).any() and one.extent(0).is_in_front_of(each.extent, eye) for one in moving)
+    }
     obstacles = tuple(
         replace(each, mask=_completed(each.mask, gone)) if index in behind else each
         for index, each in enumerate(as_it_is.obstacles[:kept], start=1)
     )
     changed = scene.changed(np.asarray(drawn, np.uint8), image)
     if 0 in behind:
-        mover = as_it_is.grounding.bbox
         changed = changed.with_mask(mover, _completed(CroppedMask.of(scene.silhouette(mover)), gone).full())
     return replace(as_it_is, scene=changed, trajectory=trajectory, obstacles=obstacles)
 
@@ -58,41 +68,11 @@ def _leaving(given: GeneratorInput, removed: Sequence[int]) -> GeneratorInput:
     """The input with a trajectory in which nothing moves but what is taken away."""
     paths: list[Path] = []
     for index in removed:
-        x0, y0, x1, y1 = given.obstacles[index - 1].bbox
-        start, bodies = ((x0 + x1) / 2, (y0 + y1) / 2), given.trajectory.bodies
-        x, y, z = bodies[index].position if bodies else (0.0, 0.0, 0.0)
-        state = (x, y, z, 0.0, 0.0, 0.0)
-        paths.append(
-            Path(
-                body=index,
-                states=(state, state),
-                points=(start, (AWAY, start[1])),
-                visible=(True, False),
-                scale=(1.0, 1.0),
-                tracks=(),
-            )
-        )
+        (x, y), bodies = _middle(given.obstacles[index - 1].bbox), given.trajectory.bodies
+        states = ((*(bodies[index].position if bodies else (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0),) * 2
+        points, visible = ((x, y), (AWAY, y)), (True, False)
+        paths.append(Path(body=index, states=states, points=points, visible=visible, scale=(1.0, 1.0), tracks=()))
     return replace(given, trajectory=given.trajectory.model_copy(update={"paths": tuple(paths)}))
-
-
-def _mover(
-    given: GeneratorInput, moving: Sequence[MovingBody], size: tuple[int, int], ground: Ground | None
-) -> StillBody:
-    """The mover, which stands still before anything moves."""
-    mask = whole = resized_mask(given.scene.silhouette(given.grounding.bbox), size)
-    for body in moving:
-        mask = mask & ~body.mask
-    placed = Placed(given.grounding.bbox, airborne=False)
-    if ground is not None:
-        body = ground.bodies[0]
-        middle, half = ground.height(np.array(body.position)), body.size[1] / 2
-        placed = Placed(given.grounding.bbox, False, body.position[2], middle - half, middle + half)
-    return StillBody(0, mask, placed, whole)
-
-
-def _is_behind(body: StillBody, moving: Sequence[MovingBody], eye: float) -> bool:
-    """Whether something that is taken away hid a part of a body."""
-    return any((body.outline & one.mask).any() and one.placed(0).in_front_of(body.placed, eye) for one in moving)
 
 
 def _completed(mask: CroppedMask, gone: Mask) -> CroppedMask:
@@ -113,29 +93,27 @@ def at_full_size(full: Image, before: Image, after: Image) -> Image:
     return np.where(share > 0, full + share * (enlarged.astype(np.float32) - full), full).astype(np.uint8)
 
 
-def put_elsewhere(trajectory: Trajectory, factual: Trajectory) -> tuple[int, ...]:
-    """The bodies that are not where the scene as it is has them when the motion begins."""
-    pairs = zip(trajectory.bodies, factual.bodies, strict=False)
-    return tuple(i for i, (body, seen) in enumerate(pairs) if body.bbox != seen.bbox)
-
-
 def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
     """The input with its scene as it is when the motion begins.
 
     `given` has the scene in which nothing is put elsewhere yet, and the trajectory after that; `factual` is that of
     the scene as it is. What is given stays known as `before`.
     """
-    put = put_elsewhere(given.trajectory, factual)
+    pairs = zip(given.trajectory.bodies, factual.bodies, strict=False)
+    put = tuple(i for i, (body, seen) in enumerate(pairs) if body.bbox != seen.bbox)
     if not put:
         return given
-    before = replace(given, trajectory=from_the_image(given, factual, put))
-    scene, image = given.scene, first_image(before)
+    before, scene = replace(given, trajectory=_with_image_first(given, factual, put)), given.scene
+    drawn = compose(take_apart(replace(before, options=CutoutOptions())), 1)
+    image = at_full_size(scene.clean, fit_within(scene.clean, MAX_SIDE), drawn)
     changed = scene.changed(np.asarray(np.where(scene.cues[..., None], scene.image, image), np.uint8), image)
     obstacles, grounding = list(given.obstacles), given.grounding
     for path in before.trajectory.paths:
         if path.body not in put:
             continue
-        bbox, mask = given.trajectory.bodies[path.body].bbox, moved_mask(before, path)
+        bbox, degrees = given.trajectory.bodies[path.body].bbox, path.rotation[1] if path.rotation else 0.0
+        mask = given.obstacles[path.body - 1].mask if path.body else CroppedMask.of(scene.silhouette(grounding.bbox))
+        mask = mask.moved(np.array(path.points[0]), np.array(path.points[1]), path.scale[1], degrees)
         if path.body:
             obstacles[path.body - 1] = replace(obstacles[path.body - 1], bbox=bbox, mask=mask)
         else:
@@ -144,22 +122,7 @@ def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
     return replace(given, scene=changed, obstacles=tuple(obstacles), grounding=grounding, before=before)
 
 
-def first_image(before: GeneratorInput) -> Image:
-    """The scene [H, W, 3] at the first frame of the clip, without its cues."""
-    small = fit_within(before.scene.clean, MAX_SIDE)
-    drawn = Compositor.of(replace(before, options=CutoutOptions())).frame(1)
-    return at_full_size(before.scene.clean, small, drawn)
-
-
-def moved_mask(before: GeneratorInput, path: Path) -> CroppedMask:
-    """The mask of a body where it is at the first frame of the clip."""
-    mask = before.obstacles[path.body - 1].mask if path.body else None
-    mask = mask or CroppedMask.of(before.scene.silhouette(before.grounding.bbox))
-    degrees = path.rotation[1] if path.rotation else 0.0
-    return mask.moved(np.array(path.points[0]), np.array(path.points[1]), path.scale[1], degrees)
-
-
-def from_the_image(given: GeneratorInput, factual: Trajectory, put: Sequence[int]) -> Trajectory:
+def _with_image_first(given: GeneratorInput, factual: Trajectory, put: Sequence[int]) -> Trajectory:
     """The trajectory with one frame more, before the others, in which all is where the image shows it.
 
     What is put elsewhere has a path, whether it moves in the clip or not.
@@ -169,36 +132,38 @@ def from_the_image(given: GeneratorInput, factual: Trajectory, put: Sequence[int
     camera = FloorCamera.of(told.camera, given.scene.width, given.scene.height)
     paths: list[Path] = []
     for path in told.paths:
+        start, state, begun = path.points[0], path.states[0], path
         if path.body in put:
             seen, body = factual.bodies[path.body], told.bodies[path.body]
-            start = given.grounding.point if path.body == 0 else _middle(seen)
-            paths.append(_put(path, seen, start, body))
-        else:
-            paths.append(_with_frame_before(path, path.states[0], path.points[0]))
-    moving = {path.body for path in told.paths}
-    for index in put:
-        if index not in moving:
-            resting = _resting(index, told.bodies[index], factual.bodies[index], camera, told.num_frames)
-            paths.append(_put(resting, factual.bodies[index], _middle(factual.bodies[index]), told.bodies[index]))
+            start = given.grounding.point if path.body == 0 else _middle(seen.bbox)
+            state, begun = (*seen.position, 0.0, 0.0, 0.0), _put_elsewhere(path, seen, body)
+        paths.append(_with_first_frame(begun, state, start))
+    for index in set(put) - {path.body for path in told.paths}:  # what stays at its new place
+        seen, body, count = factual.bodies[index], told.bodies[index], told.num_frames
+        old, new = camera.project(np.array([seen.position, body.position]))
+        middle = _middle(seen.bbox)
+        x, y = (new + (np.array(middle) - old) * seen.position[2] / body.position[2]).tolist()
+        resting = Path(
+            body=index,
+            states=((*body.position, 0.0, 0.0, 0.0),) * count,
+            points=((x, y),) * count,
+            visible=(True,) * count,
+            scale=(1.0,) * count,
+            tracks=(),
+        )
+        paths.append(_with_first_frame(_put_elsewhere(resting, seen, body), (*seen.position, 0.0, 0.0, 0.0), middle))
     bodies = tuple(factual.bodies[i] if i in put else body for i, body in enumerate(told.bodies))
     return told.model_copy(update={"bodies": bodies, "paths": tuple(paths)})
 
 
-def _put(path: Path, seen: Body, start: Point, body: Body) -> Path:
-    """A path that begins at the new place of a body, with a frame before it in which it is where it is seen."""
-    x, y, z = seen.position
-    scale = seen.position[2] / body.position[2]
-    rotation = path.rotation or (0.0,) * len(path.points)
-    begun = path.model_copy(
-        update={
-            "scale": tuple(scale * each for each in path.scale),
-            "rotation": tuple(body.rotation + each for each in rotation),
-        }
-    )
-    return _with_frame_before(begun, (x, y, z, 0.0, 0.0, 0.0), start)
+def _put_elsewhere(path: Path, seen: Body, body: Body) -> Path:
+    """A path that begins at the new place of a body, as large and turned against how the image shows it."""
+    factor, rotation = seen.position[2] / body.position[2], path.rotation or (0.0,) * len(path.points)
+    scale = tuple(factor * each for each in path.scale)
+    return path.model_copy(update={"scale": scale, "rotation": tuple(body.rotation + each for each in rotation)})
 
 
-def _with_frame_before(path: Path, state: tuple[float, float, float, float, float, float], start: Point) -> Path:
+def _with_first_frame(path: Path, state: tuple[float, float, float, float, float, float], start: Point) -> Path:
     """A path with a first frame in which its body is as the image shows it."""
     return path.model_copy(
         update={
@@ -215,21 +180,5 @@ def _with_frame_before(path: Path, state: tuple[float, float, float, float, floa
     )
 
 
-def _resting(index: int, body: Body, seen: Body, camera: FloorCamera, num_frames: int) -> Path:
-    """The path of a body that stays at its new place."""
-    old, new = camera.project(np.array([seen.position, body.position]))
-    offset = (np.array(_middle(seen)) - old) * seen.position[2] / body.position[2]
-    x, y = (new + offset).tolist()
-    return Path(
-        body=index,
-        states=((*body.position, 0.0, 0.0, 0.0),) * num_frames,
-        points=((x, y),) * num_frames,
-        visible=(True,) * num_frames,
-        scale=(1.0,) * num_frames,
-        tracks=(),
-    )
-
-
-def _middle(body: Body) -> Point:
-    x0, y0, x1, y1 = body.bbox
-    return (x0 + x1) / 2, (y0 + y1) / 2
+def _middle(bbox: BBox) -> Point:
+    return (bbox[0] + bbox[2]) / 2, (bbox[1] + bbox[3]) / 2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import Floats32, Image, Mask, scaled_size, window_of
+from cow_service.vision.masks import Floats, Floats32, Image, Mask, scaled_size, three_channels, window_of
 
 INPAINT_RADIUS = 4  # px
 WIDE = 0.6  # of the hole's size: so far around it exemplars are looked for
@@ -115,7 +115,7 @@ def _faded_in(image: Image, filled: Floats32, around: _Surroundings, size: float
     reach = np.where(wide, np.float32(max(fade, around.rim)), np.float32(around.rim))
     share = np.asarray(np.clip(1 - around.away / reach, 0, 1) * around.known, np.float32)
     share[around.inside] = 1
-    share = _three(share)
+    share = three_channels(share)
     result = image.copy()
     result[around.crop] = cv2.convertScaleAbs(np.maximum(around.source + (filled - around.source) * share, 0))
     return result
@@ -137,7 +137,7 @@ def _roughness(source: Floats32, ring: Mask) -> float:
     ys, xs = ys[::every], xs[::every]
     values = np.asarray(cv2.blur(source, (7, 7)), np.float64)[ys, xs]
     u, v = (xs - xs.mean()) / max(1.0, float(xs.std())), (ys - ys.mean()) / max(1.0, float(ys.std()))
-    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    terms = quadratic_terms(u, v)
     rest = values - terms @ np.linalg.lstsq(terms, values, rcond=None)[0]
     return float(rest.std(axis=0).max())
 
@@ -153,31 +153,31 @@ def _contact_shadow(source: Floats32, inside: Mask, known: Mask) -> Mask:
     return rim & (grey < np.percentile(grey[rim], 65) - SHADOW_STEP)
 
 
+def quadratic_terms(u: Floats, v: Floats) -> Floats:
+    """The terms [N, 6] of a quadratic surface at coordinates [N]."""
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1).astype(np.float64)
+
+
 def push_pull(source: Floats32, known: Mask) -> Floats32:
     """Unknown pixels of [h, w, 3] from known ones: averages down a pyramid, then back up (push-pull)."""
     weight = known.astype(np.float32)
-    kept = _three(weight)
+    kept = three_channels(weight)
     levels = [(source * kept, weight)]
     while min(levels[-1][1].shape) > 1 and not (levels[-1][1] > LEAST_WEIGHT).all():
         colours, weights = (np.asarray(cv2.pyrDown(layer), np.float32) for layer in levels[-1])
         levels.append((colours, weights))
     colours, weights = levels[-1]
-    value = colours / _three(np.maximum(weights, LEAST_WEIGHT))
+    value = colours / three_channels(np.maximum(weights, LEAST_WEIGHT))
     for colours, weights in reversed(levels[:-1]):
         coarse = cv2.resize(value, (weights.shape[1], weights.shape[0]), interpolation=cv2.INTER_LINEAR)
         trust = np.where(weights > LEAST_WEIGHT, np.minimum(weights, 1), 0)
         own = np.asarray(trust / np.maximum(weights, LEAST_WEIGHT), np.float32)
         rest = np.asarray(1 - np.minimum(weights, 1), np.float32)
-        value = colours * _three(own) + coarse * _three(rest)
+        value = colours * three_channels(own) + coarse * three_channels(rest)
     for _ in range(2):
         value = np.asarray(cv2.GaussianBlur(value, (0, 0), 2.0), np.float32)
         value += (source - value) * kept
     return value
-
-
-def _three(values: Floats32) -> Floats32:
-    """Values [h, w] for each of three colours: broadcasting over the last axis is several times slower."""
-    return np.asarray(cv2.merge((values, values, values)), np.float32)
 
 
 def _texture(

@@ -40,6 +40,11 @@ def resized_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     return cv2.resize(mask.astype(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) >= 128
 
 
+def three_channels(values: Floats32) -> Floats32:
+    """Values [h, w] for each of three colours: broadcasting over the last axis is several times slower."""
+    return np.asarray(cv2.merge((values, values, values)), np.float32)
+
+
 def window_of(mask: Mask, margin: int = 0) -> tuple[slice, slice] | None:
     """Rows and columns that a mask [H, W] spans, with a margin (px) inside the image; None for an empty mask."""
     left, top, across, down = cv2.boundingRect(mask.view(np.uint8))

@@ -1,8 +1,9 @@
-"""Where bodies are above the floor of the estimated camera, what lies beneath them, and which of two is in front."""
+"""The bodies of a clip: their masks, their sprites, and where each is at a frame: above what, and in front of what."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,11 +18,19 @@ from cow_service.vision.inpainting import push_pull
 from cow_service.vision.masks import Floats, Floats32, Image, Mask, hull, resized_mask, turning, window_of
 
 TOUCHING = 0.25  # of the smaller height: how deep one body may seem to stand in the one beneath it
+EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge
+MARGIN = 4  # px around the mask that the soft edge takes
+SHADING_SIGMA = 0.1  # of a ball's width: coarser than this is its shading, finer is what is printed on it
+PRINTED = 14.0  # grey levels, 80th percentile: from so much fine detail on, a ball is seen to turn
+SMALLEST = 0.5  # scale under which a half-size copy of the sprite is drawn, so that it does not flicker
+UNMOVED = 0.3  # px
+
+Window = tuple[slice, slice]  # rows and columns of the clip's frames
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A body at one frame."""
+class Extent:
+    """Where a body is at one frame."""
 
     bbox: BBox  # [x0, y0, x1, y1], px of the image
     airborne: bool  # the image does not say how far away it is
@@ -29,7 +38,7 @@ class Placed:
     bottom: float = 0.0  # m above the floor
     top: float = 0.0
 
-    def in_front_of(self, other: Placed, eye: float) -> bool:
+    def is_in_front_of(self, other: Extent, eye: float) -> bool:
         """Whether it covers the other one in the image; `eye` is the camera's height above the floor (m).
 
         What is wholly above another's top is in front where the camera looks down on that top. Else the nearer one is;
@@ -97,8 +106,7 @@ class Ground:
 
     def support_of(self, body: int) -> int | None:
         """The still body that a body stands on at the first frame; None for the floor and in the air."""
-        named = [index for index in self.still if self.bodies[index].object == self.bodies[body].support]
-        return named[0] if named else None
+        return next((i for i in self.still if self.bodies[i].object == self.bodies[body].support), None)
 
     def lower_end(self, body: int) -> float:
         """Metres above the floor of a body's lower end, at the first frame."""
@@ -118,14 +126,11 @@ class Ground:
                 best = Surface(top, index)
         return best
 
-
-EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge
-MARGIN = 4  # px around the mask that the soft edge takes
-SHADING_SIGMA = 0.1  # of a ball's width: coarser than this is its shading, finer is what is printed on it
-PRINTED = 14.0  # grey levels, 80th percentile: from so much fine detail on, a ball is seen to turn
-SMALLEST = 0.5  # scale under which a half-size copy of the sprite is drawn, so that it does not flicker
-
-Window = tuple[slice, slice]  # rows and columns of the clip's frames
+    def extent(self, body: int, bbox: BBox, airborne: bool = False, position: Sequence[float] | None = None) -> Extent:
+        """Of a body in a box, at a position [3], or else where it is at the first frame."""
+        there = np.array(self.bodies[body].position if position is None else position)
+        middle, half = self.height(there), self.bodies[body].size[1] / 2
+        return Extent(bbox, airborne, float(there[2]), middle - half, middle + half)
 
 
 @dataclass(frozen=True)
@@ -140,8 +145,37 @@ class Sprite:
     origin: tuple[float, float]  # x, y of its top left corner at the first frame, px
     start: tuple[float, float]  # x, y of the body's centre at the first frame, px
 
+    def at(self, point: Floats, scale: float, rotation: float, size: tuple[int, int]) -> tuple[Window, Floats32] | None:
+        """Its window and pixels [a, b, 4] with its centre at `point` (px); None outside a frame of `size`."""
+        parts = [(part, turn) for part, turn in ((self.fixed, 0.0), (self.turning, rotation)) if part is not None]
+        height, width = parts[0][0].shape[:2]
+        offset = np.array(self.origin) - np.array(self.start)
+        around = offset + np.array([[0, 0], [width, 0], [0, height], [width, height]])
+        corners = np.concatenate([point + around @ turning(scale, turn).T for _, turn in parts])
+        window = clipped(corners.min(axis=0) - 1, corners.max(axis=0) + 1, size)
+        if window is None:
+            return None
+        first, *others = (self._warped(part, point, scale, turn, window) for part, turn in parts)
+        return window, sum(others, first)
 
-def cut(image: Image, mask: Mask, hidden: Mask | None, start: tuple[float, float], shape: Shape | None) -> Sprite:
+    def _warped(self, part: Floats32, point: Floats, scale: float, degrees: float, window: Window) -> Floats32:
+        # Pixel centres, not corners, are what warpAffine maps.
+        cell = 1.0
+        while scale * cell < SMALLEST and min(part.shape[:2]) > 3:
+            width, height = max(1, part.shape[1] // 2), max(1, part.shape[0] // 2)
+            half = cv2.resize(part[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+            part = np.asarray(half, np.float32)
+            cell *= 2
+        turn = turning(scale, degrees)
+        rows, columns = window
+        first = np.array(self.origin) + 0.5 * cell - np.array(self.start)
+        shift = point + turn @ first - 0.5 - np.array([columns.start, rows.start])
+        size = columns.stop - columns.start, rows.stop - rows.start
+        transform = np.column_stack([turn * cell, shift])
+        return np.asarray(cv2.warpAffine(part, transform, size, flags=cv2.INTER_LINEAR), np.float32)
+
+
+def cut_out(image: Image, mask: Mask, hidden: Mask | None, start: tuple[float, float], shape: Shape | None) -> Sprite:
     """The body under a mask [h, w]; its part `hidden` behind others gets the colours next to it."""
     whole = mask if hidden is None else mask | hidden
     inside = window_of(whole, MARGIN) or (slice(0, 1), slice(0, 1))
@@ -177,24 +211,6 @@ def _detail(colours: Floats32, body: Mask) -> Floats32 | None:
     return detail if printed else None
 
 
-def moved(
-    sprite: Sprite, point: Floats, scale: float, rotation: float, size: tuple[int, int]
-) -> tuple[Window, Floats32] | None:
-    """Window and pixels [a, b, 4] of a sprite whose centre has gone to `point` (px); None outside a frame of `size`."""
-    parts = [(part, turn) for part, turn in ((sprite.fixed, 0.0), (sprite.turning, rotation)) if part is not None]
-    shape = parts[0][0].shape
-    corners = np.concatenate([_corners(sprite, shape, point, scale, turn) for _, turn in parts])
-    window = clipped(corners.min(axis=0) - 1, corners.max(axis=0) + 1, size)
-    if window is None:
-        return None
-    total: Floats32 | None = None
-    for part, turn in parts:
-        drawn = _warped(sprite, part, point, scale, turn, window)
-        total = drawn if total is None else total + drawn
-    assert total is not None  # a sprite has a part
-    return window, total
-
-
 def clipped(low: Floats, high: Floats, size: tuple[int, int]) -> Window | None:
     """The window between two corners x, y (px), inside a frame of a size (width, height); None where that is empty."""
     x0, y0 = (math.floor(min(max(float(v), 0.0), side)) for v, side in zip(low, size, strict=True))
@@ -207,39 +223,13 @@ def soft(mask: Mask) -> Floats32:
     return np.asarray(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), EDGE_SIGMA), np.float32)
 
 
-def _corners(sprite: Sprite, shape: tuple[int, ...], point: Floats, scale: float, degrees: float) -> Floats:
-    offset = np.array(sprite.origin) - np.array(sprite.start)
-    corners = offset + np.array([[0, 0], [shape[1], 0], [0, shape[0]], [shape[1], shape[0]]])
-    return point + corners @ turning(scale, degrees).T
-
-
-def _warped(sprite: Sprite, part: Floats32, point: Floats, scale: float, degrees: float, window: Window) -> Floats32:
-    """The part in a window; pixel centres, not corners, are what warpAffine maps."""
-    cell = 1.0
-    while scale * cell < SMALLEST and min(part.shape[:2]) > 3:
-        width, height = max(1, part.shape[1] // 2), max(1, part.shape[0] // 2)
-        half = cv2.resize(part[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-        part = np.asarray(half, np.float32)
-        cell *= 2
-    turn = turning(scale, degrees)
-    rows, columns = window
-    first = np.array(sprite.origin) + 0.5 * cell - np.array(sprite.start)
-    shift = point + turn @ first - 0.5 - np.array([columns.start, rows.start])
-    transform = np.column_stack([turn * cell, shift])
-    size = columns.stop - columns.start, rows.stop - rows.start
-    return np.asarray(cv2.warpAffine(part, transform, size, flags=cv2.INTER_LINEAR), np.float32)
-
-
-UNMOVED = 0.3  # px
-
-
 @dataclass(frozen=True)
 class StillBody:
     """Something that stays where it is, and hides what is farther away."""
 
     index: int  # of `Trajectory.bodies`
     mask: Mask  # [h, w]: what is seen of it
-    placed: Placed
+    extent: Extent
     whole: Mask | None = None  # [h, w]: what was said to be its silhouette, hidden parts included
 
     @cached_property
@@ -288,50 +278,43 @@ class MovingBody:
         turned = math.radians(self.path.rotation[frame]) if self.path.rotation else 0.0
         return max(math.hypot(x - x0, y - y0), side * abs(self.path.scale[frame] - 1), side * abs(turned)) < UNMOVED
 
-    def placed(self, frame: int) -> Placed:
+    def extent(self, frame: int) -> Extent:
         """At a frame of the clip."""
         point, scale = np.array(self.path.points[frame]), self.path.scale[frame]
         corners = point + (np.array(self.bbox).reshape(2, 2) - self.start) * scale
         x0, y0, x1, y1 = (float(v) for v in corners.ravel())
         bbox = (x0, y0, x1, y1)
         if self.ground is None:
-            return Placed(bbox, self.airborne)
-        there = np.array(self.path.states[frame][:3])
-        middle, half = self.ground.height(there), self.ground.bodies[self.path.body].size[1] / 2
-        return Placed(bbox, self.airborne, float(there[2]), middle - half, middle + half)
+            return Extent(bbox, self.airborne)
+        return self.ground.extent(self.path.body, bbox, self.airborne, self.path.states[frame][:3])
 
 
-def moving_body(given: GeneratorInput, path: Path, size: tuple[int, int], ground: Ground | None) -> MovingBody:
-    """The body of a path, at a clip size (width, height)."""
+def moving_bodies(given: GeneratorInput, size: tuple[int, int], ground: Ground | None) -> tuple[MovingBody, ...]:
+    """The bodies that have paths, at a clip size (width, height)."""
     airborne = ground is None and given.motion.kind in FALLING_KINDS
-    if path.body == 0:
-        bbox, mask = given.grounding.bbox, given.scene.silhouette(given.grounding.bbox)
-    else:
-        obstacle = given.obstacles[path.body - 1]
-        bbox, mask = obstacle.bbox, obstacle.mask.full()
-    # Without a camera, points follow the grounded point, wherever a given path begins.
-    start = given.grounding.point if ground is None and path.body == 0 else path.points[0]
-    support = None if ground is None else ground.support_of(path.body)
-    return MovingBody(path, bbox, np.array(start), resized_mask(mask, size), airborne, ground, support)
+    found: list[MovingBody] = []
+    for path in given.trajectory.paths:
+        if path.body == 0:
+            bbox, mask = given.grounding.bbox, given.scene.silhouette(given.grounding.bbox)
+        else:
+            obstacle = given.obstacles[path.body - 1]
+            bbox, mask = obstacle.bbox, obstacle.mask.full()
+        # Without a camera, points follow the grounded point, wherever a given path begins.
+        start = given.grounding.point if ground is None and path.body == 0 else path.points[0]
+        support = None if ground is None else ground.support_of(path.body)
+        found.append(MovingBody(path, bbox, np.array(start), resized_mask(mask, size), airborne, ground, support))
+    return tuple(found)
 
 
 def still_bodies(
-    given: GeneratorInput, moving: tuple[MovingBody, ...], size: tuple[int, int], ground: Ground | None
+    given: GeneratorInput, moving: Sequence[MovingBody], size: tuple[int, int], ground: Ground | None
 ) -> tuple[StillBody, ...]:
     """The obstacles that have no path."""
-    taken = np.zeros(moving[0].mask.shape, bool)
-    for body in moving:
-        taken |= body.mask
+    taken = np.logical_or.reduce([body.mask for body in moving])
     found: list[StillBody] = []
     for index, obstacle in enumerate(given.obstacles, start=1):
-        if any(body.path.body == index for body in moving):
-            continue
-        placed = Placed(obstacle.bbox, airborne=False)
-        if ground is not None:
-            body = ground.bodies[index]
-            middle = ground.height(np.array(body.position))
-            half = body.size[1] / 2
-            placed = Placed(obstacle.bbox, False, body.position[2], middle - half, middle + half)
-        whole = obstacle.mask.at(size)
-        found.append(StillBody(index, whole & ~taken, placed, whole))
+        if all(body.path.body != index for body in moving):
+            extent = Extent(obstacle.bbox, False) if ground is None else ground.extent(index, obstacle.bbox)
+            whole = obstacle.mask.at(size)
+            found.append(StillBody(index, whole & ~taken, extent, whole))
     return tuple(found)

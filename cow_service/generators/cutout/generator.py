@@ -1,9 +1,11 @@
-"""The generator `cutout`: all bodies that move are drawn as sprites along their paths, in the order of their depths."""
+"""The generator `cutout`: all bodies that move are drawn as sprites along their paths, in the order of their depths.
+
+A frame is put together from far to near: the background, the shadows on it, then each sprite behind what is nearer.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cmp_to_key
 
 import cv2
@@ -11,120 +13,12 @@ import numpy as np
 
 from cow_service import __version__
 from cow_service.generators.base import GeneratorInput
-from cow_service.generators.cutout.bodies import MovingBody, Sprite, StillBody, Window, moved
+from cow_service.generators.cutout.bodies import MovingBody, Sprite, StillBody, Window
 from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, Layers, take_apart
 from cow_service.physics.camera import has_passed
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.masks import Floats, Floats32, Image, scaled_size
-
-
-@dataclass(frozen=True)
-class Compositor:
-    """The layers of a scene, and what several frames need of them."""
-
-    layers: Layers
-
-    @staticmethod
-    def of(given: GeneratorInput) -> Compositor:
-        """For the frames of one clip."""
-        return Compositor(take_apart(given))
-
-    def frame(self, index: int) -> Image:
-        """The clip frame [h, w, 3] of an index."""
-        layers = self.layers
-        if all(body.is_unmoved(index) for body in layers.moving):
-            return layers.image.copy()
-        frame = layers.background.copy()
-        size = frame.shape[1], frame.shape[0]
-        for shadow in layers.shadows:
-            for drawn in shadow.at(index, size):
-                window = frame[drawn.window]
-                left = 1 - drawn.dark * self._seen(drawn.surface, drawn.window)
-                window[:] = cv2.multiply(window, left, dtype=cv2.CV_8U)
-        for body, sprite in self._far_to_near(index):
-            self._draw(frame, body, sprite, index)
-            for container in layers.containers:
-                if container.moving is not None and container.sprite is not None and container.covers(body, index):
-                    self._draw(frame, container.moving, container.sprite, index)
-        return frame
-
-    def _seen(self, surface: int | None, window: Window) -> Floats32 | float:
-        """Where in a window a surface is seen, 0..1 [a, b, 3]: the floor between still bodies, or the top of one."""
-        others = [other for other in self.layers.still if surface in (None, other.index) and _overlap(window, other)]
-        if not others:
-            return 1.0 if surface is None else 0.0
-        rows, columns = window
-        seen = np.ones((rows.stop - rows.start, columns.stop - columns.start), np.float32)
-        for other in others:
-            _hide(seen, window, other)
-        return _three(seen if surface is None else 1 - seen)
-
-    def _far_to_near(self, index: int) -> list[tuple[MovingBody, Sprite]]:
-        """The bodies before the camera at a frame, in the order in which they are drawn."""
-        there: list[tuple[MovingBody, Sprite]] = []
-        for body, sprite in zip(self.layers.moving, self.layers.sprites, strict=True):
-            depths: Floats = np.array([body.path.states[0][2], body.path.states[index][2]])
-            if not has_passed(depths, depths[0])[1]:
-                there.append((body, sprite))
-        eye = self.layers.eye
-
-        def order(a: tuple[MovingBody, Sprite], b: tuple[MovingBody, Sprite]) -> int:
-            for one, other, sign in ((a[0], b[0], 1), (b[0], a[0], -1)):
-                if any(each.index == other.path.body and each.takes(one, index) for each in self.layers.containers):
-                    return sign  # the container first, then what is in it
-            return 1 if a[0].placed(index).in_front_of(b[0].placed(index), eye) else -1
-
-        return sorted(there, key=cmp_to_key(order)) if len(there) > 1 else there
-
-    def _draw(self, frame: Image, body: MovingBody, sprite: Sprite, index: int) -> None:
-        path = body.path
-        point = self.layers.factor * np.array(path.points[index])
-        rotation = path.rotation[index] if path.rotation else 0.0
-        found = moved(sprite, point, path.scale[index], rotation, (frame.shape[1], frame.shape[0]))
-        if found is None:
-            return
-        window, pixels = found
-        for other in self._before(body, index):
-            if _overlap(window, other):
-                _hide(pixels, window, other)
-        shown = frame[window]
-        mixed = cv2.multiply(shown, _three(1 - pixels[..., 3]), dtype=cv2.CV_32F) + pixels[..., :3]
-        shown[:] = cv2.convertScaleAbs(mixed)
-
-    def _before(self, body: MovingBody, index: int) -> list[StillBody]:
-        """What hides a body at a frame: of the container that it goes into, the front wall alone."""
-        placed = body.placed(index)
-        hiding = [other for other in self.layers.still if not placed.in_front_of(other.placed, self.layers.eye)]
-        for container in self.layers.containers:
-            if container.takes(body, index):
-                hiding = [other for other in hiding if other.index != container.index]
-                if container.moving is None and container.covers(body, index):
-                    hiding.append(container.front)
-        return hiding
-
-
-def _three(values: Floats32) -> Floats32:
-    """Values [a, b] for each of three colours."""
-    return np.asarray(cv2.merge((values, values, values)), np.float32)
-
-
-def _overlap(window: Window, other: StillBody) -> bool:
-    there = other.alpha[0]
-    return all(a.start < b.stop and b.start < a.stop for a, b in zip(window, there, strict=True))
-
-
-def _hide(pixels: Floats32, window: Window, other: StillBody) -> None:
-    """Takes away the part of a window's values [a, b] or [a, b, 4] that another body covers."""
-    there, alpha = other.alpha
-    both = [slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(window, there, strict=True)]
-    inner = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, window, strict=True))
-    covered = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, there, strict=True))
-    left = 1 - alpha[covered]
-    pixels[inner] *= left if pixels.ndim == 2 else left[..., None]
-
-
-__all__ = ["MAX_SIDE", "CutoutGenerator", "CutoutOptions", "create"]
+from cow_service.vision.masks import Floats, Floats32, Image, scaled_size, three_channels
 
 
 class CutoutGenerator:
@@ -151,12 +45,97 @@ class CutoutGenerator:
     ) -> Iterator[Image]:
         """The frames of these indices, RGB [h, w, 3]; only the windows of what moves are composed."""
         source, earlier = (given, 0) if given.before is None else (given.before, 1)
-        compositor = Compositor.of(source)
+        layers = take_apart(source)
         for done, index in enumerate(indices):
             progress(done / len(indices))
-            yield compositor.frame(index + earlier)
+            yield compose(layers, index + earlier)
 
 
 def create(settings: Settings) -> CutoutGenerator:
     """Factory for the registry."""
     return CutoutGenerator()
+
+
+def compose(layers: Layers, index: int) -> Image:
+    """The clip frame [h, w, 3] of an index."""
+    if all(body.is_unmoved(index) for body in layers.moving):
+        return layers.image.copy()
+    frame = layers.background.copy()
+    for shadow in layers.shadows:
+        for shade in shadow.at(index, (frame.shape[1], frame.shape[0])):
+            window = frame[shade.window]
+            left = 1 - shade.dark * _visible_share(layers, shade.surface, shade.window)
+            window[:] = cv2.multiply(window, left, dtype=cv2.CV_8U)
+    for body, sprite in _far_to_near(layers, index):
+        _draw(layers, frame, body, sprite, index)
+        for container in layers.containers:
+            if container.moving is not None and container.sprite is not None and container.covers(body, index):
+                _draw(layers, frame, container.moving, container.sprite, index)
+    return frame
+
+
+def _visible_share(layers: Layers, surface: int | None, window: Window) -> Floats32 | float:
+    """Where in a window a surface is seen, 0..1 [a, b, 3]: the floor between still bodies, or the top of one."""
+    others = [other for other in layers.still if surface in (None, other.index) and _overlap(window, other)]
+    if not others:
+        return 1.0 if surface is None else 0.0
+    rows, columns = window
+    seen = np.ones((rows.stop - rows.start, columns.stop - columns.start), np.float32)
+    for other in others:
+        _hide(seen, window, other)
+    return three_channels(seen if surface is None else 1 - seen)
+
+
+def _far_to_near(layers: Layers, index: int) -> list[tuple[MovingBody, Sprite]]:
+    """The bodies before the camera at a frame, in the order in which they are drawn."""
+    there: list[tuple[MovingBody, Sprite]] = []
+    for body, sprite in zip(layers.moving, layers.sprites, strict=True):
+        depths: Floats = np.array([body.path.states[0][2], body.path.states[index][2]])
+        if not has_passed(depths, depths[0])[1]:
+            there.append((body, sprite))
+
+    def order(a: tuple[MovingBody, Sprite], b: tuple[MovingBody, Sprite]) -> int:
+        for one, other, sign in ((a[0], b[0], 1), (b[0], a[0], -1)):
+            if any(each.index == other.path.body and each.takes(one, index) for each in layers.containers):
+                return sign  # the container first, then what is in it
+        return 1 if a[0].extent(index).is_in_front_of(b[0].extent(index), layers.eye) else -1
+
+    return sorted(there, key=cmp_to_key(order))
+
+
+def _draw(layers: Layers, frame: Image, body: MovingBody, sprite: Sprite, index: int) -> None:
+    """Draws a body over a frame, but for what still bodies hide of it."""
+    path, extent = body.path, body.extent(index)
+    rotation = path.rotation[index] if path.rotation else 0.0
+    point = layers.factor * np.array(path.points[index])
+    found = sprite.at(point, path.scale[index], rotation, (frame.shape[1], frame.shape[0]))
+    if found is None:
+        return
+    hiding = [other for other in layers.still if not extent.is_in_front_of(other.extent, layers.eye)]
+    for container in layers.containers:
+        if container.takes(body, index):  # then its front wall alone hides the body
+            hiding = [other for other in hiding if other.index != container.index]
+            if container.moving is None and container.covers(body, index):
+                hiding.append(container.front)
+    window, pixels = found
+    for other in hiding:
+        if _overlap(window, other):
+            _hide(pixels, window, other)
+    shown = frame[window]
+    mixed = cv2.multiply(shown, three_channels(1 - pixels[..., 3]), dtype=cv2.CV_32F) + pixels[..., :3]
+    shown[:] = cv2.convertScaleAbs(mixed)
+
+
+def _overlap(window: Window, other: StillBody) -> bool:
+    there = other.alpha[0]
+    return all(a.start < b.stop and b.start < a.stop for a, b in zip(window, there, strict=True))
+
+
+def _hide(pixels: Floats32, window: Window, other: StillBody) -> None:
+    """Takes away the part of a window's values [a, b] or [a, b, 4] that another body covers."""
+    there, alpha = other.alpha
+    both = [slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(window, there, strict=True)]
+    inner = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, window, strict=True))
+    covered = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(both, there, strict=True))
+    left = 1 - alpha[covered]
+    pixels[inner] *= left if pixels.ndim == 2 else left[..., None]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cow_service.vision.inpainting import push_pull
+from cow_service.vision.inpainting import push_pull, quadratic_terms
 from cow_service.vision.masks import Floats, Floats32, Image, Mask, window_of
 
 WORKING_SIDE = 40.0  # px: the surroundings are measured at the size at which the object's longer side is so long
@@ -33,7 +33,9 @@ OPEN_END = 0.25  # of a dark patch's size, on the border of what is looked at: w
 ALIKE = 0.6  # of the darkness beside the object: it is, if it is as dark as this on the border
 CONTACT = 5  # px at the working size: so far under the object its shadow is as dark as at its rim
 
+IDENTITY, ORIGIN = np.eye(2), np.zeros(2)
 Box = tuple[float, float, float, float]
+Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,33 @@ class Shade:
     texture: float  # deviation of the texture, as a share of the lightness
     origin: tuple[float, float]
     step: float
+
+    def darkness(
+        self, window: Window, matrix: Floats = IDENTITY, to: Floats = ORIGIN, start: Floats = ORIGIN
+    ) -> Floats32:
+        """The share of light taken away in a window [a, b, 3], when `start` has gone `to` (px), turned by a matrix."""
+        return self._warped(self.dark, window, matrix, to, start, cv2.BORDER_CONSTANT)
+
+    def lit_floor(self, window: Window) -> Floats32:
+        """The floor's colours [a, b, 3] in the light, in a window of the image."""
+        return self._warped(self.floor, window, IDENTITY, ORIGIN, ORIGIN, cv2.BORDER_REPLICATE)
+
+    def corners(self, matrix: Floats = IDENTITY, to: Floats = ORIGIN, start: Floats = ORIGIN) -> tuple[Floats, Floats]:
+        """The corners (px), least and greatest, between which `darkness` takes light away."""
+        height, width = self.dark.shape[:2]
+        corners = np.array([[0, 0], [width, 0], [0, height], [width, height]]) * self.step + self.origin - start
+        there = to + corners @ matrix.T
+        return there.min(axis=0), there.max(axis=0)
+
+    def _warped(
+        self, cells: Floats32, window: Window, matrix: Floats, to: Floats, start: Floats, border: int
+    ) -> Floats32:
+        rows, columns = window
+        first = np.array(self.origin) + 0.5 * self.step - start
+        shift = to + matrix @ first - 0.5 - np.array([columns.start, rows.start])
+        size = columns.stop - columns.start, rows.stop - rows.start
+        transform = np.column_stack([matrix * self.step, shift])
+        return np.asarray(cv2.warpAffine(cells, transform, size, flags=cv2.INTER_LINEAR, borderMode=border), np.float32)
 
 
 def contact_shade(image: Image, body: Mask, box: Box, floor: Mask) -> Shade | None:
@@ -80,25 +109,32 @@ def _measured(
         return None
     step = 1 / scale
     window = slice(y0, y0 + round(size[1] * step)), slice(x0, x0 + round(size[0] * step))
-    weight = _small(floor[window].astype(np.float32), size)
-    colours = _small(image[window].astype(np.float32) * floor[window][..., None], size)
+    parts = seed[window], floor[window], image[window].astype(np.float32) * floor[window][..., None]
+    seeded, weight, colours = (
+        np.asarray(cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
+        for part in parts
+    )
     known = weight > 0.6
-    near = colours / np.maximum(weight, np.float32(1e-3))[..., None]
-    smooth = _without_texture(np.asarray(near, np.float32), known)
-    away = _away(_small(seed[window].astype(np.float32), size) > 0.3)
+    colours = colours / np.maximum(weight, np.float32(1e-3))[..., None]
+    # Without texture; what is not known takes part with the colours next to it.
+    shares = np.maximum(cv2.boxFilter(known.astype(np.float32), -1, (7, 7)), 1e-3)
+    near = cv2.boxFilter(colours * known[..., None], -1, (7, 7)) / shares[..., None]
+    levels = np.clip(np.where(known[..., None], colours, near) + 0.5, 0, 255).astype(np.uint8)
+    smooth = np.asarray(cv2.GaussianBlur(cv2.medianBlur(levels, TEXTURE).astype(np.float32), (0, 0), 0.7), np.float32)
+    away = _distance_from(seeded > 0.3)
     fitted = _floor_in_light(smooth, known, known & (away > 0.1 * side * scale) & (away < 0.5 * side * scale))
     if fitted is None:
         return None
     lit, texture = fitted
     left = smooth / lit
     # What lies nearer to another object is that one's shadow.
-    other = _away((weight < 0.4) & (away > TOUCH))
+    other = _distance_from((weight < 0.4) & (away > TOUCH))
     own = np.clip((other - away) / TOUCH + 0.5, 0, 1)
     dark = _shadow(left, texture, known, away, own.astype(np.float32), reject_open=reject_open)
     if dark is None:
         return None
-    near, far = (share * side * scale for share in fade)
-    dark = (dark * np.clip((far - away) / (far - near), 0, 1)[..., None]).astype(np.float32)
+    first, last = (share * side * scale for share in fade)
+    dark = (dark * np.clip((last - away) / (last - first), 0, 1)[..., None]).astype(np.float32)
     step = (window[1].stop - window[1].start) / size[0]
     seen = window_of(strongest(dark) > NO_SHADE, 1)
     if seen is None:
@@ -113,22 +149,8 @@ def strongest(values: Floats32) -> Floats32:
     return np.asarray(cv2.max(cv2.max(red, green), blue), np.float32)
 
 
-def _small(values: Floats32, size: tuple[int, int]) -> Floats32:
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _without_texture(colours: Floats32, known: Mask) -> Floats32:
-    """Colours [h, w, 3] without detail; what is not known takes part with the colours next to it."""
-    weight = known.astype(np.float32)
-    shares = np.maximum(cv2.boxFilter(weight, -1, (7, 7)), 1e-3)
-    near = cv2.boxFilter(colours * weight[..., None], -1, (7, 7)) / shares[..., None]
-    levels = np.clip(np.where(known[..., None], colours, near) + 0.5, 0, 255).astype(np.uint8)
-    median = cv2.medianBlur(levels, TEXTURE).astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(median, (0, 0), 0.7), np.float32)
-
-
-def _away(seed: Mask) -> Floats32:
-    """Distance (px) from a seed [h, w]."""
+def _distance_from(seed: Mask) -> Floats32:
+    """Pixels [h, w]."""
     return np.asarray(cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
@@ -143,7 +165,7 @@ def _floor_in_light(smooth: Floats32, known: Mask, around: Mask) -> tuple[Floats
         return None
     height, width = known.shape
     every = max(1, len(ys) // 1000)
-    terms = _terms(2 * xs[::every] / width - 1, 2 * ys[::every] / height - 1)
+    terms = quadratic_terms(2 * xs[::every] / width - 1, 2 * ys[::every] / height - 1)
     values = smooth[ys[::every], xs[::every]].astype(np.float64)
     grey = values.mean(axis=1)
     beside = smooth[around].mean(axis=1)
@@ -160,15 +182,12 @@ def _floor_in_light(smooth: Floats32, known: Mask, around: Mask) -> tuple[Floats
         # Of this surface only: others in the window say nothing of its texture.
         deviation = 0.5 + 1.4826 * float(np.median(np.abs(gaps[np.abs(gaps) < 2 * FAR * deviation])))
     v, u = np.mgrid[:height, :width]
-    floor = (_terms((2 * u / width - 1).ravel(), (2 * v / height - 1).ravel()) @ weights).reshape(height, width, 3)
+    surface = quadratic_terms((2 * u / width - 1).ravel(), (2 * v / height - 1).ravel()) @ weights
+    floor = surface.reshape(height, width, 3)
     level = float(np.median(floor))
     if level < 8 or deviation / level > UNEVEN:
         return None
     return np.maximum(floor, 0.3 * level).astype(np.float32), deviation / level
-
-
-def _terms(u: Floats, v: Floats) -> Floats:
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1).astype(np.float64)
 
 
 def _shadow(
@@ -184,7 +203,11 @@ def _shadow(
     beside = touching[known & (touching > least)]
     if len(beside) < LEAST_TOUCHING:
         return None
-    reached = _reached(touching, dark, round(float(away[dark > least].max())))
+    # Per pixel the least darkness on the darkest way to it from the object, for behind a lit gap lies no shadow: the
+    # morphological reconstruction of `dark` by dilation, as far as so many steps reach.
+    reached = touching
+    for _ in range(max(1, round(float(away[dark > least].max())))):
+        reached = np.minimum(np.asarray(cv2.dilate(reached, np.ones((3, 3), np.uint8)), np.float32), dark)
     patch = known & (reached > least)
     border = np.ones_like(patch)
     border[1:-1, 1:-1] = False
@@ -202,44 +225,3 @@ def _shadow(
     seen = np.where(rim[..., None], np.asarray(cv2.dilate(seen, kernel), np.float32), seen)
     under = push_pull(np.asarray(seen, np.float32), known | rim) * (own * ~border)[..., None]
     return np.where(known[..., None], lost, under).astype(np.float32)
-
-
-def _reached(marker: Floats32, dark: Floats32, steps: int) -> Floats32:
-    """Per pixel [h, w] the least darkness on the darkest way to it from the marker: behind a lit gap lies no shadow.
-
-    That is the morphological reconstruction of `dark` by dilation, as far as so many steps reach.
-    """
-    kernel = np.ones((3, 3), np.uint8)
-    for _ in range(max(1, steps)):
-        marker = np.minimum(np.asarray(cv2.dilate(marker, kernel), np.float32), dark)
-    return marker
-
-
-def drawn(shade: Shade, matrix: Floats, to: Floats, start: Floats, window: tuple[slice, slice]) -> Floats32:
-    """The share of light taken away in a window [a, b, 3], when `start` has gone `to` (px), all turned by a matrix."""
-    return _placed(shade.dark, shade, matrix, to, start, window, cv2.BORDER_CONSTANT)
-
-
-def floor_in_light(shade: Shade, window: tuple[slice, slice]) -> Floats32:
-    """The floor's colours [a, b, 3] in the light, in a window of the image."""
-    none = np.zeros(2)
-    return _placed(shade.floor, shade, np.eye(2), none, none, window, cv2.BORDER_REPLICATE)
-
-
-def _placed(
-    cells: Floats32, shade: Shade, matrix: Floats, to: Floats, start: Floats, window: tuple[slice, slice], border: int
-) -> Floats32:
-    rows, columns = window
-    first = np.array(shade.origin) + 0.5 * shade.step - start
-    shift = to + matrix @ first - 0.5 - np.array([columns.start, rows.start])
-    size = columns.stop - columns.start, rows.stop - rows.start
-    transform = np.column_stack([matrix * shade.step, shift])
-    return np.asarray(cv2.warpAffine(cells, transform, size, flags=cv2.INTER_LINEAR, borderMode=border), np.float32)
-
-
-def reach(shade: Shade, matrix: Floats, to: Floats, start: Floats) -> tuple[Floats, Floats]:
-    """The corners (px), least and greatest, between which a shade lies when it is drawn so."""
-    height, width = shade.dark.shape[:2]
-    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]]) * shade.step + shade.origin - start
-    there = to + corners @ matrix.T
-    return there.min(axis=0), there.max(axis=0)

@@ -16,16 +16,7 @@ import numpy as np
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import Ground, MovingBody, StillBody, Surface, Window, clipped
-from cow_service.generators.cutout.shade import (
-    LEAST_SHADE,
-    Shade,
-    cast_shade,
-    contact_shade,
-    drawn,
-    floor_in_light,
-    reach,
-    strongest,
-)
+from cow_service.generators.cutout.shade import LEAST_SHADE, Shade, cast_shade, contact_shade, strongest
 from cow_service.records import Path, Vector
 from cow_service.vision.masks import Floats, Floats32, Image, Mask, bbox_of
 from cow_service.vision.shadows import find_shadow
@@ -36,10 +27,14 @@ MOST_TAKEN = 0.85  # share of light
 EXTENT = 2.5  # radii around the foot, within which a sphere's shade is drawn
 CELLS = 40  # along the longer side: such a shade is smooth, and computed at so few cells
 NO_SHADE = 0.01  # share of light
+DEEP = 0.55  # share of light: with more taken away, noise is all that dividing brings back
+LEAST_SPREAD, TEXTURE = 0.02, 2.5  # of the lightness, deviations of the texture: so far a lit floor's colours spread
+RIM = 2  # px around an object, where its colours mix with those of the floor
+STRETCH = 1.25  # of a sphere's radius: how far its shadow reaches from its middle
 
 
 @dataclass(frozen=True)
-class Drawn:
+class ShadePatch:
     """The share of light that is taken away in a window of the frame, on one surface."""
 
     window: Window
@@ -50,7 +45,7 @@ class Drawn:
 class Shadow(Protocol):
     """A shadow of a moving body."""
 
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[Drawn]:
+    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
         """As it is at a clip frame, inside frames of a size (width, height)."""
         ...
 
@@ -64,11 +59,11 @@ class AttachedShadow:
     start: tuple[float, float]  # px of the clip
     factor: float  # clip px per image px
 
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[Drawn]:
+    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
         """One shadow, on the floor."""
         matrix = np.eye(2) * self.path.scale[frame]
         to = self.factor * np.array(self.path.points[frame])
-        yield from _drawn(self.shade, matrix, to, np.array(self.start), size, None, 1.0)
+        yield from _patch(self.shade, matrix, to, np.array(self.start), size, None)
 
 
 @dataclass(frozen=True)
@@ -80,7 +75,7 @@ class ContactShadow:
     shade: Shade
     support: int | None  # what it stands on, of `Trajectory.bodies`; None for the floor
 
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[Drawn]:
+    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
         """On what lies beneath the thing; none once it has risen."""
         ground, body = self.ground, self.ground.bodies[self.path.body]
         first, there = (np.array(self.path.states[index][:3]) for index in (0, frame))
@@ -94,9 +89,8 @@ class ContactShadow:
             return
         start, foot = ground.foot(first, lower), ground.foot(there, surface.height)
         matrix = np.eye(2) * (ground.depth(start) / ground.depth(foot))
-        yield from _drawn(
-            self.shade, matrix, ground.project(foot), ground.project(start), size, surface.body, min(1.0, strength)
-        )
+        ends = ground.project(foot), ground.project(start)
+        yield from _patch(self.shade, matrix, *ends, size, surface.body, min(1.0, strength))
 
 
 @dataclass(frozen=True)
@@ -108,17 +102,24 @@ class CastShadow:
     shade: Shade
     light: Vector  # m right and ahead per m of height
 
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[Drawn]:
+    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
         """On the floor, or on the top of a still body."""
         ground = self.ground
         first, there = (np.array(self.path.states[index][:3]) for index in (0, frame))
         start = cast_onto(ground, first, self.light, 0.0)
-        surface = _below_ray(ground, there, self.light, ground.bodies[self.path.body].size[1])
+        surface, length = Surface(0.0, None), ground.bodies[self.path.body].size[1]
+        for index in ground.still:  # whose top the light through it meets before the floor
+            top = ground.height(np.array(ground.bodies[index].position)) + ground.bodies[index].size[1] / 2
+            reached = cast_onto(ground, there, self.light, top)
+            below = ground.surface_below(reached, ground.height(there) - length / 2, length)
+            if below.body == index:
+                surface = below
+                break
         to = cast_onto(ground, there, self.light, surface.height)
         if to[2] <= 0:
             return
         matrix = ground.shape_on_floor(to) @ np.linalg.inv(ground.shape_on_floor(start))
-        yield from _drawn(self.shade, matrix, ground.project(to), ground.project(start), size, surface.body, 1.0)
+        yield from _patch(self.shade, matrix, ground.project(to), ground.project(start), size, surface.body)
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ class SkyShadow:
     ground: Ground
     path: Path
 
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[Drawn]:
+    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
         """On the surface beneath; nothing from some height on."""
         ground, body = self.ground, self.ground.bodies[self.path.body]
         there = np.array(self.path.states[frame][:3])
@@ -143,7 +144,7 @@ class SkyShadow:
         window = clipped(centre - across, centre + across, size)
         if window is not None and foot[2] > 0:
             dark = _sky_taken(ground, foot, window, radius, above)
-            yield Drawn(window, np.asarray(cv2.merge((dark, dark, dark)), np.float32), surface.body)
+            yield ShadePatch(window, np.asarray(cv2.merge((dark, dark, dark)), np.float32), surface.body)
 
 
 def cast_onto(ground: Ground, position: Floats, light: Vector, height: float) -> Floats:
@@ -153,24 +154,18 @@ def cast_onto(ground: Ground, position: Floats, light: Vector, height: float) ->
     return ground.foot(position, height) + fall * across
 
 
-def _below_ray(ground: Ground, position: Floats, light: Vector, size: float) -> Surface:
-    """The floor, or the still body's top that the light through a position meets before."""
-    for index in ground.still:
-        body = ground.bodies[index]
-        top = ground.height(np.array(body.position)) + body.size[1] / 2
-        bottom = ground.height(position) - size / 2
-        surface = ground.surface_below(cast_onto(ground, position, light, top), bottom, size)
-        if surface.body == index:
-            return surface
-    return Surface(0.0, None)
-
-
-def _drawn(
-    shade: Shade, matrix: Floats, to: Floats, start: Floats, size: tuple[int, int], surface: int | None, strength: float
-) -> Iterator[Drawn]:
-    window = clipped(*reach(shade, matrix, to, start), size)
+def _patch(
+    shade: Shade,
+    matrix: Floats,
+    to: Floats,
+    start: Floats,
+    size: tuple[int, int],
+    surface: int | None,
+    strength: float = 1.0,
+) -> Iterator[ShadePatch]:
+    window = clipped(*shade.corners(matrix, to, start), size)
     if window is not None:
-        yield Drawn(window, np.float32(strength) * drawn(shade, matrix, to, start, window), surface)
+        yield ShadePatch(window, np.float32(strength) * shade.darkness(window, matrix, to, start), surface)
 
 
 def _sky_taken(ground: Ground, foot: Floats, window: Window, radius: float, above: float) -> Floats32:
@@ -183,8 +178,7 @@ def _sky_taken(ground: Ground, foot: Floats, window: Window, radius: float, abov
     ys = rows.start + (np.arange(cells_y) + 0.5) * height / cells_y
     grid = np.stack(np.meshgrid(xs, ys), axis=2).reshape(-1, 2) / ground.factor
     rays = ground.camera.rays(grid)
-    up = ground.camera.up
-    sink = -rays @ up
+    sink = -rays @ ground.camera.up
     length = (ground.camera.height - ground.height(foot)) / np.where(sink > 1e-6, sink, 1.0)
     gap = ((rays * length[:, None] - foot) ** 2).sum(axis=1)
     taken = np.where(sink > 1e-6, above * radius**2 / (gap + above**2) ** 1.5, 0.0) ** SHARPNESS
@@ -193,18 +187,12 @@ def _sky_taken(ground: Ground, foot: Floats, window: Window, radius: float, abov
     return np.asarray(cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-DEEP = 0.55  # share of light: with more taken away, noise is all that dividing brings back
-LEAST_SPREAD, TEXTURE = 0.02, 2.5  # of the lightness, deviations of the texture: so far a lit floor's colours spread
-RIM = 2  # px around an object, where its colours mix with those of the floor
-STRETCH = 1.25  # of a sphere's radius: how far its shadow reaches from its middle
-
-
 @dataclass(frozen=True)
-class Lit:
+class UnshadedScene:
     """A scene without the shadows of what moves."""
 
     image: Image  # [h, w, 3]
-    lost: dict[int, Mask]  # by `Path.body`: where a body with a contact shadow has left too little to divide
+    noisy: dict[int, Mask]  # by `Path.body`: where a body with a contact shadow has left too little to divide
     shadows: tuple[Shadow, ...]
 
 
@@ -215,24 +203,25 @@ def take_shadows(
     still: Sequence[StillBody],
     ground: Ground | None,
     factor: float,
-) -> Lit:
+) -> UnshadedScene:
     """The scene [h, w, 3] without the shadows of the bodies that move, and these shadows."""
-    objects = np.zeros(image.shape[:2], bool)
-    for body in (*moving, *still):
-        objects |= body.mask
-    floor, shadows = _shrunk(~objects), list[Shadow]()
-    lost = dict[int, Mask]()
-    for body in (body for body in moving if _moves(body)):
-        index = body.path.body
+    rim = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
+    objects = np.logical_or.reduce([body.mask for body in (*moving, *still)])
+    floor, shadows = cv2.erode((~objects).astype(np.uint8), rim) > 0, list[Shadow]()
+    noisy = dict[int, Mask]()
+    for body in moving:
+        index, points = body.path.body, np.array(body.path.points)
+        if np.abs(points - points[0]).max() <= 1 and np.ptp(body.path.scale) <= 0.01:  # it stays where it is
+            continue
         if ground is not None and ground.bodies[index].support == "air":
             shadows.append(SkyShadow(ground, body.path))
-            cast = _cast(given, image, body, ground, floor)
+            cast = _cast_shadow(given, image, body, ground, floor)
             if cast is not None:
                 shadows.append(cast)
-                image, _ = _lit(image, cast.shade, ~objects)
+                image, _ = _without_shade(image, cast.shade, ~objects)
             continue
         masks = [other.mask for other in still if other.index == body.support]
-        beside = _shrunk(masks[0]) if masks else floor
+        beside = cv2.erode(masks[0].astype(np.uint8), rim) > 0 if masks else floor
         shade = None if body.airborne else contact_shade(image, body.mask, bbox_of(body.mask), beside)
         if shade is None:
             continue
@@ -241,31 +230,28 @@ def take_shadows(
             shadows.append(AttachedShadow(shade, body.path, start, factor))
         else:
             shadows.append(ContactShadow(ground, body.path, shade, body.support))
-        image, lost[index] = _lit(image, shade, masks[0] if masks else ~objects)
-    return Lit(image, lost, tuple(shadows))
+        image, noisy[index] = _without_shade(image, shade, masks[0] if masks else ~objects)
+    return UnshadedScene(image, noisy, tuple(shadows))
 
 
-def _shrunk(mask: Mask) -> Mask:
-    """A mask [h, w] without its rim."""
-    return cv2.erode(mask.astype(np.uint8), np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)) > 0
-
-
-def _moves(body: MovingBody) -> bool:
-    """Whether it leaves its place by a pixel at some frame."""
-    points = np.array(body.path.points)
-    return bool(np.abs(points - points[0]).max() > 1) or bool(np.ptp(body.path.scale) > 0.01)
-
-
-def _cast(given: GeneratorInput, image: Image, body: MovingBody, ground: Ground, floor: Mask) -> CastShadow | None:
+def _cast_shadow(
+    given: GeneratorInput, image: Image, body: MovingBody, ground: Ground, floor: Mask
+) -> CastShadow | None:
     """The shadow of a thing in the air: where the light says, or else where one is found below the mover."""
     first = np.array(body.path.states[0][:3])
     light = given.trajectory.light
     if light is None and body.path.body == 0:
-        light = _light_of_shadow(given, first, ground)
+        found, high = find_shadow(given.scene, given.grounding.bbox), ground.height(first)
+        there = None if found is None else ground.camera.floor_points(np.array([found.centre]))
+        if there is not None and np.isfinite(there).all() and high > 0:
+            gap = ground.camera.to_floor(there)[0] - ground.camera.to_floor(first[None])[0]
+            light = float(gap[0]) / high, float(gap[2]) / high
     if light is None:
         return None
     middle = cast_onto(ground, first, light, 0.0)
-    outline = ground.bodies[body.path.body].size[0] / 2 * STRETCH * _ring(ground)
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)[:, None]
+    ring = np.cos(angles) * ground.camera.right + np.sin(angles) * ground.camera.ahead
+    outline = ground.bodies[body.path.body].size[0] / 2 * STRETCH * ring
     points = np.array([ground.project(middle + step) for step in outline])
     height, width = floor.shape
     (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
@@ -279,37 +265,17 @@ def _cast(given: GeneratorInput, image: Image, body: MovingBody, ground: Ground,
     return None if shade is None else CastShadow(ground, body.path, shade, light)
 
 
-def _light_of_shadow(given: GeneratorInput, first: Floats, ground: Ground) -> Vector | None:
-    """Metres right and ahead per metre of height, from a shadow found in the image."""
-    found = find_shadow(given.scene, given.grounding.bbox)
-    if found is None:
-        return None
-    there = ground.camera.floor_points(np.array([found.centre]))
-    high = ground.height(first)
-    if not np.isfinite(there).all() or high <= 0:
-        return None
-    gap = ground.camera.to_floor(there)[0] - ground.camera.to_floor(first[None])[0]
-    return float(gap[0]) / high, float(gap[2]) / high
-
-
-def _ring(ground: Ground) -> Floats:
-    """Unit steps [N, 3] around a point of the floor."""
-    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    camera = ground.camera
-    return np.cos(angles)[:, None] * camera.right + np.sin(angles)[:, None] * camera.ahead
-
-
-def _lit(image: Image, shade: Shade, where: Mask) -> tuple[Image, Mask]:
+def _without_shade(image: Image, shade: Shade, where: Mask) -> tuple[Image, Mask]:
     """The image [h, w, 3] with a shade taken out of it in a mask, and a mask of where that leaves nothing but noise."""
-    none, deep = np.zeros(2), np.zeros_like(where)
-    window = clipped(*reach(shade, np.eye(2), none, none), (image.shape[1], image.shape[0]))
+    deep = np.zeros_like(where)
+    window = clipped(*shade.corners(), (image.shape[1], image.shape[0]))
     if window is None:
         return image, deep
-    dark = np.where(where[window][..., None], drawn(shade, np.eye(2), none, none, window), np.float32(0))
+    dark = np.where(where[window][..., None], shade.darkness(window), np.float32(0))
     result = image.copy()
     lit = image[window] / (1 - dark)
     # At a sharp edge of the shadow a pixel more or less would leave a line: nothing differs more than its texture.
-    floor, spread = floor_in_light(shade, window), max(LEAST_SPREAD, TEXTURE * shade.texture)
+    floor, spread = shade.lit_floor(window), max(LEAST_SPREAD, TEXTURE * shade.texture)
     bounded = np.clip(lit, (1 - spread) * floor, (1 + spread) * floor)
     shaded = np.clip(cv2.dilate(strongest(dark), np.ones((5, 5), np.uint8)) / LEAST_SHADE, 0, 1)[..., None]
     result[window] = np.clip(shaded * bounded + (1 - shaded) * lit + 0.5, 0, 255).astype(np.uint8)
