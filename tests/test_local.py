@@ -53,8 +53,8 @@ from cow_service.readers.local.decoding import BatchRow, Sampling
 from cow_service.readers.local.loading import device_map, load_local
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny
-from cow_service.readers.mllm import locate
 from cow_service.readers.mllm.coordinates import CoordinateFrame
+from cow_service.readers.mllm.locate import locate_schema
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Coordinates, Manifest, Source, load_manifests
 
@@ -293,7 +293,7 @@ CUBE = {"label": "cube", "bbox_2d": [50, 2, 90, 40]}
 )
 def test_a_reply_may_leave_out_what_is_optional_and_nothing_else(toy: LocalModel, reply: Any, allowed: bool) -> None:
     coordinates = Coordinates(units="thousandths", box="bbox_2d")
-    schema = locate.schema(CoordinateFrame(640, 480, (640, 480), coordinates), True, True, 100)
+    schema = locate_schema(CoordinateFrame(640, 480, (640, 480), coordinates), True, True, 100)
     grammars = toy._generator.grammars
     matcher = grammars.matcher(grammars.grammar(schema))
     tokens = grammars._tokens.tokenize_str(json.dumps(reply))

@@ -15,12 +15,11 @@ from hypothesis import strategies as st
 from mllm_server import MllmServer
 
 from cow_service.readers.base import GroundingReading, MotionReading, ReaderInput
-from cow_service.readers.mllm import priors
+from cow_service.readers.mllm import estimates
 from cow_service.readers.mllm.coordinates import CoordinateFrame
-from cow_service.readers.mllm.locate import Located, read_located
-from cow_service.readers.mllm.others import MAX_OBSTACLES
+from cow_service.readers.mllm.estimates import support_named
+from cow_service.readers.mllm.locate import MAX_OBSTACLES, Line, Located, SeenObject, read_located
 from cow_service.readers.mllm.reader import MllmReader, create
-from cow_service.readers.mllm.supports import support_named
 from cow_service.records import Estimate, Grounding, ObjectPrior
 from cow_service.settings import Settings
 from cow_service.vision.scene import Scene
@@ -29,6 +28,7 @@ from cow_service.weights.manifests import load_families
 FRAME = CoordinateFrame(640, 400, (640, 400), load_families()["qwen3-vl"].coordinates)
 BALL = {"label": "red ball", "bbox_2d": [172, 400, 297, 600]}
 VASE = {"label": "vase", "bbox_2d": [700, 300, 800, 600]}
+OPTIONAL = [name for kind in (SeenObject, Line) for name, field in kind.model_fields.items() if not field.is_required()]
 LINE = {"cue": "orientation", "along_arrow": None, "camera": None, "direction": [230, 500, 600, 500]}
 
 
@@ -48,14 +48,14 @@ def test_priors_have_widths() -> None:
     found = read(BALL | given, [VASE | {"size": 0.4, "height_above": 1}])
     assert found.prior == ObjectPrior(
         shape="sphere",
-        size=Estimate(value=0.2, deviation=priors.SIZE_DEVIATION * 0.2),
+        size=Estimate(value=0.2, deviation=estimates.SIZE_DEVIATION * 0.2),
         stands_on="floor",
-        height=Estimate(value=0.02, deviation=priors.MIN_HEIGHT_DEVIATION),
+        height=Estimate(value=0.02, deviation=estimates.MIN_HEIGHT_DEVIATION),
     )
     (vase,) = found.others
     assert vase.prior is not None
-    assert vase.prior.size == Estimate(value=0.4, deviation=priors.SIZE_DEVIATION * 0.4)
-    assert vase.prior.height == Estimate(value=1, deviation=priors.HEIGHT_DEVIATION)
+    assert vase.prior.size == Estimate(value=0.4, deviation=estimates.SIZE_DEVIATION * 0.4)
+    assert vase.prior.height == Estimate(value=1, deviation=estimates.HEIGHT_DEVIATION)
     assert (vase.role, vase.source, found.warnings) == ("target", "mllm", ())
 
 
@@ -156,7 +156,7 @@ VALUES = st.recursive(
 )
 
 
-@given(fields=st.dictionaries(st.sampled_from([*priors.OBJECT_FIELDS, *priors.MOTION_FIELDS]), VALUES))
+@given(fields=st.dictionaries(st.sampled_from(OPTIONAL), VALUES))
 def test_no_optional_field_fails_or_moves_the_box(fields: dict[str, Any]) -> None:
     found = read(BALL | fields, [VASE | fields])
     assert found.bbox == read(BALL).bbox
@@ -165,7 +165,7 @@ def test_no_optional_field_fails_or_moves_the_box(fields: dict[str, Any]) -> Non
         for estimate in () if prior is None else (prior.size, prior.height):
             assert estimate is None or (0 <= estimate.value <= 1000 and math.isfinite(estimate.deviation))
     assert found.line is not None
-    assert found.line.ends is not None or found.line.camera is not None
+    assert found.line.direction is not None or found.line.camera is not None
     assert abs(found.line.depth_degrees or 0) <= 90
 
 
@@ -276,8 +276,8 @@ def test_priors_travel_to_both_stages(mllm: MllmServer, reader: MllmReader, scen
     assert (reading.prior.shape, reading.prior.height) == ("sphere", None)
     assert any("`height_above` of 'red ball'" in warning for warning in reading.warnings)
     assert motion.depth == pytest.approx(0.5)
-    assert (motion.depth_deviation, motion.speed) == (priors.HEADING_DEVIATION, "slow")
-    assert motion.speed_deviation == priors.SPEED_DEVIATION
+    assert (motion.depth_deviation, motion.speed) == (estimates.HEADING_DEVIATION, "slow")
+    assert motion.speed_deviation == estimates.SPEED_DEVIATION
     assert motion.direction == pytest.approx((0.37 * 640, 0))
 
 
@@ -288,7 +288,7 @@ def test_without_priors_nothing_is_said(mllm: MllmServer, reader: MllmReader, sc
 
 
 def test_the_warnings_of_a_motion_alone_are_not_lost(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
-    mllm.say(json.dumps(LINE | {"speed": "warp 9"}))
+    mllm.say(json.dumps({"object": "red ball", "kind": "linear"}), json.dumps(LINE | {"speed": "warp 9"}))
     place = Grounding(object="red ball", point=(150, 200), bbox=(110, 156, 190, 236), source="request")
     motion = reader.read_motion(ReaderInput(scene, "Where does it roll?"), place, None)
     assert motion.speed is None
@@ -314,7 +314,7 @@ def test_each_object_has_one_box_and_obstacles_are_few(mllm: MllmServer, reader:
 def test_optional_fields_are_asked_for_and_may_be_left_out(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
     ground(mllm, reader, scene, BALL | LINE)
     words, sent = mllm.text(1), mllm.asked[1]["response_format"]["json_schema"]["schema"]
-    for field in (*priors.OBJECT_FIELDS, *priors.MOTION_FIELDS):
+    for field in OPTIONAL:
         assert f"`{field}`" in words
         assert field in sent["properties"]
         assert field not in sent["required"]

@@ -16,10 +16,10 @@ from runs import run_of
 
 from cow_service.errors import Canceled, CannotReadDirection, MllmUnavailable, ObjectNotFound
 from cow_service.readers.base import CallLog, MotionHints, Quantity, ReaderInput
-from cow_service.readers.mllm.changes import read_changes
 from cow_service.readers.mllm.client import MllmClient
+from cow_service.readers.mllm.identify import read_identified
 from cow_service.readers.mllm.reader import MllmReader, create
-from cow_service.records import Grounding
+from cow_service.records import Asked, Grounding
 from cow_service.settings import Settings
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
@@ -125,6 +125,41 @@ def test_further_legs_and_other_movers_are_kept(mllm: MllmServer, reader: MllmRe
 
 
 @pytest.mark.parametrize(
+    ("written", "asked"),
+    [
+        ({"relation": "lands"}, Asked(relation="lands")),
+        (
+            {"Form": "Whether", "relation": "Covers", "target": "coin", "negated": "no", "within": "2 s", "among": []},
+            Asked(relation="covers", target="coin", within=2),
+        ),
+        (
+            {"relation": "touches", "subject": "the red ball", "target": "vase"},
+            Asked(relation="touches", target="vase"),
+        ),
+        ({"relation": "explodes", "target": "vase"}, None),
+        ({"target": "vase"}, None),
+        ({"relation": "touches", "among": "all of them", "negated": "perhaps"}, None),
+        ("does it hit the vase?", None),
+        (None, None),
+    ],
+)
+def test_what_is_asked_is_read_whole_or_not_at_all(written, asked: Asked | None) -> None:
+    found = read_identified(json.dumps(BALL | {"asked": written}))
+    assert found is not None
+    assert found.asked == asked
+
+
+def test_what_is_asked_about_is_located_and_handed_on(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
+    coin = {"label": "coin", "bbox_2d": [600, 400, 700, 600]}
+    said = BALL | {"asked": {"relation": "covers", "target": "coin", "negated": False, "form": "whether"}}
+    mllm.say(json.dumps(said), json.dumps(PLACE | {"others": [coin]}))
+    reading = reader.ground(ReaderInput(scene, "Will it hide the coin below it?"))
+    assert reading.asked == Asked(relation="covers", target="coin")
+    assert "> coin" in mllm.text(1)
+    assert [(each.object, each.role) for each in reading.others] == [("coin", "target")]
+
+
+@pytest.mark.parametrize(
     ("written", "read"),
     [
         ({"kind": "place", "object": "apple", "relation": "inside", "targets": "bowl"}, ("into", ("bowl",))),
@@ -139,7 +174,7 @@ def test_further_legs_and_other_movers_are_kept(mllm: MllmServer, reader: MllmRe
     ],
 )
 def test_changes_as_replies_write_them(written, read) -> None:
-    found = read_changes({"changes": written})
+    found = read_identified(json.dumps(BALL | {"changes": written})).changes
     assert [(each.relation, each.targets) for each in found] == ([] if read is None else [read])
 
 
@@ -155,8 +190,8 @@ def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm: MllmServ
         "cue": "trail",
         "direction": [box[0], box[1], box[0] + 200, box[1]],
     }
-    for given, said in (({}, [BALL | {"object": "orange ball"}, place]), (GIVEN, [place])):
-        mllm.say(*map(json.dumps, said))
+    for given in ({}, GIVEN):
+        mllm.say(json.dumps(BALL | {"object": "orange ball"}), json.dumps(place))
         run = run_of(image, reader=lambda: reader, question="Trifft die Kugel den Würfel?", **given)
         found = run.stage("grounding", ground)
         motion = run.stage("motion", read_motion, found, run.hints)
@@ -166,11 +201,12 @@ def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm: MllmServ
         assert len(run.scene.regions) == 2, "the earlier positions are taken out of the image"
 
 
-@pytest.mark.parametrize(("source", "prompts"), [("request", {"locate"}), ("mllm", {"identify", "locate"})])
+@pytest.mark.parametrize("source", ["request", "mllm"])
 def test_without_hints_the_motion_is_asked_for_with_the_box_that_is_known(
-    source: str, prompts: set[str], mllm: MllmServer, reader: MllmReader, scene: Scene
+    source: str, mllm: MllmServer, reader: MllmReader, scene: Scene
 ) -> None:
-    mllm.say(*([json.dumps(BALL)] if "identify" in prompts else []), json.dumps(PLACE))
+    prompts = {"identify", "locate"}
+    mllm.say(json.dumps(BALL), json.dumps(PLACE))
     given = ReaderInput(scene, QUESTION)
     assert reader.read_motion(given, grounding(source), None).direction is not None
     assert given.calls.prompts.keys() == prompts | {"looking"}

@@ -9,8 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jinja2.exceptions import SecurityError
 
-from cow_service.readers.mllm import answer, identify, locate, scale
+from cow_service.readers.mllm.answer import answer_schema
 from cow_service.readers.mllm.coordinates import CoordinateFrame
+from cow_service.readers.mllm.identify import Identified
+from cow_service.readers.mllm.locate import Scale, locate_schema
+from cow_service.readers.mllm.replies import schema_of
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt, parse_prompt
 from cow_service.readers.question.wording import direction_words, motion_sentence
@@ -85,11 +88,11 @@ def test_every_shipped_prompt_renders_its_inputs_and_no_others(name: str) -> Non
 
 FRAME = CoordinateFrame(640, 480, (640, 480), Coordinates(units="thousandths"))
 SCHEMAS = {
-    "identify": identify.schema(100),
-    "locate": locate.schema(FRAME, True, True, 100),
-    "scale": scale.schema(FRAME, 100),
-    "answer-from-image": answer.schema(read_choices("", ["Yes", "No"]), 100),
-    "answer-with-frames": answer.schema(read_choices("", ["Yes", "No"]), 100),
+    "identify": schema_of(Identified, reasoning_length=100),
+    "locate": locate_schema(FRAME, True, True, 100),
+    "scale": schema_of(Scale, reasoning_length=100, numbers=FRAME.numbers),
+    "answer-from-image": answer_schema(read_choices("", ["Yes", "No"]), 100),
+    "answer-with-frames": answer_schema(read_choices("", ["Yes", "No"]), 100),
 }
 
 

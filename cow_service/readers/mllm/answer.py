@@ -9,18 +9,22 @@ from typing import Any, cast
 
 from cow_service.readers.base import AnswerReading, Imagined
 from cow_service.readers.mllm.client import PromptCall
-from cow_service.readers.mllm.free_text import MARKS, announced, is_broken_json, lines_of
 from cow_service.readers.mllm.hypothesis import hypothesis
 from cow_service.readers.mllm.replies import (
     ReplyError,
+    Schema,
     fields_of,
     first_of,
+    is_broken_json,
     is_none,
+    nullable,
+    one_of,
+    schema_of,
     text_of,
     values_in,
     without_thinking,
+    words,
 )
-from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
 from cow_service.readers.options import not_sure_option, option_saying, plain, question_without, says_not_sure
 from cow_service.records import AnswerOption
 
@@ -30,6 +34,17 @@ UNSURE_WORDS = 6  # an open answer that says "not sure" in more words says somet
 VOTING_TEMPERATURE = 0.7  # without chance every vote would be the same
 _KEYS = ("answer", "final_answer", "choice", "option", "letter")
 _REASONING_KEYS = ("reasoning", "reason", "explanation", "rationale", "thought", "thoughts")
+MARKS = "*_`\"'“” \t."
+_ANSWER_IS = re.compile(r"\b(?:final\s+)?answer\b[\s*_\"'`]*(?:is|:|=)[\s*_\"'`]*(?P<said>[^\n]*)", re.IGNORECASE)
+_TAGGED = re.compile(r"<answer>(?P<said>.*?)(?:</answer>|$)", re.IGNORECASE | re.DOTALL)
+_BOXED = re.compile(r"\\boxed\{(?:\\\w+\{)*(?P<said>[^{}]*)\}")
+# A letter alone behind such words; with a word after it, it may be an article.
+_CHOSEN = re.compile(
+    r"\b(?:[Aa]nswer|[Cc]hoose|[Pp]ick|[Ss]elect)[\s*_:]+(?:[Oo]ption\s+)?(?P<said>[(\[]?[A-Z][)\]]?)(?=[.,;*\s]*(?:\n|$))"
+    r"|^\W*(?:[Oo]ption\s+)?(?P<right>[(\[]?[A-Z][)\]]?) is (?:the )?(?:correct|right)\b",
+    re.MULTILINE,
+)
+_SPECIAL = re.compile(r"<\|\w+\|>")
 _LETTER = re.compile(
     r"(?:option\s+|choice\s+)?[(\[]?(?P<letter>[A-Za-z])[)\]]?\s*[.:)\-]?\s*(?P<text>.*)", re.DOTALL | re.IGNORECASE
 )
@@ -50,7 +65,7 @@ def answer_calls(
             "answer-from-image" if imagined is None else "answer-with-frames",
             inputs if imagined is None else inputs | hypothesis(imagined),
             jpegs,
-            schema(options, reasoning_length),
+            answer_schema(options, reasoning_length),
             lambda reply: read_answer(reply, options),
             vote=vote,
             temperature=VOTING_TEMPERATURE if votes > 1 else None,
@@ -59,10 +74,11 @@ def answer_calls(
     ]
 
 
-def schema(options: Sequence[AnswerOption], reasoning_length: int) -> Schema:
+def answer_schema(options: Sequence[AnswerOption], reasoning_length: int) -> Schema:
     """JSON schema of the reply."""
+    schema = schema_of(reasoning_length=reasoning_length)
     answer = one_of(*(option.letter for option in options)) if options else nullable(words(MAX_ANSWER))
-    return object_of(reasoning=words(reasoning_length), answer=answer)
+    return schema | {"properties": schema["properties"] | {"answer": answer}, "required": ["reasoning", "answer"]}
 
 
 def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
@@ -111,7 +127,7 @@ def _in_prose(said: str, options: Sequence[AnswerOption]) -> list[AnswerReading]
     """Answers that are announced as such in a text; else its first or last line, where that is one."""
     if is_broken_json(said):
         return []
-    answers, lines = announced(said), lines_of(said)
+    answers, lines = _announced(said), _edge_lines(said)
     if options:
         found = [option for each in answers or lines if (option := _option(each, options))]
         if answers and not found:
@@ -128,7 +144,7 @@ def _read(answer: Any, reasoning: str, options: Sequence[AnswerOption]) -> Answe
     text = text_of(answer)
     option = _option(text, options)
     if option is None and text:
-        found = {option.letter: option for each in announced(text) if (option := _option(each, options))}
+        found = {option.letter: option for each in _announced(text) if (option := _option(each, options))}
         option = next(iter(found.values())) if len(found) == 1 else None
     if option is None:
         raise ReplyError(f"the answer '{str(answer)[:80]}' is none of the options; {_remedy(options)}")
@@ -182,3 +198,23 @@ def _remedy(options: Sequence[AnswerOption]) -> str:
     if not options:
         return "give it in a few words"
     return f"give one letter of {', '.join(option.letter for option in options)}"
+
+
+def _announced(said: str) -> list[str]:
+    """Answers that a text announces as such, the surest kind of announcement alone."""
+    text = _SPECIAL.sub(" ", said)
+    for pattern in (_BOXED, _TAGGED, _ANSWER_IS, _CHOSEN):
+        groups = [next(group for group in found.groups() if group is not None) for found in pattern.finditer(text)]
+        answers = [group.strip(MARKS) for group in groups if group.strip(MARKS)]
+        if answers:
+            return answers
+    return []
+
+
+def _edge_lines(said: str) -> list[str]:
+    """First and last line of a text, without special tokens: where an answer that is not announced stands."""
+    lines = [line.strip(MARKS) for line in _SPECIAL.sub(" ", said).splitlines() if line.strip(MARKS)]
+    if not lines:
+        return []
+    last = re.sub(r"^(?:so|therefore|thus|hence)\W+", "", lines[-1], flags=re.IGNORECASE)
+    return list(dict.fromkeys((lines[0], last)))

@@ -6,27 +6,46 @@ import asyncio
 import concurrent.futures
 import hashlib
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import random
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass, replace
+from http import HTTPStatus
+from threading import Thread
 from typing import Any, Generic, TypeVar, cast
 
 import anyio
 from pydantic_ai import Agent, BinaryContent, ModelRetry, RunContext, TextOutput
 from pydantic_ai.direct import model_request
-from pydantic_ai.exceptions import AgentRunError, ContentFilterError, ModelAPIError, ModelHTTPError, UserError
+from pydantic_ai.exceptions import (
+    AgentRunError,
+    ContentFilterError,
+    ModelAPIError,
+    ModelAuthenticationError,
+    ModelConnectionError,
+    ModelContextWindowExceededError,
+    ModelHTTPError,
+    ModelNotFoundError,
+    ModelQuotaExceededError,
+    ModelRateLimitError,
+    ModelRequestRejectedError,
+    ModelTimeoutError,
+    UserError,
+)
+from pydantic_ai.messages import ModelMessage, ModelResponse
+from pydantic_ai.models import Model, ModelRequestParameters
+from pydantic_ai.models.wrapper import WrapperModel
+from pydantic_ai.output import OutputObjectDefinition
 from pydantic_ai.settings import ModelSettings
 from pydantic_ai.usage import RunUsage
+from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, stop_before_delay, wait_random_exponential
 
 from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmUnavailable
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.chat import completion_of, prepare_chat
-from cow_service.readers.mllm.event_loop import EventLoopThread
-from cow_service.readers.mllm.images import MEDIA_TYPE
+from cow_service.readers.mllm.coordinates import MEDIA_TYPE
 from cow_service.readers.mllm.models import ConfiguredModel
-from cow_service.readers.mllm.replies import ReplyError
-from cow_service.readers.mllm.retries import RetryingModel, reason_of
-from cow_service.readers.mllm.schemas import Schema
+from cow_service.readers.mllm.replies import ReplyError, Schema
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Usage
 from cow_service.settings import Settings
@@ -239,3 +258,153 @@ def seed_of_vote(seed: int, vote: int) -> int:
 
 def _parsed(context: RunContext[_ReplyParser], reply: str) -> Any:
     return context.deps(reply)
+
+
+MIN_BACKOFF, MAX_BACKOFF = 0.5, 20.0  # seconds before a retry, where the server names no time
+CONNECT_SECONDS = 10.0  # after which an address that accepts no connection is given up: a restart takes longer anyway
+_NEVER_RETRIED = (ModelRequestRejectedError, ModelQuotaExceededError)
+_RETRIED_STATUS = (
+    HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.CONFLICT, HTTPStatus.TOO_EARLY, HTTPStatus.TOO_MANY_REQUESTS,
+)  # fmt: skip
+_REASONS: tuple[tuple[type[ModelAPIError], str], ...] = (
+    (ModelAuthenticationError, "it refused the key; set COW_MLLM_API_KEY, or the provider's own variable"),
+    (ModelNotFoundError, "there is no model of that name; COW_MLLM_MODEL says under which name it is served there"),
+    (ModelContextWindowExceededError, "the images and the question are more than it takes; send fewer frames"),
+    (ModelQuotaExceededError, "the account's quota is used up"),
+    (ModelRateLimitError, "it takes no more requests for now (429); lower COW_MLLM_CONCURRENCY, or try later"),
+    (ModelTimeoutError, "it did not reply in time; COW_MLLM_TIMEOUT says how long to wait"),
+    (ModelConnectionError, "it could not be reached, or broke off; check that it runs, and COW_MLLM_BASE_URL"),
+)
+# What pydantic-ai's and the providers' code raises over a response that is not shaped as it should be.
+_MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError)
+
+
+class RetryingModel(WrapperModel):
+    """A model that repeats a failed request while that may help and `budget` seconds are not over.
+
+    Each attempt waits for one of `slots`, then takes `timeout` seconds at most. `calls` counts the attempts.
+    """
+
+    def __init__(
+        self, wrapped: Model, slots: asyncio.Semaphore, timeout: float, budget: float, schema: Schema | None
+    ) -> None:
+        super().__init__(wrapped)
+        self._slots = slots
+        self._timeout = timeout
+        self._budget = budget
+        self._schema = schema
+        self.calls = 0
+        self.last_error: ModelAPIError | None = None
+        self.truncated = False  # whether the last reply reached the limit of tokens
+
+    async def request(
+        self,
+        messages: list[ModelMessage],
+        model_settings: ModelSettings | None,
+        model_request_parameters: ModelRequestParameters,
+    ) -> ModelResponse:
+        """A reply held to the schema where there is one. Raises `ModelAPIError`, `ContentFilterError`."""
+        parameters = model_request_parameters
+        if self._schema is not None:
+            # The text is read by our own tolerant rules all the same: a server may ignore the schema.
+            output = OutputObjectDefinition(self._schema, "reply")
+            parameters = replace(parameters, output_mode="native", output_object=output)
+        retrying = AsyncRetrying(
+            retry=retry_if_exception(_is_transient),
+            wait=_backoff,
+            stop=lambda state: stop_before_delay(self._budget)(state) or _is_unreachable(state),
+            reraise=True,
+        )
+        return await retrying(self._attempt, messages, model_settings, parameters)
+
+    async def _attempt(
+        self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
+    ) -> ModelResponse:
+        self.calls += 1
+        try:
+            async with self._slots:
+                with anyio.fail_after(self._timeout):
+                    response = await super().request(messages, settings, parameters)
+        except ContentFilterError:
+            raise
+        except ModelAPIError as error:
+            self.last_error = error
+            raise
+        except TimeoutError as error:
+            self.last_error = ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s")
+            raise self.last_error from error
+        except (AgentRunError, *_MALFORMED) as error:
+            self.last_error = ModelAPIError(self.model_name, "the reply was no chat completion")
+            raise self.last_error from error
+        self.truncated = response.finish_reason == "length"
+        return response
+
+
+def reason_of(error: ModelAPIError) -> str:
+    """What went wrong and what to do about it, in words without addresses, keys or the server's own text."""
+    for kind, words in _REASONS:
+        if isinstance(error, kind):
+            return words
+    if isinstance(error, ModelHTTPError):
+        return f"it answered with status {error.status_code}"
+    return "its reply could not be read; check that COW_MLLM_BASE_URL is that of an OpenAI-compatible server"
+
+
+def _is_transient(error: BaseException) -> bool:
+    if isinstance(error, ModelHTTPError) and error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
+        return error.status_code in _RETRIED_STATUS
+    return isinstance(error, ModelAPIError) and not isinstance(error, _NEVER_RETRIED)
+
+
+def _is_unreachable(state: RetryCallState) -> bool:
+    """Whether the address has accepted no connection for a while."""
+    error = state.outcome.exception() if state.outcome else None
+    refused = isinstance(error, ModelConnectionError) and error.phase == "connect"
+    return refused and (state.seconds_since_start or 0.0) > CONNECT_SECONDS
+
+
+def _backoff(state: RetryCallState) -> float:
+    """Seconds until the next attempt: those that the server asked for, else exponential backoff, with jitter."""
+    error = state.outcome.exception() if state.outcome else None
+    retry_after = error.retry_after if isinstance(error, ModelAPIError) else None
+    if retry_after is not None:
+        return retry_after + random.uniform(0, MIN_BACKOFF)  # many callers were told the same
+    return wait_random_exponential(MIN_BACKOFF, MAX_BACKOFF)(state)
+
+
+CLOSE_SECONDS = 5.0  # that closing waits for connections
+
+
+class EventLoopThread:
+    """Runs the coroutines that call one model. Ends with the process, or earlier by `close`."""
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self._loop = asyncio.new_event_loop()
+        # A daemon, so that a reader that nobody closed does not keep the process alive.
+        self._thread = Thread(target=self._loop.run_forever, name="mllm", daemon=True)
+        self.closed = False
+        self._thread.start()
+        self.submit(model.__aenter__()).result()
+
+    def submit(self, work: Coroutine[Any, Any, T]) -> concurrent.futures.Future[T]:
+        """Starts a coroutine; its future may be canceled."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def close(self) -> None:
+        """Cancels what is running, closes the connections and ends the thread. May be called twice."""
+        if self.closed:
+            return
+        self.closed = True
+        concurrent.futures.wait([self.submit(self._end())], CLOSE_SECONDS)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(CLOSE_SECONDS)
+        if not self._thread.is_alive():
+            self._loop.close()
+
+    async def _end(self) -> None:
+        running = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+        await self._model.__aexit__(None, None, None)

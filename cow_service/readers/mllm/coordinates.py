@@ -1,4 +1,4 @@
-"""How families of multimodal LLMs write places, and the pixels of the upright image that they mean.
+"""Images as a multimodal LLM sees them, how families of models write places, and the pixels that they mean.
 
 The convention comes from the family's file in `models/families/`; nothing is inferred from the size of the numbers.
 Everything becomes pixels before any geometry: a direction read off numbers in thousandths of width and height is
@@ -13,10 +13,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from cow_service.readers.mllm.replies import ReplyError, fields_of, is_number
-from cow_service.records import BBox, Point
-from cow_service.weights.manifests import Coordinates, ImageSize
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
+from cow_service.errors import InternalError, InvalidRequest
+from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number
+from cow_service.records import BBox, Point
+from cow_service.weights.manifests import Coordinates, Family, ImageSize
+
+MEDIA_TYPE = "image/jpeg"
+QUALITY = 95  # percent; fine lines such as drawn arrows stay clean
+# Each colour channel keeps its full resolution: a red arrow on green would smear else.
+_ENCODING = (cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 OVERSHOOT = 0.02  # of the image's side: so far outside a place is cut off at the edge, further out it is refused
 LEAST_SIDE = 1.0  # px of the upright image: a narrower box has no area
 LEAST_LENGTH = 2.0  # px of the upright image between the ends of a direction
@@ -24,6 +33,7 @@ MAX_RATIO = 200  # of the sides: what rounds sides to multiples takes no narrowe
 NUMBER = r"[-+]?(?:\d{1,12}(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,2})?"
 _GAP = r"[\s\[\](){},;]"
 _NUMBERS = re.compile(rf"{_GAP}*{NUMBER}(?:{_GAP}+{NUMBER})*{_GAP}*")
+MAX_BOX_SHARE = 0.9  # of the image: a box that covers so much is hardly that of one object
 HUGE = 1e9  # no coordinate is that large
 _NAMED = (  # objects instead of lists; the names decide then, not the family's order
     ("x0", "y0", "x1", "y1"),
@@ -95,6 +105,13 @@ class CoordinateFrame:
         """The order of the numbers of a line from one point to another, in words for a prompt."""
         return "[x0, y0, x1, y1]" if self.coordinates.axes == "xy" else "[y0, x0, y1, x1]"
 
+    @property
+    def numbers(self) -> Schema:
+        """The JSON schema of one coordinate."""
+        units = self.coordinates.units
+        highest = max(self.seen) if units == "pixels" else int(self._full[0])
+        return {"type": "number" if units == "fractions" else "integer", "minimum": 0, "maximum": highest}
+
     def point(self, written: object) -> Point:
         """A point in pixels. Raises `ReplyError` where two numbers inside the image are not what was written."""
         return self._inside(*self._pairs(written, 1, "a point")[0])
@@ -149,6 +166,31 @@ class CoordinateFrame:
         return pairs if named is not None or self.coordinates.axes == "xy" else [(x, y) for y, x in pairs]
 
 
+@dataclass(frozen=True)
+class EncodedImage:
+    """An image as it is sent: JPEG, and how the model sees it."""
+
+    jpeg: bytes
+    coordinate_frame: CoordinateFrame
+
+
+def encode(pixels: NDArray[np.uint8], family: Family) -> EncodedImage:
+    """RGB [h, w, 3] for a family of models. Raises `InvalidRequest` for a shape that it takes at no size."""
+    height, width = pixels.shape[:2]
+    try:
+        size = size_seen(width, height, family.image)
+    except ReplyError as error:
+        raise InvalidRequest(f"The image cannot be shown to the multimodal LLM: {error}.") from error
+    if size != (width, height):
+        smaller = size[0] * size[1] < width * height
+        resized = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
+        pixels = np.asarray(resized, np.uint8)
+    done, data = cv2.imencode(".jpg", pixels[..., ::-1], _ENCODING)
+    if not done:
+        raise InternalError("The image could not be encoded for the multimodal LLM.")
+    return EncodedImage(data.tobytes(), CoordinateFrame(width, height, size, family.coordinates))
+
+
 def _numbers(written: object) -> list[float]:
     """The finite numbers that were written, lists inside lists unfolded; none where anything else is among them."""
     if isinstance(written, str):
@@ -179,6 +221,12 @@ def _by_name(written: object, count: int) -> list[float] | None:
         if set(names) <= set(held):
             return [number for name in names for number in _numbers(held[name])]
     return None
+
+
+def covers_image(width: int, height: int, bbox: BBox) -> bool:
+    """Whether a box covers nearly the whole image of `width` x `height` px."""
+    x0, y0, x1, y1 = bbox
+    return (x1 - x0) * (y1 - y0) > MAX_BOX_SHARE * width * height
 
 
 def names_corners(fields: Mapping[str, Any]) -> bool:

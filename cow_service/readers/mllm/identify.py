@@ -1,36 +1,53 @@
-"""First prompt: which object the question sets in motion, in words, and how it moves."""
+"""First prompt: what the question asks, which object it sets in motion, and how that moves, in words."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, cast, get_args
+from typing import Annotated, Any, ClassVar, get_args
 
-from cow_service.readers.mllm.changes import CHANGE_FIELDS, Change, read_changes
+from pydantic import BeforeValidator, Field, PlainValidator, ValidationError, WithJsonSchema, model_validator
+
+from cow_service.physics.camera import depth_motion
+from cow_service.readers.base import OtherMotionHint, StepReading
 from cow_service.readers.mllm.client import PromptCall
-from cow_service.readers.mllm.free_text import is_broken_json, names_nothing, says_absent
-from cow_service.readers.mllm.images import EncodedImage
-from cow_service.readers.mllm.legs import LEG_FIELDS, NO_LEGS, Legs, read_legs
-from cow_service.readers.mllm.lengths import LENGTH_FIELDS, NOT_SAID, Lengths, read_lengths
+from cow_service.readers.mllm.coordinates import EncodedImage
+from cow_service.readers.mllm.estimates import Distance, Seconds, Speed, seconds_of
 from cow_service.readers.mllm.replies import (
+    MAX_NAME,
+    Reply,
     ReplyError,
     fields_of,
     first_of,
+    is_broken_json,
     is_none,
+    listed,
+    name_of,
     name_words,
+    nullable,
+    one_of,
+    schema_of,
     text_of,
+    usable,
     values_in,
     without_thinking,
+    words,
 )
-from cow_service.readers.mllm.schemas import Schema, nullable, object_of, one_of, words
 from cow_service.readers.options import plain
-from cow_service.records import MotionKind
+from cow_service.readers.question.place_relations import RELATION_WORDS
+from cow_service.records import (
+    DIRECTED_KINDS,
+    Asked,
+    InterventionKind,
+    MotionKind,
+    PlaceRelation,
+    Until,
+    Vector,
+)
 
-MAX_OBJECT = 120  # characters
 MAX_OTHERS = 4
 MIN_SENTENCE, MAX_SENTENCE = 8, 240  # characters
-KINDS: tuple[MotionKind, ...] = get_args(MotionKind)
+_SAID_ALIKE = ("sentence", "speed", "distance", "duration", "until")  # fields of a reply and of `MotionHints`
 _NAMES = ("object", "moving_object", "mover", "object_name", "final_result", "result")
 _INNER = ("name", "label", "object", "description")  # of an object that is an object itself
 _ANSWERS = frozenset({"yes", "no", "not sure", "unsure", "true", "false", "unknown", "maybe"})
@@ -40,96 +57,221 @@ _SAID = re.compile(
     r"(?:final result|(?:moving )?object|mover|(?:object|thing) that moves)[*\"'`]*\s*(?:is|:|=)\s*(?P<name>[^\n]+)",
     re.IGNORECASE,
 )
+_DENIAL = re.compile(
+    r"\b(?:not|none|cannot|can['’]?t|couldn['’]?t|sorry|unable|unclear|unknown|impossible|or|there (?:is|are))\b"
+    r"|n['’]t\b|\bno\b(?!\.?\s*\d)",
+    re.IGNORECASE,
+)
+# One sentence that an object is not in the picture, and nothing else.
+_ABSENT = re.compile(
+    r"\W*(?:sorry,? |unfortunately,? )?(?:(?:but )?"
+    r"i (?:can(?:no|['’])t|can not|do(?: not|n['’]t)) (?:see|find|locate|identify)"
+    r"|there (?:is|are|['’]s) (?:no|not any)|no)\b[^.!?:;{}]{1,80}\b(?:in|on|visible in|present in|shown in) "
+    r"(?:the|this|your) (?:given |provided )?(?:image|picture|photo|photograph|scene|frame)\W*",
+    re.IGNORECASE,
+)
+_POINTING = frozenset({"it", "this", "that", "them", "they", "object", "the object", "moving object"})
+_CHANGES = {
+    "removed": "remove", "removal": "remove", "take away": "remove", "put": "place", "placed": "place", "add": "place",
+}  # fmt: skip
+_DIAGONAL = 0.5**0.5
+WAYS: dict[str, tuple[Vector, float]] = {  # direction in the image, and the depth's sense
+    "left": ((-1, 0), 0), "right": ((1, 0), 0), "up": ((0, -1), 0), "down": ((0, 1), 0),
+    "up-left": ((-_DIAGONAL, -_DIAGONAL), 0), "up-right": ((_DIAGONAL, -_DIAGONAL), 0),
+    "down-left": ((-_DIAGONAL, _DIAGONAL), 0), "down-right": ((_DIAGONAL, _DIAGONAL), 0),
+    "towards": ((0, 1), -1), "away": ((0, -1), 1),
+}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Identified:
-    """What moves, in words; nothing about where it is. `kind` and `sentence` are None where the reply has none."""
+def _known(kind: Any, synonyms: dict[str, str] | None = None, default: str | None = None) -> BeforeValidator:
+    """Reads one of the words of a `Literal`, or a synonym of one."""
+    known = {word: word for word in get_args(kind)} | (synonyms or {})
+    return BeforeValidator(lambda written: known.get(text_of(written).lower(), default))
 
-    object: str
-    others: tuple[str, ...] = ()
-    kind: MotionKind | None = None
-    sentence: str | None = None
-    changes: tuple[Change, ...] = ()
-    lengths: Lengths = NOT_SAID
-    legs: Legs = NO_LEGS
+
+def _names(most: int) -> tuple[Any, Any]:
+    """The annotations of a list of names. An object with a name is taken for it."""
+
+    def read(written: object) -> tuple[str, ...]:
+        parts = (first_of(fields_of(part), *_INNER) if isinstance(part, dict) else part for part in listed(written))
+        return tuple(dict.fromkeys(name_of(part) for part in parts if not is_none(part) and text_of(part)))[:most]
+
+    return Field(max_length=most), BeforeValidator(read)
+
+
+def _way(written: object) -> tuple[Vector, float] | None:
+    said = "-".join(text_of(written).lower().replace("the ", "").split())
+    known = WAYS.get(said) or next((WAYS[key] for key in ("towards", "away") if said.startswith(key)), None)
+    if known is None:
+        return None
+    direction, sense = known
+    return depth_motion(sense) if sense else (direction, 0.0)
+
+
+def _relation(written: object) -> PlaceRelation | None:
+    return RELATION_WORDS.get(text_of(written).lower().replace("_", "-"))
+
+
+def _asked(written: object) -> Asked | None:
+    """What is asked; null where any of it cannot be read: no verdict is better than one on another question."""
+    given = fields_of(written)
+    fields = {name: given[name] for name in Asked.model_fields if not is_none(given.get(name))}
+    for name in fields.keys() & {"form", "relation"}:
+        fields[name] = text_of(fields[name]).lower()
+    if "within" in fields:
+        fields["within"] = seconds_of(fields["within"]) or fields["within"]
+    try:
+        return Asked.model_validate(fields)
+    except ValidationError:
+        return None
+
+
+def _sentence(written: object) -> str | None:
+    sentence = text_of(written)
+    return sentence if MIN_SENTENCE <= len(sentence) <= MAX_SENTENCE else None
+
+
+Name = Annotated[str, Field(min_length=1), BeforeValidator(name_of)]
+_WAY = BeforeValidator(_way), WithJsonSchema(one_of(*WAYS))
+
+
+class Change(Reply):
+    """A change of the scene before anything moves, in words."""
+
+    other_names: ClassVar = {"object": ("name", "label"), "targets": ("target",)}
+    kind: Annotated[InterventionKind, _known(InterventionKind, _CHANGES)]
+    object: Name
+    relation: Annotated[PlaceRelation | None, BeforeValidator(_relation)] = None
+    targets: Annotated[tuple[str, ...], *_names(2)] = ()
+
+    @model_validator(mode="after")
+    def _check_place(self) -> Change:
+        if self.kind == "place" and (self.relation is None or not self.targets):
+            raise ValueError("says not where to")
+        return self
+
+
+class Leg(Reply):
+    """A further leg of the motion."""
+
+    other_names: ClassVar = {"way": ("direction",)}
+    way: Annotated[tuple[Vector, float], *_WAY]
+    distance: Distance = None
+    duration: Seconds = None
+
+
+class AlsoMoving(Reply):
+    """Another thing that is set moving at the same time."""
+
+    other_names: ClassVar = {"object": ("name", "label"), "way": ("direction",)}
+    object: Name
+    kind: Annotated[MotionKind, _known(MotionKind, default="linear")]
+    way: Annotated[tuple[Vector, float] | None, *_WAY] = None
+
+    @property
+    def hint(self) -> OtherMotionHint:
+        """As stage 2 takes it."""
+        direction, depth = self.way if self.way is not None and self.kind in DIRECTED_KINDS else (None, 0.0)
+        return OtherMotionHint(object=self.object, kind=self.kind, direction=direction, depth=depth)
+
+    @model_validator(mode="after")
+    def _check_way(self) -> AlsoMoving:
+        if self.kind == "place" or (self.kind in DIRECTED_KINDS and self.way is None):
+            raise ValueError("says not which way")
+        return self
+
+
+class Identified(Reply):
+    """What is asked and what moves, in words; nothing about where it is. Null is what the reply does not say."""
+
+    other_names: ClassVar = {"object": _NAMES}
+    object: Annotated[str, PlainValidator(text_of), WithJsonSchema(nullable(words(MAX_NAME)))]
+    others: Annotated[tuple[str, ...], *_names(MAX_OTHERS)]
+    asked: Annotated[Asked | None, BeforeValidator(_asked)]
+    kind: Annotated[MotionKind | None, _known(MotionKind)]
+    sentence: Annotated[str | None, PlainValidator(_sentence), WithJsonSchema(words(MAX_SENTENCE))]
+    changes: Annotated[tuple[Change, ...], usable(Change)] = ()
+    speed: Speed = None
+    distance: Distance = None
+    duration: Seconds = None
+    until: Annotated[Until | None, _known(Until)] = None
+    then: Annotated[tuple[Leg, ...], usable(Leg)] = ()
+    also_moving: Annotated[tuple[AlsoMoving, ...], usable(AlsoMoving)] = ()
+
+    @property
+    def must_be_found(self) -> tuple[str, ...]:
+        """The things that are changed, move at the same time, or are asked about."""
+        names = [name for change in self.changes for name in (change.object, *change.targets)]
+        names += [each.object for each in self.also_moving]
+        if self.asked is not None:
+            names += [name for name in (self.asked.subject, self.asked.target, *self.asked.among) if name is not None]
+        return tuple(names)
+
+    @property
+    def hints(self) -> dict[str, Any]:
+        """Fields of `MotionHints`, as far as the reply says them."""
+        return {
+            **{name: value for name in _SAID_ALIKE if (value := getattr(self, name)) is not None},
+            "then": tuple(StepReading(*each.way, each.distance, each.duration) for each in self.then),
+            "also": tuple(each.hint for each in self.also_moving),
+        }
 
 
 def identify_call(question: str, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
-    """The call that asks which object moves, in words, and how."""
-    return PromptCall("identify", {"question": question}, (image.jpeg,), schema(reasoning_length), read_identified)
-
-
-def schema(reasoning_length: int) -> Schema:
-    """JSON schema of the reply."""
-    optional = CHANGE_FIELDS | LENGTH_FIELDS | LEG_FIELDS
-    return object_of(
-        optional,
-        reasoning=words(reasoning_length),
-        object=nullable(words(MAX_OBJECT)),
-        others={"type": "array", "items": words(MAX_OBJECT), "maxItems": MAX_OTHERS},
-        kind=one_of(*KINDS),
-        sentence=words(MAX_SENTENCE),
-        **optional,
-    )
+    """The call that asks what is asked, which object moves, in words, and how."""
+    schema = schema_of(Identified, reasoning_length=reasoning_length)
+    return PromptCall("identify", {"question": question}, (image.jpeg,), schema, read_identified)
 
 
 def read_identified(reply: str) -> Identified | None:
     """The object that a reply names; None where it says that there is none. Raises `ReplyError`."""
     said = without_thinking(reply)
     values = values_in(said)
-    found = [named for value in values for named in _named(value)]
+    found = [fields for value in values for fields in _replies(value)]
     if not found and not any(isinstance(value, dict | list) or value is None for value in values):
-        found = [Identified(name) for name in _in_prose(said)]
-    absent = [named for named in found if says_absent(named.object)]
-    if (found and len(absent) == len(found)) or (not found and says_absent(said)):
-        return None
-    if not found:
-        if any(_says_none(value) for value in values):
+        found = [{"object": name} for name in _in_prose(said)]
+    names = [text_of(fields["object"]) for fields in found]
+    if names:
+        if all(map(_ABSENT.fullmatch, names)):
             return None
+    elif _ABSENT.fullmatch(said) or any(_says_none(value) for value in values):
+        return None
+    else:
         raise ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
-    for named in found:
-        _check(named.object)
-    if len({tuple(name_words(named.object)) for named in found}) > 1:
-        raise ReplyError(f"several objects are named ({', '.join(n.object for n in found)}); name the one that moves")
-    return found[-1]
+    for name in names:
+        _check(name)
+    if len(set(map(name_words, names))) > 1:
+        raise ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
+    return _consistent(Identified.model_validate(found[-1]))
 
 
-def _named(value: object) -> Iterator[Identified]:
+def _replies(value: object) -> Iterator[dict[str, Any]]:
+    """The fields of each reply in a value that names an object, without headings and lists around it."""
     if isinstance(value, list):
-        for part in cast("list[object]", value):
-            yield from _named(part) if isinstance(part, dict) else _as_words(part)
+        for part in listed(value):
+            yield from _replies(part if isinstance(part, dict) else {"object": part})
     fields = fields_of(value)
     name = first_of(fields, *_NAMES)
-    names = cast("list[object]", name) if isinstance(name, list) else [name]
-    for each in names:
+    for each in listed(name):
         inner = fields_of(each)
-        if any(key in inner for key in _NAMES) and "kind" in inner:  # the whole reply, under a heading
-            yield from _named(each)
+        if "kind" in inner and not inner.keys().isdisjoint(_NAMES):  # the whole reply, under a heading
+            yield from _replies(each)
             continue
-        kind, sentence = text_of(fields.get("kind")).lower(), text_of(fields.get("sentence"))
-        for named in _as_words(first_of(inner, *_INNER) if inner else each):
-            changes = read_changes(fields)
-            placed = any(each.kind == "place" and _same(each.object, named.object) for each in changes)
-            said_kind: MotionKind | None = next((known for known in KINDS if known == kind), None)
-            yield Identified(
-                object=named.object,
-                others=_others(fields, named.object),
-                kind=None if said_kind == "place" and not placed else said_kind,
-                sentence=sentence if MIN_SENTENCE <= len(sentence) <= MAX_SENTENCE else None,
-                changes=changes,
-                lengths=read_lengths(fields),
-                legs=read_legs(fields),
-            )
+        for named in listed(first_of(inner, *_INNER) if inner else each):
+            if not is_none(named) and text_of(named):
+                yield fields | {"object": named}
 
 
-def _same(one: str, other: str) -> bool:
-    return name_words(one) == name_words(other)
-
-
-def _as_words(value: object) -> Iterator[Identified]:
-    if not is_none(value) and text_of(value):
-        yield Identified(text_of(value))
+def _consistent(found: Identified) -> Identified:
+    """Without what contradicts the rest of the same reply."""
+    mover = name_words(found.object)
+    placed = any(each.kind == "place" and name_words(each.object) == mover for each in found.changes)
+    asked = found.asked
+    if asked is not None and asked.subject is not None and name_words(asked.subject) == mover:
+        asked = asked.model_copy(update={"subject": None})  # null is the mover
+    others = tuple(name for name in found.others if name_words(name) != mover)
+    kind = None if found.kind == "place" and not placed else found.kind
+    return found.model_copy(update={"others": others, "asked": asked, "kind": kind})
 
 
 def _says_none(value: object) -> bool:
@@ -155,20 +297,11 @@ def _unquoted(text: str) -> str:
 
 
 def _check(name: str) -> None:
-    if len(name) > MAX_OBJECT:
+    if len(name) > MAX_NAME:
         raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
     if _LETTERED.match(name) or (len(name.split()) <= 3 and plain(name) in _ANSWERS):
         raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
-    if names_nothing(name):
+    if _DENIAL.search(name) or name.lower().strip(" .") in _POINTING:
         raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
     if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
         raise ReplyError(f"'{name}' names no object; say in words what moves")
-
-
-def _others(fields: dict[str, Any], mover: str) -> tuple[str, ...]:
-    held = fields.get("others")
-    parts = cast("list[object]", held) if isinstance(held, list) else [held]
-    inner = [first_of(fields_of(part), *_INNER) if isinstance(part, dict) else part for part in parts]
-    names = [text_of(each)[:MAX_OBJECT] for each in inner if not is_none(each)]
-    kept = [name for name in names if name and name_words(name) != name_words(mover)]
-    return tuple(dict.fromkeys(kept))[:MAX_OTHERS]

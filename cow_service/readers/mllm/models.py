@@ -7,6 +7,7 @@ from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Any
 
+from openai import AsyncAzureOpenAI, AsyncOpenAI
 from pydantic_ai.exceptions import UserError
 from pydantic_ai.models import Model, infer_model
 from pydantic_ai.models.openai import OpenAIChatModel
@@ -15,10 +16,12 @@ from pydantic_ai.providers import infer_provider_class
 from pydantic_ai.providers.openai_compatible import OpenAICompatibleProvider
 
 from cow_service.errors import ReaderUnavailable
+from cow_service.readers.chat import Upstream
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Family, Manifest, load_families, load_manifests
 
 UNKNOWN = "generic"  # the manifest, and the family, for models that no other one describes
+NO_KEY = "none"  # what stands for a key where a client library wants one
 OWN_PROTOCOL = ("anthropic", "google", "google-gla")  # these speak their own protocol at a base URL, too
 
 
@@ -123,7 +126,7 @@ def _openai_compatible(base_url: str, key: str | None, name: str, family: Family
         # The older name is the one that every such server knows.
         openai_chat_supports_max_completion_tokens=False,
     )
-    provider = OpenAICompatibleProvider("mllm", base_url=base_url, api_key=key or "none")
+    provider = OpenAICompatibleProvider("mllm", base_url=base_url, api_key=key or NO_KEY)
     return OpenAIChatModel(name, provider=provider, profile=profile)
 
 
@@ -145,3 +148,16 @@ def _model_of(name: str, model: str, base_url: str | None, key: str | None) -> M
             raise
         raise ReaderUnavailable("it needs a key: set COW_MLLM_API_KEY, or the provider's own variable.") from error
     return infer_model(f"{name}:{model}", provider_factory=lambda _: provider)
+
+
+def upstream_of(settings: Settings, resolved: ResolvedModel, configured: ConfiguredModel) -> Upstream | None:
+    """The OpenAI-compatible server of the settings, or that of a provider; None for a protocol of its own."""
+    if settings.mllm_base_url is not None and resolved.provider not in OWN_PROTOCOL:
+        key = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
+        return Upstream(settings.mllm_base_url.rstrip("/"), resolved.name, key)
+    client: Any = getattr(configured.model, "client", None)
+    # Azure's addresses and headers are its own.
+    if not isinstance(client, AsyncOpenAI) or isinstance(client, AsyncAzureOpenAI):
+        return None
+    key = client.api_key if client.api_key != NO_KEY else None
+    return Upstream(str(client.base_url).rstrip("/"), resolved.name, key or None)

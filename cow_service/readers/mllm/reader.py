@@ -18,46 +18,46 @@ from cow_service.readers.base import (
     Imagined,
     MotionHints,
     MotionReading,
+    OtherMotionHint,
+    OtherMotionReading,
     Quantity,
     QuestionReading,
     ReaderInput,
 )
 from cow_service.readers.chat import ChatTurn, Upstream
-from cow_service.readers.embedded.english.questions import parse, parse_noun_phrase
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
-from cow_service.readers.mllm.changes import located_changes, names_of
-from cow_service.readers.mllm.checks import box_warnings, follow_arrow
 from cow_service.readers.mllm.client import MllmClient, PromptCall
-from cow_service.readers.mllm.directions import Line
+from cow_service.readers.mllm.coordinates import EncodedImage, covers_image, encode
+from cow_service.readers.mllm.estimates import HEADING_DEVIATION, SPEED_DEVIATION
 from cow_service.readers.mllm.hypothesis import pictures
-from cow_service.readers.mllm.identify import Identified, identify_call
-from cow_service.readers.mllm.images import EncodedImage, encode
-from cow_service.readers.mllm.legs import NO_LEGS, located_others
-from cow_service.readers.mllm.lengths import NOT_SAID
-from cow_service.readers.mllm.locate import Located, locate_call
-from cow_service.readers.mllm.models import UNKNOWN, configure, resolve_model
-from cow_service.readers.mllm.others import separate_objects
-from cow_service.readers.mllm.priors import HEADING_DEVIATION, SPEED_DEVIATION
+from cow_service.readers.mllm.identify import Change, Identified, identify_call
+from cow_service.readers.mllm.locate import Located, Scale, locate_call, scale_call, separate_objects
+from cow_service.readers.mllm.models import UNKNOWN, configure, resolve_model, upstream_of
 from cow_service.readers.mllm.replies import name_words
-from cow_service.readers.mllm.scale import Scaled, scale_call
-from cow_service.readers.mllm.upstream import upstream_of
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
     AnswerOption,
     BBox,
-    Cue,
     Grounding,
+    Intervention,
     LocatedObject,
     MotionKind,
     ReaderInfo,
     Source,
+    Vector,
 )
 from cow_service.settings import Settings
+from cow_service.vision.arrow_choice import arrow_at
+from cow_service.vision.masks import iou
+from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import PROMPTS
 
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
+DEFAULT_KIND: MotionKind = "linear"
+ARROW_TOLERANCE = 25.0  # degrees between an arrow and what was read of it; past that the arrow is right
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
 
 
@@ -120,12 +120,11 @@ class MllmReader:
             raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image. {GIVE_PLACE}")
         with given.cpu():
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
-            phrase = parse_noun_phrase(identified.object)
-            warnings = box_warnings(given.scene, bbox, phrase.colour if phrase else None, located.clipped)
+            warnings = box_warnings(given.scene, bbox, identified.object, located.clipped)
         others, doubles = separate_objects(bbox, located.others)
         mover = LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
         missing = f"{self._subject} does not see '{{name}}' in the image, which the question changes. {GIVE_PLACE}"
-        interventions = located_changes(identified.changes, mover, others, missing)
+        interventions = _located_changes(identified.changes, mover, others, missing)
         removed = {each.object.bbox for each in interventions if each.kind == "remove"}
         if located.label and set(name_words(located.label)).isdisjoint(name_words(identified.object)):
             mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
@@ -139,22 +138,22 @@ class MllmReader:
             warnings=(*warnings, *located.warnings, *doubles, *self._family_warnings()),
             hints=hints if given.motion_wanted else None,
             prior=located.prior,
+            asked=identified.asked,
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
-        """No call with hints; one without them where the request gave the place, else two.
+        """No call with hints, else two.
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
         """
         warnings: tuple[str, ...] = ()
         if hints is None:
-            image, identified = self._encode(given), None
-            if grounding.source != "request":
-                identified = self._client.complete(identify_call(given.question, image, self._reasoning), given)
+            image = self._encode(given)
+            identified = self._client.complete(identify_call(given.question, image, self._reasoning), given)
             located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
             warnings = () if located is None else located.warnings
-        kind = hints.kind or _kind(given, None)
-        others = located_others(hints.also, grounding.others)
+        kind = hints.kind or DEFAULT_KIND
+        others = _located_others(hints.also, grounding.others)
         reading = MotionReading(kind, None, "text", sentence=hints.sentence, warnings=warnings, others=others)
         if kind in FALLING_KINDS:
             reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
@@ -193,12 +192,11 @@ class MllmReader:
 
         None where the place was not asked for, or the object not seen. Raises `MllmBadReply`, `MllmUnavailable`.
         """
-        kind = _kind(given, identified)
+        kind = (identified.kind if identified else None) or DEFAULT_KIND
         others: tuple[str, ...] = ()
         if identified is not None and bbox is None:
-            moving = (each.object for each in identified.legs.also)
-            sought = (each for each in given.sought if name_words(each) != name_words(name))
-            others = tuple(dict.fromkeys((*names_of(identified.changes, name), *moving, *sought, *identified.others)))
+            named = (*identified.must_be_found, *given.sought, *identified.others)
+            others = tuple(dict.fromkeys(each for each in named if name_words(each) != name_words(name)))
         wants_direction = given.motion_wanted and kind in DIRECTED_KINDS
         wants_place = bbox is None or wants_direction
         wants_scale = given.motion_wanted and kind in FALLING_KINDS
@@ -209,35 +207,24 @@ class MllmReader:
             calls.append(scale_call(image, name, self._reasoning))
         results = iter(self._client.complete_all(calls, given))
         located: Located | CowError | None = next(results) if wants_place else None
-        scaled: Scaled | CowError | None = next(results) if wants_scale else None
+        scaled: Scale | CowError | None = next(results) if wants_scale else None
         if isinstance(located, CowError):
             raise located
-        line = Line() if located is None or located.line is None else located.line
-        scale = scaled if isinstance(scaled, Scaled) else Scaled()
-        lengths, legs = (NOT_SAID, NO_LEGS) if identified is None else (identified.lengths, identified.legs)
-        return located, MotionHints(
-            kind=kind,
-            sentence=identified.sentence if identified else None,
-            ends=line.ends,
-            camera=line.camera,
-            depth_degrees=line.depth_degrees,
-            speed=lengths.speed or line.speed,
-            distance=lengths.distance,
-            duration=lengths.duration,
-            until=lengths.until,
-            then=legs.then,
-            also=legs.also,
-            cue=line.cue,
-            along_arrow=line.along_arrow,
-            metres_per_pixel=scale.metres_per_pixel,
-            down=scale.down,
-            scale_error=scaled.code if isinstance(scaled, CowError) else None,
-        )
+        hints: dict[str, Any] = {"kind": kind}
+        if located is not None and (line := located.line) is not None:
+            hints |= {"ends": line.direction} | line.model_dump(exclude={"direction"})
+        if identified is not None:
+            hints |= identified.hints
+        if isinstance(scaled, Scale):
+            hints |= {"metres_per_pixel": scaled.metres_per_pixel, "down": scaled.down}
+        elif isinstance(scaled, CowError):
+            hints["scale_error"] = scaled.code
+        return located, MotionHints(**hints)
 
     def _directed(
         self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints
     ) -> MotionReading:
-        """The reading with its direction, checked against the drawn arrow where the question speaks of one."""
+        """The reading with its direction, checked against the drawn arrow where one is the cue."""
         if hints.ends is None and hints.camera is None:
             raise CannotReadDirection(
                 f"{self._subject} found nothing in the image or the question that tells which way the "
@@ -250,10 +237,7 @@ class MllmReader:
             reading = replace(reading, speed=hints.speed)
         elif hints.speed is not None:
             reading = replace(reading, speed=hints.speed, speed_deviation=SPEED_DEVIATION)
-        question = parse(given.question)
-        words = question.motion
-        guess: Cue = "arrow" if question.mentions_arrow else "text" if words.direction is not None else "orientation"
-        cue = hints.cue or guess
+        cue = hints.cue or "orientation"
         if hints.camera is not None:
             direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
             return replace(reading, direction=direction, depth=depth, depth_deviation=HEADING_DEVIATION, cue=cue)
@@ -261,12 +245,11 @@ class MllmReader:
             depth = math.sin(math.radians(hints.depth_degrees))
             reading = replace(reading, depth=depth, depth_deviation=HEADING_DEVIATION)
         (x0, y0), (x1, y1) = hints.ends or ((0.0, 0.0), (1.0, 0.0))
-        along = hints.along_arrow if cue == "arrow" else None
-        reading = replace(reading, direction=(x1 - x0, y1 - y0), cue=cue, along_arrow=along)
-        if not question.mentions_arrow:
+        reading = replace(reading, direction=(x1 - x0, y1 - y0), cue=cue)
+        if cue != "arrow":
             return reading
         with given.cpu():
-            return follow_arrow(given.scene, grounding.bbox, reading, words.arrow)
+            return follow_arrow(given.scene, grounding.bbox, replace(reading, along_arrow=hints.along_arrow))
 
     def _family_warnings(self) -> tuple[str, ...]:
         manifest, family = self._model.manifest, self._model.family
@@ -285,7 +268,87 @@ def create(settings: Settings) -> MllmReader:
     return MllmReader("mllm", MllmClient(configured, settings), settings.mllm_base_url or "", upstream)
 
 
-def _kind(given: ReaderInput, identified: Identified | None) -> MotionKind:
-    """What the model said, else what the question's verb says."""
-    said = None if identified is None else identified.kind
-    return said or parse(given.question).motion.kind or "linear"
+def follow_arrow(scene: Scene, bbox: BBox, reading: MotionReading) -> MotionReading:
+    """The reading, with the direction of the arrow drawn at the object where the two are at odds.
+
+    `along_arrow` says whether the object moves with it; where the reader does not say, only the arrow's axis counts.
+    """
+    arrow = arrow_at(scene, bbox)
+    if arrow is None or reading.direction is None:
+        return reading
+    along = reading.along_arrow
+    if along is None:
+        along = _angle(reading.direction, arrow.direction) <= 90
+    sign = 1.0 if along else -1.0
+    drawn = sign * arrow.direction[0], sign * arrow.direction[1]
+    off = _angle(reading.direction, drawn)
+    if off <= ARROW_TOLERANCE:
+        return reading
+    warning = (
+        f"The reader's direction is {off:.0f} degrees off the arrow drawn at the object "
+        f"(followed {'along' if along else 'against'} it): the arrow was taken."
+    )
+    # Its sentence was worded for another direction.
+    warnings = (*reading.warnings, warning)
+    return replace(reading, direction=drawn, along_arrow=along, sentence=None, warnings=warnings)
+
+
+def box_warnings(scene: Scene, bbox: BBox, name: str, clipped: bool) -> tuple[str, ...]:
+    """What speaks against a box that was given for an object of this name; empty where nothing does.
+
+    `clipped`: the box reached over the image's edge.
+    """
+    found: list[str] = []
+    if clipped:
+        found.append("The reader's box reaches over the image's edge; it was cut off there.")
+    if covers_image(scene.width, scene.height, bbox):
+        found.append("The reader's box covers nearly the whole image: it may not be that of one object.")
+    colours = set(name_words(name))
+    there = [each for each in scene.regions if each.colour in colours and iou(each.bbox, bbox) < SAME_OBJECT_IOU]
+    here = scene.region_of(bbox) if there else None
+    if here is not None and colours.isdisjoint((here.colour, *here.colours)):
+        x, y = there[0].centre
+        found.append(
+            f"The reader's box is around something {here.colour}, while something {there[0].colour} is at "
+            f"({x:.0f}, {y:.0f}): the box may be wrong."
+        )
+    return tuple(found)
+
+
+def _angle(a: Vector, b: Vector) -> float:
+    """Degrees between two vectors, 0 to 180."""
+    return abs(math.degrees(math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])))
+
+
+def _located_changes(
+    changes: Sequence[Change], mover: LocatedObject, others: Sequence[LocatedObject], missing: str
+) -> tuple[Intervention, ...]:
+    """The changes with the places of their objects. Raises `ObjectNotFound`, with `missing` and the name put in."""
+    known = {name_words(each.object): each for each in (mover, *others)}
+
+    def place(name: str) -> LocatedObject:
+        found = known.get(name_words(name))
+        if found is None:
+            raise ObjectNotFound(missing.format(name=name))
+        return found.model_copy(update={"role": "target"})
+
+    return tuple(
+        Intervention(
+            kind=each.kind, object=place(each.object), relation=each.relation, targets=tuple(map(place, each.targets))
+        )
+        for each in changes
+    )
+
+
+def _located_others(
+    hints: Sequence[OtherMotionHint], others: Sequence[LocatedObject]
+) -> tuple[OtherMotionReading, ...]:
+    """Other movers with their places. Raises `CannotReadDirection` for one that was not found."""
+    known = {name_words(each.object): each for each in others}
+    found: list[OtherMotionReading] = []
+    for hint in hints:
+        place = known.get(name_words(hint.object))
+        if place is None:
+            raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found. {GIVE_DIRECTION}")
+        found.append(OtherMotionReading(place, hint.kind, hint.direction, hint.depth))
+    return tuple(found)

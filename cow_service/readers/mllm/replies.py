@@ -1,4 +1,4 @@
-"""From the raw text of a model's reply to plain values: objects and lists, wherever in the text they stand.
+"""What a model wrote, as values: JSON wherever in the text it stands, read into models that declare what a prompt asks.
 
 Models fence their JSON, quote it as Python does, think aloud before it or write prose around it. What is malformed is
 repaired by a library, but only where its brackets close: a reply that was cut short must not become a shorter number.
@@ -10,11 +10,17 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any, TypeGuard, cast
+from typing import Any, ClassVar, TypeGuard, TypeVar, cast
 
 from json_repair import repair_json
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+
+Schema = dict[str, Any]
 
 MAX_LENGTH = 20_000  # characters behind the thinking; a longer reply is not looked through
+MAX_NAME = 120  # characters of an object's name, and of any text without a limit of its own
+MAX_LISTED = 4  # entries of a list without a limit of its own
+COORDINATES = "coordinates"  # key of a schema that stands for so many numbers as the model's family writes them
 _FENCE = re.compile(r"```[\w+-]*[ \t]*\n?(.*?)```", re.DOTALL)
 _THOUGHT = re.compile(r"</(?:think|thinking|thought|reasoning|seed:think)>|◁/think▷|<\|channel\|>final<\|message\|>")
 _THINKING = re.compile(r"<(?:think|thinking|thought|seed:think)>|◁think▷|<\|channel\|>analysis")
@@ -22,12 +28,103 @@ _OPENING = {"{": "}", "[": "]"}
 _NOTHING = frozenset({"", "none", "null", "n/a", "not found", "nothing"})
 _NO_JSON = object()
 _DETERMINERS = frozenset({"the", "a", "an", "this", "that"})
-_BEFORE_STRING = frozenset("{[,:(")
-_AFTER_STRING = frozenset("}],:)")
+_BEFORE_STRING, _AFTER_STRING = frozenset("{[,:("), frozenset("}],:)")
+_SCHEMA_KEYS = ("type", "enum", "minimum", "maximum", "minItems", "maxItems", "maxLength")
 
 
 class ReplyError(Exception):
-    """A reply cannot be used. The message says why, in words that the model can act on."""
+    """A reply cannot be used. The message says why, in words that the model can act on.
+
+    Not a `ValueError`: raised in a validator, it passes through pydantic as it is.
+    """
+
+
+class Reply(BaseModel):
+    """An object that a prompt asks for. Its JSON schema goes to the server, which must give fields without a default.
+
+    Reading is more tolerant: names of fields may be spelled and capitalised differently, and a missing field is null.
+    """
+
+    model_config = ConfigDict(frozen=True)
+    other_names: ClassVar[dict[str, tuple[str, ...]]] = {}  # under which models give a field, too
+
+    @model_validator(mode="before")
+    @classmethod
+    def _find_fields(cls, written: object) -> object:
+        if isinstance(written, cls):
+            return written
+        fields = fields_of(written)
+        return {name: first_of(fields, name, *cls.other_names.get(name, ())) for name in cls.model_fields}
+
+
+R = TypeVar("R", bound=Reply)
+
+
+def usable(kind: type[R], most: int = MAX_LISTED) -> BeforeValidator:
+    """Reads a list of objects, or one alone. What is none of that kind is left out."""
+
+    def read(written: object) -> tuple[R, ...]:
+        found: list[R] = []
+        for part in listed(written)[:most]:
+            with suppress(ValidationError):  # a word instead of an object is its first field
+                found.append(
+                    kind.model_validate(part if isinstance(part, dict) else {next(iter(kind.model_fields)): part})
+                )
+        return tuple(found)
+
+    return BeforeValidator(read)
+
+
+def schema_of(*kinds: type[Reply], reasoning_length: int, numbers: Schema | None = None, box_key: str = "") -> Schema:
+    """The JSON schema of a reply with the fields of these models, in the few forms that every server takes.
+
+    `reasoning` comes first. `numbers` is the schema of coordinates, and `box_key` what the model's family calls a box.
+    """
+
+    def adapted(schema: Schema, definitions: Schema) -> Schema:
+        if "$ref" in schema:
+            schema = definitions[schema["$ref"].rpartition("/")[2]]
+        if COORDINATES in schema:
+            count = schema[COORDINATES]
+            return nullable({"type": "array", "items": numbers, "minItems": count, "maxItems": count})
+        if "anyOf" in schema:
+            return {"anyOf": [adapted(each, definitions) for each in schema["anyOf"]]}
+        kept = {key: schema[key] for key in _SCHEMA_KEYS if key in schema}
+        if kept.get("type") == "string" and "enum" not in kept:
+            kept.setdefault("maxLength", MAX_NAME)
+        if kept.get("type") == "array":
+            kept |= {"items": adapted(schema["items"], definitions), "maxItems": kept.get("maxItems", MAX_LISTED)}
+        if "properties" in schema:
+            names = {name: box_key if name == "bbox" else name for name in schema["properties"]}
+            kept["properties"] = {
+                names[name]: adapted(each, definitions) for name, each in schema["properties"].items()
+            }
+            kept["required"] = [names[name] for name in schema.get("required", ())]
+            kept["additionalProperties"] = False
+        return kept
+
+    whole: Schema = {"type": "object", "properties": {"reasoning": words(reasoning_length)}, "required": ["reasoning"]}
+    for kind in kinds:
+        schema = kind.model_json_schema()
+        part = adapted(schema, schema.get("$defs", {}))
+        whole["properties"] |= part["properties"]
+        whole["required"] += part["required"]
+    return whole | {"additionalProperties": False}
+
+
+def words(longest: int) -> Schema:
+    """The schema of a text of at most so many characters."""
+    return {"type": "string", "maxLength": longest}
+
+
+def one_of(*values: str) -> Schema:
+    """The schema of one of some words."""
+    return {"type": "string", "enum": list(values)}
+
+
+def nullable(schema: Schema) -> Schema:
+    """That, or null."""
+    return {"anyOf": [schema, {"type": "null"}]}
 
 
 def without_thinking(text: str) -> str:
@@ -56,6 +153,11 @@ def values_in(text: str) -> tuple[Any, ...]:
     return tuple(fenced or _bracketed(text))
 
 
+def is_broken_json(said: str) -> bool:
+    """Whether a text without a value in it began as JSON: cut short, it is no prose to read answers from."""
+    return re.match(r"\W*(?:json\s*)?\{", said) is not None
+
+
 def fields_of(value: object) -> dict[str, Any]:
     """An object's fields with plain names: lower case, words joined by _; none where the value is no object."""
     if not isinstance(value, dict):
@@ -67,6 +169,11 @@ def fields_of(value: object) -> dict[str, Any]:
 def first_of(fields: dict[str, Any], *names: str) -> Any:
     """The value of the first of some fields that is there; None where none is."""
     return next((fields[name] for name in names if name in fields), None)
+
+
+def listed(written: object) -> list[Any]:
+    """A field that should hold a list; anything else is a list of one, and nothing an empty one."""
+    return cast("list[Any]", written) if isinstance(written, list) else [] if written is None else [written]
 
 
 def is_none(value: object) -> bool:
@@ -81,8 +188,8 @@ def is_number(value: object) -> TypeGuard[int | float]:
 
 def truth_of(value: object) -> bool | None:
     """A field that should hold true or false, also as a word; None where it holds neither."""
-    words = {"true": True, "yes": True, "false": False, "no": False}
-    return value if isinstance(value, bool) else words.get(value.strip().lower()) if isinstance(value, str) else None
+    meanings = {"true": True, "yes": True, "false": False, "no": False}
+    return value if isinstance(value, bool) else meanings.get(text_of(value).lower())
 
 
 def text_of(value: object) -> str:
@@ -90,9 +197,14 @@ def text_of(value: object) -> str:
     return " ".join(value.split()) if isinstance(value, str) else ""
 
 
-def name_words(name: str) -> list[str]:
-    """The words of an object's name without determiners, lower case."""
-    return [word for word in re.findall(r"\w+", name.lower()) if word not in _DETERMINERS]
+def name_of(value: object) -> str:
+    """A field that should hold the name of an object."""
+    return text_of(value)[:MAX_NAME]
+
+
+def name_words(name: str) -> tuple[str, ...]:
+    """The words of an object's name without determiners, lower case: names with the same words are the same."""
+    return tuple(word for word in re.findall(r"\w+", name.lower()) if word not in _DETERMINERS)
 
 
 def _parsed(text: str) -> Any:
@@ -123,9 +235,10 @@ def _spans(text: str) -> Iterator[str]:
             skipped = False
         elif quote:
             skipped = char == "\\"
-            if char == quote and _next(text, at) in _AFTER_STRING:
+            # An unescaped quotation mark inside a string is not followed by what follows a string.
+            if char == quote and text[at + 1 : at + 40].lstrip()[:1] in _AFTER_STRING:
                 quote = ""
-        elif waiting and char in "\"'" and _previous(text, at) in _BEFORE_STRING:
+        elif waiting and char in "\"'" and text[max(0, at - 40) : at].rstrip()[-1:] in _BEFORE_STRING:
             quote = char
         elif char in _OPENING:
             start = start if waiting else at
@@ -134,12 +247,3 @@ def _spans(text: str) -> Iterator[str]:
             waiting.pop()
             if not waiting:
                 yield text[start : at + 1]
-
-
-def _next(text: str, at: int) -> str:
-    """The next character that is no space; only a few are looked at."""
-    return text[at + 1 : at + 40].lstrip()[:1]
-
-
-def _previous(text: str, at: int) -> str:
-    return text[max(0, at - 40) : at].rstrip()[-1:]
