@@ -9,9 +9,8 @@ from pathlib import Path
 
 from drawn import ball, floor, png_bytes
 
-from cow_service.evals.items import Item, Task
-from cow_service.evals.observations import Observation, RunInfo
-from cow_service.evals.runs import Run
+from cow_service.evals.items import Item, Observation, RunInfo, Task
+from cow_service.evals.runs import EvalRun
 from cow_service.records import AnswerOption
 
 LETTERS = "ABCD"
@@ -116,7 +115,7 @@ def run(
     tasks: Sequence[Task] = ("collision", "trajectory"),
     mllm: str = "openai/small",
     reply_length: int = 40,
-) -> Run:
+) -> EvalRun:
     """Asked about `count` items of these tasks in turn."""
     items: list[Item] = []
     observations: list[Observation] = []
@@ -132,4 +131,4 @@ def run(
             for repeat in range(1, repeats + 1)
         ]
     asked = info(arms, repeats, items, mllm)
-    return Run(folder, asked, {each.id: each for each in items}, tuple(observations))
+    return EvalRun(folder, asked, {each.id: each for each in items}, tuple(observations))

@@ -22,12 +22,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.errors import InvalidRequest
-from cow_service.evals.items import question_text
+from cow_service.evals.asking import order_of
+from cow_service.evals.items import Pictures, appended_wording, listed_wording, question_text
 from cow_service.evals.loaders import load
-from cow_service.evals.loaders.collecting import Collected
-from cow_service.evals.pictures import Pictures
-from cow_service.evals.replies import order_of
-from cow_service.evals.wording import appended_wording, listed_wording
+from cow_service.evals.loaders.rows import Collected
 from cow_service.readers.options import split_options
 
 SAMPLE = ROOT / "cow-scenes" / "sample"
@@ -245,7 +243,7 @@ def test_a_data_set_of_the_hub_is_downloaded_and_read(tmp_path: Path) -> None:
     shard = (tmp_path / "occlusion" / "train.parquet").read_bytes()
     program = (
         "import sys; from pathlib import Path; from cow_service.evals.loaders import load;"
-        "from cow_service.evals.pictures import Pictures;"
+        "from cow_service.evals.items import Pictures;"
         "print([item.id for item in load(sys.argv[1], Pictures(Path('pictures'))).items])"
     )
     with running() as one:

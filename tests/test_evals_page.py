@@ -16,18 +16,17 @@ from playwright.sync_api import Page, expect
 pytest.importorskip("matplotlib")
 pytest.importorskip("scipy")
 
-from cow_service.evals.report.page import write_page
-from cow_service.evals.report.page_data import script_json
-from cow_service.evals.report.plots import write_plots
+from cow_service.evals.report.page import script_json, write_page
 from cow_service.evals.report.summary import summarize
-from cow_service.evals.runs import Run
+from cow_service.evals.report.write import write_plots
+from cow_service.evals.runs import EvalRun
 
 ARMS = ("never", "always", "placebo-still")
 ODD = "trajectory-3"  # is refused, fails and replies with markup
 
 
 @pytest.fixture(scope="module")
-def asked(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def asked(tmp_path_factory: pytest.TempPathFactory) -> EvalRun:
     """Six questions, each asked twice in three arms."""
     folder = tmp_path_factory.mktemp("a run & more")
     found = run(folder, 6, ARMS)
@@ -53,7 +52,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def report(asked: Run) -> Path:
+def report(asked: EvalRun) -> Path:
     folder, summaries = asked.folder / "report", summarize([asked])
     return write_page(folder, [asked], summaries, write_plots(folder, summaries), [("By hand", "Said <b>plainly</b>.")])
 
@@ -136,7 +135,7 @@ def test_what_others_wrote_is_text(report: Path, windows: Windows) -> None:
     expect(page.get_by_text("Said <b>plainly</b>.")).to_be_visible()
 
 
-def test_a_report_elsewhere_finds_its_pictures(asked: Run, tmp_path: Path, windows: Windows) -> None:
+def test_a_report_elsewhere_finds_its_pictures(asked: EvalRun, tmp_path: Path, windows: Windows) -> None:
     for copied in (False, True):
         folder = tmp_path / f"copied {copied}"
         path = write_page(folder, [asked], summarize([asked]), copy_pictures=copied)
@@ -147,14 +146,14 @@ def test_a_report_elsewhere_finds_its_pictures(asked: Run, tmp_path: Path, windo
         )
 
 
-def test_two_runs_of_the_same_questions_share_cards(asked: Run, tmp_path: Path, windows: Windows) -> None:
+def test_two_runs_of_the_same_questions_share_cards(asked: EvalRun, tmp_path: Path, windows: Windows) -> None:
     other = replace(asked, info=asked.info.model_copy(update={"mllm": "other/model"}))
     page = windows.open(write_page(tmp_path, [asked, other], summarize([asked, other])).as_uri())
     expect(page.locator(".card")).to_have_count(6)
     expect(page.locator(".card").first.locator(".arm")).to_have_count(6)
 
 
-def test_a_run_without_replies_and_pictures_has_a_page(asked: Run, tmp_path: Path, windows: Windows) -> None:
+def test_a_run_without_replies_and_pictures_has_a_page(asked: EvalRun, tmp_path: Path, windows: Windows) -> None:
     nothing = replace(asked, folder=tmp_path / "lost", observations=())
     page = windows.open(write_page(tmp_path, [nothing], ()).as_uri())
     expect(page.locator(".card")).to_have_count(6)

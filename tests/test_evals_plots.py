@@ -15,8 +15,8 @@ from PIL import Image
 pytest.importorskip("matplotlib")
 pytest.importorskip("scipy")
 
-from cow_service.evals.report.plots import PLOTS, write_plots
 from cow_service.evals.report.summary import ArmSummary, Price, summarize
+from cow_service.evals.report.write import PLOTS, write_plots
 
 NINE = (
     "never",
@@ -117,6 +117,6 @@ def test_odd_names_of_models_are_drawn(tmp_path: Path) -> None:
 
 
 def test_matplotlib_is_imported_where_it_is_used() -> None:
-    code = "import cow_service.evals.report.plots, sys; print('matplotlib' in sys.modules)"
+    code = "import cow_service.evals.report.write, sys; print('matplotlib' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"

@@ -7,7 +7,7 @@ import tomllib
 import pytest
 from conftest import ROOT
 
-from cow_service.evals.replies import read_as_paper, read_reply
+from cow_service.evals.asking import read_as_paper, read_reply
 from cow_service.records import AnswerOption
 
 OPTIONS = tuple(

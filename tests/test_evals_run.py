@@ -20,11 +20,10 @@ import pytest
 from conftest import EXAMPLES, ROOT, SCALE
 from truth_mllm import TruthMllm, truth_mllm
 
-from cow_service.evals.items import Item
+from cow_service.evals.items import Item, Pictures
 from cow_service.evals.loaders import load
-from cow_service.evals.pictures import Pictures
 from cow_service.evals.report.summary import ArmSummary, summarize
-from cow_service.evals.runs import Run, read_run
+from cow_service.evals.runs import EvalRun, read_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(420)]
 SAMPLE = ROOT / "cow-scenes" / "sample"
@@ -77,7 +76,7 @@ def evaluated(
 class Done:
     """A run of all arms, and what was asked in it."""
 
-    run: Run
+    run: EvalRun
     arms: dict[str, ArmSummary]
     mllm: TruthMllm
     out: Path

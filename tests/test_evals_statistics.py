@@ -13,7 +13,7 @@ from conftest import SCALE
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.evals.observations import Observation
+from cow_service.evals.items import Observation
 from cow_service.evals.statistics import bootstrap_interval, calibration, cost, gain, holm, rates
 
 SCENES, REPEATS, RUNS, WITHIN = 42, 5, 20, 18

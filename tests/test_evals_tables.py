@@ -11,12 +11,10 @@ import pytest
 from asked_runs import HOSTILE, run
 from conftest import ROOT
 
-from cow_service.evals.prices import read_prices
-from cow_service.evals.report.contents import pairs, tables
-from cow_service.evals.report.summary import ArmSummary, summarize
-from cow_service.evals.report.tables import Table, csv_text, latex, markdown
+from cow_service.evals.report.summary import ArmSummary, read_prices, summarize
+from cow_service.evals.report.tables import Table, csv_text, latex, markdown, pairs, tables
 from cow_service.evals.report.write import write_report
-from cow_service.evals.runs import Run
+from cow_service.evals.runs import EvalRun
 
 GOLDEN = ROOT / "tests" / "data" / "evals"
 FORMS = {"md": markdown, "csv": csv_text, "tex": latex}
@@ -24,12 +22,12 @@ TASKS = ("collision", "trajectory", "compatibility", "occlusion")
 
 
 @pytest.fixture(scope="module")
-def asked(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def asked(tmp_path_factory: pytest.TempPathFactory) -> EvalRun:
     return run(tmp_path_factory.mktemp("run"), count=24, repeats=3, tasks=TASKS)
 
 
 @pytest.fixture(scope="module")
-def summaries(asked: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[ArmSummary, ...]:
+def summaries(asked: EvalRun, tmp_path_factory: pytest.TempPathFactory) -> tuple[ArmSummary, ...]:
     prices = tmp_path_factory.mktemp("prices") / "prices.yaml"
     prices.write_text("openai/small: {input: 2, output: 10}\n")
     return summarize([asked], read_prices(prices))
@@ -42,7 +40,7 @@ def test_tables_are_as_they_were(form: str, summaries: tuple[ArmSummary, ...]) -
     assert told == (GOLDEN / f"tables.{form}").read_text(encoding="utf-8")
 
 
-def test_the_figures_of_a_table_are_those_of_the_replies(asked: Run, summaries: tuple[ArmSummary, ...]) -> None:
+def test_the_figures_of_a_table_are_those_of_the_replies(asked: EvalRun, summaries: tuple[ArmSummary, ...]) -> None:
     by_name = {table.name: table for table in tables(summaries)}
     rows = {(row[0], row[1]): dict(zip(by_name["levels"].header, row, strict=True)) for row in by_name["levels"].rows}
     for arm in asked.info.arms:
@@ -52,7 +50,7 @@ def test_the_figures_of_a_table_are_those_of_the_replies(asked: Run, summaries: 
     assert rows["GPT-5 (paper)", "TPR"]["all"] == "54.17"
 
 
-def test_every_question_and_repeat_has_a_row_of_its_own(asked: Run, summaries: tuple[ArmSummary, ...]) -> None:
+def test_every_question_and_repeat_has_a_row_of_its_own(asked: EvalRun, summaries: tuple[ArmSummary, ...]) -> None:
     rows = list(csv.DictReader(io.StringIO(csv_text(pairs([asked], summaries)))))
     assert len(rows) == 24 * 3
     for row in rows[:20]:

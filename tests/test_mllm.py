@@ -647,7 +647,7 @@ BALL = json.dumps({"object": "red ball", "others": [], "kind": "linear", "senten
 def test_a_drawn_arrow_is_right_where_the_reader_is_not(
     question, direction, along, expected, warned, scene, mllm: MllmServer, make
 ) -> None:
-    mllm.say(BALL, located(direction, along=along))
+    mllm.say(BALL, located(direction, "arrow" if "arrow" in question else "text", along))
     told = post(make(), "/simulate", image=scene, question=question)
     assert angle_between(told["motion"]["direction"], expected) < 2.5
     assert any("the arrow was taken" in warning for warning in told["warnings"]) == warned

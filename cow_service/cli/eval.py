@@ -112,9 +112,9 @@ def run(
     Exit code 0: all were asked; 3: some failed, with their reasons in the report; 1: the run could not begin or go on.
     """
     _check_installed()
-    from cow_service.evals.layout import REPORT  # noqa: PLC0415
     from cow_service.evals.plan import Plan  # noqa: PLC0415
     from cow_service.evals.run import evaluate  # noqa: PLC0415
+    from cow_service.evals.runs import REPORT  # noqa: PLC0415
 
     arms = [name.strip() for text in arm or ["never,always"] for name in text.split(",") if name.strip()]
     plan = Plan(
@@ -166,8 +166,7 @@ def report(
 ) -> None:
     """Compare runs: tables, plots and a page that opens without a server."""
     _check_installed()
-    from cow_service.evals.layout import REPORT  # noqa: PLC0415
-    from cow_service.evals.runs import read_run  # noqa: PLC0415
+    from cow_service.evals.runs import REPORT, read_run  # noqa: PLC0415
 
     priced = _priced(prices)
     _report([read_run(folder) for folder in runs], out or runs[0] / REPORT, priced)
@@ -182,7 +181,7 @@ def _report(runs: list[Any], out: Path, prices: dict[str, Any]) -> None:
 
 
 def _priced(path: Path | None) -> dict[str, Any]:
-    from cow_service.evals.prices import read_prices  # noqa: PLC0415
+    from cow_service.evals.report.summary import read_prices  # noqa: PLC0415
 
     return {} if path is None else read_prices(path)
 

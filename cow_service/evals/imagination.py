@@ -1,24 +1,115 @@
-"""Asks a server for simulations, each item's once: what is shown of it, and what it cost."""
+"""What a question is asked with: the arms that an evaluation compares."""
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import re
 import time
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 from cow_service.client import AsyncClient
+from cow_service.client.errors import Canceled
 from cow_service.client.results import AsyncSimulation
-from cow_service.errors import CannotGround, CannotReadDirection, CowError, MllmBadReply
-from cow_service.evals.arms import Shown
-from cow_service.evals.idempotency import asked_once
-from cow_service.evals.items import Item, question_text
-from cow_service.evals.pictures import Pictures
+from cow_service.errors import CannotGround, CannotReadDirection, CowError, InvalidRequest, MllmBadReply
+from cow_service.evals.items import Ask, Item, Pictures, question_text
 from cow_service.media.images import decode, encode_png, fit_within
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.hypothesis import hypothesis
 from cow_service.records import DIRECTED_KINDS, Motion, Simulation, Usage
+
+Shown = Literal["nothing", "simulation", "still", "wrong-direction", "facts", "oracle"]
+MAX_TRIES = 16
+_BEST_OF = re.compile(r"best-of-(\d+)")
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What is shown beside the image, and how often it is asked."""
+
+    name: str
+    shown: Shown = "nothing"
+    with_image: bool = True  # whether the question's image is shown
+    gated: bool = False  # whether the answers from the image alone decide if anything is imagined
+    tries: int = 1  # simulations, a reply each; the most frequent answer is taken
+
+    @property
+    def asks(self) -> tuple[Ask, ...]:
+        """The ways to ask in which there is such an arm."""
+        plain = self.shown in ("nothing", "simulation") and self.with_image
+        return ("prompt", "answer") if plain else ("prompt",)
+
+
+ARMS: dict[str, tuple[Arm, str]] = {
+    arm.name: (arm, meaning)
+    for arm, meaning in (
+        (Arm("never"), "the image alone"),
+        (Arm("always", "simulation"), "the image and frames of its imagined future"),
+        (Arm("auto", "simulation", gated=True), "the same where three answers from the image alone disagree"),
+        (
+            Arm("best-of-3", "simulation", tries=3),
+            "three simulations, each with its own seed: the most frequent answer",
+        ),
+        (Arm("placebo-still", "still"), "the first image again in place of each frame"),
+        (Arm("placebo-direction", "wrong-direction"), "frames of a simulation in the opposite direction"),
+        (Arm("encounters", "facts"), "the image, and what the simulation found in words; no frames"),
+        (Arm("frames-only", "simulation", with_image=False), "the frames without the image"),
+        (Arm("oracle", "oracle"), "the image and pictures of what really happens"),
+    )
+}
+
+
+def arm_of(name: str) -> Arm:
+    """The arm of a name; `best-of-K` for any number of simulations. Raises `InvalidRequest` for another name."""
+    best = _BEST_OF.fullmatch(name)
+    if best and 2 <= int(best[1]) <= MAX_TRIES:
+        return Arm(name, "simulation", tries=int(best[1]))
+    if name not in ARMS:
+        raise InvalidRequest(
+            f"There is no arm '{name}': there are {', '.join(ARMS)}, and best-of-K for K from 2 to {MAX_TRIES}."
+        )
+    return ARMS[name][0]
+
+
+def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[Arm, ...]:
+    """The arms of these names. Raises `InvalidRequest` for one that cannot be asked so, or of these items."""
+    arms = tuple(arm_of(name) for name in dict.fromkeys(names))
+    if not arms:
+        raise InvalidRequest(f"Name at least one arm: {', '.join(ARMS)}.")
+    for arm in arms:
+        if ask not in arm.asks:
+            there = ", ".join(name for name, (each, _) in ARMS.items() if ask in each.asks)
+            raise InvalidRequest(
+                f"The service's own /answer has no arm '{arm.name}', only {there}: use --ask prompt with --mllm."
+            )
+    without = [item for item in items if not item.oracle]
+    if without and any(arm.shown == "oracle" for arm in arms):
+        raise InvalidRequest(
+            f"The arm 'oracle' needs pictures of what really happens, and {len(without)} of {len(items)} items have "
+            f"none, such as {without[0].row}."
+        )
+    return arms
+
+
+MAX_INTERRUPTS = 20  # of one run, each of which may have canceled the same job
+Result = TypeVar("Result")
+
+
+async def asked_once(ask: Callable[[str], Awaitable[Result]], *parts: str) -> Result:
+    """What `ask` returns under the key of these parts.
+
+    A job that an interrupt has canceled stays so under its key: then there is another key. Raises what `ask` raises.
+    """
+    for attempt in range(MAX_INTERRUPTS):
+        key = hashlib.sha256("\n".join((*parts, str(attempt))).encode()).hexdigest()
+        try:
+            return await ask(key)
+        except Canceled:
+            continue
+    raise Canceled(f"The same job was canceled {MAX_INTERRUPTS} times.")
+
 
 NO_USAGE = Usage()
 # What an image and a question may come to: nothing is imagined, and the question is asked without. All else is a fault.

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
 
 from pydantic import Field
 
+from cow_service.media.artifacts import extension_of, media_type_of
+from cow_service.media.images import decode
+from cow_service.readers.options import split_options
 from cow_service.records import AnswerOption, Record
 from cow_service.records.base import Sha256
 
@@ -45,3 +51,153 @@ def question_text(item: Item, order: tuple[int, ...] | None = None) -> str:
 def letters(item: Item) -> tuple[str, ...]:
     """The letters that stand in the question, in their order."""
     return tuple(option.letter for option in item.options)
+
+
+LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+Wording = tuple[tuple[str, ...], tuple[AnswerOption, ...]]
+
+
+def listed_wording(question: str) -> Wording | None:
+    """The parts of a question around the options that it lists, and these; None where it lists none.
+
+    The letters and all words between the options stay where they are.
+    """
+    listed = split_options(question)
+    if not listed.options or len(listed.places) != len(listed.options):
+        return None
+    edges = [0, *(edge for place in listed.places for edge in place), len(question)]
+    parts = tuple(question[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True))
+    # As it stands there: a text may go over several lines.
+    options = tuple(
+        AnswerOption(letter=letter, text=question[begin:end])
+        for (letter, _), (begin, end) in zip(listed.options, listed.places, strict=True)
+    )
+    return parts, options
+
+
+def appended_wording(question: str, options: Sequence[str]) -> Wording:
+    """The same for a question whose options stand beside it: they are put below it, a line each, with letters."""
+    letters = LETTERS[: len(options)]
+    heads = [f"\n({letter}) " for letter in letters]
+    parts = (f"{question}\n{heads[0]}", *heads[1:], "")
+    return parts, tuple(AnswerOption(letter=letter, text=text) for letter, text in zip(letters, options, strict=True))
+
+
+class Pictures:
+    """A folder of pictures. The same bytes are kept once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self._known = {path.stem: path for path in folder.iterdir() if not path.name.startswith(".")}
+
+    def add(self, data: bytes) -> str:
+        """Keeps a picture; returns its digest. Raises what `decode` raises for what is none."""
+        digest = hashlib.sha256(data).hexdigest()
+        if digest not in self._known:
+            decode(data)
+            self._write(digest, data)
+        return digest
+
+    def add_made(self, data: bytes) -> str:
+        """The same for a picture that the service made."""
+        digest = hashlib.sha256(data).hexdigest()
+        if digest not in self._known:
+            self._write(digest, data)
+        return digest
+
+    def path(self, digest: str) -> Path:
+        """The file of a picture. Raises `KeyError` for one that was not added."""
+        return self._known[digest]
+
+    def read(self, digest: str) -> bytes:
+        """What a picture holds. Raises `KeyError` for one that was not added."""
+        return self.path(digest).read_bytes()
+
+    def _write(self, digest: str, data: bytes) -> None:
+        path = self.folder / f"{digest}.{extension_of(media_type_of(data) or 'image/png')}"
+        partial = path.with_name(f".{digest}.partial")
+        partial.write_bytes(data)
+        partial.replace(path)
+        self._known[digest] = path
+
+
+Ask = Literal["prompt", "answer"]
+
+
+class Observation(Record):
+    """One question, asked in one arm, in one repeat. Letters are those of the data's order, whatever was shown."""
+
+    item: str
+    task: Task
+    level: str
+    scene: str
+    arm: str
+    repeat: int = Field(ge=1)
+    options: tuple[str, ...] = Field(description="Letters of the data's order in the order in which they were shown.")
+    truth: str = Field(description="Letter of the right option.")
+    abstain: str | None = Field(description="Letter of the option that says that it is not sure.")
+    reply: str | None = Field(default=None, description="As it came; null where the question failed.")
+    read: str | None = Field(default=None, description="The letter that the reply chooses; null: unreadable.")
+    read_as_paper: str | None = Field(default=None, description="The letter that the paper's rules read in it.")
+    calls: int = Field(default=0, description="Of the multimodal LLM, those of the imagination included.")
+    input_tokens: int = 0
+    output_tokens: int = 0
+    seconds: float = Field(
+        default=0.0,
+        description="For simulations and replies, as if each were asked alone; what is found again takes less.",
+    )
+    imagining_seconds: float = Field(default=0.0, description="Of those, for simulations.")
+    imaginations: int = Field(default=0, description="Simulations that the reply rests on.")
+    refusal: str | None = Field(
+        default=None, description="Code of the problem for which nothing was imagined where it should have been."
+    )
+    frames: tuple[Sha256, ...] = Field(default=(), description="Pictures shown beside the image, in their order.")
+    overlay: Sha256 | None = None
+    probability: float | None = Field(
+        default=None, description="That what is asked happens, by the simulation; null where it tells nothing."
+    )
+    happens: bool | None = Field(default=None, description="Whether it does, by the truth; null: not a yes or no.")
+    failure: str | None = Field(default=None, description="Why there is no reply; such a question counts nowhere.")
+
+    @property
+    def right(self) -> bool:
+        """Whether the reply chooses the right option."""
+        return self.read == self.truth
+
+    @property
+    def abstained(self) -> bool:
+        """Whether the reply chooses the option that says that it is not sure."""
+        return self.read is not None and self.read == self.abstain
+
+    @property
+    def unreadable(self) -> bool:
+        """Whether there is a reply, and no option could be read in it."""
+        return self.failure is None and self.read is None
+
+
+class RunInfo(Record):
+    """What a folder of results was asked: as much as it takes to ask the same again."""
+
+    format: int = 1
+    data: str = Field(description="As it was given.")
+    data_digest: Sha256 = Field(description="Of the items, their pictures included.")
+    counts: dict[str, int] = Field(description="Items by task and level: `collision L1`.")
+    faults: tuple[str, ...] = Field(default=(), description="Rows that were left out, and why.")
+    notes: tuple[str, ...] = Field(default=(), description="What was found in the data and worked around, with counts.")
+    mllm: str = Field(description="Who answered, as Inspect names it, or `cow/embedded`.")
+    ask: Ask
+    arms: tuple[str, ...]
+    repeats: int = Field(ge=1)
+    seed: int
+    settings: dict[str, Any] = Field(description="Frames, reader, generator, generation settings.")
+    versions: dict[str, str] = Field(description="Of the packages and prompts.")
+    rounds: int = Field(default=0, description="How often what had failed was asked again.")
+    token: str = Field(default="", description="Random: names the requests and replies of the run.")
+    created_at: str = Field(description="RFC 3339, UTC.")
+
+    @property
+    def baseline_key(self) -> tuple[Any, ...]:
+        """What two runs have in common whose replies may be compared."""
+        generation: Any = self.settings.get("generation")
+        return self.data_digest, self.mllm, self.ask, self.seed, generation

@@ -1,23 +1,45 @@
-"""What is to be asked, checked before anything is, and as the record of the run."""
+"""What took part in an evaluation, and in which version."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
 import secrets
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from cow_service import __version__
 from cow_service.errors import InvalidRequest
-from cow_service.evals.arms import Arm
-from cow_service.evals.items import Item
+from cow_service.evals.imagination import Arm
+from cow_service.evals.items import Ask, Item, RunInfo
 from cow_service.evals.loaders import Collected, digest_of
-from cow_service.evals.observations import Ask, RunInfo
-from cow_service.evals.versions import versions
+from cow_service.readers.prompts import load_prompt
 from cow_service.settings import load_settings
+
+PACKAGES = ("inspect-ai", "numpy", "opencv-python-headless", "rapier3d", "scipy", "torch", "diffusers", "openai")
+PROMPTS = ("eval-question", "identify", "locate", "scale", "answer-from-image", "answer-with-frames")
+
+
+def versions() -> dict[str, str]:
+    """Of this service, of Python, of the packages that are installed, and of the prompts."""
+    found = {"cow-service": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    for name in PROMPTS:
+        prompt = load_prompt(name)
+        digest = hashlib.sha256(prompt.body.encode()).hexdigest()
+        found[f"prompts/{name}"] = f"{prompt.version} (sha256 {digest})"
+    return found
+
 
 # Providers that Inspect and the server in this process both know, and where both look for the key.
 KEYS = {"openai": "OPENAI_API_KEY", "anthropic": "ANTHROPIC_API_KEY", "google": "GOOGLE_API_KEY"}

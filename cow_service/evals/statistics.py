@@ -14,7 +14,7 @@ from pydantic import Field
 from scipy.stats import binomtest
 from scipy.stats import t as student_t
 
-from cow_service.evals.observations import Observation
+from cow_service.evals.items import Observation
 from cow_service.records import Record
 
 RESAMPLES = 10_000

@@ -6,13 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cow_service.errors import InvalidRequest
-from cow_service.evals.loaders.causalspatial import SUBSETS, load_causalspatial, subset_shards
-from cow_service.evals.loaders.collecting import Collected, collect, digest_of, refuse_broken, refuse_faults
+from cow_service.evals.items import Pictures
+from cow_service.evals.loaders.formats import (
+    READERS,
+    SUBSETS,
+    load_causalspatial,
+    scene_folders,
+    scene_rows,
+    subset_shards,
+    table_rows,
+)
 from cow_service.evals.loaders.hub import CAUSALSPATIAL, download, is_hub_name
-from cow_service.evals.loaders.rows import RowFault
-from cow_service.evals.loaders.scenes import scene_folders, scene_rows
-from cow_service.evals.loaders.tables import READERS, table_rows
-from cow_service.evals.pictures import Pictures
+from cow_service.evals.loaders.rows import Collected, RowFault, collect, digest_of, refuse_broken, refuse_faults
 
 __all__ = ["CAUSALSPATIAL", "SUBSETS", "Collected", "RowFault", "digest_of", "load"]
 

@@ -1,21 +1,30 @@
-"""The page of a report: one HTML file that opens without a server, with every question, picture and reply."""
+"""The page of a report: one HTML file that opens without a server, with every question, picture and reply.
+
+What it shows stands in it as compact JSON: texts, pictures and lists that come again are named by their place.
+"""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import json
+import os
+import shutil
+from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
+from xml.etree import ElementTree
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from cow_service.evals.report.page_data import Pictures, page_arms, page_data, script_json
-from cow_service.evals.report.page_svg import inline_svg
-from cow_service.evals.report.summary import ArmSummary
-from cow_service.evals.runs import Run
+from cow_service.evals.items import Item, Observation
+from cow_service.evals.report.summary import BASELINE, ArmSummary, baseline_run
+from cow_service.evals.runs import PICTURES, EvalRun
 
 PAGE = "index.html"
 SCRIPTS = ("data.js", "filters.js", "cards.js", "main.js")
@@ -26,11 +35,16 @@ TITLES = {
     "calibration": "Calibration of the told probabilities",
     "cost": "Right answers against their cost",
 }
+ITEMS_PER_BLOCK = 100  # items whose replies are read together, once one of them is opened
+SVG, LINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}href"
+# The four colours of figures.py that are not an arm's own.
+THEMED = {"#17211f": "var(--ink)", "#566360": "var(--dim)", "#d5dbd8": "var(--line)", "#fefefe": "var(--panel)"}
+PIXELS_PER_POINT = 1.2
 
 
 def write_page(
     folder: Path,
-    runs: Sequence[Run],
+    runs: Sequence[EvalRun],
     summaries: Sequence[ArmSummary],
     plots: Sequence[Path] = (),
     sections: Sequence[tuple[str, str]] = (),
@@ -44,8 +58,8 @@ def write_page(
     """
     folder.mkdir(parents=True, exist_ok=True)
     arms = page_arms(runs, summaries)
-    core, replies = page_data(runs, arms, Pictures(folder, runs, copy_pictures))
-    style, script = _joined(STYLES), "'use strict';\n" + _joined(SCRIPTS)
+    core, replies = page_data(runs, arms, _PictureLinks(folder, runs, copy_pictures))
+    style, script = "".join(map(_source, STYLES)), "'use strict';\n" + "".join(map(_source, SCRIPTS))
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template.filters |= {"percent": _percent, "points": _points, "p": _p}
     text = template.from_string(_source("template.html")).render(
@@ -77,10 +91,6 @@ def _source(name: str) -> str:
     return (files("cow_service.evals.report") / "page" / name).read_text(encoding="utf-8")
 
 
-def _joined(names: Sequence[str]) -> str:
-    return "".join(_source(name) for name in names)
-
-
 def _policy(style: str, script: str) -> str:
     """Nothing but this script, this style, and pictures beside the page: whatever a reply says, it does nothing."""
 
@@ -110,3 +120,184 @@ def _p(value: Any) -> str:
     if value is None:
         return ""
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+class _Interned:
+    """Values, each once, and the place of each."""
+
+    def __init__(self) -> None:
+        self.values: list[Any] = []
+        self._places: dict[Any, int] = {}
+
+    def place(self, value: Any) -> int:
+        """Of a value, which is added where it is new."""
+        if value not in self._places:
+            self._places[value] = len(self.values)
+            self.values.append(value)
+        return self._places[value]
+
+    def place_or_none(self, value: Any) -> int | None:
+        return None if value is None else self.place(value)
+
+
+@dataclass(frozen=True)
+class PageArm:
+    """One arm of one run; `against`: the place of its baseline among the arms."""
+
+    name: str
+    run: int
+    arm: str
+    against: int | None = None
+
+
+def page_arms(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> tuple[PageArm, ...]:
+    """Of all runs; those without any reply too, of which there is no summary."""
+    names = {(each.run, each.arm): each.name for each in summaries}
+    keys = [(number, arm) for number, run in enumerate(runs) for arm in run.info.arms]
+    arms: list[PageArm] = []
+    for number, arm in keys:
+        own = f"{runs[number].info.mllm}, {arm} ({number + 1})" if len(runs) > 1 else arm
+        baseline = None if arm == BASELINE else baseline_run(runs, runs[number])
+        against = None if baseline is None else keys.index((runs.index(baseline), BASELINE))
+        arms.append(PageArm(names.get((number, arm)) or own, number, arm, against))
+    return tuple(arms)
+
+
+class _PictureLinks:
+    """Addresses of pictures, relative to the page."""
+
+    def __init__(self, folder: Path, runs: Sequence[EvalRun], copied: bool) -> None:
+        self._folder, self._copied = folder, copied
+        self._files: dict[str, Path] = {}
+        for run in runs:
+            own = run.folder / PICTURES
+            for path in sorted(own.iterdir()) if own.is_dir() else ():
+                self._files.setdefault(path.stem, path)
+
+    def address(self, digest: str) -> str | None:
+        """None where the file is not there."""
+        path = self._files.get(digest)
+        if path is None:
+            return None
+        try:
+            if not self._copied:
+                return quote(Path(os.path.relpath(path.resolve(), self._folder.resolve())).as_posix())
+        except ValueError:  # on another drive: there is no relative path
+            pass
+        to = self._folder / PICTURES / path.name
+        if not to.exists():
+            to.parent.mkdir(exist_ok=True)
+            shutil.copyfile(path, to)
+        return quote(f"{PICTURES}/{path.name}")
+
+
+def page_data(
+    runs: Sequence[EvalRun], arms: Sequence[PageArm], links: _PictureLinks
+) -> tuple[dict[str, Any], list[list[str]]]:
+    """What the page needs at once, and the texts of the replies in blocks of items."""
+    data, pictures, shown, reasons, replies = (_Interned() for _ in range(5))
+
+    def packed_observation(each: Observation) -> list[Any]:
+        """The order is that of `readObservation` in page/data.js."""
+        return [
+            each.repeat,
+            "".join(each.options),
+            each.read,
+            each.read_as_paper,
+            replies.place_or_none(each.reply),
+            shown.place(tuple(map(pictures.place, each.frames))),
+            pictures.place_or_none(each.overlay),
+            reasons.place_or_none(each.refusal),
+            reasons.place_or_none(each.failure),
+            None if each.probability is None else round(each.probability, 4),
+            each.happens,
+            round(each.seconds, 2),
+            each.imaginations,
+        ]
+
+    def packed_item(item: Item, of_data: int, seen: Sequence[Sequence[Observation]]) -> list[Any]:
+        """The order is that of `readItem` in page/data.js."""
+        return [
+            of_data,
+            item.id,
+            item.row,
+            item.scene,
+            item.task,
+            item.level,
+            item.question,
+            [[each.letter, each.text] for each in item.options],
+            item.answer,
+            item.abstain,
+            pictures.place(item.image),
+            [pictures.place(each) for each in item.oracle],
+            [[packed_observation(each) for each in of_arm] for of_arm in seen],
+        ]
+
+    asked: dict[tuple[int, str], Item] = {}
+    seen: dict[tuple[int, str, int], list[Observation]] = defaultdict(list)
+    places = {(each.run, each.arm): place for place, each in enumerate(arms)}
+    for number, run in enumerate(runs):
+        of_data = data.place(run.info.data_digest)
+        for item in run.items.values():
+            asked.setdefault((of_data, item.id), item)
+        for each in run.observations:
+            if (number, each.arm) in places:
+                seen[of_data, each.item, places[number, each.arm]].append(each)
+    items: list[list[Any]] = []
+    blocks: list[list[str]] = []
+    for place, (key, item) in enumerate(asked.items()):
+        if place % ITEMS_PER_BLOCK == 0:
+            replies = _Interned()
+            blocks.append(replies.values)
+        of_arms = [sorted(seen.get((*key, arm), ()), key=lambda each: each.repeat) for arm in range(len(arms))]
+        items.append(packed_item(item, key[0], of_arms))
+    names = {each.data_digest: each.data for each in (run.info for run in reversed(runs))}
+    core = {
+        "perBlock": ITEMS_PER_BLOCK,
+        "data": [names[digest] for digest in data.values],
+        "arms": [[each.name, each.against] for each in arms],
+        "shown": shown.values,
+        "reasons": reasons.values,
+        "pictures": [links.address(each) for each in pictures.values],
+        "items": items,
+    }
+    return core, blocks
+
+
+def script_json(value: Any) -> str:
+    """JSON that can stand in a script element: nothing in it can end the element or open another."""
+    text = json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+    for letter in "<>&\u2028\u2029":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return text
+
+
+def inline_svg(path: Path, name: str) -> str:
+    """The file's drawing for an HTML page. `name` is what a screen reader calls it."""
+    root = ElementTree.parse(path).getroot()
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag == f"{SVG}style" or not child.tag.startswith(SVG) or child.tag == f"{SVG}metadata":
+                parent.remove(child)
+    kept = {each.attrib[LINK][1:] for each in root.iter() if LINK in each.attrib}
+    kept |= {each.attrib["id"] for each in root.iter(f"{SVG}clipPath")}
+    for each in root.iter():
+        _plain(each, kept)
+    for side in ("width", "height"):
+        root.attrib[side] = f"{float(root.attrib[side].removesuffix('pt')) * PIXELS_PER_POINT:.0f}"
+    # What matplotlib says in a style element, which the policy of the page does not let in.
+    root.attrib |= {"stroke-linejoin": "round", "role": "img", "aria-label": name}
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _plain(element: ElementTree.Element, kept: set[str]) -> None:
+    """Declarations of the style attribute as attributes of their own; ids that nothing refers to go."""
+    element.tag = element.tag.removeprefix(SVG)
+    if element.attrib.get("id") not in kept:
+        element.attrib.pop("id", None)
+    if LINK in element.attrib:
+        element.attrib["href"] = element.attrib.pop(LINK)
+    for declaration in element.attrib.pop("style", "").split(";"):
+        key, _, value = declaration.partition(":")
+        if value:
+            element.attrib[key.strip()] = THEMED.get(value.strip(), value.strip())

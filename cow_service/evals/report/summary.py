@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
-from pydantic import Field
+import yaml
+from pydantic import Field, TypeAdapter, ValidationError
 
-from cow_service.evals.items import TASKS, Task
-from cow_service.evals.observations import Observation
-from cow_service.evals.runs import Run
+from cow_service.errors import InvalidRequest
+from cow_service.evals.items import TASKS, Observation, Task
+from cow_service.evals.runs import EvalRun
 from cow_service.evals.statistics import (
     Calibration,
     Cost,
@@ -63,7 +66,7 @@ class Price(Record):
     output: float = Field(ge=0)
 
 
-def summarize(runs: Sequence[Run], prices: Mapping[str, Price] | None = None) -> tuple[ArmSummary, ...]:
+def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None) -> tuple[ArmSummary, ...]:
     """Of every arm that has replies, in the order of the runs and of their arms."""
     several = len({run.info.mllm for run in runs}) > 1 or len(runs) > 1
     found: list[ArmSummary] = []
@@ -75,7 +78,8 @@ def summarize(runs: Sequence[Run], prices: Mapping[str, Price] | None = None) ->
                 continue
             name = f"{run.info.mllm}, {arm}" if several else arm
             known = {each.name for each in found}
-            baseline = [] if arm == BASELINE else _baseline(runs, run)
+            compared = None if arm == BASELINE else baseline_run(runs, run)
+            baseline = [] if compared is None else compared.of_arm(BASELINE)
             found.append(
                 ArmSummary(
                     run=place,
@@ -93,14 +97,10 @@ def summarize(runs: Sequence[Run], prices: Mapping[str, Price] | None = None) ->
     return tuple(found)
 
 
-def _baseline(runs: Sequence[Run], run: Run) -> list[Observation]:
-    """The replies without imagination: of the same run, else of the first that asked the same of the same model."""
-
-    def same(other: Run) -> bool:
-        return run.info.baseline_key == other.info.baseline_key
-
-    candidates = [run, *(other for other in runs if other is not run and same(other))]
-    return next((found for other in candidates if (found := other.of_arm(BASELINE))), [])
+def baseline_run(runs: Sequence[EvalRun], run: EvalRun) -> EvalRun | None:
+    """The run with the replies without imagination: itself, else the first that asked the same of the same model."""
+    same = (other for other in runs if other is not run and other.info.baseline_key == run.info.baseline_key)
+    return next((each for each in (run, *same) if each.of_arm(BASELINE)), None)
 
 
 def _cells(observations: Sequence[Observation]) -> tuple[Cell, ...]:
@@ -134,3 +134,20 @@ def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation
 
 def _cost(observations: Sequence[Observation], price: Price | None) -> Cost:
     return cost(observations) if price is None else cost(observations, price.input, price.output)
+
+
+_TABLE: TypeAdapter[dict[str, Price]] = TypeAdapter(dict[str, Price])
+
+
+def read_prices(path: Path) -> dict[str, Price]:
+    """The prices of models, by their names. Raises `InvalidRequest` for a file that is none."""
+    try:
+        told: Any = yaml.safe_load(path.read_bytes())
+        return _TABLE.validate_python(told)
+    except OSError as error:
+        raise InvalidRequest(f"The prices '{path}' cannot be read: {error.strerror or error}.") from error
+    except (yaml.YAMLError, ValidationError) as error:
+        raise InvalidRequest(
+            f"'{path}' holds no prices: it must be like {{openai/gpt-5: {{input: 1.25, output: 10}}}}, per million "
+            f"tokens. {str(error).splitlines()[0]}"
+        ) from error

@@ -1,16 +1,59 @@
-"""Tables as Markdown, CSV and LaTeX."""
+"""The tables of a report, with what the paper printed beside them, as Markdown, CSV and LaTeX."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from cow_service.evals.asking import DIFFERENCES as READING
+from cow_service.evals.items import TASKS, Task
+from cow_service.evals.report.summary import ArmSummary
+from cow_service.evals.runs import EvalRun
+from cow_service.evals.statistics import Cost, Gain, Rates, Spread
 
 _LATEX = {
     **{character: f"\\{character}" for character in "&%$#_{}"},
     **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$"},
 }
+
+
+SOURCE = "CausalSpatial, arXiv 2601.13304"
+# Of all questions, in percent.
+PRINTED_TPR: dict[str, float] = {
+    "GPT-5": 54.17,
+    "Gemini 2.5 Pro": 50.55,
+    "Qwen3-VL-30B-T": 50.50,
+    "human": 84.49,
+}
+# Of COW with Qwen3-VL-30B-A3B-I over the same model without, in points.
+PRINTED_GAINS: dict[Task, float] = {"collision": 2.40, "trajectory": 2.20}
+PRINTED_MODEL = "Qwen3-VL-30B-A3B-I with COW"
+
+PROTOCOL = (
+    "Options are shown in a random order, another one in every repeat and the same in every arm; the public scripts "
+    "show them as the data has them.",
+    "The note about frames is worded anew; the question and the JSON template are the paper's.",
+    "An answer counts for the option whose text was shown with its letter.",
+    "Questions whose call failed count nowhere and are listed; the public scripts score the text of the error.",
+    "Intervals and tests are paired by question and drawn by scene; the paper prints means over repeats.",
+)
+DATA = (
+    "The paper's cells do not all follow from the published data (n = 1030; some of its cells have fewer questions, "
+    "and its abstain rates fit 958): figures stand beside each other and are not tuned to agree.",
+    "The option that abstains is found by its text, not by the column `not_sure`.",
+    "Items are told apart by subset, shard and row: ids are not unique.",
+)
+
+
+DIFFERENCES = {"Protocol": PROTOCOL, "Reading replies": READING, "Data": DATA}  # from the paper, by what they are about
+ALL = "all"
+NONE = ""  # a cell of which nothing is known
+_IN_SHORT = ("arm", "replies", "failed", "TPR, %", "NSR, %", "unreadable", "imagined", "refused")
+_GAINS_IN_SHORT = ("arm", "task", "questions", "gain, points", "95% interval", "helped", "hurt", "McNemar p")
 
 
 @dataclass(frozen=True)
@@ -23,20 +66,161 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
 
+def tables(summaries: Sequence[ArmSummary]) -> tuple[Table, ...]:
+    """All tables that have rows."""
+    found = (by_level(summaries), overview(summaries), gains(summaries), calibration(summaries), costs(summaries))
+    return tuple(table for table in found if table.rows)
+
+
+def by_level(summaries: Sequence[ArmSummary]) -> Table:
+    """As the paper prints it: right and abstained by task and level, with the paper's own figures below."""
+    keys = {(cell.task, cell.level) for each in summaries for cell in each.cells}
+    levels = Counter(task for task, level in keys if level is not None)
+    keys = {(task, level) for task, level in keys if level is None or levels[task] > 1}
+    columns = sorted(keys, key=lambda key: (TASKS.index(key[0]), key[1] is None, key[1] or ""))
+    rows: list[tuple[str, ...]] = []
+    for each in summaries:
+        found = {(cell.task, cell.level): cell.rates for cell in each.cells}
+        measured = [found.get(key) for key in columns] + [each.rates]
+        rows.append((each.name, "TPR", *(NONE if rates is None else _spread(rates.tpr) for rates in measured)))
+        rows.append((each.name, "NSR", *(NONE if rates is None else _spread(rates.nsr) for rates in measured)))
+    blank = (NONE,) * len(columns)
+    rows += [(f"{name} (paper)", "TPR", *blank, f"{value:.2f}") for name, value in PRINTED_TPR.items()]
+    header = ("arm", "%", *(f"{task} {level or ALL}" for task, level in columns), ALL)
+    title = f"Right (TPR) and abstained (NSR) of all questions, mean ± SD over repeats, %; paper: {SOURCE}"
+    return Table("levels", title, header, tuple(rows))
+
+
+def overview(summaries: Sequence[ArmSummary]) -> Table:
+    """The rates of each arm."""
+    columns: dict[str, Callable[[Rates], str]] = {
+        "questions": lambda rates: str(rates.questions),
+        "replies": lambda rates: str(rates.replies),
+        "failed": lambda rates: str(rates.failed),
+        "TPR, %": lambda rates: _spread(rates.tpr),
+        "NSR, %": lambda rates: _spread(rates.nsr),
+        "TPR by paper's reading, %": lambda rates: _spread(rates.tpr_as_paper),
+        "unreadable": lambda rates: str(rates.unreadable),
+        "imagined": lambda rates: f"{rates.imagined:.1%}",
+        "refused": lambda rates: f"{rates.refused:.1%}",
+    }
+    rows = tuple((each.name, *(cell(each.rates) for cell in columns.values())) for each in summaries)
+    return Table("arms", "Replies by arm", ("arm", *columns), rows)
+
+
+def gains(summaries: Sequence[ArmSummary]) -> Table:
+    """What each arm gains over `never`, and where the paper printed a gain, that."""
+    columns: dict[str, Callable[[Gain], str]] = {
+        "questions": lambda gain: str(gain.questions),
+        "scenes": lambda gain: str(gain.scenes),
+        "gain, points": lambda gain: f"{100 * gain.gain:+.2f}",
+        "95% interval": lambda gain: f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}",
+        "helped": lambda gain: str(gain.helped),
+        "hurt": lambda gain: str(gain.hurt),
+        "McNemar p": lambda gain: _p(gain.p),
+        "Holm p": lambda gain: NONE if gain.p_holm is None else _p(gain.p_holm),
+    }
+    known = [
+        (each.name, task, gain)
+        for each in summaries
+        for task, gain in ((ALL, each.gain), *((one.task, one.gain) for one in each.gains))
+        if each.gain is not None and gain is not None
+    ]
+    rows = [(name, task, *(cell(gain) for cell in columns.values())) for name, task, gain in known]
+    if rows:
+        printed = ((f"{PRINTED_MODEL} (paper)", task, f"{value:+.2f}") for task, value in PRINTED_GAINS.items())
+        rows += [(name, task, NONE, NONE, value, *(NONE,) * 5) for name, task, value in printed]
+    title = "Gain over the arm `never`, paired by question and repeat, drawn by scene"
+    return Table("gains", title, ("arm", "task", *columns), tuple(rows))
+
+
+def in_short(summaries: Sequence[ArmSummary]) -> Table:
+    """The rates of each arm, for a terminal."""
+    return _with_columns(overview(summaries), _IN_SHORT)
+
+
+def gains_in_short(summaries: Sequence[ArmSummary]) -> Table:
+    """The gains over all tasks, and those on each, for a terminal."""
+    whole = gains(summaries)
+    kept = tuple(row for row in whole.rows if row[-1] or row[1] == ALL)  # without those of the paper
+    return _with_columns(replace(whole, rows=kept), _GAINS_IN_SHORT)
+
+
+def _with_columns(whole: Table, header: tuple[str, ...]) -> Table:
+    places = [whole.header.index(name) for name in header]
+    rows = tuple(tuple(row[place] for place in places) for row in whole.rows)
+    return Table(f"{whole.name}-in-short", whole.title, header, rows)
+
+
+def calibration(summaries: Sequence[ArmSummary]) -> Table:
+    """How good the probabilities are that the simulations told."""
+    rows = [
+        (each.name, str(known.count), f"{known.brier:.3f}", f"{known.base_brier:.3f}")
+        for each in summaries
+        if (known := each.calibration) is not None
+    ]
+    header = ("arm", "questions", "Brier score", "of the base rate")
+    return Table("calibration", "Told probabilities of what is asked", header, tuple(rows))
+
+
+def costs(summaries: Sequence[ArmSummary]) -> Table:
+    """What a reply costs, as if each were asked alone."""
+    columns: dict[str, Callable[[Cost], str]] = {
+        "calls": lambda cost: _two_digits(cost.calls / cost.replies),
+        "input tokens": lambda cost: _two_digits(cost.input_tokens / cost.replies),
+        "output tokens": lambda cost: _two_digits(cost.output_tokens / cost.replies),
+        "seconds": lambda cost: f"{cost.seconds / cost.replies:.2f}",
+        "simulations": lambda cost: _two_digits(cost.imaginations / cost.replies),
+        "money in all": lambda cost: NONE if cost.money is None else f"{cost.money:.2f}",
+    }
+    rows = tuple((each.name, *(cell(each.cost) for cell in columns.values())) for each in summaries)
+    title = "Cost of a reply, simulations included, as if each were asked alone (means)"
+    return Table("cost", title, ("arm", *columns), rows)
+
+
+def pairs(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> Table:
+    """Every question and repeat, with what each arm chose; for further analysis."""
+    chosen = {
+        (run, each.arm, of.info.data_digest, each.item, each.repeat): each
+        for run, of in enumerate(runs)
+        for each in of.observations
+    }
+    places = {(of.info.data_digest, each.item, each.repeat): each for of in runs for each in of.observations}
+    rows: list[tuple[str, ...]] = []
+    for (data, item, repeat), each in sorted(places.items(), key=lambda place: place[0]):
+        told: list[str] = []
+        for one in summaries:
+            seen = chosen.get((one.run, one.arm, data, item, repeat))
+            is_reply = seen is not None and seen.failure is None
+            told += (seen.read or NONE, str(int(seen.right))) if is_reply else (NONE, NONE)
+        rows.append((data[:12], item, each.task, each.level, each.scene, str(repeat), each.truth, *told))
+    columns = tuple(f"{each.name}: {what}" for each in summaries for what in ("chosen", "right"))
+    header = ("data", "item", "task", "level", "scene", "repeat", "truth", *columns)
+    return Table("pairs", "Every question and repeat", header, tuple(rows))
+
+
+def _spread(spread: Spread) -> str:
+    return f"{100 * spread.mean:.2f}" + ("" if spread.sd is None else f" ± {100 * spread.sd:.2f}")
+
+
+def _p(value: float) -> str:
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def _two_digits(mean: float) -> str:
+    return "0" if mean == 0 else f"{mean:.{max(0, 2 - max(0, math.floor(math.log10(mean))))}f}"
+
+
 def markdown(table: Table) -> str:
     """With pipes; cells are padded, so that it can be read as it stands."""
-    lines = [tuple(map(_plain, row)) for row in (table.header, *table.rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = (cell.ljust(width) if place == 0 else cell.rjust(width) for place, (cell, width) in _places(cells))
-        return f"| {' | '.join(padded)} |"
-
-    def _places(cells: Sequence[str]) -> enumerate[tuple[str, int]]:
-        return enumerate(zip(cells, widths, strict=True))
-
-    rule = [":" + "-" * (width - 1) if place == 0 else "-" * (width - 1) + ":" for place, width in enumerate(widths)]
-    return "\n".join([line(lines[0]), f"| {' | '.join(rule)} |", *map(line, lines[1:])])
+    lines = [[" ".join(cell.replace("|", "\\|").split()) for cell in row] for row in (table.header, *table.rows)]
+    first, *others = (max(map(len, column)) for column in zip(*lines, strict=True))
+    lines.insert(1, [":" + "-" * (first - 1), *("-" * (width - 1) + ":" for width in others)])
+    padded = (
+        [row[0].ljust(first), *(cell.rjust(width) for cell, width in zip(row[1:], others, strict=True))]
+        for row in lines
+    )
+    return "\n".join(f"| {' | '.join(row)} |" for row in padded)
 
 
 def csv_text(table: Table) -> str:
@@ -48,29 +232,14 @@ def csv_text(table: Table) -> str:
 
 def latex(table: Table) -> str:
     """A `table` with the rules of the package booktabs."""
+
+    def escaped(text: str) -> str:
+        return "".join(_LATEX.get(character, character) for character in text)
+
+    header, *body = (" & ".join(map(escaped, row)) + r" \\" for row in (table.header, *table.rows))
     columns = "l" + "r" * (len(table.header) - 1)
-    body = [" & ".join(map(_latex, row)) + r" \\" for row in table.rows]
-    return "\n".join(
-        [
-            r"\begin{table}",
-            r"\centering",
-            rf"\caption{{{_latex(table.title)}}}",
-            rf"\begin{{tabular}}{{{columns}}}",
-            r"\toprule",
-            " & ".join(map(_latex, table.header)) + r" \\",
-            r"\midrule",
-            *body,
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-            "",
-        ]
-    )
-
-
-def _plain(text: str) -> str:
-    return " ".join(text.replace("|", "\\|").split())
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in text)
+    lines = (
+        r"\begin{table}", r"\centering", rf"\caption{{{escaped(table.title)}}}", rf"\begin{{tabular}}{{{columns}}}",
+        r"\toprule", header, r"\midrule", *body, r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
+    )  # fmt: skip
+    return "\n".join(lines)

@@ -4,23 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cow_service.errors import InvalidRequest, StorageUnavailable
-from cow_service.evals.report.contents import gains_in_short, in_short, pairs, tables
 from cow_service.evals.report.page import write_page
-from cow_service.evals.report.paper import differences
-from cow_service.evals.report.plots import write_plots
 from cow_service.evals.report.summary import ArmSummary, Price, summarize
-from cow_service.evals.report.tables import csv_text, latex, markdown
-from cow_service.evals.runs import Run
+from cow_service.evals.report.tables import (
+    DIFFERENCES,
+    csv_text,
+    gains_in_short,
+    in_short,
+    latex,
+    markdown,
+    pairs,
+    tables,
+)
+from cow_service.evals.runs import EvalRun
 
+PLOTS = ("gains", "rates", "calibration", "cost")
+SUFFIXES = (".svg", ".png")
+PNG_DPI = 150
 FORMATS = {"md": markdown, "csv": csv_text, "tex": latex}
 
 
-def write_report(runs: Sequence[Run], out: Path, prices: Mapping[str, Price]) -> str:
+def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]) -> str:
     """Writes all files of a report into a folder; returns its main tables as text.
 
     Raises `InvalidRequest` where nothing has been replied to, and `StorageUnavailable`.
@@ -38,7 +48,7 @@ def write_report(runs: Sequence[Run], out: Path, prices: Mapping[str, Price]) ->
     return "\n\n".join(markdown(table) for table in shown)
 
 
-def _write(runs: Sequence[Run], summaries: Sequence[ArmSummary], out: Path) -> None:
+def _write(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary], out: Path) -> None:
     (out / "tables").mkdir(parents=True, exist_ok=True)
     known = tables(summaries)
     for table in (*known, pairs(runs, summaries)):
@@ -46,14 +56,15 @@ def _write(runs: Sequence[Run], summaries: Sequence[ArmSummary], out: Path) -> N
             if table.name != "pairs" or extension == "csv":
                 (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
     plots = write_plots(out / "plots", summaries)
-    sections = [(f"Differences from the paper: {about.lower()}", "\n".join(told)) for about, told in differences()]
-    write_page(out, runs, summaries, plots, sections)
+    differs = [(f"Differences from the paper: {about.lower()}", told) for about, told in DIFFERENCES.items()]
+    write_page(out, runs, summaries, plots, [(heading, "\n".join(told)) for heading, told in differs])
     parts = [f"## {table.title}\n\n{markdown(table)}" for table in known]
-    (out / "report.md").write_text("\n\n".join(["# Evaluation", _asked(runs), *parts, _differences()]) + "\n", "utf-8")
+    parts += [f"## {heading}\n\n" + "\n".join(f"- {each}" for each in told) for heading, told in differs]
+    (out / "report.md").write_text("\n\n".join(["# Evaluation", _asked(runs), *parts]) + "\n", "utf-8")
     _write_manifest(runs, out)
 
 
-def _asked(runs: Sequence[Run]) -> str:
+def _asked(runs: Sequence[EvalRun]) -> str:
     """What was asked, and what was found in the data."""
     lines: list[str] = []
     for run in runs:
@@ -68,17 +79,41 @@ def _asked(runs: Sequence[Run]) -> str:
     return "\n".join(lines)
 
 
-def _differences() -> str:
-    parts = ["## Differences from the paper"]
-    for about, told in differences():
-        parts.append(f"{about}:\n\n" + "\n".join(f"- {each}" for each in told))
-    return "\n\n".join(parts)
-
-
-def _write_manifest(runs: Sequence[Run], out: Path) -> None:
+def _write_manifest(runs: Sequence[EvalRun], out: Path) -> None:
     """What was asked, with which versions, prompts and seeds, and the digest of every file of the report."""
     files: dict[str, str] = {}
     for path in sorted(path for path in out.rglob("*") if path.is_file() and path.name != "manifest.json"):
         files[path.relative_to(out).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     manifest: dict[str, Any] = {"runs": [run.info.model_dump(mode="json") for run in runs], "files": files}
     (out / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def write_plots(folder: Path, summaries: Sequence[ArmSummary]) -> tuple[Path, ...]:
+    """Writes the plots for which there is something to draw, and removes those of an earlier report.
+
+    The files are `gains`, `rates`, `calibration` and `cost`, each as `.svg` and `.png`. The same summaries make the
+    same bytes of SVG.
+    """
+    # A second of imports, which nobody but the writer of a report should wait for.
+    import matplotlib  # noqa: PLC0415
+
+    from cow_service.evals.report import figures  # noqa: PLC0415
+
+    folder.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    for name, draw in figures.DRAWINGS.items():
+        # A salt of its own for each plot: their ids must differ when they stand in one page.
+        style: dict[Any, Any] = {**figures.STYLE, "svg.hashsalt": f"cow-{name}"}
+        with matplotlib.rc_context(style), warnings.catch_warnings():
+            # Names of models may have letters that the font has not: the SVG keeps them as text.
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            figure = draw(summaries)
+            for suffix in SUFFIXES:
+                path = folder / f"{name}{suffix}"
+                path.unlink(missing_ok=True)
+                if figure is None:
+                    continue
+                kept_out = {"Date": None, "Creator": None} if suffix == ".svg" else {"Software": None}
+                figure.savefig(path, dpi=PNG_DPI, bbox_inches="tight", pad_inches=0.12, metadata=kept_out)
+                written.append(path)
+    return tuple(written)

@@ -1,0 +1,458 @@
+"""The figures of a report: colours that the colour-blind can tell apart, one marker per arm, axes without ornament."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.text import Annotation, Text
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
+from matplotlib.transforms import Bbox
+
+from cow_service.evals.items import TASKS
+from cow_service.evals.report.summary import BASELINE, ArmSummary
+from cow_service.evals.statistics import Calibration, Cost, Gain, Rates, Spread
+
+# The page replaces these four by the colours of its light or dark style; nothing else may use them.
+INK, DIM, LINE, GROUND = "#17211f", "#566360", "#d5dbd8", "#fefefe"
+# Okabe and Ito 2008. Their yellow is too pale on white, and their black too dark on a dark page: grey instead.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
+MARKERS = ("s", "^", "D", "v", "P", "X", "*", "<", "p", "h", ">")  # a circle is the baseline
+LINES = ("-", "--", "-.", ":")
+LONGEST_NAME = 44  # characters; longer names keep their start and their end
+LEGEND_WIDTH = 110  # characters of a row of the legend
+ROUND_FIRST = ("o", *MARKERS)
+GAIN_ROW, GAINS_WIDTH = 0.25, 8.5  # inches
+GAIN_AT, INTERVAL_AT = 1.02, 1.16  # right of the axes, whose width is 1
+RATE_PANEL, NARROWEST, WIDEST = 2.1, 5.0, 11.0  # inches
+PER_ARM, MARGIN = 0.19, 1.2  # inches across
+LABELLED = 0.13  # inches between arms, at least, for a number at each
+SQUARE = 5.2  # inches
+LARGEST = 420.0  # area of the marker of the fullest bin, points²
+SMALLEST = 14.0
+COUNTED = 2  # curves, at most, whose markers have their counts beside them
+COST_PANEL, COST_WIDTH = 3.3, 7.5  # inches
+RANGE_FOR_LOG = 12.0  # between the dearest and the cheapest arm
+# Where a label may stand, in points from its marker: near ones first.
+PLACES = [
+    (across * (far + 2 if down == 0 else far), down * far)
+    for far in (7, 14, 24, 36, 50, 66, 84)
+    for across, down in ((1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1), (0, 1), (0, -1))
+]
+LEADER = 16  # points: a label that is further away has a line to its marker
+STYLE = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "sans-serif"],
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.labelcolor": INK,
+    "axes.edgecolor": DIM,
+    "axes.linewidth": 0.8,
+    "axes.facecolor": GROUND,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "figure.facecolor": GROUND,
+    "grid.color": LINE,
+    "grid.linewidth": 0.7,
+    "text.color": INK,
+    "text.parse_math": False,  # a name with two dollar signs is a name
+    "xtick.color": DIM,
+    "xtick.labelcolor": INK,
+    "ytick.color": DIM,
+    "ytick.labelcolor": INK,
+    "legend.frameon": False,
+    "svg.fonttype": "none",  # text stays text: it can be searched, and read aloud
+    "axes.axisbelow": True,
+}
+
+
+@dataclass(frozen=True)
+class ArmStyle:
+    """How one arm is drawn, the same in every plot."""
+
+    colour: str
+    marker: str
+    line: str
+    face: str  # the baseline is hollow
+
+    def marked(self, size: float = 7.0) -> dict[str, Any]:
+        """Options of matplotlib that draw its marker."""
+        hollow = self.face == GROUND
+        return {
+            "linestyle": "none",
+            "marker": self.marker,
+            "markersize": size,
+            "markerfacecolor": self.face,
+            "markeredgecolor": self.colour if hollow else INK,
+            "markeredgewidth": 1.4 if hollow else 0.7,
+            "zorder": 3,
+        }
+
+
+def arm_styles(summaries: Sequence[ArmSummary]) -> dict[str, ArmStyle]:
+    """Of every arm, by its name in the report."""
+    found: dict[str, ArmStyle] = {}
+    others = baselines = 0
+    for each in summaries:
+        if each.arm == BASELINE:
+            marker = ROUND_FIRST[baselines % len(ROUND_FIRST)]
+            found[each.name] = ArmStyle(DIM, marker, LINES[baselines % len(LINES)], GROUND)
+            baselines += 1
+        else:
+            colour = COLOURS[others % len(COLOURS)]
+            found[each.name] = ArmStyle(colour, MARKERS[others % len(MARKERS)], LINES[others % len(LINES)], colour)
+            others += 1
+    return found
+
+
+def short(name: str, longest: int = LONGEST_NAME) -> str:
+    """A name on one line, without what cannot be drawn, cut in the middle where it is long."""
+    plain = " ".join("".join(each if each.isprintable() else " " for each in name).split())
+    if len(plain) <= longest:
+        return plain
+    start = (longest - 1) // 2
+    return f"{plain[:start]}…{plain[start + 1 - longest :]}"
+
+
+def points(share: float) -> str:
+    """A difference of shares, in percentage points, with its sign."""
+    return f"{100 * share:+.1f}".replace("-", "−").replace("+0.0", "0.0").replace("−0.0", "0.0")
+
+
+def _add_legend(figure: Figure, entries: Sequence[tuple[Line2D, str]], **options: Any) -> None:
+    drawn = figure.legend([line for line, _ in entries], list(map(str, range(len(entries)))), **options)
+    # Set afterwards: matplotlib leaves out an entry whose name starts with an underscore.
+    for text, (_, name) in zip(drawn.get_texts(), entries, strict=True):
+        text.set_text(name)
+
+
+def _draw_right_answers(axes: Axes, x: float, tpr: Spread, style: ArmStyle, size: float, **whisker: Any) -> None:
+    """The share of right answers of an arm, with its deviation over the repeats."""
+    if tpr.sd is not None:
+        axes.errorbar(x, 100 * tpr.mean, yerr=100 * tpr.sd, color=style.colour, zorder=2, **whisker)
+    axes.plot([x], [100 * tpr.mean], clip_on=False, **style.marked(size))
+
+
+def _percent_axis(axes: Axes, low: float, high: float) -> None:
+    """Right answers on the y axis, with lines to read them by."""
+    axes.set_ylim(low, high)
+    axes.set_ylabel("Right answers (%)")
+    axes.grid(axis="y")
+
+
+# Gains: a forest plot, on all questions and on each task
+
+
+def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
+    """What every arm gains over the image alone; None where no arm has a gain."""
+    rows = _gain_rows(summaries)
+    if not rows:
+        return None
+    figure = Figure(figsize=(GAINS_WIDTH, GAIN_ROW * len(rows) + 1.1), layout="constrained")
+    axes = figure.add_subplot()
+    for place, (_, style, gain) in enumerate(rows):
+        if style is not None and gain is not None:
+            _draw_gain(axes, -place, style, gain)
+        else:
+            axes.axhspan(-place - 0.5, -place + 0.5, color=LINE, alpha=0.45, linewidth=0, zorder=0)
+    axes.axvline(0, color=INK, linewidth=1, zorder=1)
+    axes.set_ylim(-len(rows) + 0.4, 0.7)
+    edge = max(5.0, *(100 * abs(end) for _, _, gain in rows if gain for end in (gain.low, gain.high)))
+    axes.set_xlim(-1.08 * edge, 1.08 * edge)
+    axes.set_yticks([-place for place in range(len(rows))], [text for text, _, _ in rows])
+    for label, (_, _, gain) in zip(axes.get_yticklabels(), rows, strict=True):
+        label.set_fontweight("normal" if gain else "bold")
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+    axes.grid(axis="x")
+    axes.set_xlabel(f"Gain in right answers over “{BASELINE}” (percentage points)")
+    title = f"Gain of each arm over the image alone (arm “{BASELINE}”)"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, weight="bold")
+    heading: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "fontsize": 8.5, "color": DIM}
+    axes.text(GAIN_AT, 0.9, "gain, 95% interval", va="bottom", **heading)
+    return figure
+
+
+def _gain_rows(summaries: Sequence[ArmSummary]) -> list[tuple[str, ArmStyle | None, Gain | None]]:
+    """The lines of the plot: headings of groups, and below each the gains of its arms."""
+    styles = arm_styles(summaries)
+    groups = {"All questions": [(each.name, each.gain) for each in summaries if each.gain is not None]}
+    for task in TASKS:
+        own = [(each.name, found.gain) for each in summaries for found in each.gains if found.task == task]
+        groups[task.capitalize()] = own
+    kept = [(heading, group) for heading, group in groups.items() if group]
+    rows: list[tuple[str, ArmStyle | None, Gain | None]] = []
+    # With one task, its group says the same as all questions.
+    for heading, group in kept[1:] if len(kept) == 2 else kept:
+        questions = max(gain.questions for _, gain in group)
+        scenes = max(gain.scenes for _, gain in group)
+        rows.append((f"{heading} ({questions} questions, {scenes} scene{'s' if scenes > 1 else ''})", None, None))
+        rows += [(short(name), styles[name], gain) for name, gain in group]
+    return rows
+
+
+def _draw_gain(axes: Axes, height: float, style: ArmStyle, gain: Gain) -> None:
+    interval = "one scene: no interval"
+    if gain.scenes > 1:
+        ends = [100 * gain.low, 100 * gain.high]
+        axes.plot(ends, [height] * 2, "|-", color=style.colour, linewidth=2.2, markersize=7, zorder=2)
+        interval = f"{points(gain.low)} to {points(gain.high)}"
+    axes.plot([100 * gain.gain], [height], **style.marked())
+    text: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 8.5}
+    axes.text(GAIN_AT, height, points(gain.gain), weight="bold", **text)
+    axes.text(INTERVAL_AT, height, interval, **text)
+
+
+# Rates: how many questions each arm answers rightly, by task, and by the levels of each task
+
+
+@dataclass(frozen=True)
+class RateGroup:
+    """Points that stand together: what they are of, and the rates of the arms that have any."""
+
+    name: str
+    rates: dict[str, Rates]
+
+
+def draw_rates(summaries: Sequence[ArmSummary]) -> Figure | None:
+    """Right answers of every arm; None where nothing was replied to."""
+    if not summaries:
+        return None
+    panels, styles = _rate_panels(summaries), arm_styles(summaries)
+    most = max(len(groups) for _, groups in panels)
+    width = min(WIDEST, max(NARROWEST, most * max(1.0, PER_ARM * (len(summaries) + 1)) + MARGIN))
+    names = [short(name) for name in styles]
+    rows = 1 + len(names) * (max(map(len, styles)) + 6) // round(11 * width)
+    figure = Figure(figsize=(width, (RATE_PANEL + 0.1) * len(panels) + 0.25 * rows + 0.5), layout="constrained")
+    handles = [Line2D([], [], **style.marked()) for style in styles.values()]
+    columns = max(1, int(width * LEGEND_WIDTH / 10 / (max(map(len, names)) + 6)))
+    options = {"ncols": min(columns, len(names)), "columnspacing": 1.4, "handletextpad": 0.3}
+    _add_legend(figure, list(zip(handles, names, strict=True)), loc="outside upper left", **options)
+    grid = figure.subplots(len(panels), squeeze=False)
+    for axes, (title, groups) in zip(grid[:, 0], panels, strict=True):
+        axes.set_title(title)
+        _draw_rate_panel(axes, groups, styles, (width - MARGIN) / len(groups))
+    return figure
+
+
+def _rate_panels(summaries: Sequence[ArmSummary]) -> list[tuple[str, list[RateGroup]]]:
+    """Titles and groups: by task, then each task that has several levels."""
+    cells = [(each.name, cell) for each in summaries for cell in each.cells]
+
+    def group(name: str, task: str, level: str | None) -> RateGroup:
+        return RateGroup(name, {arm: cell.rates for arm, cell in cells if (cell.task, cell.level) == (task, level)})
+
+    tasks = [task for task in TASKS if any(cell.task == task for _, cell in cells)]
+    by_task = [group(task, task, None) for task in tasks]
+    if len(tasks) > 1:
+        by_task.insert(0, RateGroup("all", {each.name: each.rates for each in summaries}))
+    several = any(each.rates.tpr.sd is not None for each in summaries)
+    whiskers = "mean and SD over repeats" if several else "one repeat, so no SD"
+    panels = [(f"Right answers by task (TPR): {whiskers}", by_task)]
+    for task in tasks:
+        levels = sorted({cell.level for _, cell in cells if cell.task == task and cell.level})
+        if len(levels) > 1:
+            panels.append((f"{task.capitalize()} by level", [group(level, task, level) for level in levels]))
+    return panels
+
+
+def _draw_rate_panel(axes: Axes, groups: Sequence[RateGroup], styles: dict[str, ArmStyle], space: float) -> None:
+    """`space`: inches across that a group has."""
+    step = 1 / (len(styles) + 1)
+    for middle, group in enumerate(groups):
+        for place, (name, style) in enumerate(styles.items(), 1):
+            if name not in group.rates:
+                continue
+            tpr, x = group.rates[name].tpr, middle - 0.5 + step * place
+            _draw_right_answers(axes, x, tpr, style, 6.5, linewidth=1.6, capsize=2.5)
+            if step * space >= LABELLED:
+                # Above the whisker and the marker, whichever is higher.
+                top = 100 * (tpr.mean + (tpr.sd or 0.0))
+                text = f"{100 * tpr.mean:.0f}"
+                label = axes.annotate(text, (x, top), (0, 5.5), textcoords="offset points", fontsize=7)
+                label.set(ha="center", bbox={"facecolor": GROUND, "linewidth": 0, "pad": 0.4})
+        if middle:
+            axes.axvline(middle - 0.5, color=LINE, linewidth=1)
+    counts = [max(each.questions for each in group.rates.values()) for group in groups]
+    axes.set_xlim(-0.5, len(groups) - 0.5)
+    axes.set_xticks(
+        range(len(groups)), [f"{group.name}\nn = {count}" for group, count in zip(groups, counts, strict=True)]
+    )
+    axes.tick_params(axis="x", length=0)
+    _percent_axis(axes, 0, 118)
+    axes.set_yticks(range(0, 101, 25))
+    axes.spines["left"].set_bounds(0, 100)
+    axes.axhline(100, color=DIM, linewidth=0.5)
+
+
+# Calibration: whether what the simulation tells with 70% happens in 70% of the cases
+
+
+def draw_calibration(summaries: Sequence[ArmSummary]) -> Figure | None:
+    """Told probabilities against what happened; None where none was told."""
+    curves: list[tuple[list[str], Calibration]] = []
+    for each in summaries:  # arms that share their simulations tell the same: one curve, with all of their names
+        same = next((names for names, found in curves if found == each.calibration), None)
+        if same is not None:
+            same.append(each.name)
+        elif each.calibration is not None:
+            curves.append(([each.name], each.calibration))
+    if not curves:
+        return None
+    figure = Figure(figsize=(SQUARE + 0.6, SQUARE + 0.5 + 0.42 * len(curves)), layout="constrained")
+    axes = figure.add_subplot()
+    (diagonal,) = axes.plot([0, 100], [0, 100], color=DIM, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
+    entries = [(diagonal, "as told (perfect calibration)")]
+    for place, (arms, found) in enumerate(curves):
+        base = sum(each.count * each.happened for each in found.bins) / found.count
+        scores = f"Brier score {found.brier:.3f}; base rate {100 * base:.0f}%, always told: {found.base_brier:.3f}"
+        line = _draw_curve(axes, found, place, counted=len(curves) <= COUNTED)
+        entries.append((line, f"{short(', '.join(arms), 70)}\n{scores}; n = {found.count}"))
+    axes.set(xlim=(-6, 108), ylim=(-10, 106), aspect="equal")
+    axes.grid()
+    axes.set_xlabel("Probability told by the simulation (%)")
+    axes.set_ylabel("Happened (% of cases)")
+    axes.set_title("Told probability against what happened\n(bins of 10 points; marker area: number of questions)")
+    _add_legend(figure, entries, loc="outside lower left", fontsize=8, handlelength=3)
+    return figure
+
+
+def _draw_curve(axes: Axes, found: Calibration, place: int, counted: bool) -> Line2D:
+    """A curve, and its line for the legend. `counted`: with the counts of its bins beside the markers."""
+    colour, line = COLOURS[place % len(COLOURS)], LINES[place % len(LINES)]
+    marker = ROUND_FIRST[place % len(ROUND_FIRST)]
+    told = [100 * each.told for each in found.bins]
+    happened = [100 * each.happened for each in found.bins]
+    fullest = max(each.count for each in found.bins)
+    areas = [max(SMALLEST, LARGEST * each.count / fullest) for each in found.bins]
+    axes.plot(told, happened, color=colour, linestyle=line, linewidth=1.6, zorder=2)
+    drawn: dict[str, Any] = {"marker": marker, "facecolor": colour, "edgecolor": INK, "alpha": 0.75, "linewidth": 0.8}
+    axes.scatter(told, happened, s=areas, zorder=3, **drawn)
+    for x, y, area, each in zip(told, happened, areas, found.bins, strict=True) if counted else ():
+        # The first curve's counts stand below to the right, the second's above to the left: a curve that rises
+        # runs through neither.
+        side = -1 if place else 1
+        offset = side * (0.36 * area**0.5 + 1.5)
+        label = axes.annotate(f"{each.count}", (x, y), (offset, -offset), textcoords="offset points", fontsize=7.5)
+        label.set(va="top" if side > 0 else "bottom", ha="left" if side > 0 else "right")
+    edge: dict[str, Any] = {"markersize": 7, "markeredgecolor": INK, "markeredgewidth": 0.7}
+    return Line2D([], [], color=colour, linestyle=line, marker=marker, **edge)
+
+
+# Cost: what right answers cost in seconds, tokens and money per question
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One kind of cost of all replies; None where it is not known."""
+
+    axis: str
+    title: str
+    of: Callable[[Cost], float | None]
+
+
+MEASURES = (
+    Measure("Seconds per question", "time", lambda cost: cost.seconds),
+    Measure(
+        "Tokens per question (input and output)", "tokens", lambda cost: float(cost.input_tokens + cost.output_tokens)
+    ),
+    Measure("Money per question (currency of the price table)", "money", lambda cost: cost.money),
+)
+
+
+def draw_cost(summaries: Sequence[ArmSummary]) -> Figure | None:
+    """Right answers against their cost; None where nothing is known to have cost anything."""
+    shown: list[tuple[Measure, list[tuple[ArmSummary, float]]]] = []
+    for measure in MEASURES:
+        known = [(each, each.cost.replies, measure.of(each.cost)) for each in summaries]
+        values = [(each, value / max(replies, 1)) for each, replies, value in known if value is not None]
+        if any(value > 0 for _, value in values):
+            shown.append((measure, values))
+    if not shown:
+        return None
+    figure = Figure(figsize=(COST_WIDTH, COST_PANEL * len(shown) + 0.2), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    grid = figure.subplots(len(shown), squeeze=False)
+    styles = arm_styles(summaries)
+    labels = [_draw_cost_panel(axes, *panel, styles) for axes, panel in zip(grid[:, 0], shown, strict=True)]
+    canvas.draw()
+    # Labels are placed once the axes have their size; they must not change it again.
+    figure.set_layout_engine("none")
+    for axes, found in zip(grid[:, 0], labels, strict=True):
+        _place_labels(axes, found, canvas)
+    return figure
+
+
+def _draw_cost_panel(
+    axes: Axes, measure: Measure, found: Sequence[tuple[ArmSummary, float]], styles: dict[str, ArmStyle]
+) -> list[Annotation]:
+    """The panel, and its labels, which are still to be placed."""
+    labels: list[Annotation] = []
+    leader: dict[str, Any] = {"arrowstyle": "-", "color": DIM, "linewidth": 0.6, "shrinkA": 0, "shrinkB": 4}
+    for each, value in found:
+        tpr = each.rates.tpr
+        _draw_right_answers(axes, value, tpr, styles[each.name], 8, linewidth=1.2, capsize=2)
+        text: dict[str, Any] = {"fontsize": 8, "va": "center", "zorder": 4, "arrowprops": leader}
+        place = value, 100 * tpr.mean
+        labels.append(axes.annotate(short(each.name, 34), place, PLACES[0], textcoords="offset points", **text))
+    values = [value for _, value in found]
+    if min(values) > 0 and max(values) / min(values) > RANGE_FOR_LOG:
+        axes.set_xscale("log")
+        axes.set_xlim(min(values) / 2, max(values) * 2)
+    else:
+        axes.set_xlim(0, 1.15 * max(values))
+    # Tens and units as they are written: no powers, and no offset in the corner.
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.6g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(measure.axis)
+    spreads = [each.rates.tpr for each, _ in found]
+    whiskers = " (whiskers: SD over repeats)" if any(tpr.sd is not None for tpr in spreads) else ""
+    axes.set_title(f"Right answers against {measure.title}{whiskers}")
+    lowest = min(100 * (tpr.mean - (tpr.sd or 0)) for tpr in spreads)
+    highest = max(100 * (tpr.mean + (tpr.sd or 0)) for tpr in spreads)
+    _percent_axis(axes, max(-3, lowest - 12), min(103, highest + 12))
+    axes.grid()
+    return labels
+
+
+def _place_labels(axes: Axes, labels: Sequence[Annotation], canvas: FigureCanvasAgg) -> None:
+    """Each label at the first place where it covers no marker and no other label, and stays in the panel."""
+    renderer = cast(Any, canvas).get_renderer()
+    panel = axes.get_window_extent(renderer)
+    reach = 6 * axes.figure.dpi / 72
+    markers = [axes.transData.transform(label.xy) for label in labels]
+    taken = [Bbox.from_extents(*(at - reach), *(at + reach)) for at in markers]
+
+    def faults(label: Annotation, place: tuple[float, float]) -> int:
+        text = _moved(label, place, renderer)
+        inside = text.x0 >= panel.x0 and text.x1 <= panel.x1 and text.y0 >= panel.y0 and text.y1 <= panel.y1
+        return sum(text.overlaps(other) for other in taken) + (not inside)
+
+    for label in labels:
+        free = (place for place in PLACES if not faults(label, place))
+        best = next(free, None) or min(PLACES, key=lambda place: faults(label, place))
+        taken.append(_moved(label, best, renderer))
+
+
+def _moved(label: Annotation, place: tuple[float, float], renderer: Any) -> Bbox:
+    """The box of the label's text, without the line to the marker, after the label was put to a place."""
+    across, down = place
+    label.set_position(place)
+    label.set(
+        ha="center" if across == 0 else "left" if across > 0 else "right",
+        va="center" if down == 0 else "bottom" if down > 0 else "top",
+    )
+    if label.arrow_patch is not None:
+        label.arrow_patch.set_visible(max(abs(across), abs(down)) > LEADER)
+    label.update_positions(renderer)
+    return Text.get_window_extent(label, renderer)
+
+
+DRAWINGS = {"gains": draw_gains, "rates": draw_rates, "calibration": draw_calibration, "cost": draw_cost}
