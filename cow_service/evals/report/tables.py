@@ -191,8 +191,10 @@ def pairs(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> Table:
         told: list[str] = []
         for one in summaries:
             seen = chosen.get((one.run, one.arm, data, item, repeat))
-            is_reply = seen is not None and seen.failure is None
-            told += (seen.read or NONE, str(int(seen.right))) if is_reply else (NONE, NONE)
+            if seen is None or seen.failure is not None:
+                told += (NONE, NONE)
+            else:
+                told += (seen.read or NONE, str(int(seen.right)))
         rows.append((data[:12], item, each.task, each.level, each.scene, str(repeat), each.truth, *told))
     columns = tuple(f"{each.name}: {what}" for each in summaries for what in ("chosen", "right"))
     header = ("data", "item", "task", "level", "scene", "repeat", "truth", *columns)
