@@ -8,7 +8,7 @@ from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.answering import answer_question, ask_first, gate_of
 from cow_service.stages.generation import generate
-from cow_service.stages.grounding import ground, use_stored_masks
+from cow_service.stages.grounding import ground
 from cow_service.stages.keys import FirstAnswers, Verdicts
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
@@ -25,9 +25,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
     """
     run.check_request()
     grounding = run.stage("grounding", ground)
-    run.before_computing(lambda: use_stored_masks(run, grounding))  # it looks for trails, which takes long
     motion = run.stage("motion", read_motion, grounding, run.hints)
-    run.before_computing(lambda: run.place_mover(grounding.bbox, motion.cue))
     trajectory = run.stage("trajectory", compute_trajectory, grounding, motion)
     clip = run.stage("generation", generate, grounding, motion, trajectory)
     return Simulation(

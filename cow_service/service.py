@@ -7,7 +7,7 @@ import uuid
 from functools import partial
 from importlib.metadata import entry_points
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import (
@@ -25,7 +25,7 @@ from cow_service.media.images import DecodedImage, decode, decode_data_url
 from cow_service.net.egress import ImageUrls
 from cow_service.observability.metrics import Metrics
 from cow_service.pipeline import answer, simulate
-from cow_service.readers.base import Reader
+from cow_service.readers.base import Reader, WordReader
 from cow_service.readers.chat import ChatReader
 from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulation
 from cow_service.registry import Registry
@@ -47,6 +47,7 @@ from cow_service.weights.lock import ready
 from cow_service.weights.manifests import find_manifest, load_manifests
 
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
+WORD_READER = "embedded"  # it needs no weights: it reads the words of requests whose images another reader looks at
 Request = TypeVar("Request", bound=SimulateRequest)
 Place = TypeVar("Place", bound=PlaceRequest)
 _OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)
@@ -201,6 +202,7 @@ class Service:
         return Backends(
             reader_name=reader,
             reader=partial(self._reader, reader),
+            words=lambda: cast(WordReader, self.readers.get(WORD_READER)),
             generator=partial(self._generator, generator),
             artifacts=self.artifacts,
             cpu=self.cpu,

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from cow_service.readers.question.facts import facts_of
+from cow_service.narration import facts_of
 from cow_service.records import Asked, Body, Contact, Encounter, Outcome, Path, Trajectory
 
 FRAMES, FPS = 21, 10.0

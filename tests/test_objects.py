@@ -16,7 +16,7 @@ from cow_service.readers.base import GroundingReading
 from cow_service.records import Grounding, LocatedObject
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
-from cow_service.stages.grounding import ground, use_stored_masks
+from cow_service.stages.grounding import ground
 
 MOVER = (160, 160, 240, 240)
 CUBE = (400, 220, 480, 300)
@@ -70,8 +70,8 @@ def test_a_mask_gives_box_and_outline_and_is_found_again(pixels: np.ndarray) -> 
     assert disc.mask is not None
     assert disc.mask.sha256 in result.artifacts
     assert (decode_own(again.backends.artifacts.read(disc.mask.sha256))[..., 0] == mask).all()
-    use_stored_masks(run, result.value)  # a run that has found the grounding stored
-    assert (run.scene.silhouette(disc.bbox) == (mask > 0)).all()
+    scene = run.scene_of(result.value)  # of a run that has found the grounding stored
+    assert (scene.silhouette(disc.bbox) == (mask > 0)).all()
 
 
 def test_the_mover_may_be_given_by_mask(pixels: np.ndarray) -> None:
@@ -81,7 +81,7 @@ def test_the_mover_may_be_given_by_mask(pixels: np.ndarray) -> None:
     assert mover.bbox == (170, 170, 231, 231)
     assert mover.prior is not None
     assert mover.prior.shape == "sphere"
-    assert (run.scene.silhouette(mover.bbox) == (mask > 0)).all()
+    assert (run.scene_of(mover).silhouette(mover.bbox) == (mask > 0)).all()
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,11 @@ from runs import run_of
 from cow_service.errors import CannotGround
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, CutoutOptions
-from cow_service.readers.question.facts import facts_of
+from cow_service.narration import facts_of
+from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding, Intervention, LocatedObject, Motion, Trajectory
 from cow_service.stages.bodies import obstacles_of
+from cow_service.stages.grounding import understood
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
@@ -53,6 +55,7 @@ def put(
     placed = Intervention(kind="place", object=located(name, mover), relation=relation, targets=targets)
     middle = (mover[0] + mover[2]) / 2, (mover[1] + mover[3]) / 2
     grounding = Grounding(object=name, point=middle, bbox=mover, interventions=(placed,), source="request")
+    grounding = understood(grounding, EmbeddedReader())
     motion = read_motion(run, grounding, None).value
     return run, grounding, motion, compute_trajectory(run, grounding, motion).value
 

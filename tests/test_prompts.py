@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jinja2.exceptions import SecurityError
 
+from cow_service.narration import direction_words
 from cow_service.readers.mllm.answer import answer_schema
 from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.identify import Identified
@@ -16,8 +17,8 @@ from cow_service.readers.mllm.locate import Scale, locate_schema
 from cow_service.readers.mllm.replies import schema_of
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt, parse_prompt
-from cow_service.readers.question.wording import direction_words, motion_sentence
 from cow_service.records import MotionKind, Vector
+from cow_service.stages.motion import motion_sentence
 from cow_service.weights.manifests import PROMPTS, Coordinates
 
 HEAD = "---\nversion: 1\ninputs: [name]\n---\n"

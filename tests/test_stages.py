@@ -339,10 +339,21 @@ class TestKeys:
 
     def test_what_the_request_gives_decides_alone(self, scene: Scene) -> None:
         given = {"grounding": POINT, "motion": {"kind": "fall"}}
+        reader = {"identity": lambda role: {"name": "another"}}
         for stage in ("grounding", "motion"):
-            assert self.key(scene, stage, question="a", **given) == self.key(scene, stage, question="b", **given)
+            assert self.key(scene, stage, **given) == self.key(scene, stage, **given, **reader)
             assert self.key(scene, stage, question="a") != self.key(scene, stage, question="b")
-            assert self.key(scene, stage) != self.key(scene, stage, identity=lambda role: {"name": "another"})
+            assert self.key(scene, stage) != self.key(scene, stage, **reader)
+        assert self.key(scene, "motion", question="a", **given) == self.key(scene, "motion", question="b", **given)
+
+    def test_what_is_asked_decides_the_grounding_and_nothing_after_it(self, scene: Scene) -> None:
+        asked = {"asked": {"relation": "touches", "target": "cube"}}
+        for place in ({}, {"grounding": POINT}):
+            assert self.key(scene, "grounding", question="a", **place) != self.key(scene, "grounding", **place)
+            assert self.key(scene, "grounding", **asked, **place) != self.key(scene, "grounding", **place)
+        for stage in ("motion", "trajectory", "generation"):
+            assert self.key(scene, stage, **asked) == self.key(scene, stage)
+        assert self.key(scene, "trajectory", question="a") == self.key(scene, "trajectory")
 
     def test_a_point_given_beside_a_path_is_not_a_path_alone(self, scene: Scene) -> None:
         path = {"trajectory": {"points": [(200, 200), (300, 200)]}}

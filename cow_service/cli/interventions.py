@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 
 from cow_service.errors import InvalidRequest
-from cow_service.readers.question.place_relations import PREPOSITIONS, RELATION_WORDS
+from cow_service.narration import PREPOSITIONS, RELATION_WORDS
 
 _WORDS = "|".join(sorted(RELATION_WORDS, key=len, reverse=True))  # "in front of" before "in"
 _PLACED = re.compile(rf"\s*(?P<object>.+?)\s+(?P<relation>{_WORDS})\s+(?P<targets>.+?)\s*", re.IGNORECASE)

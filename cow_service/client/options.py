@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 if TYPE_CHECKING:
     from cow_service.records import Law
     from cow_service.requests import (
+        AskedRequest,
         CameraRequest,
         FramesRequest,
         GroundingRequest,
@@ -38,6 +39,7 @@ class SimulateOptions(TypedDict, total=False):
     trajectory: TrajectoryRequest | Given | None
     objects: Sequence[ObjectRequest | Given] | None
     interventions: Sequence[InterventionRequest | Given] | None
+    asked: AskedRequest | Given | None
     camera: CameraRequest | Given | None
     law: Law | None
     ensemble: int | None

@@ -7,8 +7,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from cow_service.records import (
@@ -33,6 +31,7 @@ from cow_service.records import (
     Usage,
     Vector,
 )
+from cow_service.vision.masks import Image, Mask
 from cow_service.vision.scene import Scene
 
 SpeedWord = Literal["slow", "normal", "fast"]
@@ -146,6 +145,7 @@ class QuestionReading:
     asked: Asked | None = None  # null where the reader cannot tell from the words alone
     changes: tuple[NamedChange, ...] = ()  # what is taken away or put somewhere
     trail_named: bool = False  # the question speaks of a trail
+    drawings_named: frozenset[str] = frozenset()  # "arrow" and "box", where the question speaks of one
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,9 @@ class GroundingReading:
     interventions: tuple[Intervention, ...] = ()
     hints: MotionHints | None = None
     prior: ObjectPrior | None = None  # of the mover
+    mask: Mask | None = None  # [H, W] of the mover, where it does not follow from the box
     asked: Asked | None = None  # what the question wants to know; null where the reader cannot say
+    changes: tuple[NamedChange, ...] = ()  # as `interventions`, of things that the request locates
 
 
 @dataclass(frozen=True)
@@ -192,8 +194,8 @@ class Imagined:
     """What an answer may be drawn from besides the image: the simulation and its frames."""
 
     simulation: Simulation
-    frames: tuple[NDArray[np.uint8], ...]  # RGB [h, w, 3] of `simulation.frames`, in their order
-    factual_frames: tuple[NDArray[np.uint8], ...] = ()  # of `simulation.factual_frames`
+    frames: tuple[Image, ...]  # RGB [h, w, 3] of `simulation.frames`, in their order
+    factual_frames: tuple[Image, ...] = ()  # of `simulation.factual_frames`
 
 
 @dataclass(frozen=True)
@@ -204,6 +206,22 @@ class AnswerReading:
     not_sure: bool
     reasoning: str = ""  # empty where the reader does not reason in words
     notes: tuple[str, ...] = ()  # what the answer rests on or lacks, in whole sentences: warnings for the caller
+
+
+class WordReader(Protocol):
+    """Reads words alone, without an image, weights or calls: for every request, whoever looks at its image."""
+
+    def read_question(self, question: str) -> QuestionReading:
+        """What a question says in words that it understands."""
+        ...
+
+    def read_name(self, name: str) -> ObjectPrior:
+        """What the name of an object says of its shape."""
+        ...
+
+    def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:
+        """Those of some names that a phrase for several things means, such as "both mugs"; else the phrase itself."""
+        ...
 
 
 class Reader(Protocol):
@@ -223,10 +241,6 @@ class Reader(Protocol):
 
         Where not, its answers are samples: none is handed to two requests. Readers without this method are sampled.
         """
-        ...
-
-    def read_question(self, question: str) -> QuestionReading:
-        """What the words alone say, for requests that give the place of what moves: no image, no call of a model."""
         ...
 
     def ground(self, given: ReaderInput) -> GroundingReading:

@@ -19,6 +19,37 @@ InterventionKind = Literal["remove", "place"]
 PlaceRelation = Literal["into", "onto", "between", "in-front-of", "behind", "next-to", "left-of", "right-of"]
 Until = Literal["contact", "out-of-view"]
 Cue = Literal["arrow", "trail", "orientation", "text", "gravity", "request"]
+Opening = Literal["round", "square", "none"]
+
+
+AskedRelation = Literal["touches", "covers", "covered", "inside", "tips", "moves", "leaves", "lands"]
+AskedForm = Literal["whether", "which-first", "when", "how-many", "where", "what-happens", "changes"]
+
+
+class Asked(Record):
+    """The event that a question asks about, and what it wants to know of it."""
+
+    form: AskedForm = "whether"
+    relation: AskedRelation = Field(
+        description="`touches`: the subject hits it or lands on it; `covers`: the subject hides it; `covered`: the "
+        "subject is hidden by it; `inside`: the subject fits or ends up in it; `tips`: the target is knocked over; "
+        "`moves`: the target is set in motion; `leaves`: the subject leaves the image; `lands`: the subject "
+        "comes down on the floor."
+    )
+    subject: str | None = Field(
+        default=None, description="Who does it, in the question's words, where that is not the mover; null: the mover."
+    )
+    target: str | None = Field(default=None, description="The thing asked about in the question's words; null: any.")
+    negated: bool = Field(default=False, description="Asked is that it does not happen: to miss, to stay visible.")
+    among: tuple[str, ...] = Field(
+        default=(),
+        description="The things that are meant where the question names several, or things of a kind; empty: any.",
+    )
+    every: bool = Field(default=False, description="It counts only where it happens with each of `among`.")
+    partly: bool = Field(default=False, description="Of `covers` and `covered`: it counts where any part is hidden.")
+    within: float | None = Field(
+        default=None, gt=0, description="How long it may take to happen, s; null: as long as the clip."
+    )
 
 
 class Estimate(Record):
@@ -35,6 +66,11 @@ class ObjectPrior(Record):
     size: Estimate | None = Field(default=None, description="Its longest side, m.")
     stands_on: str | None = Field(default=None, description="`floor`, `air`, or an object in words.")
     height: Estimate | None = Field(default=None, description="Of its lower end above what it stands on, m.")
+    elongated: bool = Field(default=False, description="Longer along its heading than across, as vehicles are.")
+    equal_sided: bool = Field(default=False, description="As wide as high, as cubes are.")
+    opening: Opening | None = Field(
+        default=None, description="Of a container, the form of its opening; `none`: nothing goes into it."
+    )
 
 
 class LocatedObject(Record):
@@ -71,6 +107,12 @@ class Grounding(Record):
         default=(), description="What is taken away or put in before the motion; not among `others`."
     )
     prior: ObjectPrior | None = None
+    asked: Asked | None = Field(
+        default=None, description="What the question wants to know; null where that was not understood."
+    )
+    trail_named: bool = Field(
+        default=False, description="The question speaks of a trail: balls that look alike, one after another, are one."
+    )
     source: Source
 
 

@@ -7,7 +7,7 @@ from cow_service.requests.motion import (
     OtherMotionRequest,
     TrajectoryRequest,
 )
-from cow_service.requests.places import GroundingRequest, InterventionRequest, ObjectRequest, PlaceRequest
+from cow_service.requests.places import AskedRequest, GroundingRequest, InterventionRequest, ObjectRequest, PlaceRequest
 from cow_service.requests.simulation import (
     PRIORITIES,
     AnswerRequest,
@@ -22,6 +22,7 @@ from cow_service.requests.values import Finite, Flag, ImageArtifact, ImageRef, I
 __all__ = [
     "PRIORITIES",
     "AnswerRequest",
+    "AskedRequest",
     "CameraRequest",
     "Finite",
     "Flag",

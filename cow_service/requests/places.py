@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, field_validator, model_validator
 
-from cow_service.records import BBox, InterventionKind, ObjectRole, PlaceRelation, Record, Shape
+from cow_service.records import Asked, BBox, InterventionKind, ObjectRole, PlaceRelation, Record, Shape
 from cow_service.requests.values import Finite, MaskRef, Words
 
 MAX_OBJECTS = 64
@@ -53,6 +53,19 @@ class ObjectRequest(PlaceRequest):
 
     object: ObjectWords
     role: ObjectRole = Field(default="target", description="target: the question asks about it; obstacle: it is there.")
+
+
+class AskedRequest(Asked):
+    """What the question wants to know. Objects are named as in `objects`, or as the question names them."""
+
+    subject: ObjectWords | None = Field(default=None, description="Who does it; null: the object that moves.")
+    target: ObjectWords | None = Field(default=None, description="The thing asked about; null: any.")
+    among: tuple[ObjectWords, ...] = Field(
+        default=(), max_length=MAX_OBJECTS, description="The things that are meant where there are several; empty: any."
+    )
+    within: Annotated[Finite, Field(gt=0, le=3600)] | None = Field(
+        default=None, description="How long it may take to happen, s; null: as long as the clip."
+    )
 
 
 class InterventionRequest(Record):

@@ -10,7 +10,7 @@ from pydantic import Discriminator, Field, Tag, field_validator
 
 from cow_service.records import AnswerOption, FramePolicy, Law, Record
 from cow_service.requests.motion import CameraRequest, MotionRequest, TrajectoryRequest
-from cow_service.requests.places import MAX_OBJECTS, GroundingRequest, InterventionRequest, ObjectRequest
+from cow_service.requests.places import MAX_OBJECTS, AskedRequest, GroundingRequest, InterventionRequest, ObjectRequest
 from cow_service.requests.values import Finite, Flag, ImageRef, MaskRef, Name, Whole, Words, writable
 
 MAX_FRAMES = 481
@@ -85,6 +85,9 @@ class SimulateRequest(Record):
         default=(),
         max_length=8,
         description="What is taken away or put somewhere before the motion, beside the question's.",
+    )
+    asked: AskedRequest | None = Field(
+        default=None, description="What the question wants to know; by default it is read from the question."
     )
     camera: CameraRequest | None = None
     ensemble: Whole = Field(

@@ -11,13 +11,11 @@ import numpy as np
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit, fit_shadow, prior
 from cow_service.physics.outcome import Query
-from cow_service.readers.embedded.english.nouns import is_cube, is_vehicle, kind_of, shape_of
-from cow_service.readers.embedded.english.options_said import may_name
 from cow_service.readers.options import plain
 from cow_service.records import Asked, BBox, Grounding, LocatedObject, Motion, Shape
 from cow_service.requests import CameraRequest
-from cow_service.vision.masks import CroppedMask, iou
-from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.stages.grounding import others_of
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.scene import Obstacle, Scene
 from cow_service.vision.shadows import find_shadow
 
@@ -33,8 +31,8 @@ def seen_bodies(scene: Scene, grounding: Grounding, obstacles: Sequence[Obstacle
         shape=_shape(scene, LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior)),
         source=grounding.source,
         prior=grounding.prior,
-        elongated=is_vehicle(grounding.object),
-        equal_sided=is_cube(grounding.object),
+        elongated=grounding.prior is not None and grounding.prior.elongated,
+        equal_sided=grounding.prior is not None and grounding.prior.equal_sided,
     )
     return mover, *(_obstacle(scene, grounding, obstacle) for obstacle in obstacles)
 
@@ -53,22 +51,6 @@ def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ..
     return tuple(kept), taken
 
 
-def others_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
-    """The other objects of a grounding, what is put somewhere and what it is put to among them."""
-    found = list(grounding.others)
-    for each in grounding.interventions:
-        moved = [each.object] if each.kind == "place" and not is_mover(each.object, grounding) else []
-        for thing in (*moved, *each.targets):
-            if not any(iou(thing.bbox, other.bbox) >= SAME_OBJECT_IOU for other in found):
-                found.append(thing)
-    return tuple(found)
-
-
-def is_mover(thing: LocatedObject, grounding: Grounding) -> bool:
-    """Whether a thing is the grounded object."""
-    return iou(thing.bbox, grounding.bbox) >= SAME_OBJECT_IOU
-
-
 def removed_objects(grounding: Grounding) -> tuple[LocatedObject, ...]:
     """What is taken away before the motion."""
     return tuple(each.object for each in grounding.interventions if each.kind == "remove")
@@ -76,35 +58,24 @@ def removed_objects(grounding: Grounding) -> tuple[LocatedObject, ...]:
 
 def query_of(asked: Asked, grounding: Grounding, bodies: Sequence[SeenBody]) -> Query | None:
     """What a question asks of bodies; None where one that it names was not found under that name."""
-    subject = 0 if asked.subject is None else body_named(asked.subject, grounding, bodies)
-    target = None if asked.target is None else body_named(asked.target, grounding, bodies)
-    among = [bodies_meant(name, grounding, bodies, subject) for name in asked.among]
-    if subject is None or (asked.target is not None and target is None) or not all(among):
+    subjects = (0,) if asked.subject is None else bodies_named(asked.subject, grounding, bodies)
+    targets = (None,) if asked.target is None else bodies_named(asked.target, grounding, bodies)
+    among = [bodies_named(name, grounding, bodies) for name in asked.among]
+    if not subjects or not targets or not all(among):
         return None
     known = tuple(dict.fromkeys(body for meant in among for body in meant))
-    named = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})  # not by a kind any more
-    return Query(named, target, subject, known)
+    named = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})
+    return Query(named, targets[0], subjects[0], known)
 
 
-def bodies_meant(words: str, grounding: Grounding, bodies: Sequence[SeenBody], subject: int | None) -> tuple[int, ...]:
-    """The body of a name, or those of a kind without the mover and the subject; none where they are not as many as
-    is said."""
-    one, kind = body_named(words, grounding, bodies), kind_of(words)
-    if one is not None or kind is None:
-        return () if one is None else (one,)
-    boxes = {other.bbox for other in others_of(grounding) if may_name(kind.phrase, other.object)}
-    found = tuple(i for i, body in enumerate(bodies) if i not in {0, subject} and body.bbox in boxes)
-    return found if kind.count in (None, len(found)) else ()
-
-
-def body_named(words: str, grounding: Grounding, bodies: Sequence[SeenBody]) -> int | None:
-    """Which body was found under a name; the mover is the first."""
+def bodies_named(words: str, grounding: Grounding, bodies: Sequence[SeenBody]) -> tuple[int, ...]:
+    """The bodies that were found under a name; the mover is the first."""
     name = plain(words)
     if name == plain(grounding.object):
-        return 0
+        return (0,)
     placed = (*others_of(grounding), *removed_objects(grounding))
     boxes = {other.bbox for other in placed if plain(other.object) == name}
-    return next((i for i, body in enumerate(bodies) if i and body.bbox in boxes), None)
+    return tuple(i for i, body in enumerate(bodies) if i and body.bbox in boxes)
 
 
 def _obstacle(scene: Scene, grounding: Grounding, obstacle: Obstacle) -> SeenBody:
@@ -123,11 +94,11 @@ def _obstacle(scene: Scene, grounding: Grounding, obstacle: Obstacle) -> SeenBod
 
 
 def _shape(scene: Scene, located: LocatedObject) -> Shape:
-    """What is said of it, else by its noun, else by its outline: a disc is a sphere, the rest stands upright."""
+    """What is said of it, else by its outline: a disc is a sphere, the rest stands upright."""
     if located.prior is not None and located.prior.shape is not None:
         return located.prior.shape
     region = scene.region_of(located.bbox)
-    return shape_of(located.object) or ("sphere" if region is not None and region.is_disc else "cylinder")
+    return "sphere" if region is not None and region.is_disc else "cylinder"
 
 
 GIVEN_PITCH_SIGMA, GIVEN_ROLL_SIGMA = math.radians(1.0), math.radians(0.5)

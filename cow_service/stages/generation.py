@@ -128,7 +128,7 @@ def _clip(
             frames, video = _render(run, given, artifacts, encoder)
             factual = _factual_frames(run, as_it_is, [frame.index for frame in frames], encoder)
         with run.cpu():
-            overlay = _overlay(run.scene.image, given, as_it_is or given, motion, trajectory)
+            overlay = _overlay(run.image.pixels, given, as_it_is or given, motion, trajectory)
         return Clip(
             frames=stored(frames, artifacts),
             factual_frames=stored(factual, artifacts),
@@ -154,12 +154,13 @@ def _inputs(
     run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory
 ) -> tuple[GeneratorInput, GeneratorInput | None]:
     """What the generator is given and, where something is changed first, what it is given for the scene as it is."""
-    obstacles, taken = obstacles_of(run.scene, grounding)
+    scene = run.scene_of(grounding, motion.cue)
+    obstacles, taken = obstacles_of(scene, grounding)
     options, seed = run.generator_options, run.request.clip_seed
     if trajectory.factual is None:
-        return GeneratorInput(run.scene, grounding, motion, trajectory, obstacles, seed, options), None
+        return GeneratorInput(scene, grounding, motion, trajectory, obstacles, seed, options), None
     everything = (*obstacles, *taken)
-    as_it_is = GeneratorInput(run.scene, grounding, motion, trajectory.factual, everything, seed, options)
+    as_it_is = GeneratorInput(scene, grounding, motion, trajectory.factual, everything, seed, options)
     removed = range(len(obstacles) + 1, len(everything) + 1)
     given = without_removed(as_it_is, removed, trajectory) if taken else replace(as_it_is, trajectory=trajectory)
     return with_put(given, trajectory.factual), as_it_is

@@ -77,7 +77,7 @@ def digest_of(value: BaseModel | Mapping[str, Any]) -> str:
 
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 9  # of stored results; raised where what a stage means or stores changes
+FORMAT = 10  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
@@ -102,23 +102,22 @@ class KeyFields:
     read_with: str | None = None  # a stage: where the reader reads for it, too, it says no less of this one
 
 
-READER_FIELDS = ("question", "seed", "left_to_reader")
-TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "ensemble", "question", "num_frames", "fps")
+TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "ensemble", "num_frames", "fps")
 KEY_FIELDS: dict[Stage, KeyFields] = {
     "gating": KeyFields(("question", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
     "grounding": KeyFields(
-        READER_FIELDS,
+        ("seed", "left_to_reader"),
         "reader",
         set_by_request=("place",),
-        always=("objects", "interventions"),
+        always=("question", "asked", "objects", "interventions"),
         # The reader is asked the same of the place; hints for the motion are not used where the request gives it.
         read_with="motion",
     ),
     "motion": KeyFields(
-        READER_FIELDS,
+        ("question", "seed", "left_to_reader"),
         "reader",
         set_by_request=("stated_motion", "trajectory"),
-        always=("law", "motion"),
+        always=("law", "motion", "camera"),
         prompt="motion-sentence",
     ),
     "trajectory": KeyFields(TRAJECTORY_FIELDS),

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from cow_service.errors import FieldError, InvalidRequest
+from cow_service.narration import bare_name, direction_words, same_name
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.physics.trail_fit import fit_throw, straight_direction
 from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
-from cow_service.readers.question.wording import bare_name, direction_words, motion_sentence, same_name
+from cow_service.readers.prompts import load_prompt
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
@@ -36,8 +37,9 @@ from cow_service.requests import (
     TrajectoryRequest,
 )
 from cow_service.stages.bodies import camera_of
+from cow_service.stages.grounding import placed_mover
 from cow_service.stages.keys import StageResult
-from cow_service.stages.placing import placed_mover, placing_sentence
+from cow_service.stages.placing import placing_sentence
 from cow_service.stages.run import Run
 from cow_service.vision.scene import Scene
 from cow_service.vision.trails import Trail, trail_of
@@ -195,6 +197,33 @@ THROW_DEPTH_DEVIATION = 15.0  # degrees: words and arrows tell a throw's heading
 _GLIDING_ONLY = ("distance", "duration", "until", "steps")  # what only a motion along a line can have
 
 
+def motion_sentence(
+    object: str,
+    kind: MotionKind,
+    direction: Vector | None,
+    depth: float,
+    sentence: str | None = None,
+    further: Sequence[str] = (),
+    stops: bool = False,
+    also: Sequence[str] = (),
+) -> str:
+    """The motion in one line: a declarative `sentence` of a reader, or one made here; and that the camera stays.
+
+    `further` are the directions of more legs in words, `also` what else moves, such as "car moves to the left".
+    """
+    prompt = load_prompt("motion-sentence")
+    text = prompt.render(
+        object=bare_name(object),
+        kind=kind,
+        words=direction_words(direction, depth),
+        sentence="" if sentence is None else sentence.strip().rstrip(".") + ".",
+        further=further,
+        stops=stops,
+        also=also,
+    )
+    return " ".join(text.split())
+
+
 def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHints | None) -> StageResult[Motion]:
     """The motion, from the request where it gives one or a whole path, else from the reader, which gave the `hints`.
 
@@ -211,21 +240,21 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     elif placed is not None and grounding.source == "request":
         reading = MotionReading("place", None, "request")
     else:
-        reading, source = run.reader.read_motion(run.reader_input("motion"), grounding, hints), run.reader.source
+        with run.cpu():
+            given_reader = run.reader_input("motion", run.scene_of(grounding))
+        reading, source = run.reader.read_motion(given_reader, grounding, hints), run.reader.source
         if run.request.motion is not None:
             reading = _with_lengths(reading, run.request.motion)
     if placed is not None and reading.kind == "place":
         reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
     if run.request.motion is not None and run.request.motion.others:
         reading = replace(reading, others=given_others(run.request.motion.others, grounding))
-    if placed is not None and reading.kind == "place":
-        reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
     reading, unused = _fitting(reading)
-    motion = _complete(run.scene.width, grounding, reading, source, run.request.law)
+    motion = _complete(run.image.info.width, grounding, reading, source, run.request.law)
     if motion.cue == "trail":
         with run.cpu():
-            run.place_mover(grounding.bbox, motion.cue)
-            motion = along_trail(run.scene, grounding, motion, run.request.camera, reading.speed is not None)
+            scene = run.scene_of(grounding, motion.cue)
+            motion = along_trail(scene, grounding, motion, run.request.camera, reading.speed is not None)
     return StageResult(value=motion, warnings=(*reading.warnings, *unused, *_assumed(motion, reading)))
 
 

@@ -10,14 +10,12 @@ from dataclasses import replace
 import numpy as np
 
 from cow_service.errors import CannotGround
+from cow_service.narration import bare_name, cannot_stay, place_words
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.placement import Placements, Put
 from cow_service.physics.world import WorldInput, Worlds
-from cow_service.readers.embedded.english.nouns import container_form
-from cow_service.readers.question.placement_facts import cannot_stay, place_words
-from cow_service.readers.question.wording import bare_name
 from cow_service.records import BBox, Grounding, Intervention, LocatedObject, Motion, PlacedBefore, Placement
-from cow_service.stages.bodies import is_mover
+from cow_service.stages.grounding import is_same, placed_mover
 from cow_service.stages.paths import visible_share
 from cow_service.vision.masks import iou
 from cow_service.vision.openings import SeenOpening, measure_opening
@@ -27,14 +25,6 @@ from cow_service.vision.scene import Scene
 BELOW = 4  # px below the outline of a body in which another one that hides it begins
 LEAST_STAYING = 0.5  # of the worlds: what stays in fewer where it is put is refused
 HIDDEN = 0.25  # of the columns of a body: with so many ending at another one, its foot is hidden
-
-
-def placed_mover(grounding: Grounding) -> Intervention | None:
-    """The intervention that puts the grounded object somewhere; None where it stays or moves by itself."""
-    for each in grounding.interventions:
-        if each.kind == "place" and iou(each.object.bbox, grounding.bbox) >= SAME_OBJECT_IOU:
-            return each
-    return None
 
 
 def placing_sentence(grounding: Grounding, placed: Intervention) -> str:
@@ -67,7 +57,7 @@ def put_before(
     found: list[Put] = []
     for each in placed_before(grounding, motion):
         name = each.object.object
-        body = 0 if is_mover(each.object, grounding) else _body(each.object, bodies)
+        body = 0 if is_same(each.object.bbox, grounding.bbox) else _body(each.object, bodies)
         put = _put(scene, each, body, bodies)
         if carried and 0 in put.targets:
             raise CannotGround(
@@ -176,13 +166,13 @@ def _body(target: LocatedObject, bodies: Sequence[SeenBody]) -> int:
 
 def _opening(scene: Scene, target: SeenBody) -> SeenOpening:
     """The opening of a container, by its noun and by its rim in the image."""
-    form = container_form(target.name)
+    form = None if target.prior is None else target.prior.opening
     if form == "none":
         raise CannotGround(
             f"'{target.name}' is no open container: nothing goes into it. Name a bowl, cup or box, or put it `onto` it."
         )
     seen = measure_opening(scene.clean, target.mask, square=form == "square")
-    if form == "unknown" and not seen.has_edge:
+    if form is None and not seen.has_edge:
         raise CannotGround(
             f"No opening is seen in '{target.name}': call it what it is, such as a bowl, a cup or a box."
         )

@@ -8,7 +8,7 @@ from collections import abc
 from collections.abc import Callable
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -17,13 +17,13 @@ from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, Patience, try_once
-from cow_service.media.images import DecodedImage
+from cow_service.media.images import DecodedImage, decode_own
 from cow_service.observability.logging import rfc3339
-from cow_service.readers.base import CallLog, MotionHints, Reader, ReaderInput
-from cow_service.readers.embedded.english.questions import parse
-from cow_service.records import BBox, Cue, Grounding, ReaderInfo, Record, Usage
+from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Reader, ReaderInput, WordReader
+from cow_service.records import Artifact, BBox, Cue, Grounding, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
+from cow_service.vision.masks import Mask
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
 
 
@@ -108,6 +108,7 @@ class Backends:
 
     reader_name: str
     reader: Callable[[], Reader]
+    words: Callable[[], WordReader]  # of the request, whichever reader looks at the image
     generator: Callable[[], Generator]
     artifacts: ArtifactStore
     cpu: PrioritySemaphore
@@ -128,23 +129,48 @@ class Run(Generic[Request_co]):
     created_at: str = field(default_factory=now)
     turn: int = 0  # of the job, among those of all callers: the lower comes first
     seen: SeenImages | None = None  # images that other runs have measured; None: everything is measured anew
-    _first_scene: Scene | None = None
     _image_key: ImageKey = (None, "")
     results: dict[Stage, StageResult[Any]] = field(default_factory=dict[Stage, StageResult[Any]])
     timings: dict[str, float] = field(default_factory=dict[str, float])  # seconds per stage
     reused: list[Stage] = field(default_factory=list[Stage])  # results that another request had computed
     _calls: dict[Stage, CallLog] = field(default_factory=dict[Stage, CallLog])  # of the stages that asked the reader
-    _before: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
     _current: tuple[Stage | None, float] = (None, 0.0)
 
     @cached_property
     def scene(self) -> Scene:
-        """The image, and what is measured in it when first asked for."""
-        scene = Scene(self.image.pixels, trail_named=parse(self.request.question).motion.trail is not None)
+        """The image before it is known what moves, and what is measured in it when first asked for."""
+        scene = Scene(self.image.pixels, trail_named=self.question.trail_named)
         if self.seen is not None:
             self.seen.recall(self._image_key, scene)
-        self._first_scene = scene
         return scene
+
+    def scene_with(self, mover: BBox, trail_named: bool) -> Scene:
+        """The image in which a trail ends at what moves: its earlier positions are taken out.
+
+        Where a trail is named, balls that look alike, one after another, are one.
+        """
+        scene = self.scene.with_trail_named() if trail_named else self.scene
+        return scene.with_mover(mover)
+
+    def scene_of(self, grounding: Grounding, cue: Cue | None = None) -> Scene:
+        """The image as a grounding, and the cue of its motion, have it; its masks are those that were stored.
+
+        A mask cut again from its box may differ from one that was cut around a point, or given.
+        """
+        scene = self.scene_with(grounding.bbox, grounding.trail_named or cue == "trail")
+        changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
+        for placed in (grounding, *grounding.others, *changed):
+            if placed.mask is not None:
+                scene.preset_mask(placed.bbox, partial(self._stored_mask, placed.mask))
+        return scene
+
+    def _stored_mask(self, mask: Artifact) -> Mask:
+        return decode_own(self.backends.artifacts.read(mask.sha256))[..., 0] > 0
+
+    @cached_property
+    def question(self) -> QuestionReading:
+        """What the question says in words."""
+        return self.backends.words().read_question(self.request.question)
 
     @contextmanager
     def with_images(self, seen: SeenImages | None, owner: str | None = None) -> abc.Generator[Self]:
@@ -153,20 +179,8 @@ class Run(Generic[Request_co]):
         try:
             yield self
         finally:
-            if seen is not None and self._first_scene is not None:
-                seen.keep(self._image_key, self._first_scene)
-
-    def place_mover(self, bbox: BBox, cue: Cue | None) -> None:
-        """Has the scene know where what moves is: which end of a trail it is, the other positions are taken out.
-
-        Where `cue` says that a trail tells the motion, balls that look alike, one after another, are one.
-        """
-        scene = self.scene.with_trail_named() if cue == "trail" else self.scene
-        self.scene = scene.with_mover(bbox)
-
-    def before_computing(self, work: Callable[[], None]) -> None:
-        """Has something done before the next stage is computed: never, where all stages that follow are found again."""
-        self._before.append(work)
+            if seen is not None and "scene" in self.__dict__:
+                seen.keep(self._image_key, self.scene)
 
     @property
     def reader(self) -> Reader:
@@ -239,11 +253,11 @@ class Run(Generic[Request_co]):
         """To be held around the work of the generator."""
         return self.backends.device().held(self.priority, self.check_canceled)
 
-    def reader_input(self, stage: Stage) -> ReaderInput:
-        """What the reader is given on behalf of a stage."""
+    def reader_input(self, stage: Stage, scene: Scene | None = None) -> ReaderInput:
+        """What the reader is given on behalf of a stage; by default with nothing known of what moves."""
         self._calls[stage] = CallLog()
         return ReaderInput(
-            scene=self.scene,
+            scene=scene or self.scene,
             question=self.request.question,
             seed=self.request.seed,
             motion_wanted="motion" in self.request.left_to_reader,
@@ -317,9 +331,6 @@ class Run(Generic[Request_co]):
         return {"generator": fingerprint, "options": self.generator_options.model_dump(mode="json")}
 
     def _compute(self, name: Stage, function: Callable[..., StageResult[Any]], inputs: tuple[Any, ...]) -> Any:
-        while self._before:
-            self._before[0]()
-            self._before.pop(0)  # only now: what fails is done again where the stage is
         result = function(self, *inputs)
         if name not in self._calls:
             return result

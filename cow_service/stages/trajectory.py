@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cow_service.narration import facts_of, facts_of_both
 from cow_service.physics.ballistic import FreePath, ballistic_path, given_path, latest, sampled
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import Camera, FloorCamera
@@ -18,13 +19,10 @@ from cow_service.physics.outcome import KIND_OF, Decided, Query, answers_of, dec
 from cow_service.physics.placing import flies
 from cow_service.physics.projection import spread_anchors, swept
 from cow_service.physics.world import Led, WorldInput, Worlds, run_world
-from cow_service.readers.embedded.english.asked import read_asked
-from cow_service.readers.embedded.english.questions import parse
-from cow_service.readers.question.both_worlds import facts_of_both
-from cow_service.readers.question.facts import facts_of
 from cow_service.records import Asked, Grounding, Intervention, Motion, Outcome, Path, Trajectory
 from cow_service.requests import SimulateRequest, TrajectoryRequest
 from cow_service.stages.bodies import camera_of, obstacles_of, query_of, seen_bodies
+from cow_service.stages.grounding import placed_mover
 from cow_service.stages.keys import StageResult
 from cow_service.stages.paths import (
     body_records,
@@ -41,7 +39,6 @@ from cow_service.stages.paths import (
 )
 from cow_service.stages.placing import (
     placed_before,
-    placed_mover,
     placed_records,
     placement_of,
     put_before,
@@ -235,9 +232,10 @@ _OWN = ("kind", "direction", "depth", "speed", "speed_deviation")  # of each mov
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
-        obstacles, taken = obstacles_of(run.scene, grounding)
-        trajectory = trajectory_of(run.scene, grounding, motion, obstacles, run.request, taken)
-        return StageResult(value=trajectory, warnings=warnings_of(run.scene, run.request, grounding, trajectory))
+        scene = run.scene_of(grounding, motion.cue)
+        obstacles, taken = obstacles_of(scene, grounding)
+        trajectory = trajectory_of(scene, grounding, motion, obstacles, run.request, taken)
+        return StageResult(value=trajectory, warnings=warnings_of(run.request, grounding, trajectory))
 
 
 def trajectory_of(
@@ -252,7 +250,7 @@ def trajectory_of(
     bodies = seen_bodies(scene, grounding, (*obstacles, *taken))
     free = _free_path(scene, grounding, motion, request)
     known = bool(scene.regions or obstacles or taken)
-    asked = read_asked(parse(request.question))
+    asked = grounding.asked
     query = None if asked is None else query_of(asked, grounding, bodies)
     kept = len(bodies) - len(taken)
     world = _world(scene, (bodies[:kept], bodies[kept:]), motion, request, free, grounding, query)

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import math
 
-from cow_service.readers.question.placement_facts import doubts_of
+from cow_service.narration import doubts_of
 from cow_service.records import Grounding, Trajectory
 from cow_service.requests import SimulateRequest
-from cow_service.vision.scene import Scene
 
 OFF_CENTRE = 0.25  # of the object's size: a given path that begins further from its centre is remarked on
 
 
-def warnings_of(
-    scene: Scene, request: SimulateRequest, grounding: Grounding, trajectory: Trajectory
-) -> tuple[str, ...]:
+def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Trajectory) -> tuple[str, ...]:
     """Warnings, in whole sentences; empty where there is nothing to say."""
     found = (
         _no_surroundings(trajectory),
-        _cues_not_spoken_of(scene, request),
         _motion_beside_path(request),
         _path_off_object(request, grounding),
         _path_of_another_length(request),
@@ -55,18 +51,6 @@ def _no_surroundings(trajectory: Trajectory) -> str | None:
     return (
         "The surroundings could not be separated into objects, so encounters were not computed: "
         "an empty list does not mean that nothing is hit."
-    )
-
-
-def _cues_not_spoken_of(scene: Scene, request: SimulateRequest) -> str | None:
-    words = request.question.lower()
-    places = [f"an arrow at ({a.tail[0]:.0f}, {a.tail[1]:.0f})" for a in scene.arrows if "arrow" not in words]
-    places += [f"a box at ({b.bbox[0]:.0f}, {b.bbox[1]:.0f})" for b in scene.boxes if "box" not in words]
-    if not places:
-        return None
-    return (
-        f"Taken for drawn over the image though the question speaks of none: {', '.join(places)}. "
-        f"A generator that cleans cues takes them out; `generator_options.clean_cues: false` keeps them."
     )
 
 

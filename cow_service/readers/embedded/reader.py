@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from cow_service import __version__
 from cow_service.errors import CannotGround, CannotReadDirection
+from cow_service.narration import same_name
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import (
     AnswerReading,
@@ -31,9 +32,9 @@ from cow_service.readers.embedded.facing import facing
 from cow_service.readers.embedded.kinds import is_kind_asked, things_of_kinds
 from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, match_one
 from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
+from cow_service.readers.embedded.names import names_meant, read_name
 from cow_service.readers.embedded.naming import is_known
 from cow_service.readers.embedded.trails import along_trail, scene_of_mover
-from cow_service.readers.question.wording import same_name
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,
@@ -42,6 +43,7 @@ from cow_service.records import (
     Grounding,
     LocatedObject,
     MotionKind,
+    ObjectPrior,
     ReaderInfo,
     Source,
     Vector,
@@ -78,7 +80,17 @@ class EmbeddedReader:
             )
             for change in read.interventions
         )
-        return QuestionReading(read_asked(read), tuple(changes), read.motion.trail is not None)
+        words = question.lower()
+        drawings = frozenset(each for each in ("arrow", "box") if each in words)
+        return QuestionReading(read_asked(read), tuple(changes), read.motion.trail is not None, drawings)
+
+    def read_name(self, name: str) -> ObjectPrior:
+        """By its noun."""
+        return read_name(name)
+
+    def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:
+        """Those of the kind, where they are as many as the words say."""
+        return names_meant(words, names)
 
     def ground(self, given: ReaderInput) -> GroundingReading:
         """The region that fits the mover's words. Raises `CannotGround` where none or several do."""
@@ -138,9 +150,8 @@ class EmbeddedReader:
         question = parse(given.question)
         outcome = None if imagined is None else imagined.simulation.trajectory.outcome
         alternatives = read_alternatives(question)
-        reading = answer_from(
-            options, read_asked(question), outcome, imagined is not None, alternatives, unread(question)
-        )
+        asked = read_asked(question) if grounding is None else grounding.asked
+        reading = answer_from(options, asked, outcome, imagined is not None, alternatives, unread(question))
         if votes > 1:
             again = "The embedded reader gives the same answer every time: more votes say no more."
             reading = replace(reading, notes=(*reading.notes, again))

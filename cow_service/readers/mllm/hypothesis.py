@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.media.overlay import named_strip
+from cow_service.narration import state_words
 from cow_service.readers.base import Imagined
-from cow_service.readers.question.placement_facts import state_words
 from cow_service.records import MEETINGS, AskedRelation, Doubt, Encounter, Outcome, Simulation, Trajectory
 
 AS_IT_IS = "As it is"  # the name of the frames with nothing changed

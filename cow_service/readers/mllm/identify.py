@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import BeforeValidator, Field, PlainValidator, ValidationError, WithJsonSchema, model_validator
 
+from cow_service.narration import RELATION_WORDS
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import OtherMotionHint, StepReading
 from cow_service.readers.mllm.client import PromptCall
@@ -34,7 +35,6 @@ from cow_service.readers.mllm.replies import (
     words,
 )
 from cow_service.readers.options import plain
-from cow_service.readers.question.place_relations import RELATION_WORDS
 from cow_service.records import (
     DIRECTED_KINDS,
     Asked,

@@ -21,7 +21,6 @@ from cow_service.readers.base import (
     OtherMotionHint,
     OtherMotionReading,
     Quantity,
-    QuestionReading,
     ReaderInput,
 )
 from cow_service.readers.chat import ChatTurn, Upstream
@@ -99,10 +98,6 @@ class MllmReader:
     async def chat(self, body: dict[str, Any]) -> ChatTurn:
         """The reply to a chat of OpenAI's protocol, through pydantic-ai. Raises `InvalidRequest`, `MllmUnavailable`."""
         return await self._client.chat(body)
-
-    def read_question(self, question: str) -> QuestionReading:
-        """Nothing: it takes a call of the model, which `ground` makes."""
-        return QuestionReading()
 
     def ground(self, given: ReaderInput) -> GroundingReading:
         """Two calls: what moves, in words; then where it is and, in the same call, which way it moves.

@@ -1,12 +1,156 @@
-"""Says what happens in a world, in one sentence made of the facts of its trajectory."""
+"""Says in English what happens in a world: names, ways and places in words, and a trajectory in one sentence."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from cow_service.readers.question.placement_facts import placement_parts, placement_share
-from cow_service.records import Contact, Encounter, EncounterKind, Path, Trajectory
+if TYPE_CHECKING:  # the command line prints its help without records
+    from cow_service.records import (
+        Contact,
+        Encounter,
+        EncounterKind,
+        Intervention,
+        Path,
+        PlacedBefore,
+        Placement,
+        PlacementResult,
+        PlaceRelation,
+        Trajectory,
+        Vector,
+    )
+
+MAX_OBJECT = 200  # characters
+ALONG_AXIS = 0.95  # sine of the angle out of the image plane from which only the depth is worth a word
+IN_PLANE = 0.3  # and up to which it is not
+
+# 16 sectors of 22.5 degrees, from the right, turning upwards.
+_QUARTERS = (("to the right", "up"), ("up", "to the left"), ("to the left", "down"), ("down", "to the right"))
+_DETERMINERS = ("the ", "a ", "an ", "this ", "that ")
+
+
+def direction_words(direction: Vector | None, depth: float) -> str:
+    """A direction as a short phrase, such as "to the right and slightly up"; empty where there is none.
+
+    `direction` is in image pixels, x right, y down, of any length; `depth` as in `Motion`.
+    """
+    flat = _flat_words(direction)
+    away = "away from the camera" if depth > 0 else "towards the camera"
+    if not flat or abs(depth) >= ALONG_AXIS:
+        return away if abs(depth) > IN_PLANE else flat
+    return f"{flat} and {away}" if abs(depth) > IN_PLANE else flat
+
+
+def _flat_words(direction: Vector | None) -> str:
+    if direction is None or math.hypot(*direction) == 0 or not all(map(math.isfinite, direction)):
+        return ""
+    sector = round(math.atan2(-direction[1], direction[0]) / (math.pi / 8)) % 16
+    main, side = _QUARTERS[sector // 4]
+    return (main, f"{main} and slightly {side}", f"{main} and {side}", f"{side} and slightly {main}")[sector % 4]
+
+
+def same_name(one: str, other: str) -> bool:
+    """Whether two texts name an object alike, whatever their determiners, letters' case and spaces."""
+    words = [re.findall(r"\w+", bare_name(name).lower()) for name in (one, other)]
+    return words[0] == words[1] != []
+
+
+def bare_name(object: str) -> str:
+    """An object's name in one line, without its determiner."""
+    name = " ".join(object.split())[:MAX_OBJECT].rstrip()
+    determiner = next((word for word in _DETERMINERS if name.lower().startswith(word)), "")
+    return name[len(determiner) :]
+
+
+PREPOSITIONS: dict[PlaceRelation, str] = {
+    "into": "into", "onto": "onto", "between": "between", "in-front-of": "in front of", "behind": "behind",
+    "next-to": "next to", "left-of": "to the left of", "right-of": "to the right of",
+}  # fmt: skip
+_OTHER_WORDS: dict[str, PlaceRelation] = {
+    "in": "into", "inside": "into", "on": "onto", "on top of": "onto", "beside": "next-to", "left of": "left-of",
+    "right of": "right-of",
+}  # fmt: skip
+RELATION_WORDS: dict[str, PlaceRelation] = {
+    **{name: name for name in PREPOSITIONS},
+    **{words: relation for relation, words in PREPOSITIONS.items()},
+    **_OTHER_WORDS,
+}
+
+
+SURE = 0.9  # share of the worlds: where something is as it was meant in fewer, a warning says so
+HARDLY_SEEN = 0.25  # share of a thing that is seen
+_WHERE: dict[PlaceRelation, str] = {"into": "in", "onto": "on"}  # of what is there; else as it is put
+_DOES_NOT_STAY: dict[PlacementResult, str] = {
+    "overlaps": "there is no room for it, and it overlaps",
+    "falls-off": "it does not stay there, but falls off",
+    "tips": "it does not stay there: it tips over, or tips over what it is put to",
+}
+_NOT_AS_MEANT: dict[PlacementResult, str] = {
+    "sticks-out": "goes in but sticks out",
+    "on-the-rim": "does not go in, but lies on the rim",
+}
+_ENDS: dict[PlacementResult, str] = {
+    "inside": "goes in and stays inside",
+    "sticks-out": "goes in but sticks out",
+    "on-the-rim": "does not go in and stays on the rim",
+    "on-top": "stays on top",
+    "beside": "stays there without overlapping",
+    "overlaps": "has no room there and overlaps",
+    "falls-off": "falls off",
+    "tips": "tips over, or tips over what it was put to",
+}
+
+
+def placement_parts(placement: Placement) -> list[str]:
+    """The parts of a sentence about it, after its name."""
+    end = _ENDS[placement.result]
+    if placement.result in ("inside", "sticks-out") and placement.above_rim:
+        end = f"{end} with {round(100 * placement.above_rim)}% of its height above the rim"
+    return ["is carried over", "is let go", end]
+
+
+def placement_share(placement: Placement) -> float | None:
+    """The share of the worlds with the result that is told; None without an ensemble."""
+    return placement.probabilities.get(placement.result, 0.0) if placement.probabilities else None
+
+
+def place_words(placed: Intervention) -> str:
+    """Where something is put, as in: between the bowl and the cone."""
+    to = " and ".join(f"the {bare_name(target.object)}" for target in placed.targets)
+    return f"{PREPOSITIONS[placed.relation or 'into']} {to}"
+
+
+def state_words(placed: Intervention) -> str:
+    """What is where once it is put there, as in: the white mug next to the blue mug."""
+    at = _WHERE.get(placed.relation or "into", "")
+    where = place_words(placed)
+    return f"the {bare_name(placed.object.object)} {f'{at} {where.split(maxsplit=1)[1]}' if at else where}"
+
+
+def cannot_stay(placed: PlacedBefore) -> str:
+    """Why something cannot be put somewhere, in a sentence."""
+    faults: list[PlacementResult] = [result for result in _DOES_NOT_STAY if result in placed.probabilities]
+    result = placed.result
+    if result not in _DOES_NOT_STAY:
+        result = max(faults, key=lambda fault: placed.probabilities[fault])
+    share = placed.probabilities.get(result)
+    sure = "" if share is None else f" ({share:.0%} of the computed worlds)"
+    return f"'{placed.object}' cannot be put {placed.place}: {_DOES_NOT_STAY[result]}{sure}."
+
+
+def doubts_of(placed: PlacedBefore) -> tuple[str, ...]:
+    """What is in doubt of something that is put somewhere, in sentences: whether it stays there, and is seen."""
+    told, where = list[str](), f"'{placed.object}', put {placed.place},"
+    if placed.result in _NOT_AS_MEANT:
+        told.append(f"{where} {_NOT_AS_MEANT[placed.result]}.")
+    elif placed.fits is not None and placed.fits < SURE:
+        told.append(f"{where} is there as it was meant in {placed.fits:.0%} of the computed worlds.")
+    if placed.visible < HARDLY_SEEN:
+        told.append(f"{where} is hardly to be seen in the frames: others hide it there, or it is outside the image.")
+    return tuple(told)
+
 
 MAX_NAME = 60  # characters
 BOUNCE = 0.15  # m/s of a meeting with the floor, from which it is a bounce
@@ -317,3 +461,26 @@ def _count(trajectory: Trajectory) -> int:
     kind = None if outcome is None else _KINDS[outcome.asked.relation]
     own = [each for each in trajectory.encounters if each.subject == body and each.kind == kind]
     return len({(each.body, each.object) for each in own if _happened(each) and _is_meant(each.object, trajectory)})
+
+
+def facts_of_both(changes: Sequence[Intervention], mover: str, changed: Trajectory, factual: Trajectory) -> str:
+    """As in: without the vase, the car slides to the right and meets the mug after 1.2 s; with it, ...
+
+    Or: with the cup next to the mug, the car slides to the right; without that change, ...
+    """
+    removed = [named(each.object.object, "the") for each in changes if each.kind == "remove"]
+    placed = [state_words(each) for each in changes if each.kind == "place"]
+    without = [f"without {' and '.join(removed)}"] if removed else []
+    given = " and ".join([*without, *([f"with {' and '.join(placed)}"] if placed else [])])
+    if placed:
+        back = "without that change" if len(changes) == 1 else "without these changes"
+    else:
+        back = "with it" if len(removed) == 1 else "with them"
+    told, otherwise = _within(facts_of(mover, changed)), _within(facts_of(mover, factual))
+    return f"{given[0].upper()}{given[1:]}, {told}; {back}, {otherwise}."
+
+
+def _within(sentence: str) -> str:
+    """A sentence as a part of another one."""
+    bare = sentence.rstrip(".")
+    return bare[0].lower() + bare[1:]

@@ -1,1 +1,0 @@
-"""What a what-if question says, without looking at the image."""
