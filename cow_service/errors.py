@@ -88,6 +88,10 @@ class CowError(Exception):
     status: int = 500
     request_id: str | None = None  # of the response that carried it, if any
 
+    def __init_subclass__(cls, *, code: str | None = None, status: int | None = None, **others: Any) -> None:
+        super().__init_subclass__(**others)
+        cls.code, cls.status = code or cls.code, status or cls.status
+
     def __init__(
         self, detail: str, *, errors: tuple[FieldError, ...] = (), headers: dict[str, str] | None = None
     ) -> None:
@@ -114,250 +118,168 @@ class CowError(Exception):
         return problem if self.usage is None else problem | {"usage": self.usage}
 
 
-class InvalidRequest(CowError):
+class InvalidRequest(CowError, code="invalid-request", status=422):
     """The request is not valid."""
 
-    code, status = "invalid-request", 422
 
-
-class MalformedBody(InvalidRequest):
+class MalformedBody(InvalidRequest, code="malformed-body", status=400):
     """The body could not be read."""
 
-    code, status = "malformed-body", 400
 
-
-class NotFound(CowError):
+class NotFound(CowError, code="not-found", status=404):
     """There is nothing here."""
 
-    code, status = "not-found", 404
 
-
-class MethodNotAllowed(CowError):
+class MethodNotAllowed(CowError, code="method-not-allowed", status=405):
     """This address does not take that method."""
 
-    code, status = "method-not-allowed", 405
 
-
-class Unauthorized(CowError):
+class Unauthorized(CowError, code="unauthorized", status=401):
     """The request has no valid key."""
 
-    code, status = "unauthorized", 401
 
-
-class OriginNotAllowed(CowError):
+class OriginNotAllowed(CowError, code="origin-not-allowed", status=403):
     """A web page from there may not use the server."""
 
-    code, status = "origin-not-allowed", 403
 
-
-class RateLimited(CowError):
+class RateLimited(CowError, code="rate-limited", status=429):
     """Too many requests came in too short a time."""
 
-    code, status = "rate-limited", 429
 
-
-class ArtifactNotFound(CowError):
+class ArtifactNotFound(CowError, code="artifact-not-found", status=404):
     """No artifact has that digest."""
 
-    code, status = "artifact-not-found", 404
 
-
-class RangeNotSatisfiable(CowError):
+class RangeNotSatisfiable(CowError, code="range-not-satisfiable", status=416):
     """The range lies outside the artifact."""
 
-    code, status = "range-not-satisfiable", 416
 
-
-class BodyTooLarge(CowError):
+class BodyTooLarge(CowError, code="body-too-large", status=413):
     """The body is larger than the server takes."""
 
-    code, status = "body-too-large", 413
 
-
-class BodyTooSlow(CowError):
+class BodyTooSlow(CowError, code="body-too-slow", status=408):
     """The body did not arrive in time."""
 
-    code, status = "body-too-slow", 408
 
-
-class BodyTypeUnsupported(CowError):
+class BodyTypeUnsupported(CowError, code="body-type-unsupported", status=415):
     """The body has a media type that the server does not take."""
 
-    code, status = "body-type-unsupported", 415
 
-
-class ImageTooLarge(CowError):
+class ImageTooLarge(CowError, code="image-too-large", status=413):
     """The image has more pixels than the server takes."""
 
-    code, status = "image-too-large", 413
 
-
-class ImageUnreadable(CowError):
+class ImageUnreadable(CowError, code="image-unreadable", status=422):
     """The image could not be decoded."""
 
-    code, status = "image-unreadable", 422
 
-
-class ImageTypeUnsupported(CowError):
+class ImageTypeUnsupported(CowError, code="image-type-unsupported", status=415):
     """The image is not PNG, JPEG or WebP."""
 
-    code, status = "image-type-unsupported", 415
 
-
-class ImageUrlNotAllowed(CowError):
+class ImageUrlNotAllowed(CowError, code="image-url-not-allowed", status=422):
     """The image may not be fetched from that URL."""
 
-    code, status = "image-url-not-allowed", 422
 
-
-class ImageUrlUnreachable(CowError):
+class ImageUrlUnreachable(CowError, code="image-url-unreachable", status=422):
     """The image could not be fetched from its URL."""
 
-    code, status = "image-url-unreachable", 422
 
-
-class CannotGround(CowError):
+class CannotGround(CowError, code="cannot-ground", status=422):
     """An object that the question names could not be found, or not be used as it says."""
 
-    code, status = "cannot-ground", 422
 
-
-class ObjectNotFound(CannotGround):
+class ObjectNotFound(CannotGround, code="object-not-found"):
     """The multimodal LLM did not see the object in the image."""
 
-    code = "object-not-found"
 
-
-class CannotReadDirection(CowError):
+class CannotReadDirection(CowError, code="cannot-read-direction", status=422):
     """The direction of the motion could not be read."""
 
-    code, status = "cannot-read-direction", 422
 
-
-class ReaderUnavailable(CowError):
+class ReaderUnavailable(CowError, code="reader-unavailable", status=503):
     """The reader cannot run on this server."""
 
-    code, status = "reader-unavailable", 503
 
-
-class MllmBadReply(CowError):
+class MllmBadReply(CowError, code="mllm-bad-reply", status=502):
     """The multimodal LLM gave no reply that can be used."""
 
-    code, status = "mllm-bad-reply", 502
 
-
-class MllmUnavailable(CowError):
+class MllmUnavailable(CowError, code="mllm-unavailable", status=503):
     """The multimodal LLM could not be asked."""
 
-    code, status = "mllm-unavailable", 503
 
-
-class GeneratorUnavailable(CowError):
+class GeneratorUnavailable(CowError, code="generator-unavailable", status=503):
     """The generator cannot run on this server."""
 
-    code, status = "generator-unavailable", 503
 
-
-class WeightsUnavailable(GeneratorUnavailable):
+class WeightsUnavailable(GeneratorUnavailable, code="weights-unavailable"):
     """Weights are missing here, or are not those that were recorded when they were downloaded."""
 
-    code = "weights-unavailable"
 
-
-class CheckpointInvalid(GeneratorUnavailable):
+class CheckpointInvalid(GeneratorUnavailable, code="checkpoint-invalid"):
     """A checkpoint does not fit the model."""
 
-    code = "checkpoint-invalid"
 
-
-class GeneratorOutOfMemory(CowError):
+class GeneratorOutOfMemory(CowError, code="generator-out-of-memory", status=503):
     """The clip does not fit into the memory of the device."""
 
-    code, status = "generator-out-of-memory", 503
 
-
-class DeviceFailed(CowError):
+class DeviceFailed(CowError, code="device-failed", status=503):
     """The GPU failed in the middle of a clip."""
 
-    code, status = "device-failed", 503
 
-
-class ModelNotFound(CowError):
+class ModelNotFound(CowError, code="model-not-found", status=404):
     """No model has that name."""
 
-    code, status = "model-not-found", 404
 
-
-class JobNotFound(CowError):
+class JobNotFound(CowError, code="job-not-found", status=404):
     """There is no such job."""
 
-    code, status = "job-not-found", 404
 
-
-class DownloadUnavailable(CowError):
+class DownloadUnavailable(CowError, code="download-unavailable", status=409):
     """The job has no such file."""
 
-    code, status = "download-unavailable", 409
 
-
-class IdempotencyKeyReused(CowError):
+class IdempotencyKeyReused(CowError, code="idempotency-key-reused", status=422):
     """The idempotency key belongs to another request."""
 
-    code, status = "idempotency-key-reused", 422
 
-
-class WebhookNotAllowed(CowError):
+class WebhookNotAllowed(CowError, code="webhook-not-allowed", status=422):
     """The server does not call that webhook."""
 
-    code, status = "webhook-not-allowed", 422
 
-
-class QueueFull(CowError):
+class QueueFull(CowError, code="queue-full", status=503):
     """The queue is full."""
 
-    code, status = "queue-full", 503
 
-
-class NotReady(CowError):
+class NotReady(CowError, code="not-ready", status=503):
     """The server is not ready yet."""
 
-    code, status = "not-ready", 503
 
-
-class ShuttingDown(CowError):
+class ShuttingDown(CowError, code="shutting-down", status=503):
     """The server is stopping."""
 
-    code, status = "shutting-down", 503
 
-
-class Canceled(CowError):
+class Canceled(CowError, code="canceled", status=409):
     """The work was canceled."""
 
-    code, status = "canceled", 409
 
-
-class StorageUnavailable(CowError):
+class StorageUnavailable(CowError, code="storage-unavailable", status=503):
     """The data folder, the object store or the job database cannot be used."""
 
-    code, status = "storage-unavailable", 503
 
-
-class WorkerEnded(CowError):
+class WorkerEnded(CowError, code="worker-ended", status=500):
     """The process that computed the job ended before the job was done."""
 
-    code, status = "worker-ended", 500
 
-
-class JobTimeout(CowError):
+class JobTimeout(CowError, code="job-timeout", status=504):
     """The job took longer than this server allows."""
 
-    code, status = "job-timeout", 504
 
-
-class InternalError(CowError):
+class InternalError(CowError, code="internal-error", status=500):
     """The server met an error of its own."""
-
-    code, status = "internal-error", 500
 
 
 def unforeseen() -> InternalError:

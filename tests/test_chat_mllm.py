@@ -84,17 +84,17 @@ def told(response: httpx.Response) -> dict[str, Any]:
 # --- what goes on ---
 
 
-def test_a_plain_pass_through_is_the_callers_body_byte_for_byte(served: Served, mllm: RandomMllm) -> None:
+def test_a_plain_pass_through_is_the_callers_body(served: Served, mllm: RandomMllm) -> None:
     raw = (
         '{ "temperature" : 1.0,\t"cow": {"num_frames": 4}, "messages":[{"content":"h\\u00e9 \\ud83d\\ude00 / \\/",'
-        '"role":"user"}],\n "model"  :"%s", "seed":-0, "top_p":1E-1 , "x":{"cow":1,"model":"a"}  }  '
+        '"role":"user"}],\n "model"  :"%s", "seed":18446744073709551617, "top_p":1E-1 , "x":{"cow":1,"model":"a"}  }  '
     )
     response = post(served, (raw % WITHOUT).encode(), Authorization=f"Bearer {CALLERS_KEY}", Cookie="c=1")
     assert told(response)["cow"]["reason"] == "no-imagination"
     assert "`cow` was not used" in response.json()["cow"]["warnings"][0]
-    wanted = (raw % SERVED_NAME).replace(',\t"cow": {"num_frames": 4}', "")
+    wanted = json.loads((raw % SERVED_NAME).replace(',\t"cow": {"num_frames": 4}', ""))
     received = mllm.received[-1]
-    assert received.body.decode() == wanted
+    assert repr(json.loads(received.body)) == repr(wanted)  # also the order of its members, and 1.0 is not 1
     assert received.headers["authorization"] == f"Bearer {KEY}"
     assert CALLERS_KEY not in str(received.headers)
     assert "cookie" not in received.headers
@@ -102,13 +102,11 @@ def test_a_plain_pass_through_is_the_callers_body_byte_for_byte(served: Served, 
 
 
 def test_a_reply_comes_back_as_it_is(served: Served, mllm: RandomMllm) -> None:
-    ours = {"id": "mine", "choices": [], "usage": None, "odd": [1.50, "é"], "cow": "of another COW"}
+    ours = {"id": "mine", "choices": [], "usage": None, "odd": [1.50, "é", "\ud83d"], "cow": "of another COW"}
     raw = json.dumps(ours, indent=3).encode()
     mllm.next_replies = [failing(200, raw)]
     response = post(served, {"model": WITHOUT, "messages": HELLO})
     assert {**told(response), "cow": 0} == {**ours, "cow": 0}
-    kept, _, _ = raw.decode().partition('"cow"')
-    assert response.text.startswith(kept)
     ChatImagination.model_validate(response.json()["cow"])
 
 
@@ -457,7 +455,7 @@ def test_many_at_a_time_wait_for_a_place(mllm: RandomMllm) -> None:
     upstream = Upstream(mllm.address, "m")
 
     async def ask() -> Any:
-        async with forwarder.send(upstream, json.dumps({"messages": HELLO}).encode()) as reply:
+        async with forwarder.send(upstream, {"messages": HELLO}) as reply:
             return reply
 
     async def ask_twice() -> list[Any]:

@@ -7,7 +7,7 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from starlette.types import ASGIApp
@@ -16,14 +16,11 @@ from cow_service import __version__
 from cow_service.api.middleware.access import PROBES, ApiKeys, KeyRing, Origins, RateLimit, cors, is_loopback
 from cow_service.api.middleware.access_log import AccessLog, Correlation
 from cow_service.api.middleware.body_limit import BodyLimit
-from cow_service.api.openai.routes import Completer, chat_routes, document_chat
-from cow_service.api.openai.stream import ChatProblems
-from cow_service.api.page import page_routes
+from cow_service.api.openai import routes as chats
+from cow_service.api.openai.routes import Completer, document_chat
 from cow_service.api.problems import documented, install_problem_handlers
-from cow_service.api.routes.artifacts import artifact_routes, download_routes
-from cow_service.api.routes.health import docs_routes, health_routes
-from cow_service.api.routes.jobs import job_routes
-from cow_service.api.routes.simulate import simulate_routes
+from cow_service.api.routes import artifacts, health, jobs, page, simulate
+from cow_service.api.routes.artifacts import MAX_CONCURRENT_DOWNLOADS
 from cow_service.api.submission import Submitter
 from cow_service.errors import OriginNotAllowed, RateLimited, Unauthorized
 from cow_service.jobs.engine import JobEngine
@@ -34,7 +31,84 @@ from cow_service.records import Problem
 from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.settings import Settings
 
-DROPPED = ("HTTPValidationError", "ValidationError")  # the framework's error shapes, which no operation returns
+SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out."
+FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")  # of errors that no operation returns
+
+log = logging.getLogger("cow_service")
+
+
+def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing: bool = True) -> FastAPI:
+    """The application of an engine, which it starts if it is not running yet.
+
+    When the app ends, it closes engine and service, unless `closing` is false because others use them.
+    """
+    service = engine.service
+    submitter = Submitter(engine)
+    completer = Completer(submitter)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
+        if not engine.is_running:
+            await to_thread.run_sync(engine.start)
+        yield
+        await completer.close()
+        if closing:
+            await to_thread.run_sync(engine.close)
+            await to_thread.run_sync(service.close)
+            await to_thread.run_sync(tracing.stop)
+
+    app = LayeredApp(
+        title="COW",
+        version=__version__,
+        summary=SUMMARY,
+        docs_url=None,  # the framework's page loads its script from elsewhere; ours is in `routes/page.py`
+        redoc_url=None,
+        redirect_slashes=False,
+        lifespan=lifespan,
+    )
+    app.state.engine, app.state.readiness = engine, readiness or Readiness(service)
+    app.state.submitter, app.state.completer = submitter, completer
+    # Else a few GIFs would take the threads of all operations.
+    app.state.downloads = CapacityLimiter(MAX_CONCURRENT_DOWNLOADS)
+    install_problem_handlers(app)
+    install_layers(app, service.settings, service.metrics)
+    for module in (simulate, chats, jobs, artifacts, health, page):
+        app.include_router(module.router)
+    app.openapi = lambda: contract(app)
+    return app
+
+
+class LayeredApp(FastAPI):
+    """FastAPI with layers around its own, which see also what its handler of unforeseen errors answers."""
+
+    surround: Callable[[ASGIApp], ASGIApp]
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """The framework's layers, and ours around them."""
+        return self.surround(super().build_middleware_stack())
+
+
+def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> None:
+    """Puts the middleware around the routes of an app, the innermost first."""
+    keys = KeyRing(settings.api_keys)
+    limits = {"megabytes": settings.max_body_mb, "seconds": settings.body_timeout}
+    app.add_middleware(BodyLimit, **limits, megabytes_at_once=settings.max_bodies_mb)
+    if settings.rate_limit is not None:
+        app.add_middleware(RateLimit, per_minute=settings.rate_limit)
+    app.add_middleware(ApiKeys, keys=keys, count_failures=settings.rate_limit is not None)
+
+    def surround(stack: ASGIApp) -> ASGIApp:
+        stack = cors(stack, settings.cors_origins)
+        stack = Origins(stack, settings.cors_origins, only_local=not keys and is_loopback(settings.host))
+        return Correlation(AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"]))
+
+    app.surround = surround
+
+
+def warn_if_open(settings: Settings) -> None:
+    """Logs a warning where anybody who reaches the server can use it."""
+    if not settings.api_keys and not is_loopback(settings.host):
+        log.warning("COW_API_KEYS is not set: whoever reaches %s can use this server.", settings.host)
 
 
 def contract(app: FastAPI) -> dict[str, Any]:
@@ -52,7 +126,7 @@ def contract(app: FastAPI) -> dict[str, Any]:
                     del operation["responses"]["422"]  # the framework's own; ours are problems
         _document_middleware(document)
         document_chat(document)
-        for name in DROPPED:
+        for name in FRAMEWORK_SCHEMAS:
             schemas.pop(name, None)
         document["components"]["schemas"] = dict(sorted(schemas.items()))
         app.openapi_schema = document
@@ -74,93 +148,3 @@ def _document_middleware(document: dict[str, Any]) -> None:
                 if known is not response:
                     known["description"] += ", " + response["description"]
             operation["responses"] = dict(sorted(responses.items()))
-
-
-log = logging.getLogger("cow_service")
-
-
-class LayeredApp(FastAPI):
-    """FastAPI with layers around its own, which see also what its handler of unforeseen errors answers."""
-
-    surround: Callable[[ASGIApp], ASGIApp] | None = None
-
-    def build_middleware_stack(self) -> ASGIApp:
-        """The framework's layers, and ours around them."""
-        stack = super().build_middleware_stack()
-        return stack if self.surround is None else self.surround(stack)
-
-
-def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> None:
-    """Puts all layers but the body's limit around the routes of an app that is being made."""
-    keys = KeyRing(settings.api_keys)
-    if settings.rate_limit is not None:
-        app.add_middleware(RateLimit, per_minute=settings.rate_limit)
-    app.add_middleware(ApiKeys, keys=keys, count_failures=settings.rate_limit is not None)
-
-    def surround(stack: ASGIApp) -> ASGIApp:
-        stack = cors(stack, settings.cors_origins)
-        stack = Origins(stack, settings.cors_origins, only_local=not keys and is_loopback(settings.host))
-        return Correlation(AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"]))
-
-    app.surround = surround
-
-
-def warn_if_open(settings: Settings) -> None:
-    """Logs a warning where anybody who reaches the server can use it."""
-    if not settings.api_keys and not is_loopback(settings.host):
-        log.warning("COW_API_KEYS is not set: whoever reaches %s can use this server.", settings.host)
-
-
-SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out."
-
-
-def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing: bool = True) -> FastAPI:
-    """The application of an engine, which it starts if it is not running yet. The app itself holds no state.
-
-    When the app ends, it closes engine and service, unless `closing` is false because others use them.
-    """
-    service = engine.service
-    readiness = readiness or Readiness(service)
-    submitter = Submitter(engine)
-    completer = Completer(submitter)
-
-    @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
-        if not engine.is_running:
-            await to_thread.run_sync(engine.start)
-        yield
-        await completer.close()
-        if closing:
-            await to_thread.run_sync(engine.close)
-            await to_thread.run_sync(service.close)
-            await to_thread.run_sync(tracing.stop)
-
-    app = LayeredApp(
-        title="COW",
-        version=__version__,
-        summary=SUMMARY,
-        docs_url=None,  # the framework's page loads its script from elsewhere; ours is in `routes/docs.py`
-        redoc_url=None,
-        redirect_slashes=False,
-        lifespan=lifespan,
-    )
-    limits = {"megabytes": service.settings.max_body_mb, "seconds": service.settings.body_timeout}
-    app.add_middleware(BodyLimit, **limits, megabytes_at_once=service.settings.max_bodies_mb)
-    install_problem_handlers(app)
-    install_layers(app, service.settings, service.metrics)
-    layers = app.surround
-    # Outermost: the other layers refuse requests, too.
-    app.surround = lambda stack: ChatProblems(stack if layers is None else layers(stack))
-    for router in (
-        simulate_routes(submitter),
-        chat_routes(submitter, completer),
-        job_routes(engine),
-        download_routes(engine),
-        artifact_routes(engine),
-        health_routes(engine, readiness),
-        page_routes(lambda: engine.service.artifacts, service.settings.artifacts_redirect),
-        docs_routes(),
-    ):
-        app.include_router(router)
-    app.openapi = lambda: contract(app)
-    return app

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
@@ -10,10 +11,11 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
+from starlette.types import Scope
 
 from cow_service.errors import (
     CowError,
@@ -25,9 +27,16 @@ from cow_service.errors import (
     shortened,
     unforeseen,
 )
+from cow_service.records import Problem, Record
 from cow_service.requests.values import SHOWN_CHARACTERS, field_errors
 
 MEDIA_TYPE = "application/problem+json"
+OPENAI_ROOT = "/v1/"  # of the paths of operations that OpenAI's clients call
+OPENAI_TYPES = {
+    HTTPStatus.UNAUTHORIZED: "authentication_error",
+    HTTPStatus.FORBIDDEN: "permission_error",
+    HTTPStatus.TOO_MANY_REQUESTS: "rate_limit_error",
+}
 
 log = logging.getLogger("cow_service")
 
@@ -43,44 +52,76 @@ def invalid(
     return InvalidRequest(f"{summary}. See /openapi.json for what the request may hold.", errors=fields)
 
 
-def respond(error: CowError) -> JSONResponse:
-    """The HTTP response for an error."""
+class ChatError(Record):
+    """An error as OpenAI's clients read it."""
+
+    message: str = Field(description="`detail` of the problem.")
+    type: str
+    param: str | None = Field(description="The first invalid field.")
+    code: str = Field(description="The last segment of the problem's `type`.")
+
+
+class ChatProblem(Problem):
+    """Why a request under `/v1` failed: a problem (RFC 9457), and the same as OpenAI's clients read it."""
+
+    error: ChatError
+
+
+def openai_error(error: CowError) -> dict[str, Any]:
+    """An error as OpenAI's clients read it: a `ChatError`."""
+    other = "server_error" if error.status >= HTTPStatus.INTERNAL_SERVER_ERROR else "invalid_request_error"
+    param = None
+    if error.errors:  # a JSON Pointer as OpenAI writes places: messages[0].content
+        steps = [step.replace("~1", "/").replace("~0", "~") for step in error.errors[0].pointer.split("/")[1:]]
+        param = "".join(f"[{step}]" if re.fullmatch("[0-9]+", step) else f".{step}" for step in steps).lstrip(".")
+    return {
+        "message": error.detail,
+        "type": OPENAI_TYPES.get(HTTPStatus(error.status), other),
+        "param": param or None,
+        "code": error.code,
+    }
+
+
+def chat_problem(error: CowError) -> dict[str, Any]:
+    """An error as `ChatProblem`."""
+    return error.as_problem() | {"error": openai_error(error)}
+
+
+def respond(error: CowError, scope: Scope) -> JSONResponse:
+    """The HTTP response for an error, which OpenAI's clients, too, can read where the request is one of theirs."""
+    problem = chat_problem(error) if scope["path"].startswith(OPENAI_ROOT) else error.as_problem()
     headers = {"Retry-After": "5"} if error.status == HTTPStatus.SERVICE_UNAVAILABLE else {}
-    return JSONResponse(error.as_problem(), error.status, headers=headers | error.headers, media_type=MEDIA_TYPE)
+    return JSONResponse(problem, error.status, headers=headers | error.headers, media_type=MEDIA_TYPE)
 
 
 def install_problem_handlers(app: FastAPI) -> None:
     """Makes every error of the app a problem, those of the framework and unforeseen ones included."""
 
-    async def cow_error(_: Request, error: Exception) -> JSONResponse:
-        assert isinstance(error, CowError)
-        return respond(error)
+    @app.exception_handler(CowError)
+    async def cow_error(request: Request, error: CowError) -> Response:
+        return respond(error, request.scope)
 
-    async def framework_error(request: Request, error: Exception) -> JSONResponse:
-        assert isinstance(error, HTTPException)
-        response = respond(_translated(error, request))
+    @app.exception_handler(RequestValidationError)
+    async def validation_error(request: Request, error: RequestValidationError) -> Response:
+        return respond(invalid(error), request.scope)
+
+    @app.exception_handler(HTTPException)
+    async def framework_error(request: Request, error: HTTPException) -> Response:
+        response = respond(_translated(error, request), request.scope)
         response.headers.update(error.headers or {})
         if response.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
             response.headers["Allow"] = ", ".join(sorted(_methods(request)))
         return response
 
-    async def validation_error(_: Request, error: Exception) -> JSONResponse:
-        assert isinstance(error, RequestValidationError)
-        return respond(invalid(error))
-
-    async def any_other(request: Request, error: Exception) -> JSONResponse:
-        log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return respond(unforeseen())
-
-    async def gone(request: Request, _: Exception) -> Response:
+    @app.exception_handler(ClientDisconnect)
+    async def gone(request: Request, error: ClientDisconnect) -> Response:
         log.info("%s %s: the caller left before its body was in", request.method, request.url.path)
         return Response(status_code=HTTPStatus.BAD_REQUEST)
 
-    app.add_exception_handler(ClientDisconnect, gone)
-    app.add_exception_handler(CowError, cow_error)
-    app.add_exception_handler(HTTPException, framework_error)
-    app.add_exception_handler(RequestValidationError, validation_error)
-    app.add_exception_handler(Exception, any_other)
+    @app.exception_handler(Exception)
+    async def any_other(request: Request, error: Exception) -> Response:
+        log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+        return respond(unforeseen(), request.scope)
 
 
 def documented(*errors: type[CowError]) -> dict[int | str, dict[str, Any]]:
@@ -96,10 +137,11 @@ def documented(*errors: type[CowError]) -> dict[int | str, dict[str, Any]]:
 
 
 def _translated(error: HTTPException, request: Request) -> CowError:
+    path = shortened(request.url.path, SHOWN_CHARACTERS)
     if error.status_code == HTTPStatus.NOT_FOUND:
-        return NotFound(f"Nothing is served at {_path(request)}. GET /openapi.json lists what is.")
+        return NotFound(f"Nothing is served at {path}. GET /openapi.json lists what is.")
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-        return MethodNotAllowed(f"{_path(request)} does not take {request.method}.")
+        return MethodNotAllowed(f"{path} does not take {request.method}.")
     if HTTPStatus.BAD_REQUEST <= error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
         return MalformedBody(f"{error.detail}.")
     return InternalError(f"{error.detail}.")
@@ -111,7 +153,3 @@ def _methods(request: Request) -> set[str]:
     routes = [*request.app.routes, *(route for router in routers if router is not None for route in router.routes)]
     fitting = (route for route in routes if route.matches(request.scope)[0] is not Match.NONE)
     return {method for route in fitting for method in getattr(route, "methods", None) or ()}
-
-
-def _path(request: Request) -> str:
-    return shortened(request.url.path, SHOWN_CHARACTERS)

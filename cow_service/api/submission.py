@@ -8,10 +8,10 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar
 
 from anyio import CapacityLimiter, to_thread
-from fastapi import Request, Response
+from fastapi import Depends, Request, Response
 
 from cow_service.api.body import Body, parse, receive
 from cow_service.api.middleware.body_limit import release_body
@@ -41,6 +41,23 @@ def owner_of(request: Request) -> str | None:
     """Whose key the request came with; None where the server has no keys."""
     owner: str | None = request.scope.get("state", {}).get("owner")
     return owner
+
+
+def from_app(name: str) -> Any:
+    """A dependency of operations: what `create_app` keeps in the app's state under this name."""
+
+    async def get(request: Request) -> Any:  # not run in a thread, as plain functions are
+        return getattr(request.app.state, name)
+
+    return Depends(get)
+
+
+async def _owner(request: Request) -> str | None:
+    return owner_of(request)
+
+
+Engine = Annotated[JobEngine, from_app("engine")]
+Owner = Annotated[str | None, Depends(_owner)]
 
 
 @dataclass
@@ -249,6 +266,9 @@ class Submitter:
         if found.result is None:
             raise Canceled("The job was canceled before it was done.")
         return found.result
+
+
+JobSubmitter = Annotated[Submitter, from_app("submitter")]
 
 
 def json_response(body: str, status: int = HTTPStatus.OK, headers: dict[str, str] | None = None) -> Response:

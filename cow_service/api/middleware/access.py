@@ -132,7 +132,7 @@ class RateLimit:
             if wait:
                 whose = "this key" if owner is not None else "your address"
                 detail = f"The server takes {self.buckets.per_minute} requests a minute with {whose}."
-                await respond(rate_limited(detail, wait))(scope, receive, send)
+                await respond(rate_limited(detail, wait), scope)(scope, receive, send)
                 return
         await self.app(scope, receive, send)
 
@@ -161,7 +161,7 @@ class ApiKeys:
                 key = _bearer(scope)
                 owner = None if key is None else self.keys.owner_of(key)
                 if owner is None:
-                    await respond(self._refusal(scope, given=key is not None))(scope, receive, send)
+                    await respond(self._refusal(scope, given=key is not None), scope)(scope, receive, send)
                     return
                 state["owner"] = owner
         await self.app(scope, receive, send)
@@ -239,7 +239,7 @@ class Origins:
         """Passes a request on, or refuses it."""
         error = None if scope["type"] == "lifespan" else self._refusal(Headers(scope=scope))
         if error is not None:
-            await respond(error)(scope, receive, send)
+            await respond(error, scope)(scope, receive, send)
             return
         await self.app(scope, receive, send)
 

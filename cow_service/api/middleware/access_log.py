@@ -64,7 +64,7 @@ class AccessLog:
         except Exception as error:
             if not status:
                 log.error("%s %s failed", scope["method"], _shown(scope), exc_info=error)
-                await respond(unforeseen())(scope, receive, observed)
+                await respond(unforeseen(), scope)(scope, receive, observed)
             elif not complete:
                 raise  # the server must break the connection off: the caller would take the part for the whole
             # Else the framework has answered and logged it, and raised it again only to tell the server.

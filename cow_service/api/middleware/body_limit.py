@@ -33,7 +33,7 @@ class BodyLimit:
             return
         limit = int(self.megabytes * 1_000_000)
         if (refusal := self._refused(scope, limit)) is not None:
-            await respond(refusal)(scope, receive, send)
+            await respond(refusal, scope)(scope, receive, send)
             return
         deadline = asyncio.get_running_loop().time() + self.seconds
         seen = 0

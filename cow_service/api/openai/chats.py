@@ -1,78 +1,27 @@
-"""A chat as it arrived: its text, which goes on unchanged, and what COW needs to know of its messages."""
+"""A chat as it arrived. It goes on unchanged in meaning; here is what COW needs to know of it."""
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cow_service.api.body import read_object
-from cow_service.errors import FieldError, InvalidRequest
+from cow_service.errors import CowError, FieldError, InvalidRequest
 
-_SPACE = re.compile(r"[ \t\r\n]*")
-_DECODER = json.JSONDecoder()
-SEPARATORS = (",", ":")
-
-
-@dataclass(frozen=True)
-class Member:
-    """A member of an object: its key, and where it and its value stand in the text."""
-
-    key: str
-    start: int  # of the key
-    value: int  # of the value
-    end: int
+EXTENSION = "cow"  # COW's own field of a request, and of a reply
 
 
 def as_json(value: Any) -> str:
-    """A value as compact JSON."""
-    return json.dumps(value, separators=SEPARATORS, ensure_ascii=False)
+    """A value as compact JSON. Only ASCII: replies of an MLLM may hold halves of surrogate pairs."""
+    return json.dumps(value, separators=(",", ":"))
 
 
-def spliced(text: str, replaced: Mapping[str, str], *, dropped: str = "") -> str:
-    """The object with these members replaced, each by JSON, or added at its end; and without the one named `dropped`.
-
-    `text` must be one well-formed JSON object whose keys differ.
-    """
-    members = list(_members(text))
-    edits: list[tuple[int, int, str]] = []
-    for place, member in enumerate(members):
-        if member.key in replaced:
-            edits.append((member.value, member.end, replaced[member.key]))
-        elif member.key == dropped:
-            after = members[place + 1].start if place + 1 < len(members) else member.end
-            edits.append((members[place - 1].end, member.end, "") if place else (member.start, after, ""))
-    new = [f"{as_json(key)}:{value}" for key, value in replaced.items() if key not in {m.key for m in members}]
-    if new:
-        kept = [member for member in members if member.key != dropped]
-        end = members[-1].end if members else text.index("{") + 1
-        edits.append((end, end, ("," if kept else "") + ",".join(new)))
-    parts: list[str] = []
-    at = 0
-    for start, end, value in edits:
-        parts += [text[at:start], value]
-        at = end
-    return "".join([*parts, text[at:]])
-
-
-def _members(text: str) -> Iterator[Member]:
-    at = _after_space(text, text.index("{") + 1)
-    while text[at] != "}":
-        key, end = _DECODER.raw_decode(text, at)
-        value = _after_space(text, _after_space(text, end) + 1)  # behind the colon
-        _, stop = _DECODER.raw_decode(text, value)
-        yield Member(key, at, value, stop)
-        at = _after_space(text, stop)
-        at = _after_space(text, at + 1) if text[at] == "," else at
-
-
-def _after_space(text: str, at: int) -> int:
-    found = _SPACE.match(text, at)
-    return at if found is None else found.end()
+def wrong(pointer: str, detail: str) -> InvalidRequest:
+    """The error for one field."""
+    return InvalidRequest(f"{pointer or 'The body'}: {detail}.", errors=(FieldError(pointer, detail),))
 
 
 @dataclass(frozen=True)
@@ -83,12 +32,49 @@ class ImagePart:
     pointer: str  # JSON Pointer to the part
     url_pointer: str  # and to its URL
     role: str  # of its message
-    detail: str | None  # that it is to be seen in, where the part says one
+    detail: str | None  # the resolution it is to be seen in, where the part says one
 
     @property
     def reference(self) -> str | dict[str, str]:
         """The image as requests have it."""
         return self.url if self.url[:5].lower() == "data:" else {"url": self.url}
+
+
+@dataclass(frozen=True)
+class Chat:
+    """The body of a chat completion. Nothing of `fields` is validated but what is a field here."""
+
+    fields: dict[str, Any]
+    model: str
+    stream: bool
+    cow: dict[str, Any]  # COW's own options
+
+    @classmethod
+    def parse(cls, fields: dict[str, Any]) -> Chat:
+        """The chat of a JSON object. Raises `InvalidRequest`."""
+        model, cow = fields.get("model"), fields.get(EXTENSION)
+        if not isinstance(model, str):
+            raise wrong("/model", "is missing; give a name of `GET /v1/models`" if model is None else "is no text")
+        if cow is not None and not isinstance(cow, dict):
+            raise wrong(f"/{EXTENSION}", "is no object: give fields of `POST /simulate` in it")
+        return cls(fields, model, fields.get("stream") is True, cast("dict[str, Any]", cow or {}))
+
+    @property
+    def messages(self) -> list[Any]:
+        """Its messages; none where the field holds something else, which is for the MLLM to say."""
+        messages = self.fields.get("messages")
+        return cast("list[Any]", messages) if isinstance(messages, list) else []
+
+    @property
+    def with_usage(self) -> bool:
+        """Whether a stream is to end with a chunk that has `usage`."""
+        options = self.fields.get("stream_options")
+        return isinstance(options, dict) and bool(cast("dict[str, Any]", options).get("include_usage"))
+
+    def question(self) -> tuple[int, str]:
+        """The place of the last user message, -1 where there is none, and its text."""
+        place = max((place for place, each in enumerate(self.messages) if role_of(each) == "user"), default=-1)
+        return place, "" if place < 0 else "\n".join(texts_of(self.messages[place]))
 
 
 def role_of(message: Any) -> str:
@@ -134,52 +120,18 @@ def _parts(messages: list[Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
                 yield f"{pointer}/{number}", role_of(message), cast("dict[str, Any]", held)
 
 
-EXTENSION = "cow"  # COW's own field of a request, and of a reply
+def point_into_chat(pointer: str, own: Mapping[str, str]) -> str:
+    """The JSON Pointer into a chat for one into the request made of it; `own` has those outside the field `cow`."""
+    head = "/".join(pointer.split("/")[:2])
+    return own.get(head, f"/{EXTENSION}{pointer}") if pointer else ""
 
 
-@dataclass(frozen=True)
-class Chat:
-    """The body of a chat completion: one JSON object. Nothing of it is validated but what is a field here."""
-
-    text: str
-    fields: dict[str, Any]
-    model: str
-    stream: bool
-    cow: dict[str, Any]  # what COW itself is told
-
-    def sent(self, model: str, messages: list[Any] | None = None) -> bytes:
-        """The body for the MLLM: as it arrived, but for the model's name, `cow`, and messages if others are given."""
-        replaced = {"model": as_json(model)}
-        if messages is not None:
-            replaced["messages"] = as_json(messages)
-        return spliced(self.text, replaced, dropped=EXTENSION).encode()
-
-    def messages(self) -> list[Any]:
-        """Its messages; none where the field holds something else, which is for the MLLM to say."""
-        messages = self.fields.get("messages")
-        return cast("list[Any]", messages) if isinstance(messages, list) else []
-
-
-def read_chat(body: bytes) -> Chat:
-    """The chat of a body. Raises `MalformedBody`, `InvalidRequest`."""
-    text = body.decode("utf-8-sig", errors="replace")
-    return chat_of(read_object(body, "The body"), text)
-
-
-def chat_of(fields: dict[str, Any], text: str | None = None) -> Chat:
-    """The chat of a JSON object, written here unless its text is given. Raises `InvalidRequest`."""
-    model, cow = fields.get("model"), fields.get(EXTENSION)
-    if not isinstance(model, str):
-        raise wrong("/model", "is missing; give a name of `GET /v1/models`" if model is None else "is no text")
-    if cow is not None and not isinstance(cow, dict):
-        raise wrong(f"/{EXTENSION}", "is no object: give fields of `POST /simulate` in it")
-    given = cast("dict[str, Any]", cow or {})
-    return Chat(as_json(fields) if text is None else text, fields, model, fields.get("stream") is True, given)
-
-
-def wrong(pointer: str, detail: str) -> InvalidRequest:
-    """The error for one field."""
-    return InvalidRequest(f"{pointer or 'The body'}: {detail}.", errors=(FieldError(pointer, detail),))
+def locate_in_chat(error: CowError, own: Mapping[str, str]) -> CowError:
+    """An error of the request made of a chat, pointing into the chat."""
+    fields = tuple(FieldError(point_into_chat(field.pointer, own), field.detail) for field in error.errors)
+    located = type(error)(error.detail, errors=fields, headers=error.headers)
+    located.usage = error.usage
+    return located
 
 
 class ChatMessage(BaseModel):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncGenerator, AsyncIterator
-from contextlib import asynccontextmanager, suppress
+import re
+from collections.abc import AsyncGenerator, AsyncIterator, Generator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any, cast
@@ -13,8 +14,8 @@ from typing import Any, cast
 import httpx
 
 from cow_service import __version__
-from cow_service.api.openai.chats import as_json
-from cow_service.errors import CowError, MllmBadReply, MllmUnavailable, shortened
+from cow_service.api.openai.chats import as_json, wrong
+from cow_service.errors import MllmBadReply, MllmUnavailable, shortened
 from cow_service.readers.chat import Upstream
 from cow_service.settings import Settings
 
@@ -24,14 +25,14 @@ PASSED_HEADERS = ("retry-after", "retry-after-ms", "x-should-retry")
 PASSED_PREFIX = "x-ratelimit-"
 # These say that this server's own key, or address, is wrong: nothing that a caller could mend.
 NOT_THE_CALLERS = (HTTPStatus.UNAUTHORIZED, HTTPStatus.PROXY_AUTHENTICATION_REQUIRED)
-END = b"[DONE]"
+_BLANK_LINE = re.compile(rb"\r\n\r\n|\n\n|\r\r")
 
 
 @dataclass(frozen=True)
 class Whole:
-    """A reply in one piece: a JSON object, be it a completion or an error, with the status that it came with."""
+    """A reply in one piece, be it a completion or an error, with the status that it came with."""
 
-    text: str
+    body: dict[str, Any]
     status: int = HTTPStatus.OK
     headers: dict[str, str] = field(default_factory=dict[str, str])
 
@@ -54,7 +55,7 @@ class Forwarder:
     def __init__(self, settings: Settings) -> None:
         self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
         self._permits = settings.mllm_concurrency
-        self._slots: asyncio.Semaphore | None = None
+        self._slots = asyncio.Semaphore(self._permits)
         self._client: httpx.AsyncClient | None = None
 
     async def close(self) -> None:
@@ -64,30 +65,30 @@ class Forwarder:
             self._client = None
 
     @asynccontextmanager
-    async def send(self, upstream: Upstream, body: bytes) -> AsyncGenerator[Whole | Events]:
-        """The reply to a chat, sent once. Raises `MllmUnavailable`, `MllmBadReply`."""
+    async def send(self, upstream: Upstream, body: dict[str, Any]) -> AsyncGenerator[Whole | Events]:
+        """The reply to a chat, sent once. Raises `InvalidRequest`, `MllmUnavailable`, `MllmBadReply`."""
+        try:
+            content = json.dumps(body, allow_nan=False)
+        except ValueError as error:
+            raise wrong("", "holds a number that is too large for a double, such as 1e999") from error
         headers = {"Content-Type": "application/json"}
         if upstream.key is not None:
             headers["Authorization"] = f"Bearer {upstream.key}"
-        request = self._pool().build_request(
-            "POST", f"{upstream.base_url}/chat/completions", content=body, headers=headers
-        )
+        url = f"{upstream.base_url}/chat/completions"
+        request = self._pool().build_request("POST", url, content=content, headers=headers)
         async with self._slot():
-            response = await self._sent(request)
+            with _translated():
+                response = await self._pool().send(request, stream=True)
             try:
                 streams = response.headers.get("content-type", "").startswith("text/event-stream")
                 if response.status_code == HTTPStatus.OK and streams:
                     yield Events(_events(response))
                 else:
-                    yield _whole(response, await _read(response), upstream)
+                    with _translated():
+                        await response.aread()
+                    yield _whole(response, upstream)
             finally:
                 await response.aclose()
-
-    async def _sent(self, request: httpx.Request) -> httpx.Response:
-        try:
-            return await self._pool().send(request, stream=True)
-        except httpx.HTTPError as error:
-            raise _unavailable(error) from error
 
     def _pool(self) -> httpx.AsyncClient:
         if self._client is None:
@@ -100,8 +101,6 @@ class Forwarder:
 
     @asynccontextmanager
     async def _slot(self) -> AsyncGenerator[None]:
-        if self._slots is None:
-            self._slots = asyncio.Semaphore(self._permits)
         try:
             async with asyncio.timeout(self._budget):
                 await self._slots.acquire()
@@ -116,52 +115,54 @@ class Forwarder:
             self._slots.release()
 
 
-async def _read(response: httpx.Response) -> bytes:
+@contextmanager
+def _translated() -> Generator[None]:
+    """Translates the errors of a connection, in words without addresses."""
     try:
-        return await response.aread()
+        yield
     except httpx.HTTPError as error:
-        raise _unavailable(error) from error
+        if isinstance(error, httpx.TimeoutException):
+            reason = "it did not reply in time (COW_MLLM_TIMEOUT)"
+        elif isinstance(error, httpx.ConnectError):
+            reason = "it could not be reached; check that it runs, and COW_MLLM_BASE_URL"
+        else:
+            reason = "it broke off before its reply was whole"
+        detail = f"The server of the multimodal LLM gave no reply: {reason}. It was asked once."
+        raise MllmUnavailable(detail) from error
 
 
 async def _events(response: httpx.Response) -> AsyncGenerator[bytes]:
     """The events of a stream. Raises `MllmUnavailable` where it breaks off before its end."""
     ended = False
-    try:
-        async for event in whole_events(response.aiter_bytes()):
-            ended = ended or event.strip().removeprefix(b"data:").strip() == END
+    with _translated():
+        async for event in split_events(response.aiter_bytes()):
+            ended = ended or event.strip().removeprefix(b"data:").strip() == b"[DONE]"
             yield event
-    except httpx.HTTPError as error:
-        raise _unavailable(error) from error
     if not ended:
         raise MllmUnavailable("The server of the multimodal LLM ended its stream before the reply was whole ([DONE]).")
 
 
-async def whole_events(chunks: AsyncIterator[bytes]) -> AsyncGenerator[bytes]:
+async def split_events(chunks: AsyncIterator[bytes]) -> AsyncGenerator[bytes]:
     """Bytes as they arrive, cut where an event ends: behind a blank line, however lines end."""
     held = b""
     async for chunk in chunks:
         held += chunk
-        while (cut := _end_of_event(held)) is not None:
-            event, held = held[:cut], held[cut:]
-            yield event
+        while (end := _BLANK_LINE.search(held)) is not None:
+            yield held[: end.end()]
+            held = held[end.end() :]
     if held.strip():
         yield held
 
 
-def _end_of_event(data: bytes) -> int | None:
-    ends = [at + len(mark) for mark in (b"\n\n", b"\r\n\r\n", b"\r\r") if (at := data.find(mark)) >= 0]
-    return min(ends, default=None)
-
-
-def _whole(response: httpx.Response, body: bytes, upstream: Upstream) -> Whole:
+def _whole(response: httpx.Response, upstream: Upstream) -> Whole:
     status = response.status_code
-    text, value = body.decode("utf-8", errors="replace"), None
+    text, value = response.content.decode("utf-8", errors="replace"), None
     with suppress(ValueError, RecursionError):
         value = json.loads(text)
     if status == HTTPStatus.OK:
         if not isinstance(value, dict):
             raise MllmBadReply("The server of the multimodal LLM replied with something that is no JSON object.")
-        return Whole(text)
+        return Whole(cast("dict[str, Any]", value))
     if status in NOT_THE_CALLERS or status < HTTPStatus.BAD_REQUEST:
         raise MllmUnavailable(
             f"The server of the multimodal LLM answered with status {status}: its address or this server's own key for "
@@ -172,8 +173,18 @@ def _whole(response: httpx.Response, body: bytes, upstream: Upstream) -> Whole:
         for name, value in response.headers.items()
         if name in PASSED_HEADERS or name.startswith(PASSED_PREFIX)
     }
-    told = _error_of(status, value, text if response.headers.get("content-type", "").startswith("text/plain") else "")
-    return Whole(_without(as_json(told), upstream.key), status, headers)
+    is_text = response.headers.get("content-type", "").startswith("text/plain")
+    error = _error_of(status, value, text if is_text else "")
+    return Whole(_without(error, upstream.key) if upstream.key else error, status, headers)
+
+
+def _without(value: Any, key: str) -> Any:
+    """A JSON value in which this server's own key does not stand."""
+    if isinstance(value, dict):
+        return {name: _without(held, key) for name, held in cast("dict[str, Any]", value).items()}
+    if isinstance(value, list):
+        return [_without(held, key) for held in cast("list[Any]", value)]
+    return value.replace(key, "***") if isinstance(value, str) else value
 
 
 def _error_of(status: int, value: Any, text: str) -> dict[str, Any]:
@@ -192,19 +203,3 @@ def _error_of(status: int, value: Any, text: str) -> dict[str, Any]:
             "code": given.get("code", str(status)),
         }
     }
-
-
-def _without(text: str, key: str | None) -> str:
-    """A text that a key of this server does not stand in."""
-    return text.replace(key, "***") if key else text
-
-
-def _unavailable(error: httpx.HTTPError) -> CowError:
-    """The error for a connection that failed, in words without addresses."""
-    if isinstance(error, httpx.TimeoutException):
-        reason = "it did not reply in time (COW_MLLM_TIMEOUT)"
-    elif isinstance(error, httpx.ConnectError):
-        reason = "it could not be reached; check that it runs, and COW_MLLM_BASE_URL"
-    else:
-        reason = "it broke off before its reply was whole"
-    return MllmUnavailable(f"The server of the multimodal LLM gave no reply: {reason}. It was asked once.")

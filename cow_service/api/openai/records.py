@@ -11,9 +11,9 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.errors import FieldError, ModelNotFound, shortened
-from cow_service.records import Answer, Frame, JobStatus, Problem, Record, Usage
+from cow_service.records import Answer, Frame, JobStatus, Record, Usage
+from cow_service.requests.values import SHOWN_CHARACTERS
 from cow_service.service import Service
-from cow_service.settings import Settings
 
 
 class ChatModel(Record):
@@ -150,15 +150,6 @@ class ChatChunk(Record):
     )
 
 
-class ChatError(Record):
-    """An error as OpenAI's clients read it."""
-
-    message: str = Field(description="`detail` of the problem.")
-    type: str
-    param: str | None = Field(description="The first invalid field.")
-    code: str = Field(description="The last segment of the problem's `type`.")
-
-
 class UpstreamError(BaseModel):
     """An error of the MLLM's server, with its status, in OpenAI's form."""
 
@@ -167,16 +158,9 @@ class UpstreamError(BaseModel):
     error: dict[str, Any] = Field(description="`message`, `type`, `param` and `code`, as far as the server gave them.")
 
 
-class ChatProblem(Problem):
-    """Why a request under `/v1` failed: a problem (RFC 9457), and the same as OpenAI's clients read it."""
-
-    error: ChatError
-
-
 PREFIX = "cow/"
 WITHOUT = ":no-imagination"  # a suffix: names of MLLMs may hold colons themselves
 MLLM_READERS = ("mllm", "local")  # they serve the MLLM of the settings, and are called after it
-SHOWN_CHARACTERS = 80  # of what the caller sent
 
 
 @dataclass(frozen=True)
@@ -190,16 +174,17 @@ class Answerer:
 def answerers(service: Service) -> dict[str, Answerer]:
     """All models by name: the default reader first, as some callers take whatever comes first."""
     settings = service.settings
+    serving = settings.reader if settings.reader in MLLM_READERS else "mllm"  # whom the MLLM's name stands for
     found: dict[str, Answerer] = {}
     for reader in sorted(service.readers.names(), key=lambda name: name != settings.reader):
-        name = _name_of(reader, settings)
+        name = reader if reader not in MLLM_READERS else settings.mllm if reader == serving else None
         if name is not None:
             found[PREFIX + name] = Answerer(reader, "always")
             found[PREFIX + name + WITHOUT] = Answerer(reader, "never")
     return found
 
 
-def answerer(service: Service, model: str) -> Answerer:
+def find_answerer(service: Service, model: str) -> Answerer:
     """Who answers under that name. Raises `ModelNotFound`."""
     known = answerers(service)
     if model not in known:
@@ -208,14 +193,7 @@ def answerer(service: Service, model: str) -> Answerer:
     return known[model]
 
 
-def usable(service: Service) -> tuple[str, ...]:
+def usable_models(service: Service) -> tuple[str, ...]:
     """The names of the models of which nothing is known that would keep them from answering."""
     unready = {reader.name for reader in service.models().readers if reader.ready is False}
     return tuple(name for name, one in answerers(service).items() if one.reader not in unready)
-
-
-def _name_of(reader: str, settings: Settings) -> str | None:
-    if reader not in MLLM_READERS:
-        return reader
-    serving = settings.reader if settings.reader in MLLM_READERS else "mllm"
-    return settings.mllm if reader == serving else None

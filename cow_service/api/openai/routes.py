@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import replace
 from functools import partial
@@ -11,33 +10,43 @@ from typing import Annotated, Any
 from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel
-from pydantic.json_schema import JsonSchemaMode
 
 from cow_service import errors
 from cow_service.api.body import read_object
-from cow_service.api.openai.chats import EXTENSION, Chat, ChatRequest, ResponsesRequest, as_json, chat_of, read_chat
+from cow_service.api.openai.answering import FIELDS_OF_CHAT, ParsedChat, answer_events, completion_of, parse_chat
+from cow_service.api.openai.chats import EXTENSION, Chat, ChatRequest, ResponsesRequest, as_json, locate_in_chat
 from cow_service.api.openai.forwarding import Whole
-from cow_service.api.openai.parsing import FIELDS_OF_CHAT, ChatAnswer, ParsedChat, parse_chat
 from cow_service.api.openai.proxy import Proxy, preferences_without_key
 from cow_service.api.openai.records import (
     ChatChunk,
     ChatCompletion,
     ChatModel,
     ChatModels,
-    ChatProblem,
     MllmCompletion,
     ResponseReply,
     UpstreamError,
-    answerer,
-    usable,
+    find_answerer,
+    usable_models,
 )
 from cow_service.api.openai.responses import as_response, chat_fields, response_of
-from cow_service.api.openai.stream import ROOT, EventsResponse, Streamed, answer_events, document_problems
-from cow_service.api.problems import documented
+from cow_service.api.openai.stream import EventsResponse, Streamed
+from cow_service.api.problems import MEDIA_TYPE, OPENAI_ROOT, ChatProblem, documented
 from cow_service.api.routes.simulate import ACCEPTED, FAILURES, PREFERENCES
-from cow_service.api.submission import Submission, Submitter, json_response
+from cow_service.api.submission import Submission, Submitter, from_app, json_response
 from cow_service.errors import BodyTypeUnsupported, CowError, shortened
 from cow_service.requests import AnswerRequest
+from cow_service.requests.values import SHOWN_CHARACTERS
+
+ANSWER_FIELDS = "ChatExtension"  # the schema of `cow` in a request
+REFERENCE = "#/components/schemas/{model}"
+UPSTREAM_ERRORS: dict[int | str, dict[str, Any]] = {
+    "default": {
+        "description": "What the server of the MLLM answered with, as it came, in OpenAI's form.",
+        "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=UpstreamError.__name__)}}},
+    }
+}
+REQUESTS = (ChatRequest, ResponsesRequest)
+REPLIES = (ChatChunk, ChatCompletion, MllmCompletion, ResponseReply, UpstreamError, ChatProblem)
 
 
 class Completer:
@@ -45,170 +54,59 @@ class Completer:
 
     def __init__(self, submitter: Submitter) -> None:
         self._submitter = submitter
-        self._service = submitter.engine.service
+        self.service = submitter.engine.service
+        self.settings = self.service.settings
         self._proxy = Proxy(submitter)
+        self.started = int(time.time())
 
     async def close(self) -> None:
         """Closes connections."""
         await self._proxy.close()
+
+    async def read_body(self, request: Request) -> dict[str, Any]:
+        """The JSON object that a request holds. Raises `BodyTypeUnsupported`, `MalformedBody`."""
+        media_type = request.headers.get("content-type", "none").partition(";")[0].strip().lower()
+        if media_type != "application/json" and not media_type.endswith("+json"):
+            raise BodyTypeUnsupported(
+                f"The body has the media type '{shortened(media_type, SHOWN_CHARACTERS)}'. Send application/json."
+            )
+        return await self._submitter.in_thread(partial(read_object, await request.body(), "The body"))
 
     async def complete(self, request: Request, chat: Chat, *, stored: bool = True) -> Whole | Streamed | Response:
         """The reply; a response where the caller takes the job instead, which needs `stored`.
 
         Raises `ModelNotFound`, `InvalidRequest`, and what the MLLM or the job fails with.
         """
-        who = answerer(self._service, chat.model)
-        reader = await to_thread.run_sync(self._service.chat_reader, who.reader)
+        answerer = find_answerer(self.service, chat.model)
+        reader = await to_thread.run_sync(self.service.chat_reader, answerer.reader)
         if reader is not None:
-            return await self._proxy.complete(request, chat, who, reader)
+            return await self._proxy.complete(request, chat, answerer, reader)
         submission = self._submitter.submission(request, "answer")
         if not stored:
             submission = replace(submission, prefer=preferences_without_key(request))
-        parsed = await self._submitter.in_thread(partial(parse_chat, chat, who))
+        parsed = await self._submitter.in_thread(partial(parse_chat, chat, answerer))
         try:
-            return await self._answered(request, submission, parsed)
+            return await self._answer(request, submission, parsed)
         except CowError as error:
-            raise parsed.pointers.translate_error(error) from error
+            raise locate_in_chat(error, parsed.pointers) from error
 
-    async def _answered(
-        self, request: Request, submission: Submission, chat: ParsedChat
-    ) -> Whole | Streamed | Response:
+    async def _answer(self, request: Request, submission: Submission, chat: ParsedChat) -> Whole | Streamed | Response:
         """The reply of a job. Errors point into its `AnswerRequest`."""
         submitter = self._submitter
         if chat.stream:
             created_at = await submitter.submit(submission, chat.request, None)
-            events = answer_events(submitter, submission, chat, created_at)
-            left = partial(submitter.leave, submission, created_at)
-            return Streamed(events, chat.pointers.translate_error, left)
+            return Streamed(
+                answer_events(submitter, submission, chat, created_at),
+                locate=lambda error: locate_in_chat(error, chat.pointers),
+                leave=partial(submitter.leave, submission, created_at),
+            )
         result = await submitter.result(request, submission, chat.request, None)
         if result is None:
             return await submitter.accepted(submission)
-        return Whole(await to_thread.run_sync(lambda: ChatAnswer.parse(chat, result).completion()))
+        return Whole(await to_thread.run_sync(completion_of, chat, result))
 
 
-SHOWN_CHARACTERS = 80  # of what the caller sent
-ANSWER_FIELDS = "ChatExtension"  # the schema of `cow` in a request
-REFERENCE = "#/components/schemas/{model}"
-TAG = "OpenAI-compatible"
-UPSTREAM_ERRORS: dict[int | str, dict[str, Any]] = {
-    "default": {
-        "description": "What the server of the MLLM answered with, as it came, in OpenAI's form.",
-        "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=UpstreamError.__name__)}}},
-    }
-}
-RECORDS: tuple[tuple[type[BaseModel], JsonSchemaMode], ...] = (
-    (ChatRequest, "validation"),
-    (ResponsesRequest, "validation"),
-    (ChatChunk, "serialization"),
-    (ChatCompletion, "serialization"),
-    (MllmCompletion, "serialization"),
-    (ResponseReply, "serialization"),
-    (UpstreamError, "serialization"),
-    (ChatProblem, "serialization"),
-)
-
-
-def chat_routes(submitter: Submitter, completer: Completer) -> APIRouter:
-    """The operations, bound to an engine."""
-    router = APIRouter(prefix=ROOT.rstrip("/"), tags=[TAG])
-    engine = submitter.engine
-    settings = engine.service.settings
-    created = int(time.time())
-
-    @router.post(
-        "/chat/completions",
-        operation_id="chat",
-        summary="The MLLM behind a model, seeing more",
-        responses={
-            200: _reply([ChatCompletion, MllmCompletion], "A `ChatChunk`, or a `ChatProblem` at the end"),
-            **ACCEPTED,
-            **documented(*FAILURES, errors.ModelNotFound),
-            **UPSTREAM_ERRORS,
-        },
-        openapi_extra={"requestBody": _body_of(ChatRequest), "parameters": PREFERENCES},
-    )
-    async def chat(request: Request) -> Response:
-        """The chat goes on to the MLLM as it is, and the MLLM's reply comes back as it is, with `cow` beside it.
-
-        Where the last user message asks a what-if question about the only image, what would happen is simulated first,
-        and the imagined frames are added behind that message. `cow.imagined` says whether. A model without an MLLM,
-        such as `cow/embedded`, answers as `POST /answer`.
-        """
-        body = await _body(request)
-        asked = await submitter.in_thread(partial(read_chat, body))
-        reply = await completer.complete(request, asked)
-        if isinstance(reply, Response):
-            return reply
-        if isinstance(reply, Streamed):
-            return EventsResponse(reply, settings)
-        return json_response(reply.text, reply.status, reply.headers)
-
-    @router.post(
-        "/responses",
-        operation_id="responses",
-        summary="The same, as OpenAI's responses",
-        responses={
-            200: _reply([ResponseReply], "An event of OpenAI's responses"),
-            **documented(*FAILURES, errors.ModelNotFound),
-            **UPSTREAM_ERRORS,
-        },
-        openapi_extra={"requestBody": _body_of(ResponsesRequest), "parameters": PREFERENCES[2:]},
-    )
-    async def responses(request: Request) -> Response:
-        """Text and images in, without state: what needs it (`previous_response_id`, `store`...) is refused by name.
-
-        The input is turned into a chat, which is answered as above, and the reply into a response.
-        """
-        body = await _body(request)
-        asked = await submitter.in_thread(lambda: read_object(body, "The body"))
-        chat_asked = chat_of(chat_fields(asked))
-        reply = await completer.complete(request, chat_asked, stored=False)
-        if isinstance(reply, Response):
-            return reply
-        if isinstance(reply, Streamed):
-            return EventsResponse(as_response(reply, asked, chat_asked.model), settings)
-        if not reply.succeeded:
-            return json_response(reply.text, reply.status, reply.headers)
-        return json_response(as_json(response_of(json.loads(reply.text), asked)))
-
-    @router.get("/models", operation_id="chatModels", summary="Models to chat with")
-    def models() -> ChatModels:
-        """Every reader, with imagination and without (`:no-imagination`); the server's default comes first."""
-        return ChatModels(data=tuple(ChatModel(id=name, created=created) for name in usable(engine.service)))
-
-    @router.get(
-        "/models/{model:path}",
-        operation_id="chatModel",
-        summary="A model to chat with",
-        responses=documented(errors.ModelNotFound),
-    )
-    def model(model: Annotated[str, Path(description="Its `id`, slash and all.")]) -> ChatModel:
-        """Whether there is one of that name. Why it might not run, a chat says."""
-        answerer(engine.service, model)
-        return ChatModel(id=model, created=created)
-
-    return router
-
-
-def document_chat(document: dict[str, Any]) -> None:
-    """Adds to the contract what the framework does not see: chunks, problems, and what `cow` of a request holds."""
-    schemas = document["components"]["schemas"]
-    for record, mode in RECORDS:
-        schema = record.model_json_schema(ref_template=REFERENCE, mode=mode)
-        for name, part in (schema.pop("$defs", {}) | {record.__name__: schema}).items():
-            schemas.setdefault(name, part)
-    others = AnswerRequest.model_json_schema(ref_template=REFERENCE)["properties"]
-    schemas[ANSWER_FIELDS] = {
-        "type": "object",
-        "additionalProperties": False,
-        "description": "An `AnswerRequest` without what messages and model say; with an MLLM behind the model, a "
-        "`SimulateRequest` without image and question.",
-        "properties": {name: schema for name, schema in others.items() if name not in FIELDS_OF_CHAT},
-    }
-    for request in (ChatRequest, ResponsesRequest):
-        own = schemas[request.__name__]["properties"][EXTENSION]
-        own["anyOf"] = [{"$ref": REFERENCE.format(model=ANSWER_FIELDS)}, {"type": "null"}]
-    document_problems(document)
+ChatCompleter = Annotated[Completer, from_app("completer")]
 
 
 def _body_of(record: type[BaseModel]) -> dict[str, Any]:
@@ -230,10 +128,105 @@ def _reply(records: list[type[BaseModel]], data: str) -> dict[str, Any]:
     }
 
 
-async def _body(request: Request) -> bytes:
-    media_type = request.headers.get("content-type", "none").partition(";")[0].strip().lower()
-    if media_type != "application/json" and not media_type.endswith("+json"):
-        raise BodyTypeUnsupported(
-            f"The body has the media type '{shortened(media_type, SHOWN_CHARACTERS)}'. Send application/json."
-        )
-    return await request.body()
+router = APIRouter(prefix=OPENAI_ROOT.rstrip("/"), tags=["OpenAI-compatible"])
+
+
+@router.post(
+    "/chat/completions",
+    operation_id="chat",
+    summary="The MLLM behind a model, seeing more",
+    responses={
+        200: _reply([ChatCompletion, MllmCompletion], "A `ChatChunk`, or a `ChatProblem` at the end"),
+        **ACCEPTED,
+        **documented(*FAILURES, errors.ModelNotFound),
+        **UPSTREAM_ERRORS,
+    },
+    openapi_extra={"requestBody": _body_of(ChatRequest), "parameters": PREFERENCES},
+)
+async def chat(request: Request, completer: ChatCompleter) -> Response:
+    """The chat goes on to the MLLM as it is, and the MLLM's reply comes back as it is, with `cow` beside it.
+
+    Where the last user message asks a what-if question about the only image, what would happen is simulated first,
+    and the imagined frames are added behind that message. `cow.imagined` says whether. A model without an MLLM,
+    such as `cow/embedded`, answers as `POST /answer`.
+    """
+    asked = Chat.parse(await completer.read_body(request))
+    reply = await completer.complete(request, asked)
+    if isinstance(reply, Streamed):
+        return EventsResponse(reply, completer.settings)
+    return await _whole(reply) if isinstance(reply, Whole) else reply
+
+
+@router.post(
+    "/responses",
+    operation_id="responses",
+    summary="The same, as OpenAI's responses",
+    responses={
+        200: _reply([ResponseReply], "An event of OpenAI's responses"),
+        **documented(*FAILURES, errors.ModelNotFound),
+        **UPSTREAM_ERRORS,
+    },
+    openapi_extra={"requestBody": _body_of(ResponsesRequest), "parameters": PREFERENCES[2:]},
+)
+async def responses(request: Request, completer: ChatCompleter) -> Response:
+    """Text and images in, without state: what needs it (`previous_response_id`, `store`...) is refused by name.
+
+    The input is turned into a chat, which is answered as above, and the reply into a response.
+    """
+    body = await completer.read_body(request)
+    asked = Chat.parse(chat_fields(body))
+    reply = await completer.complete(request, asked, stored=False)
+    if isinstance(reply, Streamed):
+        return EventsResponse(as_response(reply, body, asked.model), completer.settings)
+    if isinstance(reply, Whole):
+        return await _whole(replace(reply, body=response_of(reply.body, body)) if reply.succeeded else reply)
+    return reply
+
+
+@router.get("/models", operation_id="chatModels", summary="Models to chat with")
+def models(completer: ChatCompleter) -> ChatModels:
+    """Every reader, with imagination and without (`:no-imagination`); the server's default comes first."""
+    names = usable_models(completer.service)
+    return ChatModels(data=tuple(ChatModel(id=name, created=completer.started) for name in names))
+
+
+@router.get(
+    "/models/{model:path}",
+    operation_id="chatModel",
+    summary="A model to chat with",
+    responses=documented(errors.ModelNotFound),
+)
+def model(model: Annotated[str, Path(description="Its `id`, slash and all.")], completer: ChatCompleter) -> ChatModel:
+    """Whether there is one of that name. Why it might not run, a chat says."""
+    find_answerer(completer.service, model)
+    return ChatModel(id=model, created=completer.started)
+
+
+async def _whole(reply: Whole) -> Response:
+    return json_response(await to_thread.run_sync(as_json, reply.body), reply.status, reply.headers)
+
+
+def document_chat(document: dict[str, Any]) -> None:
+    """Adds to the contract what the framework does not see: chunks, problems, and what `cow` of a request holds."""
+    schemas = document["components"]["schemas"]
+    for record in (*REQUESTS, *REPLIES):
+        mode = "validation" if record in REQUESTS else "serialization"
+        schema = record.model_json_schema(ref_template=REFERENCE, mode=mode)
+        for name, part in (schema.pop("$defs", {}) | {record.__name__: schema}).items():
+            schemas.setdefault(name, part)
+    others = AnswerRequest.model_json_schema(ref_template=REFERENCE)["properties"]
+    schemas[ANSWER_FIELDS] = {
+        "type": "object",
+        "additionalProperties": False,
+        "description": "An `AnswerRequest` without what messages and model say; with an MLLM behind the model, a "
+        "`SimulateRequest` without image and question.",
+        "properties": {name: schema for name, schema in others.items() if name not in FIELDS_OF_CHAT},
+    }
+    for request in REQUESTS:
+        own = schemas[request.__name__]["properties"][EXTENSION]
+        own["anyOf"] = [{"$ref": REFERENCE.format(model=ANSWER_FIELDS)}, {"type": "null"}]
+    for path, operations in document["paths"].items():
+        for operation in operations.values() if path.startswith(OPENAI_ROOT) else ():
+            for response in operation["responses"].values():
+                if problem := response.get("content", {}).get(MEDIA_TYPE):
+                    problem["schema"] = {"$ref": REFERENCE.format(model=ChatProblem.__name__)}

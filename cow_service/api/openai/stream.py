@@ -1,115 +1,110 @@
-"""Chats as server-sent events: progress while a job runs, then the reply."""
+"""Replies as server-sent events: OpenAI's chunks, progress while a job runs, and a failure as the last event."""
 
 from __future__ import annotations
 
 import asyncio
-import re
-from collections.abc import AsyncGenerator, Awaitable, Callable
+import json
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
 from contextlib import aclosing, suppress
 from dataclasses import dataclass
-from http import HTTPStatus
-from typing import Any
+from datetime import datetime
+from typing import Any, cast
 
 from anyio import to_thread
 from sse_starlette import EventSourceResponse
-from starlette.datastructures import Headers, MutableHeaders
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 
-from cow_service.api.openai.parsing import ChatAnswer, Chunks, ParsedChat
-from cow_service.api.openai.records import ChatError, ChatProblem
-from cow_service.api.problems import MEDIA_TYPE
+from cow_service.api.openai.chats import EXTENSION, as_json
+from cow_service.api.openai.records import ChatProgress
+from cow_service.api.problems import chat_problem
 from cow_service.api.routes.jobs import PING_SECONDS
 from cow_service.api.submission import Submission, Submitter
 from cow_service.errors import CowError
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.events import QUEUED, follow
-from cow_service.records import TERMINAL, Job, Problem
+from cow_service.records import TERMINAL, Job
 from cow_service.settings import Settings
-
-ROOT = "/v1/"
-TYPES = {
-    HTTPStatus.UNAUTHORIZED: "authentication_error",
-    HTTPStatus.FORBIDDEN: "permission_error",
-    HTTPStatus.TOO_MANY_REQUESTS: "rate_limit_error",
-}
-
-
-def chat_problem(problem: Problem) -> ChatProblem:
-    """A problem with what OpenAI's clients read."""
-    other = "server_error" if problem.status >= HTTPStatus.INTERNAL_SERVER_ERROR else "invalid_request_error"
-    error = ChatError(
-        message=problem.detail,
-        type=TYPES.get(HTTPStatus(problem.status), other),
-        param=_parameter(problem.errors[0].pointer) if problem.errors else None,
-        code=problem.code,
-    )
-    return ChatProblem(**dict(problem), error=error)
-
-
-class ChatProblems:
-    """ASGI middleware, the outermost: adds the member `error` to every problem under `/v1`."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes a request on; a response that is a problem is buffered and extended."""
-        if scope["type"] != "http" or not scope["path"].startswith(ROOT):
-            await self.app(scope, receive, send)
-            return
-        start: Message | None = None
-        body = b""
-
-        async def extended(message: Message) -> None:
-            nonlocal start, body
-            if message["type"] == "http.response.start" and _is_problem(message):
-                start = message
-            elif start is None:
-                await send(message)
-            else:
-                body += message.get("body", b"")
-                if not message.get("more_body", False):
-                    text = chat_problem(Problem.model_validate_json(body)).model_dump_json().encode()
-                    MutableHeaders(scope=start)["Content-Length"] = str(len(text))
-                    await send(start)
-                    await send({**message, "body": text})
-
-        await self.app(scope, receive, extended)
-
-
-def document_problems(document: dict[str, Any]) -> None:
-    """Puts their shape into the contract."""
-    reference = f"#/components/schemas/{ChatProblem.__name__}"
-    for path, operations in document["paths"].items():
-        for operation in operations.values() if path.startswith(ROOT) else ():
-            for response in operation["responses"].values():
-                if problem := response.get("content", {}).get(MEDIA_TYPE):
-                    problem["schema"] = {"$ref": reference}
-
-
-def _is_problem(start: Message) -> bool:
-    return Headers(raw=start["headers"]).get("content-type") == MEDIA_TYPE
-
-
-def _parameter(pointer: str) -> str | None:
-    """A JSON Pointer as OpenAI writes places: messages[0].content."""
-    parts = [part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:]]
-    written = "".join(f"[{part}]" if re.fullmatch("[0-9]+", part) else f".{part}" for part in parts)
-    return written.lstrip(".") or None
-
 
 MIN_PROGRESS_SECONDS = 0.25  # between two chunks of progress
 CLOSING_SECONDS = 2.0  # for the last event of a stream, after the grace period of a server that stops
-DONE = "[DONE]"
+DONE = b"data: [DONE]\n\n"
+HEAD = ("id", "created", "model", "system_fingerprint", "service_tier")  # the same in a completion and its chunks
 
 
-async def nothing() -> None:
+def event_of(data: dict[str, Any], name: str | None = None) -> bytes:
+    """A server-sent event that holds a JSON object."""
+    head = "" if name is None else f"event: {name}\n"
+    return f"{head}data: {as_json(data)}\n\n".encode()
+
+
+def data_of(event: bytes) -> dict[str, Any]:
+    """The JSON object of a server-sent event; empty for the end, and for comments."""
+    value: Any = None
+    with suppress(ValueError):
+        value = json.loads(b"".join(line[5:] for line in event.splitlines() if line.startswith(b"data:")))
+    return cast("dict[str, Any]", value) if isinstance(value, dict) else {}
+
+
+def head_of(reply: dict[str, Any]) -> dict[str, Any]:
+    """What all chunks share with a completion, or with another chunk of the same stream."""
+    return {name: reply[name] for name in HEAD if name in reply} | {"object": "chat.completion.chunk"}
+
+
+def job_head(job_id: str, created_at: str, model: str) -> dict[str, Any]:
+    """What a completion and its chunks share where a job makes them."""
+    return {
+        "id": f"chatcmpl-{job_id}",
+        "object": "chat.completion.chunk",
+        "created": int(datetime.fromisoformat(created_at).timestamp()),
+        "model": model,
+    }
+
+
+def chunk_of(
+    head: dict[str, Any], delta: dict[str, Any], finish_reason: Any = None, index: int = 0, **others: Any
+) -> dict[str, Any]:
+    """A chunk that adds `delta` to the message of one choice."""
+    logprobs = others.pop("logprobs", None)
+    choice = {"index": index, "delta": delta, "finish_reason": finish_reason, "logprobs": logprobs}
+    return head | {"choices": [choice]} | others
+
+
+def chunks_of(completion: dict[str, Any], *, with_usage: bool) -> Iterator[dict[str, Any]]:
+    """The chunks of a whole completion: `cow`, each choice's message, each choice's end, and usage where it is wanted.
+
+    An error is its only chunk.
+    """
+    if "error" in completion:
+        yield {"error": completion["error"]}
+        return
+    head = head_of(completion)
+    if EXTENSION in completion:
+        yield chunk_of(head, {}, cow=completion[EXTENSION])
+    choices = completion.get("choices")
+    for place, each in enumerate(cast("list[Any]", choices) if isinstance(choices, list) else ()):
+        choice = cast("dict[str, Any]", each) if isinstance(each, dict) else {}
+        index = choice.get("index", place)
+        message = {name: value for name, value in (choice.get("message") or {}).items() if value is not None}
+        if calls := message.get("tool_calls", ()):
+            message["tool_calls"] = [{"index": number, **call} for number, call in enumerate(calls)]
+        yield chunk_of(head, message, None, index, logprobs=choice.get("logprobs"))
+        yield chunk_of(head, {}, choice.get("finish_reason"), index)
+    if with_usage and "usage" in completion:
+        yield head | {"choices": [], "usage": completion["usage"]}
+
+
+def progress_of(job: Job) -> dict[str, Any]:
+    """How far a job is: `cow` of a chunk."""
+    return ChatProgress(job=job.id, status=job.status, stage=job.stage, progress=job.progress).model_dump()
+
+
+def progress_chunk(job: Job, head: dict[str, Any], delta: dict[str, Any] | None = None) -> bytes:
+    """How far a job is, as an event."""
+    return event_of(chunk_of(head, delta or {}, cow=progress_of(job)))
+
+
+async def do_nothing() -> None:
     """Does nothing."""
-
-
-def unchanged(error: CowError) -> CowError:
-    """The error itself."""
-    return error
 
 
 @dataclass(frozen=True)
@@ -117,9 +112,9 @@ class Streamed:
     """A reply as it is streamed: server-sent events, each whole, with the blank line at its end."""
 
     events: AsyncGenerator[bytes]
-    located: Callable[[CowError], CowError] = unchanged  # an error, pointing into what the caller sent
-    left: Callable[[], Awaitable[None]] = nothing  # to be called where the caller has disconnected
-    close: Callable[[], Awaitable[None]] = nothing  # to be called at the end, however it came
+    locate: Callable[[CowError], CowError] = lambda error: error  # an error, pointing into what the caller sent
+    leave: Callable[[], Awaitable[None]] = do_nothing  # to be called where the caller has disconnected
+    close: Callable[[], Awaitable[None]] = do_nothing  # to be called at the end, however it came
 
 
 class EventsResponse(EventSourceResponse):
@@ -128,11 +123,19 @@ class EventsResponse(EventSourceResponse):
     def __init__(self, streamed: Streamed, settings: Settings) -> None:
         async def disconnected(_: Message) -> None:
             with suppress(CowError):
-                await streamed.left()
+                await streamed.leave()
+
+        async def events() -> AsyncGenerator[bytes]:
+            try:
+                async with aclosing(streamed.events) as own:
+                    async for event in own:
+                        yield event
+            except CowError as error:
+                yield event_of(chat_problem(streamed.locate(error)))
 
         self._close = streamed.close
         super().__init__(
-            _told_to_the_end(streamed),
+            events(),
             ping=PING_SECONDS,
             sep="\n",
             headers={"Cache-Control": "no-store"},
@@ -149,58 +152,17 @@ class EventsResponse(EventSourceResponse):
             await self._close()
 
 
-async def _told_to_the_end(streamed: Streamed) -> AsyncGenerator[bytes]:
-    """The events; the last may be the problem that they ended with."""
-    try:
-        async with aclosing(streamed.events) as events:
-            async for event in events:
-                yield event
-    except CowError as error:
-        yield event_of(problem_of(streamed.located(error)))
-
-
-def problem_of(error: CowError) -> str:
-    """An error as `ChatProblem`, JSON on one line."""
-    return chat_problem(Problem(**error.as_problem())).model_dump_json()
-
-
-def event_of(data: str, name: str | None = None) -> bytes:
-    """A server-sent event whose data is one line."""
-    head = "" if name is None else f"event: {name}\n"
-    return f"{head}data: {data}\n\n".encode()
-
-
-async def answer_events(
-    submitter: Submitter, submission: Submission, chat: ParsedChat, created_at: str | None
-) -> AsyncGenerator[bytes]:
-    """The chunks of an answer job: progress first. Raises what the job fails with."""
-    async with aclosing(follow_job(submitter, submission, created_at)) as news:
-        job = await anext(news)
-        assert isinstance(job, Job), "the job itself comes first"
-        chunks = Chunks(job.id, job.created_at, chat.model)
-        last = chunks.progress(job)
-        yield event_of(chunks.first(job))
-        async for update in news:
-            if isinstance(update, str):
-                told = await to_thread.run_sync(lambda result=update: chunks.answer(ChatAnswer.parse(chat, result)))
-                for chunk in told:
-                    yield event_of(chunk)
-            elif (chunk := chunks.progress(update)) != last:
-                last = chunk
-                yield event_of(chunk)
-    yield event_of(DONE)
-
-
 async def follow_job(submitter: Submitter, submission: Submission, created_at: str | None) -> AsyncGenerator[Job | str]:
-    """The job as it is now, then as it goes on, a few times a second; last its result as JSON.
+    """The job as it is now, then whenever it has got further, a few times a second; last its result as JSON.
 
     Raises what the job fails with.
     """
     engine = submitter.engine
-    yield (await to_thread.run_sync(lambda: engine.find(submission.job_id, submission.owner, full=False))).job
-    updates: asyncio.Queue[Job | None] = asyncio.Queue()
+    job = (await to_thread.run_sync(lambda: engine.find(submission.job_id, submission.owner, full=False))).job
+    yield job
+    updates: asyncio.Queue[Job | None] = asyncio.Queue()  # None: the job has ended
 
-    def over(task: asyncio.Future[str | None]) -> None:
+    def end(task: asyncio.Future[str | None]) -> None:
         if not task.cancelled():
             task.exception()  # else asyncio logs it as never retrieved where the caller has disconnected
         updates.put_nowait(None)
@@ -209,10 +171,15 @@ async def follow_job(submitter: Submitter, submission: Submission, created_at: s
         listening = asyncio.ensure_future(_listen(engine, submission, updates))
         gone = asyncio.Event()  # never set: the response itself notices that the caller has disconnected
         ending = asyncio.ensure_future(submitter.outcome(submission, waiter, created_at, gone, may_have_ended=True))
-        ending.add_done_callback(over)
+        ending.add_done_callback(end)
         try:
-            while (job := await _newest(updates)) is not None:
-                yield job
+            while not ending.done():
+                update = await updates.get()
+                while update is not None and not updates.empty():
+                    update = updates.get_nowait()  # only the latest counts
+                if update is not None and progress_of(update) != progress_of(job):
+                    job = update
+                    yield job
                 await asyncio.wait({ending}, timeout=MIN_PROGRESS_SECONDS)
             result = await ending
         finally:
@@ -229,11 +196,3 @@ async def _listen(engine: JobEngine, submission: Submission, updates: asyncio.Qu
             async for event in events:
                 if event.job is not None and event.job.status not in TERMINAL:
                     updates.put_nowait(event.job)
-
-
-async def _newest(updates: asyncio.Queue[Job | None]) -> Job | None:
-    """The latest update; None once the job has ended."""
-    news = [await updates.get()]
-    while not updates.empty():
-        news.append(updates.get_nowait())
-    return None if None in news else news[-1]

@@ -1,15 +1,13 @@
-"""`GET /artifacts/{sha256}`."""
+"""`GET /artifacts/{sha256}` and `GET /jobs/{id}/download`: files."""
 
 from __future__ import annotations
 
 import json
 import shutil
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from datetime import datetime
-from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
@@ -24,12 +22,13 @@ from starlette.types import Receive, Scope, Send
 from cow_service import errors
 from cow_service.api.problems import documented
 from cow_service.api.routes.jobs import GONE, JobId
-from cow_service.api.submission import owner_of
+from cow_service.api.routes.page import is_known
+from cow_service.api.submission import Engine, Owner
 from cow_service.errors import DownloadUnavailable, StorageUnavailable
 from cow_service.jobs.engine import JobEngine
 from cow_service.media.animations import animation
-from cow_service.media.artifacts import ArtifactStore, extension_of
-from cow_service.records import Answer, Job, Sha256, Simulation, artifacts_of, documents_of
+from cow_service.media.artifacts import extension_of
+from cow_service.records import Answer, Job, Simulation, artifacts_of, documents_of
 
 CACHE_CONTROL = "max-age=31536000, immutable"  # bytes never change under their digest
 # A signed URL works for so long, and a caller may take it again for less: a video is read in pieces.
@@ -72,155 +71,11 @@ class ArtifactResponse(FileResponse):
             ) from error
 
 
-def artifact_routes(engine: JobEngine) -> APIRouter:
-    """The operation, bound to an engine, which knows the owners of artifacts."""
-    router = APIRouter()
-
-    @router.head("/artifacts/{sha256}", include_in_schema=False)
-    @router.get(
-        "/artifacts/{sha256}",
-        operation_id="artifact",
-        tags=["artifacts"],
-        summary="Bytes by their SHA-256",
-        response_class=Response,
-        responses={
-            200: {"description": "The bytes.", "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}},
-            206: {
-                "description": "The ranges asked for.",
-                "content": {"*/*": {"schema": {"type": "string", "format": "binary"}}},
-            },
-            304: {"description": "The caller has them."},
-            307: {
-                "description": "Where the bytes are: a signed URL of an object store (`COW_ARTIFACTS`), which works "
-                "for 15 minutes, needs no key and answers `Range` itself."
-            },
-            **documented(errors.ArtifactNotFound, errors.RangeNotSatisfiable, errors.StorageUnavailable),
-        },
-    )
-    def artifact(
-        sha256: Annotated[str, Path(description="64 lower-case hexadecimal digits.")], request: Request
-    ) -> Response:
-        """Images, frames and videos that the service keeps. The ETag is the digest."""
-        owner = owner_of(request)
-        engine.may_read(sha256, owner)
-        store, redirects = engine.service.artifacts, engine.service.settings.artifacts_redirect
-        stored = store.get(sha256)
-        etag = f'"{sha256}"'
-        headers = {
-            "ETag": etag,
-            "Cache-Control": f"{'public' if owner is None else 'private'}, {CACHE_CONTROL}",
-            "X-Content-Type-Options": "nosniff",
-        }
-        known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
-        if etag in known or "*" in known:
-            return Response(status_code=304, headers=headers)
-        if redirects and (url := store.signed_url(sha256, SIGNED_SECONDS)) is not None:
-            if request.method == "HEAD":  # the URL is signed for GET alone
-                sizes = {"Content-Length": str(stored.size), "Accept-Ranges": "bytes"}
-                return Response(media_type=stored.media_type, headers=headers | sizes)
-            ArtifactResponse.check_range(request, stored.size)
-            return RedirectResponse(url, headers={"Cache-Control": f"private, max-age={REDIRECT_SECONDS}"})
-        with ExitStack() as stack:
-            path = stack.enter_context(store.local_file(sha256))
-            release = stack.pop_all().close
-        return ArtifactResponse(path, release, media_type=stored.media_type, headers=headers)
-
-    return router
-
-
-@dataclass(frozen=True)
-class Succeeded:
-    """A job that has succeeded, and its result."""
-
-    job: Job
-    result: Simulation | Answer
-
-
-class Downloads:
-    """Makes files of jobs. Its methods block: not for an event loop."""
-
-    def __init__(self, engine: JobEngine) -> None:
-        self._engine = engine
-
-    def zip(self, job_id: str, owner: str | None) -> tuple[FilePath, Callable[[], None]]:
-        """A temporary file with all of a job, and what removes it.
-
-        Raises `JobNotFound`, `DownloadUnavailable`, `ArtifactNotFound`, `StorageUnavailable`.
-        """
-        found, store = self._succeeded(job_id, owner), self._engine.service.artifacts
-        request = self._engine.request_of(job_id, owner).request
-        texts = documents_of(found.result) | {"request.json": json.dumps(request, indent=2, ensure_ascii=False) + "\n"}
-        image = found.result.image.sha256
-        image_file = f"image.{extension_of(store.get(image).media_type)}"
-        with ExitStack() as stack:
-            path = stack.enter_context(store.scratch())
-            at = datetime.fromisoformat(found.job.created_at)
-            _write_zip(path, texts, {image_file: image} | artifacts_of(found.result), store, at)
-            return path, stack.pop_all().close
-
-    def animation(self, job_id: str, owner: str | None, wanted: str) -> bytes:
-        """The video of a job in a format of `animations.FORMATS`. Raises as `zip` does."""
-        video = self._engine.service.artifacts.read(_video_of(self._succeeded(job_id, owner)))
-        with self._engine.service.cpu.held():
-            return animation(video, wanted)
-
-    def _succeeded(self, job_id: str, owner: str | None) -> Succeeded:
-        """The job with its result. Raises `JobNotFound`, and `DownloadUnavailable` where it has none."""
-        found = self._engine.find(job_id, owner)
-        if found.result is not None:
-            model = Answer if found.job.kind == "answer" else Simulation
-            return Succeeded(found.job, model.model_validate_json(found.result))
-        if found.job.status in ("queued", "running"):
-            detail = f"is {found.job.status}: ask again when it has succeeded; GET /jobs/{job_id}/events tells"
-        else:
-            why = "" if found.error is None else f" ({found.error.code})"
-            detail = f"{_ENDS[found.job.status]}{why}: GET /jobs/{job_id}/request is what to send again"
-        raise DownloadUnavailable(f"The job {job_id} {detail}.")
-
-
-_ENDS = {"failed": "failed", "canceled": "was canceled"}
-
-
-def _video_of(found: Succeeded) -> Sha256:
-    """The digest of the video. Raises `DownloadUnavailable` where there is none."""
-    result, again = found.result, f"Change GET /jobs/{found.job.id}/request and send it again"
-    simulation = result.simulation if isinstance(result, Answer) else result
-    if simulation is None:
-        raise DownloadUnavailable(
-            f"Nothing was imagined for the answer {found.job.id}, so nothing moves: its zip has all there is. {again}, "
-            "with `imagine: always`, or with what `simulation_problem` says is missing."
-        )
-    if simulation.video is None:
-        raise DownloadUnavailable(f"The job {found.job.id} has no video. {again}, with `video: true`.")
-    return simulation.video.sha256
-
-
-def _write_zip(
-    path: FilePath, texts: Mapping[str, str], artifacts: Mapping[str, Sha256], store: ArtifactStore, at: datetime
-) -> None:
-    """Writes texts and artifacts as they are: pictures and videos do not compress."""
-    try:
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-            for name, text in texts.items():
-                archive.writestr(_entry(name, at), text)
-            for name, sha256 in artifacts.items():
-                with (
-                    store.local_file(sha256) as file,
-                    file.open("rb") as source,
-                    archive.open(_entry(name, at), "w") as target,
-                ):
-                    shutil.copyfileobj(source, target)
-    except OSError as error:
-        raise StorageUnavailable(f"The zip could not be written ({type(error).__name__}): is the disk full?") from error
-
-
-def _entry(name: str, at: datetime) -> zipfile.ZipInfo:
-    """By the time of the job, so that the same job is the same bytes whenever it is asked for."""
-    return zipfile.ZipInfo(name, at.timetuple()[:6])
+BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+router = APIRouter()
 
 
 DownloadFormat = Literal["zip", "gif", "webp", "sheet"]
-MAX_CONCURRENT_DOWNLOADS = 4  # made at the same time; pictures are encoded by `COW_CONCURRENCY` of them
 # By format: what comes behind the job's id in the name of the file, and its media type.
 FILES: dict[DownloadFormat, tuple[str, str]] = {
     "zip": (".zip", "application/zip"),
@@ -228,50 +83,148 @@ FILES: dict[DownloadFormat, tuple[str, str]] = {
     "webp": (".webp", "image/webp"),
     "sheet": ("-sheet.png", "image/png"),
 }
-BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+FORMAT = Query(
+    description="`zip`: result, request, image, frames, overlay and video; `gif`, `webp`: the video as an animated "
+    "picture; `sheet`: twelve of its frames as a PNG."
+)
+MAX_CONCURRENT_DOWNLOADS = 4  # made at the same time; pictures are encoded by `COW_CONCURRENCY` of them
 
 
-def download_routes(engine: JobEngine) -> APIRouter:
-    """The operation, bound to an engine."""
-    router = APIRouter(tags=["jobs"])
-    downloads = Downloads(engine)
-    limiter = CapacityLimiter(MAX_CONCURRENT_DOWNLOADS)  # else a few GIFs would take the threads of all operations
+@router.get(
+    "/jobs/{id}/download",
+    operation_id="download",
+    tags=["jobs"],
+    summary="A job as a file",
+    response_class=Response,
+    responses={
+        200: {"description": "The file, as an attachment.", "content": {kind: BINARY for _, kind in FILES.values()}},
+        206: {"description": "The ranges of a zip that were asked for.", "content": {"*/*": BINARY}},
+        **documented(*GONE, errors.DownloadUnavailable, errors.ArtifactNotFound, errors.RangeNotSatisfiable),
+    },
+)
+async def download(
+    request: Request, engine: Engine, owner: Owner, id: JobId, format: Annotated[DownloadFormat, FORMAT] = "zip"
+) -> Response:
+    """All of a job that has succeeded, or its video in forms that go where no video does."""
+    ending, media_type = FILES[format]
+    headers = {
+        "Content-Disposition": f'attachment; filename="cow-{id}{ending}"',
+        "X-Content-Type-Options": "nosniff",
+    }
+    limiter: CapacityLimiter = request.app.state.downloads
+    if format == "zip":
+        path, release = await to_thread.run_sync(make_zip, engine, id, owner, limiter=limiter)
+        return ArtifactResponse(path, release, media_type=media_type, headers=headers)
+    data = await to_thread.run_sync(make_animation, engine, id, owner, format, limiter=limiter)
+    return Response(data, media_type=media_type, headers=headers)
 
-    @router.get(
-        "/jobs/{id}/download",
-        operation_id="download",
-        summary="A job as a file",
-        response_class=Response,
-        responses={
-            200: {
-                "description": "The file, as an attachment.",
-                "content": {kind: BINARY for _, kind in FILES.values()},
-            },
-            206: {"description": "The ranges of a zip that were asked for.", "content": {"*/*": BINARY}},
-            **documented(*GONE, errors.DownloadUnavailable, errors.ArtifactNotFound, errors.RangeNotSatisfiable),
+
+def make_zip(engine: JobEngine, job_id: str, owner: str | None) -> tuple[FilePath, Callable[[], None]]:
+    """A temporary file with all of a job, and what removes it. Blocks: not for an event loop.
+
+    Raises `JobNotFound`, `DownloadUnavailable`, `ArtifactNotFound`, `StorageUnavailable`.
+    """
+    job, result = _find_succeeded(engine, job_id, owner)
+    store, request = engine.service.artifacts, engine.request_of(job_id, owner).request
+    texts = documents_of(result) | {"request.json": json.dumps(request, indent=2, ensure_ascii=False) + "\n"}
+    image = result.image.sha256
+    artifacts = {f"image.{extension_of(store.get(image).media_type)}": image} | artifacts_of(result)
+    # By the time of the job, so that the same job is the same bytes whenever it is asked for.
+    at = datetime.fromisoformat(job.created_at).timetuple()[:6]
+    with ExitStack() as stack:
+        path = stack.enter_context(store.scratch())
+        try:
+            with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:  # pictures and videos do not compress
+                for name, text in texts.items():
+                    archive.writestr(zipfile.ZipInfo(name, at), text)
+                for name, sha256 in artifacts.items():
+                    with (
+                        store.local_file(sha256) as file,
+                        file.open("rb") as source,
+                        archive.open(zipfile.ZipInfo(name, at), "w") as target,
+                    ):
+                        shutil.copyfileobj(source, target)
+        except OSError as error:
+            detail = f"The zip could not be written ({type(error).__name__}): is the disk full?"
+            raise StorageUnavailable(detail) from error
+        return path, stack.pop_all().close
+
+
+def make_animation(engine: JobEngine, job_id: str, owner: str | None, wanted: str) -> bytes:
+    """The video of a job in a format of `animations.FORMATS`. Blocks, and raises as `make_zip` does."""
+    job, result = _find_succeeded(engine, job_id, owner)
+    again = f"Change GET /jobs/{job.id}/request and send it again"
+    simulation = result.simulation if isinstance(result, Answer) else result
+    if simulation is None:
+        raise DownloadUnavailable(
+            f"Nothing was imagined for the answer {job.id}, so nothing moves: its zip has all there is. {again}, "
+            "with `imagine: always`, or with what `simulation_problem` says is missing."
+        )
+    if simulation.video is None:
+        raise DownloadUnavailable(f"The job {job.id} has no video. {again}, with `video: true`.")
+    video = engine.service.artifacts.read(simulation.video.sha256)
+    with engine.service.cpu.held():
+        return animation(video, wanted)
+
+
+def _find_succeeded(engine: JobEngine, job_id: str, owner: str | None) -> tuple[Job, Simulation | Answer]:
+    """The job with its result. Raises `JobNotFound`, and `DownloadUnavailable` where it has none."""
+    found = engine.find(job_id, owner)
+    if found.result is not None:
+        model = Answer if found.job.kind == "answer" else Simulation
+        return found.job, model.model_validate_json(found.result)
+    if found.job.status in ("queued", "running"):
+        detail = f"is {found.job.status}: ask again when it has succeeded; GET /jobs/{job_id}/events tells"
+    else:
+        end = "was canceled" if found.job.status == "canceled" else "failed"
+        why = "" if found.error is None else f" ({found.error.code})"
+        detail = f"{end}{why}: GET /jobs/{job_id}/request is what to send again"
+    raise DownloadUnavailable(f"The job {job_id} {detail}.")
+
+
+@router.head("/artifacts/{sha256}", include_in_schema=False)
+@router.get(
+    "/artifacts/{sha256}",
+    operation_id="artifact",
+    tags=["artifacts"],
+    summary="Bytes by their SHA-256",
+    response_class=Response,
+    responses={
+        200: {"description": "The bytes.", "content": {"*/*": BINARY}},
+        206: {"description": "The ranges asked for.", "content": {"*/*": BINARY}},
+        304: {"description": "The caller has them."},
+        307: {
+            "description": "Where the bytes are: a signed URL of an object store (`COW_ARTIFACTS`), which works "
+            "for 15 minutes, needs no key and answers `Range` itself."
         },
-    )
-    async def download(
-        request: Request,
-        id: JobId,
-        format: Annotated[
-            DownloadFormat,
-            Query(
-                description="`zip`: result, request, image, frames, overlay and video; `gif`, `webp`: the video as an "
-                "animated picture; `sheet`: twelve of its frames as a PNG."
-            ),
-        ] = "zip",
-    ) -> Response:
-        """All of a job that has succeeded, or its video in forms that go where no video does."""
-        ending, media_type = FILES[format]
-        headers = {
-            "Content-Disposition": f'attachment; filename="cow-{id}{ending}"',
-            "X-Content-Type-Options": "nosniff",
-        }
-        if format == "zip":
-            path, release = await to_thread.run_sync(downloads.zip, id, owner_of(request), limiter=limiter)
-            return ArtifactResponse(path, release, media_type=media_type, headers=headers)
-        make = partial(downloads.animation, id, owner_of(request), format)
-        return Response(await to_thread.run_sync(make, limiter=limiter), media_type=media_type, headers=headers)
-
-    return router
+        **documented(errors.ArtifactNotFound, errors.RangeNotSatisfiable, errors.StorageUnavailable),
+    },
+)
+def artifact(
+    sha256: Annotated[str, Path(description="64 lower-case hexadecimal digits.")],
+    request: Request,
+    engine: Engine,
+    owner: Owner,
+) -> Response:
+    """Images, frames and videos that the service keeps. The ETag is the digest."""
+    engine.may_read(sha256, owner)
+    store = engine.service.artifacts
+    stored = store.get(sha256)
+    headers = {
+        "ETag": f'"{sha256}"',
+        "Cache-Control": f"{'public' if owner is None else 'private'}, {CACHE_CONTROL}",
+        "X-Content-Type-Options": "nosniff",
+    }
+    if is_known(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    redirects = engine.service.settings.artifacts_redirect
+    if redirects and (url := store.signed_url(sha256, SIGNED_SECONDS)) is not None:
+        if request.method == "HEAD":  # the URL is signed for GET alone
+            sizes = {"Content-Length": str(stored.size), "Accept-Ranges": "bytes"}
+            return Response(media_type=stored.media_type, headers=headers | sizes)
+        ArtifactResponse.check_range(request, stored.size)
+        return RedirectResponse(url, headers={"Cache-Control": f"private, max-age={REDIRECT_SECONDS}"})
+    with ExitStack() as stack:
+        path = stack.enter_context(store.local_file(sha256))
+        release = stack.pop_all().close
+    return ArtifactResponse(path, release, media_type=stored.media_type, headers=headers)

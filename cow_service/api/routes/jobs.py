@@ -1,4 +1,4 @@
-"""`GET /jobs`, `GET /jobs/{id}`, its request and events, cancellation and deletion."""
+"""`GET /jobs`, `GET /jobs/{id}`, its request and events, cancellation and deletion. A caller sees those of its key."""
 
 from __future__ import annotations
 
@@ -14,135 +14,133 @@ from cow_service import errors
 from cow_service.api.preferences import MINIMAL_APPLIED, minimal_job, preferences_of
 from cow_service.api.problems import documented
 from cow_service.api.routes.simulate import RETURN
-from cow_service.api.submission import json_response, owner_of
-from cow_service.jobs.engine import JobEngine
+from cow_service.api.submission import Engine, Owner, json_response
 from cow_service.jobs.events import END, follow
 from cow_service.jobs.state import JobFilters
 from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, JobStatus
 
 JobId = Annotated[str, Path(max_length=64, pattern=r"^[A-Za-z0-9-]+$", description="As the job says.")]
 GONE = (errors.JobNotFound, errors.InvalidRequest, errors.StorageUnavailable)
-
 PING_SECONDS = 15  # between comments that keep the connection open
 
 EVENT: dict[str, Any] = {
     "type": "object",
     "required": ["event", "data"],
     "properties": {
-        "event": {
-            "enum": ["queued", "running", "stage", "progress", "succeeded", "failed", "canceled", "deleted"],
-        },
+        "event": {"enum": ["queued", "running", "stage", "progress", "succeeded", "failed", "canceled", "deleted"]},
         "id": {"type": "string", "description": "Not of `progress`."},
         "data": {"type": "string", "contentMediaType": "application/json", "description": "A `Job`, or `{}`."},
     },
 }
 
+router = APIRouter(tags=["jobs"])
 
-def job_routes(engine: JobEngine) -> APIRouter:
-    """The operations, bound to an engine. A caller sees the jobs of its own key alone."""
-    router = APIRouter(tags=["jobs"])
 
-    @router.get(
-        "/jobs",
-        operation_id="jobs",
-        summary="Jobs, newest first",
-        responses=documented(errors.InvalidRequest, errors.StorageUnavailable),
-    )
-    def jobs(
-        request: Request,
-        status: Annotated[list[JobStatus] | None, Query(description="May be repeated.")] = None,
-        kind: Annotated[JobKind | None, Query()] = None,
-        created_after: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
-        created_before: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
-        limit: Annotated[int, Query(ge=1, le=500)] = 50,
-        cursor: Annotated[
-            str | None, Query(max_length=40_000, pattern=r"^[A-Za-z0-9_-]*$", description="`next` of the page before.")
-        ] = None,
-    ) -> JobPage:
-        """Without their results. Jobs that come or go between two pages are neither shown twice nor hide others."""
-        filters = JobFilters(tuple(status or ()), kind, created_after, created_before, limit, cursor)
-        return engine.page(owner_of(request), filters)
+@router.get(
+    "/jobs",
+    operation_id="jobs",
+    summary="Jobs, newest first",
+    responses=documented(errors.InvalidRequest, errors.StorageUnavailable),
+)
+def jobs(
+    engine: Engine,
+    owner: Owner,
+    status: Annotated[list[JobStatus] | None, Query(description="May be repeated.")] = None,
+    kind: Annotated[JobKind | None, Query()] = None,
+    created_after: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
+    created_before: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    cursor: Annotated[
+        str | None, Query(max_length=40_000, pattern=r"^[A-Za-z0-9_-]*$", description="`next` of the page before.")
+    ] = None,
+) -> JobPage:
+    """Without their results. Jobs that come or go between two pages are neither shown twice nor hide others."""
+    filters = JobFilters(tuple(status or ()), kind, created_after, created_before, limit, cursor)
+    return engine.page(owner, filters)
 
-    @router.get(
-        "/jobs/{id}",
-        operation_id="job",
-        summary="A job",
-        response_model=Job,
-        responses=documented(*GONE),
-        openapi_extra={"parameters": [RETURN]},
-    )
-    def job(request: Request, id: JobId) -> Response:
-        """How far it is; its result or problem once it has ended."""
-        found = engine.find(id, owner_of(request)).as_json()
-        if not preferences_of(request.headers).minimal:
-            return json_response(found)
-        return json_response(minimal_job(found), headers=MINIMAL_APPLIED)
 
-    @router.get(
-        "/jobs/{id}/request",
-        operation_id="request_of",
-        summary="The request that became a job",
-        responses=documented(*GONE),
-    )
-    def request_of(request: Request, id: JobId) -> AcceptedRequest:
-        """As it was accepted, to be sent again or changed: its image need not be sent with it."""
-        return engine.request_of(id, owner_of(request))
+@router.get(
+    "/jobs/{id}",
+    operation_id="job",
+    summary="A job",
+    response_model=Job,
+    responses=documented(*GONE),
+    openapi_extra={"parameters": [RETURN]},
+)
+def job(request: Request, engine: Engine, owner: Owner, id: JobId) -> Response:
+    """How far it is; its result or problem once it has ended."""
+    found = engine.find(id, owner).as_json()
+    if not preferences_of(request.headers).minimal:
+        return json_response(found)
+    return json_response(minimal_job(found), headers=MINIMAL_APPLIED)
 
-    @router.post(
-        "/jobs/{id}/cancel",
-        operation_id="cancel",
-        summary="End a job",
-        response_model=Job,
-        responses=documented(*GONE),
-    )
-    def cancel(request: Request, id: JobId) -> Response:
-        """Whoever works on it stops at the next step. A job that has ended stays as it is."""
-        return json_response(engine.cancel(id, owner_of(request)).as_json())
 
-    @router.delete(
-        "/jobs/{id}",
-        operation_id="delete",
-        summary="Delete a job and what only it holds",
-        status_code=204,
-        responses=documented(*GONE),
-    )
-    def delete(request: Request, id: JobId) -> None:
-        """Ends it first where it has not ended. Its artifacts go unless another job holds them."""
-        engine.delete(id, owner_of(request))
+@router.get(
+    "/jobs/{id}/request",
+    operation_id="request_of",
+    summary="The request that became a job",
+    responses=documented(*GONE),
+)
+def request_of(engine: Engine, owner: Owner, id: JobId) -> AcceptedRequest:
+    """As it was accepted, to be sent again or changed: its image need not be sent with it."""
+    return engine.request_of(id, owner)
 
-    @router.get(
-        "/jobs/{id}/events",
-        operation_id="events",
-        summary="Follow a job",
-        response_class=Response,
-        responses={
-            200: {
-                "description": "`queued`, `running`, `stage` (one is done), `progress`, then `succeeded`, `failed`, "
-                "`canceled` or `deleted`. The data is the job without its result.",
-                "content": {"text/event-stream": {"schema": EVENT}},
-            },
-            204: {"description": "The job has ended, and the caller has heard of it: no need to come back."},
-            **documented(*GONE),
+
+@router.post(
+    "/jobs/{id}/cancel",
+    operation_id="cancel",
+    summary="End a job",
+    response_model=Job,
+    responses=documented(*GONE),
+)
+def cancel(engine: Engine, owner: Owner, id: JobId) -> Response:
+    """Whoever works on it stops at the next step. A job that has ended stays as it is."""
+    return json_response(engine.cancel(id, owner).as_json())
+
+
+@router.delete(
+    "/jobs/{id}",
+    operation_id="delete",
+    summary="Delete a job and what only it holds",
+    status_code=204,
+    responses=documented(*GONE),
+)
+def delete(engine: Engine, owner: Owner, id: JobId) -> None:
+    """Ends it first where it has not ended. Its artifacts go unless another job holds them."""
+    engine.delete(id, owner)
+
+
+@router.get(
+    "/jobs/{id}/events",
+    operation_id="events",
+    summary="Follow a job",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "`queued`, `running`, `stage` (one is done), `progress`, then `succeeded`, `failed`, "
+            "`canceled` or `deleted`. The data is the job without its result.",
+            "content": {"text/event-stream": {"schema": EVENT}},
         },
-    )
-    async def events(
-        request: Request,
-        id: JobId,
-        last_event_id: Annotated[str | None, Header(description="The id of the last event that was heard.")] = None,
-    ) -> Response:
-        """Events have ids, the same after a restart of the server; progress has none and is not repeated."""
-        owner = owner_of(request)
-        found = await to_thread.run_sync(lambda: engine.find(id, owner, full=False))
-        seen = last_event_id or ""
-        after = int(seen) if seen.isascii() and seen.isdigit() and len(seen) < 10 else 0
-        if after >= END and found.job.status in TERMINAL:
-            return Response(status_code=204)
+        204: {"description": "The job has ended, and the caller has heard of it: no need to come back."},
+        **documented(*GONE),
+    },
+)
+async def events(
+    engine: Engine,
+    owner: Owner,
+    id: JobId,
+    last_event_id: Annotated[str | None, Header(description="The id of the last event that was heard.")] = None,
+) -> Response:
+    """Events have ids, the same after a restart of the server; progress has none and is not repeated."""
+    found = await to_thread.run_sync(lambda: engine.find(id, owner, full=False))
+    seen = last_event_id or ""
+    after = int(seen) if seen.isascii() and seen.isdigit() and len(seen) < 10 else 0
+    if after >= END and found.job.status in TERMINAL:
+        return Response(status_code=204)
 
-        async def stream() -> AsyncGenerator[ServerSentEvent]:
-            async for event in follow(engine, id, after):
-                number = None if event.number is None else str(event.number)
-                yield ServerSentEvent(event.data, event=event.name, id=number, sep="\n")
+    async def stream() -> AsyncGenerator[ServerSentEvent]:
+        async for event in follow(engine, id, after):
+            number = None if event.number is None else str(event.number)
+            yield ServerSentEvent(event.data, event=event.name, id=number, sep="\n")
 
-        return EventSourceResponse(stream(), ping=PING_SECONDS, sep="\n", headers={"Cache-Control": "no-store"})
-
-    return router
+    return EventSourceResponse(stream(), ping=PING_SECONDS, sep="\n", headers={"Cache-Control": "no-store"})

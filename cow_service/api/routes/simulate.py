@@ -9,7 +9,7 @@ from fastapi import APIRouter, Request, Response
 from cow_service import errors
 from cow_service.api.body import body_of
 from cow_service.api.problems import documented
-from cow_service.api.submission import Submitter
+from cow_service.api.submission import JobSubmitter
 from cow_service.records import Answer, Job, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
 
@@ -53,41 +53,39 @@ RESULT_PREFERENCES = [_header("Prefer", f"{WAIT}; {MINIMAL} (RFC 7240)."), KEY, 
 RETURN = _header("Prefer", f"{MINIMAL} (RFC 7240).")
 
 
-def simulate_routes(submitter: Submitter) -> APIRouter:
-    """The operations, bound to an engine."""
-    router = APIRouter()
+router = APIRouter()
 
-    @router.post(
-        "/simulate",
-        operation_id="simulate",
-        response_model=Simulation,
-        tags=["simulation"],
-        summary="Imagine the future of an image",
-        responses={**ACCEPTED, **documented(*FAILURES)},
-        openapi_extra={"requestBody": body_of(SimulateRequest), "parameters": RESULT_PREFERENCES},
-    )
-    async def simulate(request: Request) -> Response:
-        """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once.
 
-        A caller who closes the connection ends the work, a video model after the step that it is in, unless a header
-        `Prefer` or `Idempotency-Key` says that somebody comes back.
-        """
-        return await submitter.run(request, "simulate", SimulateRequest)
+@router.post(
+    "/simulate",
+    operation_id="simulate",
+    response_model=Simulation,
+    tags=["simulation"],
+    summary="Imagine the future of an image",
+    responses={**ACCEPTED, **documented(*FAILURES)},
+    openapi_extra={"requestBody": body_of(SimulateRequest), "parameters": RESULT_PREFERENCES},
+)
+async def simulate(request: Request, submitter: JobSubmitter) -> Response:
+    """Finds what moves, reads its motion, computes its trajectory, renders it, and returns everything at once.
 
-    @router.post(
-        "/answer",
-        operation_id="answer",
-        response_model=Answer,
-        tags=["answering"],
-        summary="Look, then answer",
-        responses={**ACCEPTED, **documented(*FAILURES)},
-        openapi_extra={"requestBody": body_of(AnswerRequest), "parameters": RESULT_PREFERENCES},
-    )
-    async def answer(request: Request) -> Response:
-        """Imagines the future of the image, then has the reader answer the question from the image and those frames.
+    A caller who closes the connection ends the work, a video model after the step that it is in, unless a header
+    `Prefer` or `Idempotency-Key` says that somebody comes back.
+    """
+    return await submitter.run(request, "simulate", SimulateRequest)
 
-        A simulation that fails does not lose the answer: it is then given from the image alone, and `warnings` says so.
-        """
-        return await submitter.run(request, "answer", AnswerRequest)
 
-    return router
+@router.post(
+    "/answer",
+    operation_id="answer",
+    response_model=Answer,
+    tags=["answering"],
+    summary="Look, then answer",
+    responses={**ACCEPTED, **documented(*FAILURES)},
+    openapi_extra={"requestBody": body_of(AnswerRequest), "parameters": RESULT_PREFERENCES},
+)
+async def answer(request: Request, submitter: JobSubmitter) -> Response:
+    """Imagines the future of the image, then has the reader answer the question from the image and those frames.
+
+    A simulation that fails does not lose the answer: it is then given from the image alone, and `warnings` says so.
+    """
+    return await submitter.run(request, "answer", AnswerRequest)
