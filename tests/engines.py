@@ -39,6 +39,8 @@ def app_for(service: Service) -> FastAPI:
     """An application whose jobs are this service's from now on. Only one service is at work at a time."""
     engine = running_engine()
     end_jobs(engine)
+    if engine.service is not service:
+        engine.service.close()  # its connections to an MLLM
     engine.use(service)
     return create_app(engine, closing=False)
 
