@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from functools import partial
+from typing import ClassVar
 
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cow_service.api.app import create_app
-from cow_service.api.connections import Connection, allow_connections
 from cow_service.errors import CowError, StorageUnavailable
 from cow_service.jobs.computing import Elsewhere
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
-from cow_service.settings import Settings, SettingsError
+from cow_service.settings import SettingsError
 from cow_service.warm_up import warm_up
 from cow_service.workers.pool import WorkerPool
 
@@ -41,44 +44,25 @@ class Server(uvicorn.Server):
         self._engine = engine
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listens, and says how to begin."""
+        """Listens, and logs how to begin."""
         await super().startup(sockets)
         if self.started:
+            key = ' -H "Authorization: Bearer $COW_API_KEY"' if self._engine.service.settings.api_keys else ""
+            question = "If the ball falls freely, what does it hit?"
             log.info("open %s/ in a browser", self.address)
-            log.info("or try: %s", _example_call(self._engine.service.settings, self.address))
+            log.info('or try: curl%s -F image=@photo.jpg -F question="%s" %s/simulate', key, question, self.address)
 
     @property
     def address(self) -> str:
-        """Where it listens, once it has started."""
-        return _address(self._engine.service.settings.host, self.servers[0].sockets[0].getsockname()[1])
+        """Where it listens, once it has started, as this machine reaches it."""
+        host, port = self._engine.service.settings.host, self.servers[0].sockets[0].getsockname()[1]
+        name = "127.0.0.1" if host in EVERYWHERE else host
+        return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Accepts no more jobs, then closes connections, then lets the app end."""
         self._engine.drain()
         await super().shutdown(sockets)
-
-
-def _address(host: str, port: int) -> str:
-    """Of the server, as this machine reaches it."""
-    name = "127.0.0.1" if host in EVERYWHERE else host
-    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
-
-
-def _example_call(settings: Settings, address: str) -> str:
-    """A request from this machine, for a shell."""
-    key = ' -H "Authorization: Bearer $COW_API_KEY"' if settings.api_keys else ""
-    question = "If the ball falls freely, what does it hit?"
-    return f'curl{key} -F image=@photo.jpg -F question="{question}" {address}/simulate'
-
-
-def _parts(service: Service, pool: WorkerPool | None) -> tuple[JobEngine, Readiness]:
-    """The engine of a server of its role, and what tells whether it is ready."""
-    if service.settings.role == "api":
-        return JobEngine(service, Elsewhere()), Readiness(service, lambda: None)
-    if pool is None:
-        warm = partial(warm_up, service.settings) if service.settings.warmup else lambda: None
-        return JobEngine(service), Readiness(service, warm_up=warm)
-    return JobEngine(service, pool), Readiness(service, pool.check)
 
 
 def run_worker(service: Service, pool: WorkerPool) -> None:
@@ -92,7 +76,12 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
         signal.signal(number, end)
     engine = JobEngine(service, pool, "worker")
     try:
-        _serve_metrics(service)
+        host, port = service.settings.host, service.settings.metrics_port
+        if port is not None:
+            try:
+                service.metrics.serve(host, port)
+            except OSError as error:
+                raise SettingsError(f"Bad settings: COW_METRICS_PORT={port}: {error.strerror or error}.") from error
         pool.check()
         engine.start()
         log.info("this worker takes jobs: %s", ", ".join(service.settings.queues) or "of all queues")
@@ -102,17 +91,6 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
             engine.close()
         pool.close()
         service.close()
-
-
-def _serve_metrics(service: Service) -> None:
-    """Raises `SettingsError` where the port cannot be had."""
-    host, port = service.settings.host, service.settings.metrics_port
-    if port is None:
-        return
-    try:
-        service.metrics.serve(host, port)
-    except OSError as error:
-        raise SettingsError(f"Bad settings: COW_METRICS_PORT={port}: {error.strerror or error}.") from error
 
 
 def run_server(service: Service, pool: WorkerPool | None = None) -> None:
@@ -169,9 +147,15 @@ def serving(service: Service, pool: WorkerPool | None = None) -> Generator[str]:
 
 
 def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngine, Readiness]:
-    """A server that does not run yet, with its parts."""
+    """A server of its role that does not run yet, its engine, and what tells whether it is ready."""
     settings = service.settings
-    engine, readiness = _parts(service, pool)
+    if settings.role == "api":
+        engine, readiness = JobEngine(service, Elsewhere()), Readiness(service, lambda: None)
+    elif pool is not None:
+        engine, readiness = JobEngine(service, pool), Readiness(service, pool.check)
+    else:
+        warm = partial(warm_up, settings) if settings.warmup else lambda: None
+        engine, readiness = JobEngine(service), Readiness(service, warm_up=warm)
     config = uvicorn.Config(
         create_app(engine, readiness),
         host=settings.host,
@@ -184,3 +168,79 @@ def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngin
     )
     allow_connections()
     return Server(config, engine), engine, readiness
+
+
+REQUEST_SECONDS = 20.0  # for a request's line and headers, from the connection or the first byte behind a response
+MAX_CONNECTIONS = 10_000
+RESERVED_FILES = 256  # of what the system lets this process open: for databases, artifacts and other servers
+
+
+class Connection(H11Protocol):
+    """uvicorn's HTTP/1.1 connection. It is closed where no request comes in time.
+
+    Where there are more than `most`, one that has never sent any is closed for the next, the oldest first.
+    """
+
+    most: ClassVar[int] = MAX_CONNECTIONS
+    _timer: asyncio.TimerHandle | None = None
+
+    @property
+    def waits(self) -> bool:
+        """Whether there is no request that is being received or answered."""
+        return self.cycle is None or self.cycle.response_complete  # pyright: ignore[reportUnnecessaryComparison]
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begins to wait for a request."""
+        super().connection_made(transport)
+        self._start_timer()
+        if len(self.connections) > self.most:
+            idle = [each for each in self.connections if isinstance(each, Connection) and each.waits]
+            min(idle, key=lambda each: each.priority).close()
+
+    def data_received(self, data: bytes) -> None:
+        """Goes on to wait where the headers are not all there."""
+        super().data_received(data)
+        if self.waits:
+            self._start_timer()
+        else:
+            self._stop_timer()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Waits no more."""
+        self._stop_timer()
+        super().connection_lost(exc)
+
+    @property
+    def priority(self) -> tuple[bool, float]:
+        """Which of two waiting ones stays, the larger: one that had a request before, then the one that came later."""
+        timer = self._timer or self.timeout_keep_alive_task
+        return bool(self.cycle), 0.0 if timer is None else timer.when()
+
+    def close(self) -> None:
+        """Closes the connection unless it has a request by now."""
+        self._timer = None
+        if self.waits and not self.transport.is_closing():
+            self.transport.close()
+
+    def _start_timer(self) -> None:
+        if self._timer is None:  # slow bytes give no new time
+            self._timer = self.loop.call_later(REQUEST_SECONDS, self.close)
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+
+def allow_connections() -> None:
+    """Raises the number of files that this process may open as far as the system lets it, and fits `most` to it."""
+    if sys.platform == "win32":
+        return  # it has no such limit on connections
+    import resource  # noqa: PLC0415 # of Unix
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_CONNECTIONS + RESERVED_FILES
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        soft = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        Connection.most = max(soft // 2, min(MAX_CONNECTIONS, soft - RESERVED_FILES))

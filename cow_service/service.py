@@ -22,7 +22,7 @@ from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifact_stores import open_artifact_store
 from cow_service.media.artifacts import Patience, media_type_of, try_once
 from cow_service.media.images import DecodedImage, decode, decode_data_url
-from cow_service.net.egress import ImageUrls
+from cow_service.net import ImageUrls
 from cow_service.observability.metrics import Metrics
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader

@@ -18,8 +18,8 @@ FILES = 320  # that the server may have open
 SERVE = f"""
 import resource
 resource.setrlimit(resource.RLIMIT_NOFILE, ({FILES}, {FILES}))
-from cow_service.api import connections
-connections.REQUEST_SECONDS = {SECONDS}
+from cow_service import server
+server.REQUEST_SECONDS = {SECONDS}
 from cow_service.cli.main import app
 app(["serve"])
 """

@@ -23,17 +23,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.errors import ImageUrlNotAllowed, ImageUrlUnreachable
-from cow_service.net.egress import (
+from cow_service.net import (
     TRANSLATED,
     Egress,
     EgressError,
+    HostList,
     ImageUrls,
     NotAllowed,
     Unreachable,
     _translated,
+    host_name,
+    is_public,
     look_up,
 )
-from cow_service.net.hosts import HostList, host_name, is_public
 from cow_service.settings import Settings, SettingsError, load_settings
 
 MOST = 100_000  # bytes

@@ -26,7 +26,7 @@ from servers import BODY, data_url
 from cow_service.api.submission import MAX_CONCURRENT_BODIES
 from cow_service.jobs.open_jobs import OpenJobs
 from cow_service.media.images import encode_png
-from cow_service.net.egress import ImageUrls
+from cow_service.net import ImageUrls
 from cow_service.service import Service
 from cow_service.settings import Settings
 

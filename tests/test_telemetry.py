@@ -116,7 +116,7 @@ def test_faults_carry_the_ids_too(
     app = create_app(JobEngine(service))
     monkeypatch.setattr(service, "models", fail)
     in_route = ask(app, ("GET", "/models", {"X-Request-Id": "one"}))[0]
-    monkeypatch.setattr(Origins, "_refusal", fail)
+    monkeypatch.setattr(Origins, "_is_local", fail)
     in_layer = ask(app, ("GET", "/livez", {"X-Request-Id": "two"}))[0]
     for response, given in ((in_route, "one"), (in_layer, "two")):
         assert response.status_code == 500

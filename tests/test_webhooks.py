@@ -25,7 +25,7 @@ from fastapi.testclient import TestClient
 from servers import ASYNC, BODY, SLOW_GENERATOR, TIME_LIMIT, events_of, eventually, problem, slow
 
 from cow_service.jobs import webhooks
-from cow_service.net.egress import Egress
+from cow_service.net import Egress
 from cow_service.records import Job
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError, load_settings

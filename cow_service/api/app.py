@@ -13,7 +13,7 @@ from fastapi.openapi.utils import get_openapi
 from starlette.types import ASGIApp
 
 from cow_service import __version__
-from cow_service.api.middleware.access import PROBES, ApiKeys, KeyRing, Origins, RateLimit, cors, is_loopback
+from cow_service.api.middleware.access import PROBES, Callers, Gate, KeyRing, Origins, cors, is_loopback
 from cow_service.api.middleware.access_log import AccessLog, Correlation
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.openai import routes as chats
@@ -93,13 +93,12 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
     keys = KeyRing(settings.api_keys)
     limits = {"megabytes": settings.max_body_mb, "seconds": settings.body_timeout}
     app.add_middleware(BodyLimit, **limits, megabytes_at_once=settings.max_bodies_mb)
-    if settings.rate_limit is not None:
-        app.add_middleware(RateLimit, per_minute=settings.rate_limit)
-    app.add_middleware(ApiKeys, keys=keys, count_failures=settings.rate_limit is not None)
+    app.add_middleware(Gate, refuse=Callers(keys, settings.rate_limit).refuse)
 
     def surround(stack: ASGIApp) -> ASGIApp:
         stack = cors(stack, settings.cors_origins)
-        stack = Origins(stack, settings.cors_origins, only_local=not keys and is_loopback(settings.host))
+        origins = Origins(settings.cors_origins, only_local=not keys and is_loopback(settings.host))
+        stack = Gate(stack, origins.refuse)
         return Correlation(AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"]))
 
     app.surround = surround

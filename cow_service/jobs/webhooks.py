@@ -27,7 +27,7 @@ from cow_service.records import Job
 from cow_service.settings import Settings
 
 if TYPE_CHECKING:
-    from cow_service.net.egress import Egress
+    from cow_service.net import Egress
 
 MAX_CONCURRENT_DELIVERIES = 100
 MAX_CONCURRENT_DELIVERIES_TO_ONE = 2  # receiver: one that is silent holds up its own calls alone
@@ -50,7 +50,7 @@ class Webhooks:
 
     @cached_property
     def _egress(self) -> Egress:
-        from cow_service.net.egress import Egress  # noqa: PLC0415 # an HTTP client is costly to import
+        from cow_service.net import Egress  # noqa: PLC0415 # an HTTP client is costly to import
 
         return Egress(None) if self._given is None else self._given
 
@@ -60,7 +60,7 @@ class Webhooks:
 
     def check(self, url: str) -> None:
         """Raises `WebhookNotAllowed` for a URL that would not be called."""
-        from cow_service.net.egress import NotAllowed  # noqa: PLC0415
+        from cow_service.net import NotAllowed  # noqa: PLC0415
 
         if self._secret is None:
             raise WebhookNotAllowed("This server calls no webhooks: COW_WEBHOOK_SECRET is not set. Ask for the job.")
@@ -76,7 +76,7 @@ class Webhooks:
 
     def send(self, job: Job, url: str, attempt: int) -> float | None:
         """Makes one attempt; returns the seconds until the next one, or None where none follows."""
-        from cow_service.net.egress import NotAllowed, Unreachable  # noqa: PLC0415
+        from cow_service.net import NotAllowed, Unreachable  # noqa: PLC0415
 
         event = {"type": f"job.{job.status}", "timestamp": job.finished_at, "data": job.model_dump(mode="json")}
         body = json.dumps(event, separators=(",", ":")).encode()

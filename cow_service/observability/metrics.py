@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter as Counts
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from prometheus_client import (
     CollectorRegistry,
@@ -132,96 +133,75 @@ class Metrics:
         return generate_latest(self._registry)
 
 
+Samples = Iterable[tuple[Sequence[str], float]]  # the values of labels, and the value of the gauge
+
+
 class _Gauges(Collector):
     """Gauges that are computed when the metrics are read."""
 
     def __init__(self, metrics: Metrics) -> None:
         self._metrics = metrics
+        # Name, description, labels, and what reads the values.
+        self._gauges: tuple[tuple[str, str, tuple[str, ...], Callable[[], Samples]], ...] = (
+            (
+                "cow_queue_depth",
+                "Jobs on the job database that wait or run.",
+                ("queue", "generator", "state"),
+                lambda: metrics.queue_depth().items(),
+            ),
+            (
+                "cow_queue_oldest_seconds",
+                "How long the oldest job has waited in a queue, s; 0 where none waits.",
+                ("queue",),
+                lambda: [((queue,), seconds) for queue, seconds in metrics.queue_oldest().items()],
+            ),
+            (
+                "cow_queue_unserved",
+                "Jobs that wait, and that no process takes: none has their queue, or their workflow version.",
+                ("queue", "reason"),
+                lambda: metrics.queue_unserved().items(),
+            ),
+            ("cow_workers", "Workers of this process.", ("queue", "state"), self._count_workers),
+            (
+                "cow_worker_memory_bytes",
+                "Resident memory of a worker.",
+                ("worker",),
+                lambda: [((worker.name,), worker.memory_mb * BYTES) for worker in metrics.workers()],
+            ),
+            (
+                "cow_gpu_memory_bytes",
+                "GPU memory: allocated and reserved by a worker, total of the device.",
+                ("worker", "device", "kind"),
+                self._measure_gpus,
+            ),
+        )
 
     def describe(self) -> Iterable[GaugeMetricFamily]:
         """The gauges without values, so that registering them computes nothing."""
-        own = _workers_gauge(), _worker_memory_gauge(), _gpu_gauge()
-        return (_depth_gauge(), _oldest_gauge(), _unserved_gauge(), *own)
+        return [GaugeMetricFamily(name, text, labels=labels) for name, text, labels, _ in self._gauges]
 
     def collect(self) -> Iterable[GaugeMetricFamily]:
         """The gauges as of now."""
-        for source in (self._depth, self._oldest, self._unserved, self._workers, self._worker_memory, self._gpus):
+        for name, text, labels, read in self._gauges:
+            gauge = GaugeMetricFamily(name, text, labels=labels)
             try:
-                yield source()
+                for values, number in read():
+                    gauge.add_metric(values, number)
             except Exception as error:  # the other metrics are wanted all the more
                 log.error("A metric could not be read", exc_info=error)
+            else:
+                yield gauge
 
-    def _depth(self) -> GaugeMetricFamily:
-        gauge = _depth_gauge()
-        for labels, number in self._metrics.queue_depth().items():
-            gauge.add_metric(labels, number)
-        return gauge
-
-    def _oldest(self) -> GaugeMetricFamily:
-        gauge = _oldest_gauge()
-        for queue, seconds in self._metrics.queue_oldest().items():
-            gauge.add_metric((queue,), seconds)
-        return gauge
-
-    def _unserved(self) -> GaugeMetricFamily:
-        gauge = _unserved_gauge()
-        for labels, number in self._metrics.queue_unserved().items():
-            gauge.add_metric(labels, number)
-        return gauge
-
-    def _workers(self) -> GaugeMetricFamily:
-        number: dict[tuple[str, str], int] = {}
+    def _count_workers(self) -> Samples:
+        number: Counts[tuple[str, str]] = Counts()
         for worker in self._metrics.workers():
-            for state, is_so in (("busy", bool(worker.jobs)), ("idle", not worker.jobs)):
-                key = worker.queue or "all", state
-                number[key] = number.get(key, 0) + is_so
-        gauge = _workers_gauge()
-        for labels, workers in number.items():
-            gauge.add_metric(labels, workers)
-        return gauge
+            queue = worker.queue or "all"
+            number.update({(queue, "busy"): bool(worker.jobs), (queue, "idle"): not worker.jobs})
+        return number.items()
 
-    def _worker_memory(self) -> GaugeMetricFamily:
-        gauge = _worker_memory_gauge()
-        for worker in self._metrics.workers():
-            gauge.add_metric((worker.name,), worker.memory_mb * BYTES)
-        return gauge
-
-    def _gpus(self) -> GaugeMetricFamily:
-        gauge = _gpu_gauge()
+    def _measure_gpus(self) -> Samples:
         of_workers = [(worker.name, gpu) for worker in self._metrics.workers() for gpu in worker.gpus]
         for name, gpu in of_workers or [(OWN_PROCESS, gpu) for gpu in gpu_memory()]:
-            for kind, megabytes in (
-                ("allocated", gpu.allocated_mb),
-                ("reserved", gpu.reserved_mb),
-                ("total", gpu.total_mb),
-            ):
-                gauge.add_metric((name, gpu.device, kind), megabytes * BYTES)
-        return gauge
-
-
-def _depth_gauge() -> GaugeMetricFamily:
-    labels = ("queue", "generator", "state")
-    return GaugeMetricFamily("cow_queue_depth", "Jobs on the job database that wait or run.", labels=labels)
-
-
-def _oldest_gauge() -> GaugeMetricFamily:
-    text = "How long the oldest job has waited in a queue, s; 0 where none waits."
-    return GaugeMetricFamily("cow_queue_oldest_seconds", text, labels=("queue",))
-
-
-def _unserved_gauge() -> GaugeMetricFamily:
-    text = "Jobs that wait, and that no process takes: none has their queue, or their workflow version."
-    return GaugeMetricFamily("cow_queue_unserved", text, labels=("queue", "reason"))
-
-
-def _workers_gauge() -> GaugeMetricFamily:
-    return GaugeMetricFamily("cow_workers", "Workers of this process.", labels=("queue", "state"))
-
-
-def _worker_memory_gauge() -> GaugeMetricFamily:
-    return GaugeMetricFamily("cow_worker_memory_bytes", "Resident memory of a worker.", labels=("worker",))
-
-
-def _gpu_gauge() -> GaugeMetricFamily:
-    text = "GPU memory: allocated and reserved by a worker, total of the device."
-    return GaugeMetricFamily("cow_gpu_memory_bytes", text, labels=("worker", "device", "kind"))
+            yield (name, gpu.device, "allocated"), gpu.allocated_mb * BYTES
+            yield (name, gpu.device, "reserved"), gpu.reserved_mb * BYTES
+            yield (name, gpu.device, "total"), gpu.total_mb * BYTES

@@ -54,24 +54,81 @@ class KeyRing:
         return owner
 
 
-PATHS = frozenset({"/", "/docs"})
-PREFIXES = ("/docs/", "/web/")
-
-
-def is_page(scope: Scope) -> bool:
-    """Whether a request is for a page or a file of one: what the page then asks for needs the key as ever."""
-    if scope["type"] != "http" or scope["method"] not in ("GET", "HEAD"):
-        return False
-    return scope["path"] in PATHS or scope["path"].startswith(PREFIXES)
-
-
-MAX_CALLERS = 10_000  # remembered; beyond that the one that has been idle longest gets a full bucket
 PROBES = frozenset({"/livez", "/readyz"})
+PAGES = frozenset({"/", "/docs"})
+PAGE_FILES = ("/docs/", "/web/")
+MAX_CALLERS = 10_000  # remembered; beyond that the one that has been idle longest gets a full bucket
+MAX_FAILURES = 30  # per minute from one address, before it has to wait
 
 
-def is_probe(scope: Scope) -> bool:
-    """Whether a request is a health probe, which must always be served."""
-    return scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and scope["path"] in PROBES
+class Gate:
+    """ASGI middleware: answers with the error of `refuse`, where that has one for a request; else passes it on."""
+
+    def __init__(self, app: ASGIApp, refuse: Callable[[Scope], CowError | None]) -> None:
+        self.app = app
+        self._refuse = refuse
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Passes a request on, or refuses it."""
+        error = None if scope["type"] == "lifespan" else self._refuse(scope)
+        await (self.app if error is None else respond(error, scope))(scope, receive, send)
+
+
+class Callers:
+    """Finds the owner of the key of each request, `scope["state"]["owner"]`, and limits requests by key.
+
+    Without keys the owner is None, and requests are limited by address. Probes, and pages with their files, are open to
+    everybody: what a page then asks for needs the key as ever. Refusing stands before the router, so that a route that
+    is added tomorrow is closed as well.
+    """
+
+    def __init__(self, keys: KeyRing, per_minute: int | None) -> None:
+        self._keys = keys
+        self._requests = None if per_minute is None else Buckets(per_minute)
+        self._failures = None if per_minute is None else Buckets(MAX_FAILURES)
+
+    def refuse(self, scope: Scope) -> CowError | None:
+        """Why a request is refused, if it is."""
+        state = scope.setdefault("state", {})
+        owner = state["owner"] = None
+        if scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
+            path = scope["path"]
+            if path in PROBES or path in PAGES or path.startswith(PAGE_FILES):
+                return None
+        if self._keys:
+            key = _bearer(scope)
+            owner = state["owner"] = None if key is None else self._keys.owner_of(key)
+            if owner is None:
+                return self._unauthorized(scope, "no key" if key is None else "a key that is none of this server's")
+        if self._requests is None:
+            return None
+        whose = "your address" if owner is None else "this key"
+        wait = self._requests.take(f"address {address_of(scope)}" if owner is None else f"key {owner}")
+        detail = f"The server takes {self._requests.per_minute} requests a minute with {whose}."
+        return rate_limited(detail, wait) if wait else None
+
+    def _unauthorized(self, scope: Scope, what: str) -> CowError:
+        # A right key passes in any case: else one bad neighbour behind the same address would lock all others out.
+        if self._failures is not None and (wait := self._failures.take(address_of(scope))):
+            return rate_limited("Too many requests without a valid key came from your address.", wait)
+        return Unauthorized(
+            f"The request has {what}. Send the header `Authorization: Bearer <key>` with a key that the server's "
+            "operator gave you.",
+            headers={"WWW-Authenticate": "Bearer"},
+        )
+
+
+def rate_limited(detail: str, wait: float) -> RateLimited:
+    """The error for a caller who is to wait so many seconds."""
+    seconds = max(1, math.ceil(wait))
+    return RateLimited(f"{detail} Try again in {seconds} s.", headers={"Retry-After": str(seconds)})
+
+
+def _bearer(scope: Scope) -> str | None:
+    """The key that was sent; None where there is none, or more than one."""
+    sent = Headers(scope=scope).getlist("authorization")
+    scheme, _, key = sent[0].strip().partition(" ") if len(sent) == 1 else ("", "", "")
+    return key.strip() or None if scheme.lower() == "bearer" else None
 
 
 def address_of(scope: Scope) -> str:
@@ -109,80 +166,6 @@ class Buckets:
         if len(self._levels) > self._most:
             self._levels.popitem(last=False)
         return wait
-
-
-def rate_limited(detail: str, wait: float) -> RateLimited:
-    """The error for a caller who is to wait so many seconds."""
-    seconds = max(1, math.ceil(wait))
-    return RateLimited(f"{detail} Try again in {seconds} s.", headers={"Retry-After": str(seconds)})
-
-
-class RateLimit:
-    """ASGI middleware: so many requests a minute for each key, or for each address where there are no keys."""
-
-    def __init__(self, app: ASGIApp, per_minute: int) -> None:
-        self.app = app
-        self.buckets = Buckets(per_minute)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes a request on, or answers that it came too soon."""
-        if scope["type"] != "lifespan" and not is_probe(scope) and not is_page(scope):
-            owner = scope["state"]["owner"]
-            wait = self.buckets.take(f"key {owner}" if owner is not None else f"address {address_of(scope)}")
-            if wait:
-                whose = "this key" if owner is not None else "your address"
-                detail = f"The server takes {self.buckets.per_minute} requests a minute with {whose}."
-                await respond(rate_limited(detail, wait), scope)(scope, receive, send)
-                return
-        await self.app(scope, receive, send)
-
-
-MAX_FAILURES = 30  # per minute from one address, before it has to wait
-
-
-class ApiKeys:
-    """ASGI middleware: finds the owner of the key of each request, `scope["state"]["owner"]`.
-
-    The owner is None where the server has no keys, and for probes and pages. It stands before the router, so that a
-    route that is added tomorrow is closed as well.
-    """
-
-    def __init__(self, app: ASGIApp, keys: KeyRing, count_failures: bool) -> None:
-        self.app = app
-        self.keys = keys
-        self._failures = Buckets(MAX_FAILURES) if count_failures else None
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes a request on with its owner, or refuses it."""
-        if scope["type"] != "lifespan":
-            state = scope.setdefault("state", {})
-            state["owner"] = None
-            if self.keys and not is_probe(scope) and not is_page(scope):
-                key = _bearer(scope)
-                owner = None if key is None else self.keys.owner_of(key)
-                if owner is None:
-                    await respond(self._refusal(scope, given=key is not None), scope)(scope, receive, send)
-                    return
-                state["owner"] = owner
-        await self.app(scope, receive, send)
-
-    def _refusal(self, scope: Scope, given: bool) -> CowError:
-        # A right key passes in any case: else one bad neighbour behind the same address would lock all others out.
-        wait = self._failures.take(address_of(scope)) if self._failures is not None else 0.0
-        if wait:
-            return rate_limited("Too many requests without a valid key came from your address.", wait)
-        detail = "The key is none of this server's." if given else "The request has no key."
-        return Unauthorized(
-            f"{detail} Send the header `Authorization: Bearer <key>` with a key that the server's operator gave you.",
-            headers={"WWW-Authenticate": "Bearer"},
-        )
-
-
-def _bearer(scope: Scope) -> str | None:
-    """The key that was sent; None where there is none, or more than one."""
-    sent = Headers(scope=scope).getlist("authorization")
-    scheme, _, key = sent[0].strip().partition(" ") if len(sent) == 1 else ("", "", "")
-    return key.strip() or None if scheme.lower() == "bearer" else None
 
 
 METHODS = ("GET", "HEAD", "POST", "DELETE")
@@ -223,35 +206,28 @@ def is_loopback(host: str) -> bool:
 
 
 class Origins:
-    """ASGI middleware: refuses what a foreign page sends.
+    """Refuses what a foreign page sends.
 
     `only_local` says that nothing but the address protects the server. A page may then give its own name that address
     (DNS rebinding) and so look like the server's own; names that anybody can register are therefore refused, too.
     """
 
-    def __init__(self, app: ASGIApp, allowed: Collection[str], only_local: bool) -> None:
-        self.app = app
-        self.allowed = frozenset(allowed)
-        self.only_local = only_local
+    def __init__(self, allowed: Collection[str], only_local: bool) -> None:
+        self._allowed = frozenset(allowed)
+        self._only_local = only_local
         self._hosts = frozenset(filter(None, (urlsplit(origin).hostname for origin in allowed)))
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes a request on, or refuses it."""
-        error = None if scope["type"] == "lifespan" else self._refusal(Headers(scope=scope))
-        if error is not None:
-            await respond(error, scope)(scope, receive, send)
-            return
-        await self.app(scope, receive, send)
-
-    def _refusal(self, headers: Headers) -> OriginNotAllowed | None:
+    def refuse(self, scope: Scope) -> OriginNotAllowed | None:
+        """Why a request is refused, if it is."""
+        headers = Headers(scope=scope)
         host = headers.get("host", "").lower()
         for origin in headers.getlist("origin"):
-            if origin not in self.allowed and "*" not in self.allowed and not _is_own(origin.lower(), host):
+            if origin not in self._allowed and "*" not in self._allowed and not _is_own(origin.lower(), host):
                 return OriginNotAllowed(
                     f"A page of '{origin[:200]}' may not use this server. Its operator can list that origin in "
                     "COW_CORS_ORIGINS."
                 )
-        if self.only_local and not self._is_local(host):
+        if self._only_local and not self._is_local(host):
             return OriginNotAllowed(
                 f"The server listens on this machine only, without keys, and is not known as '{host[:200]}'. Ask for "
                 "localhost or 127.0.0.1; its operator can list https://<name> in COW_CORS_ORIGINS, or set COW_API_KEYS."

@@ -16,7 +16,7 @@ _RELEASE = "release_body"  # in the state of a request
 class BodyLimit:
     """ASGI middleware: counts the body's bytes, and the seconds from the request's headers to the body's end.
 
-    How long the headers take is the matter of `api/connections.py`: the app hears of a request once they are in.
+    How long the headers take is the matter of `server.Connection`: the app hears of a request once they are in.
     """
 
     def __init__(self, app: ASGIApp, megabytes: float, seconds: float, megabytes_at_once: float) -> None:
@@ -48,7 +48,11 @@ class BodyLimit:
                 async with asyncio.timeout_at(deadline):
                     message = await receive()
             except TimeoutError as error:
-                raise self._too_slow(seen) from error
+                raise BodyTooSlow(
+                    f"Of the body {seen} bytes came in {self.seconds:g} s, and not its end. Send it at once, or raise "
+                    "COW_BODY_TIMEOUT on the server.",
+                    headers={"Connection": "close"},
+                ) from error
             waiting = bool(message.get("more_body", False))
             size = len(message.get("body", b""))
             seen += size
@@ -57,7 +61,11 @@ class BodyLimit:
             if seen > limit:
                 raise self._too_large()
             if self._held > self.megabytes_at_once * 1e6:
-                raise self._too_many()
+                raise QueueFull(
+                    f"The server holds {self.megabytes_at_once:g} MB of bodies that it has not read yet, all that "
+                    "COW_MAX_BODIES_MB lets it. Send the request again in a while.",
+                    headers={"Retry-After": "1", "Connection": "close"},
+                )
             return message
 
         def release() -> None:
@@ -94,20 +102,6 @@ class BodyLimit:
         return BodyTooLarge(
             f"The body is larger than {self.megabytes:g} MB. Send a smaller image, or raise COW_MAX_BODY_MB on the "
             "server."
-        )
-
-    def _too_many(self) -> QueueFull:
-        return QueueFull(
-            f"The server holds {self.megabytes_at_once:g} MB of bodies that it has not read yet, all that "
-            "COW_MAX_BODIES_MB lets it. Send the request again in a while.",
-            headers={"Retry-After": "1", "Connection": "close"},
-        )
-
-    def _too_slow(self, seen: int) -> BodyTooSlow:
-        return BodyTooSlow(
-            f"Of the body {seen} bytes came in {self.seconds:g} s, and not its end. Send it at once, or raise "
-            "COW_BODY_TIMEOUT on the server.",
-            headers={"Connection": "close"},
         )
 
 

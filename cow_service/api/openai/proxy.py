@@ -30,9 +30,8 @@ from cow_service.api.openai.stream import (
     job_head,
     progress_chunk,
 )
-from cow_service.api.preferences import Preferences, preferences_of
 from cow_service.api.problems import invalid
-from cow_service.api.submission import Submission, Submitter, disconnected, owner_of
+from cow_service.api.submission import Preferences, Submission, Submitter, disconnected, owner_of, preferences_of
 from cow_service.errors import Canceled, CowError, InvalidRequest, MllmBadReply
 from cow_service.jobs.engine import new_job_id
 from cow_service.media.artifacts import ArtifactStore

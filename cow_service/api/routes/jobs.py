@@ -11,10 +11,9 @@ from pydantic import AwareDatetime
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from cow_service import errors
-from cow_service.api.preferences import MINIMAL_APPLIED, minimal_job, preferences_of
 from cow_service.api.problems import documented
 from cow_service.api.routes.simulate import RETURN
-from cow_service.api.submission import Engine, Owner, json_response
+from cow_service.api.submission import MINIMAL_APPLIED, Engine, Owner, json_response, minimal_job, preferences_of
 from cow_service.jobs.events import END, follow
 from cow_service.jobs.state import JobFilters
 from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, JobStatus

@@ -1,1 +1,0 @@
-"""Outgoing HTTP to addresses that callers name."""
