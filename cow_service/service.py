@@ -9,15 +9,8 @@ from importlib.metadata import entry_points
 from threading import Lock
 from typing import Any, TypeVar, cast
 
+from cow_service import errors
 from cow_service.concurrency import PrioritySemaphore
-from cow_service.errors import (
-    CowError,
-    FieldError,
-    GeneratorUnavailable,
-    InvalidRequest,
-    ReaderUnavailable,
-    field_of,
-)
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifact_stores import open_artifact_store
 from cow_service.media.artifacts import Patience, media_type_of, try_once
@@ -68,9 +61,9 @@ class Service:
         self.metrics = Metrics()
         self._image_urls = ImageUrls(settings)
         self.artifacts = open_artifact_store(settings)
-        self.readers: Registry[Reader] = Registry("cow_service.readers", ReaderUnavailable, settings)
+        self.readers: Registry[Reader] = Registry("cow_service.readers", errors.ReaderUnavailable, settings)
         self._generator_limits = {point.name: point for point in entry_points(group="cow_service.generator_limits")}
-        self.generators: Registry[Generator] = Registry("cow_service.generators", GeneratorUnavailable, settings)
+        self.generators: Registry[Generator] = Registry("cow_service.generators", errors.GeneratorUnavailable, settings)
         for setting, name, names in (
             ("COW_READER", settings.reader, self.readers.names()),
             ("COW_GENERATOR", settings.generator, self.generators.names()),
@@ -147,8 +140,8 @@ class Service:
         reader = self._known("reader", request.reader or self.settings.reader, self.readers)
         name = self._known("generator", request.generator or self.settings.generator, self.generators)
         if self.settings.role != "api":  # else workers have what it lacks
-            _check_modules(reader, ReaderUnavailable)
-            _check_modules(name, GeneratorUnavailable)
+            _check_modules(reader, errors.ReaderUnavailable)
+            _check_modules(name, errors.GeneratorUnavailable)
         limits = self._limits(name)
         if limits is not None:
             check_request(limits, request)
@@ -218,11 +211,11 @@ class Service:
             return self._devices.setdefault(name, PrioritySemaphore(permits))
 
     def _reader(self, name: str) -> Reader:
-        _check_modules(name, ReaderUnavailable)
+        _check_modules(name, errors.ReaderUnavailable)
         return self.readers.get(name)
 
     def _generator(self, name: str) -> Generator:
-        _check_modules(name, GeneratorUnavailable)
+        _check_modules(name, errors.GeneratorUnavailable)
         return self.generators.get(name)
 
     def image_of(self, ref: ImageRef) -> tuple[str, DecodedImage]:
@@ -246,14 +239,16 @@ class Service:
         data = decode_data_url(place.mask, pointer)
         if media_type_of(data) != "image/png":
             detail = "is no PNG"
-            raise InvalidRequest(f"`{field_of(pointer)}` {detail}.", errors=(FieldError(pointer, detail),))
+            raise errors.InvalidRequest(
+                f"`{errors.field_of(pointer)}` {detail}.", errors=(errors.FieldError(pointer, detail),)
+            )
         kept = ImageArtifact(artifact=self.artifacts.put(data, "image/png").sha256)
         return place.model_copy(update={"mask": kept})
 
     def _known(self, role: str, name: str, registry: Registry[Reader] | Registry[Generator]) -> str:
         if name not in registry.names():
             detail = f"There is no {role} '{name}'. There are: {', '.join(registry.names()) or 'none'}."
-            raise InvalidRequest(detail, errors=(FieldError(f"/{role}", detail),))
+            raise errors.InvalidRequest(detail, errors=(errors.FieldError(f"/{role}", detail),))
         return name
 
     def _describe(self, role: str, name: str) -> BackendInfo:
@@ -284,7 +279,7 @@ def is_url(ref: ImageRef) -> bool:
     return isinstance(ref, ImageUrl) or (isinstance(ref, str) and _OTHER_URL.match(ref[:256]) is not None)
 
 
-def _check_modules(name: str, unavailable: type[CowError]) -> None:
+def _check_modules(name: str, unavailable: type[errors.CowError]) -> None:
     """Raises `unavailable`, with the command that helps, where a backend's modules are not installed."""
     manifest = find_manifest(name)
     if manifest is not None and (missing := manifest.missing_modules()):

@@ -17,16 +17,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import Match
 from starlette.types import Scope
 
-from cow_service.errors import (
-    CowError,
-    InternalError,
-    InvalidRequest,
-    MalformedBody,
-    MethodNotAllowed,
-    NotFound,
-    shortened,
-    unforeseen,
-)
+from cow_service import errors
 from cow_service.records import Problem, Record
 from cow_service.requests.values import SHOWN_CHARACTERS, field_errors
 
@@ -43,13 +34,13 @@ log = logging.getLogger("cow_service")
 
 def invalid(
     error: ValidationError | RequestValidationError, placed: Callable[[str], str] = lambda pointer: pointer
-) -> InvalidRequest:
+) -> errors.InvalidRequest:
     """A pydantic error as ours, with a JSON Pointer per field; `placed` says where that stands in the request."""
     if any(item["type"] in ("json_invalid", "model_type") and not item["loc"] for item in error.errors()):
-        return MalformedBody(f"The body is no JSON object: {error.errors()[0]['msg']}.")
+        return errors.MalformedBody(f"The body is no JSON object: {error.errors()[0]['msg']}.")
     fields = field_errors(error.errors(), placed)
     summary = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in fields[:5])
-    return InvalidRequest(f"{summary}. See /openapi.json for what the request may hold.", errors=fields)
+    return errors.InvalidRequest(f"{summary}. See /openapi.json for what the request may hold.", errors=fields)
 
 
 class ChatError(Record):
@@ -67,7 +58,7 @@ class ChatProblem(Problem):
     error: ChatError
 
 
-def openai_error(error: CowError) -> dict[str, Any]:
+def openai_error(error: errors.CowError) -> dict[str, Any]:
     """An error as OpenAI's clients read it: a `ChatError`."""
     other = "server_error" if error.status >= HTTPStatus.INTERNAL_SERVER_ERROR else "invalid_request_error"
     param = None
@@ -82,12 +73,12 @@ def openai_error(error: CowError) -> dict[str, Any]:
     }
 
 
-def chat_problem(error: CowError) -> dict[str, Any]:
+def chat_problem(error: errors.CowError) -> dict[str, Any]:
     """An error as `ChatProblem`."""
     return error.as_problem() | {"error": openai_error(error)}
 
 
-def respond(error: CowError, scope: Scope) -> JSONResponse:
+def respond(error: errors.CowError, scope: Scope) -> JSONResponse:
     """The HTTP response for an error, which OpenAI's clients, too, can read where the request is one of theirs."""
     problem = chat_problem(error) if scope["path"].startswith(OPENAI_ROOT) else error.as_problem()
     headers = {"Retry-After": "5"} if error.status == HTTPStatus.SERVICE_UNAVAILABLE else {}
@@ -97,8 +88,8 @@ def respond(error: CowError, scope: Scope) -> JSONResponse:
 def install_problem_handlers(app: FastAPI) -> None:
     """Makes every error of the app a problem, those of the framework and unforeseen ones included."""
 
-    @app.exception_handler(CowError)
-    async def cow_error(request: Request, error: CowError) -> Response:
+    @app.exception_handler(errors.CowError)
+    async def cow_error(request: Request, error: errors.CowError) -> Response:
         return respond(error, request.scope)
 
     @app.exception_handler(RequestValidationError)
@@ -121,10 +112,10 @@ def install_problem_handlers(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def any_other(request: Request, error: Exception) -> Response:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return respond(unforeseen(), request.scope)
+        return respond(errors.unforeseen(), request.scope)
 
 
-def documented(*errors: type[CowError]) -> dict[int | str, dict[str, Any]]:
+def documented(*errors: type[errors.CowError]) -> dict[int | str, dict[str, Any]]:
     """The `responses` of an operation that can fail in these ways, for the OpenAPI document."""
     by_status: dict[int | str, dict[str, Any]] = {}
     for status in sorted({error.status for error in errors}):
@@ -136,15 +127,15 @@ def documented(*errors: type[CowError]) -> dict[int | str, dict[str, Any]]:
     return by_status
 
 
-def _translated(error: HTTPException, request: Request) -> CowError:
-    path = shortened(request.url.path, SHOWN_CHARACTERS)
+def _translated(error: HTTPException, request: Request) -> errors.CowError:
+    path = errors.shortened(request.url.path, SHOWN_CHARACTERS)
     if error.status_code == HTTPStatus.NOT_FOUND:
-        return NotFound(f"Nothing is served at {path}. GET /openapi.json lists what is.")
+        return errors.NotFound(f"Nothing is served at {path}. GET /openapi.json lists what is.")
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-        return MethodNotAllowed(f"{path} does not take {request.method}.")
+        return errors.MethodNotAllowed(f"{path} does not take {request.method}.")
     if HTTPStatus.BAD_REQUEST <= error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
-        return MalformedBody(f"{error.detail}.")
-    return InternalError(f"{error.detail}.")
+        return errors.MalformedBody(f"{error.detail}.")
+    return errors.InternalError(f"{error.detail}.")
 
 
 def _methods(request: Request) -> set[str]:

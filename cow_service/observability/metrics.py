@@ -7,14 +7,7 @@ import sys
 from collections import Counter as Counts
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from prometheus_client import (
-    CollectorRegistry,
-    Counter,
-    Histogram,
-    ProcessCollector,
-    generate_latest,
-    start_http_server,
-)
+import prometheus_client as prometheus
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
@@ -62,37 +55,37 @@ class Metrics:
         self.queue_oldest: QueueOldest = dict
         self.queue_unserved: QueueUnserved = dict
         self.workers: ListWorkers = tuple
-        self._registry = registry = CollectorRegistry()
-        self._requests = Counter(
+        self._registry = registry = prometheus.CollectorRegistry()
+        self._requests = prometheus.Counter(
             "cow_http_requests", "Requests answered.", ("method", "route", "status"), registry=registry
         )
-        self._request_seconds = Histogram(
+        self._request_seconds = prometheus.Histogram(
             "cow_http_request_seconds",
             "From a request's head to the last byte of its answer, s.",
             ("route",),
             buckets=_REQUEST_BUCKETS,
             registry=registry,
         )
-        self._stage_seconds = Histogram(
+        self._stage_seconds = prometheus.Histogram(
             "cow_stage_seconds", "Time in a stage, s.", ("stage",), buckets=_STAGE_BUCKETS, registry=registry
         )
-        self._jobs = Counter("cow_jobs", "Jobs that ended.", ("kind", "outcome"), registry=registry)
-        self._stage_cache = Counter(
+        self._jobs = prometheus.Counter("cow_jobs", "Jobs that ended.", ("kind", "outcome"), registry=registry)
+        self._stage_cache = prometheus.Counter(
             "cow_stage_cache", "Stages looked for among earlier results.", ("stage", "result"), registry=registry
         )
-        self._worker_ends = Counter(
+        self._worker_ends = prometheus.Counter(
             "cow_worker_ends", "Worker processes that ended, and why.", ("reason",), registry=registry
         )
-        self._webhooks = Counter(
+        self._webhooks = prometheus.Counter(
             "cow_webhook_attempts",
             "Attempts to call a webhook, and what came of them.",
             ("outcome",),
             registry=registry,
         )
-        self._webhooks_given_up = Counter(
+        self._webhooks_given_up = prometheus.Counter(
             "cow_webhooks_given_up", "Webhooks that were not delivered after the last attempt.", registry=registry
         )
-        ProcessCollector(registry=registry)
+        prometheus.ProcessCollector(registry=registry)
         registry.register(_Gauges(self))
 
     def request(self, method: str, route: str, status: int, seconds: float) -> None:
@@ -126,11 +119,11 @@ class Metrics:
 
     def serve(self, host: str, port: int) -> None:
         """Serves the exposition over HTTP, on every path, until the process ends. Raises `OSError`."""
-        start_http_server(port, host, self._registry)
+        prometheus.start_http_server(port, host, self._registry)
 
     def exposition(self) -> bytes:
         """Everything in Prometheus' text format, as `MEDIA_TYPE`."""
-        return generate_latest(self._registry)
+        return prometheus.generate_latest(self._registry)
 
 
 Samples = Iterable[tuple[Sequence[str], float]]  # the values of labels, and the value of the gauge

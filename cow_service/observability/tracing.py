@@ -12,16 +12,8 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from opentelemetry import trace
 from opentelemetry.context import Context, attach, detach
-from opentelemetry.trace import (
-    NonRecordingSpan,
-    SpanContext,
-    SpanKind,
-    StatusCode,
-    TraceFlags,
-    get_current_span,
-    use_span,
-)
 
 from cow_service import __version__
 from cow_service.observability import logging as context
@@ -89,7 +81,7 @@ def span(name: str, *, parent: str | None = None, **attributes: Attribute) -> Ge
     """
     above = None if parent is None else context.remote(parent)
     if _provider is not None:
-        with _recorded(_provider, name, SpanKind.INTERNAL, above, attributes):
+        with _recorded(_provider, name, trace.SpanKind.INTERNAL, above, attributes):
             yield
     elif above is not None:
         token = attach(above)
@@ -106,29 +98,33 @@ def request_span(name: str, parent: str | None) -> Generator[None]:
     """The span of a request around the block; `parent` is the caller's traceparent."""
     above = context.remote(parent)
     if _provider is not None:
-        with _recorded(_provider, name, SpanKind.SERVER, above, {}):
+        with _recorded(_provider, name, trace.SpanKind.SERVER, above, {}):
             yield
         return
-    caller = get_current_span(above).get_span_context()
+    caller = trace.get_current_span(above).get_span_context()
     trace_id = caller.trace_id or secrets.randbits(128) or 1
-    sampled = TraceFlags(caller.trace_flags & TraceFlags.SAMPLED)
-    ids = SpanContext(trace_id, secrets.randbits(64) or 1, is_remote=False, trace_flags=sampled)
-    with use_span(NonRecordingSpan(ids)):
+    sampled = trace.TraceFlags(caller.trace_flags & trace.TraceFlags.SAMPLED)
+    ids = trace.SpanContext(trace_id, secrets.randbits(64) or 1, is_remote=False, trace_flags=sampled)
+    with trace.use_span(trace.NonRecordingSpan(ids)):
         yield
 
 
 def describe(name: str, *, failed: bool, **attributes: Attribute) -> None:
     """Renames the current span, now that more is known of it, and adds attributes."""
-    here = get_current_span()
+    here = trace.get_current_span()
     here.update_name(name)
     here.set_attributes({key: value for key, value in attributes.items() if value is not None})
     if failed:
-        here.set_status(StatusCode.ERROR)
+        here.set_status(trace.StatusCode.ERROR)
 
 
 @contextmanager
 def _recorded(
-    provider: TracerProvider, name: str, kind: SpanKind, above: Context | None, attributes: Mapping[str, Attribute]
+    provider: TracerProvider,
+    name: str,
+    kind: trace.SpanKind,
+    above: Context | None,
+    attributes: Mapping[str, Attribute],
 ) -> Generator[None]:
     known = {key: value for key, value in attributes.items() if value is not None}
     tracer = provider.get_tracer("cow_service", __version__)

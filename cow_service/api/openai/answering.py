@@ -11,16 +11,7 @@ from typing import Any
 from anyio import to_thread
 from pydantic import ValidationError
 
-from cow_service.api.openai.chats import (
-    Chat,
-    ImagePart,
-    images_of,
-    other_parts,
-    point_into_chat,
-    role_of,
-    texts_of,
-    wrong,
-)
+from cow_service.api.openai import chats
 from cow_service.api.openai.records import Answerer
 from cow_service.api.openai.stream import DONE, chunk_of, event_of, follow_job, job_head, progress_chunk
 from cow_service.api.problems import invalid
@@ -60,28 +51,28 @@ class ParsedChat:
     with_usage: bool
 
 
-def parse_chat(chat: Chat, model: Answerer) -> ParsedChat:
+def parse_chat(chat: chats.Chat, model: Answerer) -> ParsedChat:
     """The answer that a chat asks for. Raises `InvalidRequest`."""
     if not chat.messages:
-        raise wrong("/messages", "is missing: send the image and the question in one user message")
+        raise chats.wrong("/messages", "is missing: send the image and the question in one user message")
     image = _image_of(chat.messages)
     place, question = chat.question()
     if not question.strip():
-        raise wrong(f"/messages/{place}/content", "the last user message has no text: put the question there")
+        raise chats.wrong(f"/messages/{place}/content", "the last user message has no text: put the question there")
     for name in FIELDS_OF_CHAT:
         if name in chat.cow:
-            raise wrong(f"/cow/{name}", "is said by `messages` and `model`; leave it out")
+            raise chats.wrong(f"/cow/{name}", "is said by `messages` and `model`; leave it out")
     seed = chat.fields.get("seed")
     seeds: dict[str, Any] = {} if seed is None else {"seed": seed}
     if seeds and "seed" in chat.cow:
-        raise wrong("/cow/seed", "stands in `seed`, too; give it once")
+        raise chats.wrong("/cow/seed", "stands in `seed`, too; give it once")
     pointers = {"/image": image.url_pointer, "/question": f"/messages/{place}/content", "/reader": "/model"}
     pointers |= {"/seed": "/seed"} if seeds else {}
     fields = {**chat.cow, **seeds, "question": question, "image": image.reference}
     try:
         request = AnswerRequest.model_validate({**fields, "reader": model.reader, "imagine": model.imagine})
     except ValidationError as error:
-        raise invalid(error, lambda pointer: point_into_chat(pointer, pointers)) from error
+        raise invalid(error, lambda pointer: chats.point_into_chat(pointer, pointers)) from error
     limits = [limit for name in ("max_tokens", "max_completion_tokens") if type(limit := chat.fields.get(name)) is int]
     return ParsedChat(
         model=chat.model,
@@ -94,17 +85,17 @@ def parse_chat(chat: Chat, model: Answerer) -> ParsedChat:
     )
 
 
-def _image_of(messages: list[Any]) -> ImagePart:
+def _image_of(messages: list[Any]) -> chats.ImagePart:
     """The only image. The same image may stand in several messages."""
-    for pointer, kind in other_parts(messages):
-        raise wrong(f"{pointer}/type", f"is {kind}: only parts of the types `text` and `image_url` are read")
-    found: dict[str, ImagePart] = {}
-    for image in images_of(messages):
+    for pointer, kind in chats.other_parts(messages):
+        raise chats.wrong(f"{pointer}/type", f"is {kind}: only parts of the types `text` and `image_url` are read")
+    found: dict[str, chats.ImagePart] = {}
+    for image in chats.images_of(messages):
         if image.role != "user":
-            raise wrong(image.pointer, f"images are read in `user` messages only, got one of `{image.role}`")
+            raise chats.wrong(image.pointer, f"images are read in `user` messages only, got one of `{image.role}`")
         found.setdefault(image.url, image)
     if not found:
-        raise wrong(
+        raise chats.wrong(
             f"/messages/{len(messages) - 1}/content",
             "no user message has an image: add a part "
             '{"type": "image_url", "image_url": {"url": "data:image/png;base64,..."}}',
@@ -115,16 +106,18 @@ def _image_of(messages: list[Any]) -> ImagePart:
         raise InvalidRequest(f"`messages`: {detail}.", errors=places)
     image = next(iter(found.values()))
     if not image.url[:8].lower().startswith(("data:", "http://", "https://")):
-        raise wrong(image.url_pointer, "is neither a data URL (data:image/png;base64,...) nor one of http or https")
+        raise chats.wrong(
+            image.url_pointer, "is neither a data URL (data:image/png;base64,...) nor one of http or https"
+        )
     return image
 
 
-def _warnings(chat: Chat, question: int) -> Iterator[str]:
+def _warnings(chat: chats.Chat, question: int) -> Iterator[str]:
     """What of the chat has no effect."""
     unread = [
-        f"{place} ({role_of(message)})"
+        f"{place} ({chats.role_of(message)})"
         for place, message in enumerate(chat.messages)
-        if place != question and any(text.strip() for text in texts_of(message))
+        if place != question and any(text.strip() for text in chats.texts_of(message))
     ]
     if unread:
         yield (

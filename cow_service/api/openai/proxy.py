@@ -15,21 +15,10 @@ from fastapi import Request
 from pydantic import ValidationError
 
 from cow_service import errors
+from cow_service.api.openai import stream
 from cow_service.api.openai.chats import EXTENSION, Chat, ImagePart, images_of, locate_in_chat, other_parts, wrong
 from cow_service.api.openai.forwarding import Events, Forwarder, Whole
 from cow_service.api.openai.records import WITHOUT, Answerer, ChatImagination
-from cow_service.api.openai.stream import (
-    DONE,
-    Streamed,
-    chunk_of,
-    chunks_of,
-    data_of,
-    event_of,
-    follow_job,
-    head_of,
-    job_head,
-    progress_chunk,
-)
 from cow_service.api.problems import invalid
 from cow_service.api.submission import Preferences, Submission, Submitter, disconnected, owner_of, preferences_of
 from cow_service.errors import Canceled, CowError, InvalidRequest, MllmBadReply
@@ -72,7 +61,9 @@ class Proxy:
         """Closes its connections."""
         await self._forwarder.close()
 
-    async def complete(self, request: Request, chat: Chat, answerer: Answerer, reader: ChatReader) -> Whole | Streamed:
+    async def complete(
+        self, request: Request, chat: Chat, answerer: Answerer, reader: ChatReader
+    ) -> Whole | stream.Streamed:
         """The reply to a chat, streamed where it says so.
 
         Raises `InvalidRequest` for what COW itself is told, the errors of a simulation that are not those of the chat,
@@ -99,17 +90,19 @@ class Proxy:
 
     def _stream(
         self, submission: Submission, created_at: str | None, chat: Chat, what_if: WhatIf, reader: ChatReader
-    ) -> Streamed:
+    ) -> stream.Streamed:
         """Progress while the simulation runs, then the reply's own events."""
         stack = AsyncExitStack()
 
         async def events() -> AsyncGenerator[bytes]:
             result = ""
             try:
-                async with aclosing(follow_job(self._submitter, submission, created_at)) as updates:
+                async with aclosing(stream.follow_job(self._submitter, submission, created_at)) as updates:
                     async for update in updates:
                         if isinstance(update, Job):
-                            yield progress_chunk(update, job_head(update.id, update.created_at, chat.model))
+                            yield stream.progress_chunk(
+                                update, stream.job_head(update.id, update.created_at, chat.model)
+                            )
                         else:
                             result = update
                 enriched = await to_thread.run_sync(add_frames, chat, what_if, result, self._artifacts)
@@ -118,9 +111,11 @@ class Proxy:
             async for event in _events_of(await self._ask(enriched, reader, stack), enriched):
                 yield event
 
-        return Streamed(events(), leave=partial(self._submitter.leave, submission, created_at), close=stack.aclose)
+        return stream.Streamed(
+            events(), leave=partial(self._submitter.leave, submission, created_at), close=stack.aclose
+        )
 
-    async def _forward(self, request: Request, enriched: EnrichedChat, reader: ChatReader) -> Whole | Streamed:
+    async def _forward(self, request: Request, enriched: EnrichedChat, reader: ChatReader) -> Whole | stream.Streamed:
         """The reply of the MLLM. It is given up where the caller goes away before it has begun."""
         stack = AsyncExitStack()
         try:
@@ -130,7 +125,7 @@ class Proxy:
             await stack.aclose()
             raise
         if enriched.chat.stream and (isinstance(reply, Events) or reply.succeeded):
-            return Streamed(_events_of(reply, enriched), close=stack.aclose)
+            return stream.Streamed(_events_of(reply, enriched), close=stack.aclose)
         await stack.aclose()
         if isinstance(reply, Events):
             raise MllmBadReply("The server of the multimodal LLM streamed its reply, which the chat did not ask for.")
@@ -292,17 +287,17 @@ def frame_parts(
 async def _events_of(reply: Whole | Events, enriched: EnrichedChat) -> AsyncGenerator[bytes]:
     """A reply as events: its own, behind one that carries `cow`; of a whole reply, chunks made of it."""
     if isinstance(reply, Whole):
-        for chunk in chunks_of(reply.body, with_usage=enriched.chat.with_usage):
-            yield event_of(chunk)
+        for chunk in stream.chunks_of(reply.body, with_usage=enriched.chat.with_usage):
+            yield stream.event_of(chunk)
         if reply.succeeded:
-            yield DONE
+            yield stream.DONE
         return
     is_first = True
     async with aclosing(reply.events) as events:
         async for event in events:
-            if is_first and "choices" in (chunk := data_of(event)):
+            if is_first and "choices" in (chunk := stream.data_of(event)):
                 is_first = False
-                yield event_of(chunk_of(head_of(chunk), {}, cow=enriched.extension()))
+                yield stream.event_of(stream.chunk_of(stream.head_of(chunk), {}, cow=enriched.extension()))
             yield event
 
 

@@ -13,21 +13,11 @@ from pydantic import BaseModel
 
 from cow_service import errors
 from cow_service.api.body import read_object
+from cow_service.api.openai import records
 from cow_service.api.openai.answering import FIELDS_OF_CHAT, ParsedChat, answer_events, completion_of, parse_chat
 from cow_service.api.openai.chats import EXTENSION, Chat, ChatRequest, ResponsesRequest, as_json, locate_in_chat
 from cow_service.api.openai.forwarding import Whole
 from cow_service.api.openai.proxy import Proxy, preferences_without_key
-from cow_service.api.openai.records import (
-    ChatChunk,
-    ChatCompletion,
-    ChatModel,
-    ChatModels,
-    MllmCompletion,
-    ResponseReply,
-    UpstreamError,
-    find_answerer,
-    usable_models,
-)
 from cow_service.api.openai.responses import as_response, chat_fields, response_of
 from cow_service.api.openai.stream import EventsResponse, Streamed
 from cow_service.api.problems import MEDIA_TYPE, OPENAI_ROOT, ChatProblem, documented
@@ -42,11 +32,18 @@ REFERENCE = "#/components/schemas/{model}"
 UPSTREAM_ERRORS: dict[int | str, dict[str, Any]] = {
     "default": {
         "description": "What the server of the MLLM answered with, as it came, in OpenAI's form.",
-        "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=UpstreamError.__name__)}}},
+        "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=records.UpstreamError.__name__)}}},
     }
 }
 REQUESTS = (ChatRequest, ResponsesRequest)
-REPLIES = (ChatChunk, ChatCompletion, MllmCompletion, ResponseReply, UpstreamError, ChatProblem)
+REPLIES = (
+    records.ChatChunk,
+    records.ChatCompletion,
+    records.MllmCompletion,
+    records.ResponseReply,
+    records.UpstreamError,
+    ChatProblem,
+)
 
 
 class Completer:
@@ -77,7 +74,7 @@ class Completer:
 
         Raises `ModelNotFound`, `InvalidRequest`, and what the MLLM or the job fails with.
         """
-        answerer = find_answerer(self.service, chat.model)
+        answerer = records.find_answerer(self.service, chat.model)
         reader = await to_thread.run_sync(self.service.chat_reader, answerer.reader)
         if reader is not None:
             return await self._proxy.complete(request, chat, answerer, reader)
@@ -136,7 +133,7 @@ router = APIRouter(prefix=OPENAI_ROOT.rstrip("/"), tags=["OpenAI-compatible"])
     operation_id="chat",
     summary="The MLLM behind a model, seeing more",
     responses={
-        200: _reply([ChatCompletion, MllmCompletion], "A `ChatChunk`, or a `ChatProblem` at the end"),
+        200: _reply([records.ChatCompletion, records.MllmCompletion], "A `ChatChunk`, or a `ChatProblem` at the end"),
         **ACCEPTED,
         **documented(*FAILURES, errors.ModelNotFound),
         **UPSTREAM_ERRORS,
@@ -162,7 +159,7 @@ async def chat(request: Request, completer: ChatCompleter) -> Response:
     operation_id="responses",
     summary="The same, as OpenAI's responses",
     responses={
-        200: _reply([ResponseReply], "An event of OpenAI's responses"),
+        200: _reply([records.ResponseReply], "An event of OpenAI's responses"),
         **documented(*FAILURES, errors.ModelNotFound),
         **UPSTREAM_ERRORS,
     },
@@ -184,10 +181,10 @@ async def responses(request: Request, completer: ChatCompleter) -> Response:
 
 
 @router.get("/models", operation_id="chatModels", summary="Models to chat with")
-def models(completer: ChatCompleter) -> ChatModels:
+def models(completer: ChatCompleter) -> records.ChatModels:
     """Every reader, with imagination and without (`:no-imagination`); the server's default comes first."""
-    names = usable_models(completer.service)
-    return ChatModels(data=tuple(ChatModel(id=name, created=completer.started) for name in names))
+    names = records.usable_models(completer.service)
+    return records.ChatModels(data=tuple(records.ChatModel(id=name, created=completer.started) for name in names))
 
 
 @router.get(
@@ -196,10 +193,12 @@ def models(completer: ChatCompleter) -> ChatModels:
     summary="A model to chat with",
     responses=documented(errors.ModelNotFound),
 )
-def model(model: Annotated[str, Path(description="Its `id`, slash and all.")], completer: ChatCompleter) -> ChatModel:
+def model(
+    model: Annotated[str, Path(description="Its `id`, slash and all.")], completer: ChatCompleter
+) -> records.ChatModel:
     """Whether there is one of that name. Why it might not run, a chat says."""
-    find_answerer(completer.service, model)
-    return ChatModel(id=model, created=completer.started)
+    records.find_answerer(completer.service, model)
+    return records.ChatModel(id=model, created=completer.started)
 
 
 async def _whole(reply: Whole) -> Response:
