@@ -440,7 +440,7 @@ def test_spans_nest_and_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_without_a_collector_the_sdk_is_not_imported() -> None:
     code = (
-        "import sys; from cow_service.observability import context, tracing; assert not tracing.start({})\n"
+        "import sys; from cow_service.observability import logging as context, tracing; assert not tracing.start({})\n"
         "with tracing.request_span('GET', None), tracing.span('x', a=1): tracing.describe('y', failed=False)\n"
         "assert context.traceparent() is None\n"
         "print([m for m in sys.modules if m.startswith(('opentelemetry.sdk', 'opentelemetry.exporter'))])"
