@@ -223,24 +223,22 @@ def _is_secret(text: str) -> bool:
         return False
 
 
+# Messages about settings that may hold a secret, whose value is not repeated.
+SECRET_SETTINGS = {
+    "mllm_base_url": "must begin with http:// or https://",
+    "artifacts": "must be a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX, without "
+    "credentials: those come from variables of their own, such as AWS_*",
+    "webhook_secret": "must be whsec_ and the base64 of 24 to 64 random bytes, or two of them",
+    "api_keys": 'must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes ("sha256:" and 64 '
+    "hexadecimal digits), a different one for each; it takes no plain keys. `cow keys new NAME` makes both",
+}
+
+
 def _message(item: Any) -> str:
-    """One bad setting. A key or an address may hold a secret, and is not repeated."""
+    """One bad setting."""
     name = str(item["loc"][0])
-    if name == "mllm_base_url":
-        return "COW_MLLM_BASE_URL must begin with http:// or https://"
-    if name == "artifacts":
-        return (
-            "COW_ARTIFACTS must be a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX, "
-            "without credentials: those come from variables of their own, such as AWS_*"
-        )
-    if name == "webhook_secret":
-        return "COW_WEBHOOK_SECRET must be whsec_ and the base64 of 24 to 64 random bytes, or two of them"
-    if name == "api_keys":
-        return (
-            'COW_API_KEYS must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes '
-            '("sha256:" and 64 hexadecimal digits), a different one for each; it takes no plain keys. '
-            "`cow keys new NAME` makes both"
-        )
+    if name in SECRET_SETTINGS:
+        return f"COW_{name.upper()} {SECRET_SETTINGS[name]}"
     return f"COW_{name.upper()}={item['input']!r}: {item['msg'].removeprefix('Value error, ')}"
 
 

@@ -10,11 +10,12 @@ from typing import Any
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp
 
 from cow_service import __version__
-from cow_service.api.middleware.access import PROBES, Callers, Gate, KeyRing, Origins, cors, is_loopback
-from cow_service.api.middleware.access_log import AccessLog, Correlation
+from cow_service.api.middleware.access import PROBES, Callers, Gate, KeyRing, Origins, is_loopback
+from cow_service.api.middleware.access_log import AccessLog
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.openai import routes as chats
 from cow_service.api.openai.routes import Completer, document_chat
@@ -33,6 +34,19 @@ from cow_service.settings import Settings
 
 SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out."
 FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")  # of errors that no operation returns
+# What web pages of COW_CORS_ORIGINS may send and read.
+CORS_METHODS = ("GET", "HEAD", "POST", "DELETE")
+REQUEST_HEADERS = (
+    "Authorization",
+    "Content-Type",
+    "Idempotency-Key",
+    "Prefer",
+    "Cache-Control",
+    "Last-Event-ID",
+    "X-Request-Id",
+    "traceparent",
+)
+RESPONSE_HEADERS = ("X-Request-Id", "Location", "Retry-After", "traceparent")
 
 log = logging.getLogger("cow_service")
 
@@ -96,10 +110,17 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
     app.add_middleware(Gate, refuse=Callers(keys, settings.rate_limit).refuse)
 
     def surround(stack: ASGIApp) -> ASGIApp:
-        stack = cors(stack, settings.cors_origins)
+        if settings.cors_origins:
+            stack = CORSMiddleware(
+                stack,
+                allow_origins=settings.cors_origins,
+                allow_methods=CORS_METHODS,
+                allow_headers=REQUEST_HEADERS,
+                expose_headers=RESPONSE_HEADERS,
+            )
         origins = Origins(settings.cors_origins, only_local=not keys and is_loopback(settings.host))
         stack = Gate(stack, origins.refuse)
-        return Correlation(AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"]))
+        return AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"])
 
     app.surround = surround
 

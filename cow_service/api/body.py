@@ -198,8 +198,13 @@ def read_object(text: bytes | str, what: str) -> dict[str, Any]:
         raise MalformedBody(f"{what} holds a whole number of thousands of digits: no field takes one.") from error
     if not isinstance(value, dict):
         raise MalformedBody(f"{what} must be a JSON object, got {_NAMES[type(value)]}: send {{...}}.")
-    if _SURROGATE.search(unicode):
-        _check_pairs(value, what)
+    try:
+        if _SURROGATE.search(unicode):
+            json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        half = _shown(error.object[error.start])
+        detail = f"{what} holds {half}, half of a surrogate pair: send the whole character, or none."
+        raise MalformedBody(detail) from error
     return value
 
 
@@ -217,16 +222,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _reject_constant(literal: str) -> NoReturn:
     raise MalformedBody(f"{literal} is no JSON number: give a finite one, or leave the field out.")
-
-
-def _check_pairs(value: dict[str, Any], what: str) -> None:
-    try:
-        json.dumps(value, ensure_ascii=False).encode()
-    except UnicodeEncodeError as error:
-        half = error.object[error.start]
-        raise MalformedBody(
-            f"{what} holds {_shown(half)}, half of a surrogate pair: send the whole character, or none."
-        ) from error
 
 
 def _shown(text: str) -> str:

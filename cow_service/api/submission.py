@@ -110,7 +110,7 @@ class Submitter:
             return await self.accepted(submission)
         if not submission.prefer.minimal:
             return json_response(result, headers=submission.headers)
-        shorter = await to_thread.run_sync(minimal_result, result)
+        shorter = await to_thread.run_sync(minimize, result)
         return json_response(shorter, headers=MINIMAL_APPLIED | submission.headers)
 
     def submission(self, request: Request, kind: JobKind) -> Submission:
@@ -344,32 +344,17 @@ def preferences_of(headers: Headers) -> Preferences:
 
 
 LEFT_OUT = ("states", "scale", "rotation", "band", "futures", "tracks", "tracks_visible")  # of `Path`, all per frame
-SEPARATORS = (",", ":")
 
 
-def minimal_result(result: str) -> str:
-    """A `Simulation` or an `Answer`, as JSON, without the lists. CPU work: not for the event loop."""
-    return _written(_without_lists(json.loads(result)))
-
-
-def minimal_job(job: str) -> str:
-    """A `Job`, as JSON, the same with its result."""
-    read: dict[str, Any] = json.loads(job)
-    if read.get("result") is not None:
-        _without_lists(read["result"])
-    return _written(read)
-
-
-def _without_lists(result: dict[str, Any]) -> dict[str, Any]:
-    simulation = result.get("simulation", result)  # that of an answer, which may be null
-    trajectory = None if simulation is None else simulation["trajectory"]
+def minimize(text: str) -> str:
+    """A `Job`, a `Simulation` or an `Answer`, as JSON, without the lists. CPU work: not for the event loop."""
+    read: dict[str, Any] = json.loads(text)
+    result = read.get("result", read) or {}
+    simulation = result.get("simulation", result) or {}  # that of an answer, which may be null
+    trajectory = simulation.get("trajectory")
     while trajectory is not None:
         for path in trajectory["paths"]:
             for name in LEFT_OUT:
                 path.pop(name, None)
         trajectory = trajectory.get("factual")
-    return result
-
-
-def _written(value: dict[str, Any]) -> str:
-    return json.dumps(value, separators=SEPARATORS, ensure_ascii=False)
+    return json.dumps(read, separators=(",", ":"), ensure_ascii=False)

@@ -76,23 +76,12 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _FAILED_JOB = "Exception encountered in background workflow"
 
 
-class Ids(logging.Filter):
-    """Puts the ids of the request or job at work onto each record; keeps those that it brings."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Takes every record."""
-        for name, value in ids().items():
-            if not hasattr(record, name):
-                setattr(record, name, value)
-        return True
-
-
-class NoFailedJobs(logging.Filter):
-    """Drops what the job engine says of jobs that failed: the service says it itself, with code and ids."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Takes every other record."""
-        return not str(record.msg).startswith(_FAILED_JOB)
+def add_ids(record: logging.LogRecord) -> bool:
+    """A filter that takes every record, and gives it the ids of the request or job at work that it does not bring."""
+    for name, value in ids().items():
+        if not hasattr(record, name):
+            setattr(record, name, value)
+    return True
 
 
 class TextFormatter(logging.Formatter):
@@ -129,7 +118,10 @@ def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None 
     """Sends all logs of the process through one format. Setting up once more replaces what was set up before."""
     formatter = JsonFormatter() if settings.log_format == "json" else TextFormatter()
     level = settings.log_level.upper()
-    problems, requests = (_handler(stream, formatter) for stream in (err or sys.stderr, out or sys.stdout))
+    problems, requests = logging.StreamHandler(err or sys.stderr), logging.StreamHandler(out or sys.stdout)
+    for handler in (problems, requests):
+        handler.setFormatter(formatter)
+        handler.addFilter(add_ids)
     root = logging.getLogger()
     root.handlers = [problems]
     root.setLevel(max(logging.WARNING, logging.getLevelNamesMapping()[level]))  # libraries have much to tell below that
@@ -141,16 +133,11 @@ def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None 
     access.handlers, access.propagate = [requests], False
     # The job engine adds a handler of its own to a logger that has none.
     engine = logging.getLogger("dbos")
-    engine.handlers, engine.propagate, engine.filters = [problems], False, [NoFailedJobs()]
+    engine.handlers, engine.propagate = [problems], False
+    # It need not log jobs that failed: the service does, with code and ids.
+    engine.filters = [lambda record: not str(record.msg).startswith(_FAILED_JOB)]
     engine.setLevel(logging.WARNING)
     logging.captureWarnings(True)
-
-
-def _handler(stream: TextIO, formatter: logging.Formatter) -> logging.Handler:
-    handler = logging.StreamHandler(stream)
-    handler.setFormatter(formatter)
-    handler.addFilter(Ids())
-    return handler
 
 
 def _trace_of(formatter: logging.Formatter, record: logging.LogRecord) -> str:

@@ -14,7 +14,6 @@ from ipaddress import ip_address, ip_network
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
-from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from cow_service.api.problems import respond
@@ -168,33 +167,8 @@ class Buckets:
         return wait
 
 
-METHODS = ("GET", "HEAD", "POST", "DELETE")
-REQUEST_HEADERS = (
-    "Authorization",
-    "Content-Type",
-    "Idempotency-Key",
-    "Prefer",
-    "Cache-Control",
-    "Last-Event-ID",
-    "X-Request-Id",
-    "traceparent",
-)
-RESPONSE_HEADERS = ("X-Request-Id", "Location", "Retry-After", "traceparent")
 _PORT = re.compile(r":\d*$", re.ASCII)
 _DEFAULT_PORTS = {"http": ":80", "https": ":443"}  # browsers leave them out
-
-
-def cors(app: ASGIApp, allowed: Collection[str]) -> ASGIApp:
-    """The app with CORS headers for the pages of those origins; without any, the app as it is."""
-    if not allowed:
-        return app
-    return CORSMiddleware(
-        app,
-        allow_origins=tuple(allowed),
-        allow_methods=METHODS,
-        allow_headers=REQUEST_HEADERS,
-        expose_headers=RESPONSE_HEADERS,
-    )
 
 
 def is_loopback(host: str) -> bool:

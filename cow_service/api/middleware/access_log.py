@@ -26,15 +26,18 @@ METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 UNMATCHED = "unmatched"
 CLIENT_CLOSED = 499  # nothing was sent: the caller disconnected, or the server stopped
 MAX_PATH = 500  # characters of a path in a log
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}", re.ASCII)
 
 log = logging.getLogger("cow_service")
 access = logging.getLogger("cow_service.access")
 
 
 class AccessLog:
-    """ASGI middleware: records each request from its first to its last byte.
+    """ASGI middleware, the outermost: records each request from its first to its last byte, with ids.
 
-    `paths` gives the templates of all routes, for requests that were refused before the router saw them.
+    Every response has X-Request-Id, traceparent and X-Content-Type-Options. A caller's own X-Request-Id is kept where
+    it is harmless in a log, and its trace goes on where it is valid. `paths` gives the templates of all routes, for
+    requests that were refused before the router saw them.
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics, paths: Callable[[], Iterable[str]]) -> None:
@@ -44,10 +47,19 @@ class AccessLog:
         self._templates: list[tuple[re.Pattern[str], str]] | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes a request on, and records what came of it."""
+        """Passes a request on within its ids."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
+        headers = Headers(scope=scope)
+        given = headers.get("x-request-id", "")
+        request_id = given if _REQUEST_ID.fullmatch(given) else secrets.token_hex(16)
+        with tracing.request_span(scope["method"], headers.get("traceparent")), context.bound(request=request_id):
+            ids = {"X-Request-Id": request_id, "traceparent": context.traceparent() or ""}
+            await self._observe(scope, receive, send, ids | {"X-Content-Type-Options": "nosniff"})
+
+    async def _observe(self, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
+        """Passes a request on, adds the headers to its response, and records both."""
         started = time.perf_counter()
         status, complete = 0, False
 
@@ -55,6 +67,7 @@ class AccessLog:
             nonlocal status, complete
             if message["type"] == "http.response.start":
                 status = message["status"]
+                MutableHeaders(scope=message).update(headers)
             elif message["type"] == "http.response.body":
                 complete = not message.get("more_body", False)
             await send(message)
@@ -73,7 +86,7 @@ class AccessLog:
 
     def _record(self, scope: Scope, status: int, seconds: float) -> None:
         method = scope["method"] if scope["method"] in METHODS else "other"
-        route = self._route(scope)
+        route, path = self._route(scope), _shown(scope)
         owner = scope.get("state", {}).get("owner")
         self.metrics.request(method, route, status, seconds)
         tracing.describe(
@@ -83,18 +96,13 @@ class AccessLog:
                 "http.request.method": method,
                 "http.response.status_code": status,
                 "http.route": route,
-                "url.path": _shown(scope),
+                "url.path": path,
                 "cow.owner": owner,
             },
         )
-        fields = {
-            "method": method,
-            "path": _shown(scope),
-            "status": status,
-            "milliseconds": round(seconds * 1000, 1),
-            "owner": owner,
-        }
-        access.info("%s %s %d %.1f ms", method, fields["path"], status, seconds * 1000, extra=fields)
+        milliseconds = round(seconds * 1000, 1)
+        fields = {"method": method, "path": path, "status": status, "milliseconds": milliseconds, "owner": owner}
+        access.info("%s %s %d %.1f ms", method, path, status, milliseconds, extra=fields)
 
     def _route(self, scope: Scope) -> str:
         """The template of the route that was or would have been taken: of those there are only so many."""
@@ -109,37 +117,3 @@ class AccessLog:
 def _shown(scope: Scope) -> str:
     """The path without its query, percent-encoded: nothing in it can end a line of a log."""
     return quote(scope["path"][:MAX_PATH], safe="/:@!$&'()*+,;=~")
-
-
-_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}", re.ASCII)
-
-
-class Correlation:
-    """ASGI middleware, the outermost: X-Request-Id, traceparent and X-Content-Type-Options on every response.
-
-    A caller's own X-Request-Id is kept where it is harmless in a log, and its trace goes on where it is valid.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes a request on within its ids."""
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
-        headers = Headers(scope=scope)
-        given = headers.get("x-request-id", "")
-        request_id = given if _REQUEST_ID.fullmatch(given) else secrets.token_hex(16)
-        with tracing.request_span(scope["method"], headers.get("traceparent")), context.bound(request=request_id):
-            traceparent = context.traceparent() or ""
-
-            async def tagged(message: Message) -> None:
-                if message["type"] == "http.response.start":
-                    response = MutableHeaders(scope=message)
-                    response["X-Request-Id"] = request_id
-                    response["traceparent"] = traceparent
-                    response["X-Content-Type-Options"] = "nosniff"
-                await send(message)
-
-            await self.app(scope, receive, tagged)

@@ -13,7 +13,7 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from cow_service import errors
 from cow_service.api.problems import documented
 from cow_service.api.routes.simulate import RETURN
-from cow_service.api.submission import MINIMAL_APPLIED, Engine, Owner, json_response, minimal_job, preferences_of
+from cow_service.api.submission import MINIMAL_APPLIED, Engine, Owner, json_response, minimize, preferences_of
 from cow_service.jobs.events import END, follow
 from cow_service.jobs.state import JobFilters
 from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, JobStatus
@@ -71,7 +71,7 @@ def job(request: Request, engine: Engine, owner: Owner, id: JobId) -> Response:
     found = engine.find(id, owner).as_json()
     if not preferences_of(request.headers).minimal:
         return json_response(found)
-    return json_response(minimal_job(found), headers=MINIMAL_APPLIED)
+    return json_response(minimize(found), headers=MINIMAL_APPLIED)
 
 
 @router.get(
