@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 3
 
-.PHONY: demo serve test test-fast soak lint openapi bench clean
+.PHONY: demo serve test test-fast soak lint unasync openapi bench clean
 
 demo: $(VENV)/.base ## run the main job on an example
 	$(BIN)/cow demo --out demo
@@ -29,6 +29,9 @@ lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+unasync: $(VENV)/.test ## write the blocking client from the async one
+	$(BIN)/python tests/sync_twins.py
 
 openapi: $(VENV)/.base ## write openapi.yaml from the app
 	$(BIN)/cow openapi > openapi.yaml

@@ -20,8 +20,8 @@ from cow_service.client import (
     AsyncJobHandle,
     AsyncSimulation,
     Client,
-    async_connection,
-    connection,
+    async_io,
+    sync_io,
 )
 
 Kind = Literal["sync", "async"]
@@ -147,8 +147,8 @@ class Hurried:
 def hurried(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> Connect:
     """The same, and no client sleeps: `slept` has what each pause would have been."""
     connect.slept.clear()
-    monkeypatch.setattr(connection, "time", Hurried(connection.time, connect.slept))
-    monkeypatch.setattr(async_connection, "asyncio", Hurried(asyncio, connect.slept))
+    monkeypatch.setattr(sync_io, "time", Hurried(sync_io.time, connect.slept))
+    monkeypatch.setattr(async_io, "asyncio", Hurried(asyncio, connect.slept))
     return connect
 
 

@@ -28,10 +28,9 @@ from typer.testing import CliRunner
 
 from cow_service.cli.main import app
 from cow_service.client import AsyncClient, Client, errors
-from cow_service.client.batch_progress import BatchProgress, duration, pace
-from cow_service.client.batches import OutageTimer
+from cow_service.client.batches import OutageTimer, Question, questions
 from cow_service.client.journal import Journal
-from cow_service.client.questions import Question, questions
+from cow_service.client.progress import BatchProgress, duration, pace
 
 COMMAND = [sys.executable, "-m", "cow_service.cli.main", "batch"]
 GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}

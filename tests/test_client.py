@@ -41,9 +41,9 @@ import cow_service.client
 from cow_service import records
 from cow_service.client import AsyncClient, Client, CowError, Event, Simulation, errors
 from cow_service.client.display import simulation_html
-from cow_service.client.inputs import Upload, image_input
 from cow_service.client.options import AnswerOptions, SimulateOptions
 from cow_service.client.progress import reporting
+from cow_service.client.request import Upload, image_input
 from cow_service.records import Job
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, ObjectRequest, SimulateRequest
 
@@ -580,7 +580,7 @@ def test_jobs_are_found_by_what_they_are(client: Any, served: Served) -> None:
 
 
 def test_jobs_come_page_by_page(connect: Connect, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cow_service.client.operations.JOBS_PER_PAGE", 2)
+    monkeypatch.setattr("cow_service.client.protocol.JOBS_PER_PAGE", 2)
     http, seen = connect.seen()
     client = connect(address, http_client=http)
     ids = [client.simulate(IMAGE, QUESTION, fresh=False, **SMALL).id for _ in range(5)]
@@ -737,11 +737,12 @@ def test_examples_in_the_docs_are_true(address: str, tmp_path: Path, monkeypatch
     shutil.copy(PHOTO, tmp_path / "image.jpg")
     monkeypatch.chdir(tmp_path)
     names = [f"cow_service.client.{found.name}" for found in pkgutil.iter_modules(cow_service.client.__path__)]
+    names = [name for name in names if ".async_" not in name]  # what is awaited there is called here
     with Client(address) as client:
         own = {"client": client, "base_url": address, "asyncio": asyncio}
         found = {name: doctest.testmod(importlib.import_module(name), extraglobs=own) for name in names}
     assert not {name: each for name, each in found.items() if each.failed}
-    modules = {"client", "async_client", "base", "results"}
+    modules = {"sync_client", "sync_connection", "display"}
     assert {name.rpartition(".")[2] for name, each in found.items() if each.attempted} >= modules
 
 

@@ -38,7 +38,7 @@ from sdk import (
 from servers import IMAGE, QUESTION, Served, data_url, eventually, slow
 
 from cow_service.client import AsyncClient, CowError, errors
-from cow_service.client.retries import MAX_RETRY_AFTER_SECONDS
+from cow_service.client.protocol import MAX_RETRY_AFTER_SECONDS
 from cow_service.errors import kinds
 
 __all__ = ["connect", "hurried"]  # fixtures

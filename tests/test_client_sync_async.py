@@ -16,11 +16,12 @@ from conftest import EXAMPLES, Server
 from PIL import Image
 from sdk import KINDS, Connect
 from servers import IMAGE, QUESTION, data_url
+from sync_twins import CLIENT, TWINS, twin_of
 
 from cow_service import client as sdk
 from cow_service.client import CowError
 from cow_service.client.async_connection import AsyncConnection
-from cow_service.client.connection import Connection
+from cow_service.client.sync_connection import Connection
 
 PAIRS = [
     (sdk.Client, sdk.AsyncClient),
@@ -43,6 +44,11 @@ SMALL: dict[str, Any] = {
 
 
 # --- names and signatures ---
+
+
+@pytest.mark.parametrize("source", TWINS)
+def test_the_blocking_twin_is_up_to_date(source: str) -> None:
+    assert twin_of(CLIENT / source) == (CLIENT / TWINS[source]).read_text(), "run `make unasync`"
 
 
 def _members(kind: type) -> dict[str, Any]:

@@ -39,13 +39,10 @@ from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.client import AsyncClient, CowError
 from cow_service.client.errors import CannotGround
 from cow_service.errors import FieldError, InvalidRequest, Unauthorized
-from cow_service.mcp.backends import backend_for, for_its_owner
-from cow_service.mcp.errors import REMEDIES, error_text
-from cow_service.mcp.images import image_of
-from cow_service.mcp.inputs import AnswerInput, SimulateInput, parsed
-from cow_service.mcp.pictures import MAX_BYTES, fitted
+from cow_service.mcp.arguments import REMEDIES, error_text, image_of, request_fields
+from cow_service.mcp.results import MAX_BYTES, fit_pictures
 from cow_service.mcp.server import Caller
-from cow_service.mcp.transport import protection, with_own_keys
+from cow_service.mcp.serving import backend_for, for_its_owner, protection, with_own_keys
 from cow_service.media.images import encode_jpeg
 from cow_service.requests import ImageArtifact
 from cow_service.settings import Settings, SettingsError
@@ -284,20 +281,19 @@ def test_simulate_over_stdio_returns_pictures_words_and_data(here: tuple[Session
     session, _ = here
     result = session.call("simulate", image=str(SCENE), question=MOVES, video=True)
     simulation = data(session, "simulate", result)
-    assert simulation["object"] == "yellow ball"
-    assert simulation["kind"] == "linear"
-    assert simulation["direction"] == pytest.approx([0.98, 0.18], abs=0.02)
-    last = simulation["encounters"][-1]
+    assert simulation["grounding"]["object"] == "yellow ball"
+    assert simulation["motion"]["kind"] == "linear"
+    assert simulation["motion"]["direction"] == pytest.approx([0.98, 0.18], abs=0.02)
+    last = simulation["trajectory"]["encounters"][-1]
     assert (last["object"], last["kind"]) == ("blue mug", "touches")
-    assert last["time_s"] == pytest.approx(last["frame"] / 16, abs=0.01)
-    assert (simulation["image_width"], simulation["image_height"]) == SIZE
+    assert (simulation["image"]["width"], simulation["image"]["height"]) == SIZE
     assert len(json.dumps(simulation)) < 4000
     assert sizes(result) == [SIZE, *((frame["width"], frame["height"]) for frame in simulation["frames"])]
     for told in (
         "yellow ball",
-        f"touches blue mug from {last['time_s']:g} s",
+        f"touches blue mug from {last['first_frame'] / 16:.2f} s",
         "leaves the image",
-        simulation["image_sha256"],
+        simulation["image"]["sha256"],
     ):
         assert told in text(result)
     assert session.told[0][1:] == (1.0, "grounding")
@@ -305,9 +301,9 @@ def test_simulate_over_stdio_returns_pictures_words_and_data(here: tuple[Session
     done = [told[0] for told in session.told]
     assert done == sorted(set(done))
     # Nobody can open an address of a service in this process: the protocol itself brings the video.
-    assert simulation["video"]["url"] is None
-    assert simulation["video"]["uri"] in text(result)
-    [video] = session.portal.call(session.client.read_resource, simulation["video"]["uri"]).contents
+    assert simulation["video"]["url"].startswith("cow://artifacts/")
+    assert simulation["video"]["url"] in text(result)
+    [video] = session.portal.call(session.client.read_resource, simulation["video"]["url"]).contents
     assert video.mime_type == "video/mp4"
     assert base64.b64decode(video.blob)[4:8] == b"ftyp"
 
@@ -316,9 +312,9 @@ def test_answer_over_stdio_and_the_same_image_again(here: tuple[Session, Path]) 
     session, _ = here
     answer = checked_answer(session, str(SCENE), votes=2, baseline=True)
     assert answer["baseline"]["answer"] == "C"
-    again = checked_answer(session, answer["image_sha256"], options=json.dumps(["Yes", "No"]))
-    assert again["image_sha256"] == answer["image_sha256"]
-    assert again["simulation"]["encounters"] == answer["simulation"]["encounters"]
+    again = checked_answer(session, answer["image"]["sha256"], options=json.dumps(["Yes", "No"]))
+    assert again["image"]["sha256"] == answer["image"]["sha256"]
+    assert again["simulation"]["trajectory"] == answer["simulation"]["trajectory"]
 
 
 def test_a_tool_takes_what_people_know_better(here: tuple[Session, Path]) -> None:
@@ -340,7 +336,8 @@ def test_a_tool_takes_what_people_know_better(here: tuple[Session, Path]) -> Non
         reader=None,
     )
     simulation = data(session, "simulate", result)
-    assert (simulation["object"], simulation["kind"], simulation["speed"]) == ("ball", "projectile", 100)
+    motion = simulation["motion"]
+    assert (simulation["grounding"]["object"], motion["kind"], motion["speed"]) == ("ball", "projectile", 100)
     assert [frame["index"] for frame in simulation["frames"]] == [0, 16]
     assert len(sizes(result)) == 3
 
@@ -358,7 +355,7 @@ def test_a_tool_takes_what_people_know_better(here: tuple[Session, Path]) -> Non
         ({"image": "0" * 64}, ("artifact-not-found", "Send the image itself")),
         ({"image": "https://example.org/a.png"}, ("image-url-not-allowed", "COW_ALLOW_IMAGE_URLS")),
         ({"image": "data:image/png;base64,AAAA"}, ("image-type-unsupported", "image")),
-        ({"bbox": [1, 2, 3]}, ("invalid-request", "bbox: list should have at least 4 items")),
+        ({"bbox": [1, 2, 3]}, ("invalid-request", "bbox/3: ")),
         ({"bbox": [9, 9, 9, 9]}, ("invalid-request", "bbox: [x0, y0, x1, y1] must span at least 2 px")),
         ({"object": "ball"}, ("invalid-request", "give either `bbox` or `point`")),
         ({"motion_kind": "projectile"}, ("invalid-request", "needs a `direction`")),
@@ -416,7 +413,7 @@ def test_over_http_the_caller_has_the_key(keyed: str, alice: Session) -> None:
     assert "(generation)" not in str(alice.told)
     assert alice.told[-1] == (1.0, 1.0, "succeeded")
     with over_http(keyed, BOB, mode="legacy") as bob:  # what is Alice's is hers
-        told = failure(bob.call("simulate", image=answer["image_sha256"], question=MOVES))
+        told = failure(bob.call("simulate", image=answer["image"]["sha256"], question=MOVES))
         assert told.startswith("artifact-not-found")
         assert checked_answer(bob, data_url(SCENE.read_bytes()))["id"] != answer["id"]
         assert bob.told
@@ -607,8 +604,8 @@ def test_images_by_whatever_names_them(tmp_path: Path) -> None:
 
 
 def test_arguments_become_a_request() -> None:
-    plain = parsed(SimulateInput, {"image": "x", "question": "?"})
-    assert plain.request_fields() == {"frames": {"policy": "events"}, "video": False}
+    plain = {"image": "x", "question": "?"}
+    assert request_fields("simulate", plain) == {**plain, "frames": {"policy": "events"}, "video": False}
     full = {
         "image": "x",
         "question": "?",
@@ -617,7 +614,8 @@ def test_arguments_become_a_request() -> None:
         "motion_kind": "fall",
         "options": '["a","b"]',
     }
-    assert parsed(AnswerInput, full).request_fields() == {
+    assert request_fields("answer", full) == {
+        **plain,
         "grounding": {"object": "cup", "point": [1, 2]},
         "motion": {"kind": "fall"},
         "options": ["a", "b"],
@@ -627,11 +625,11 @@ def test_arguments_become_a_request() -> None:
 def test_large_pictures_are_made_fit_for_a_model() -> None:
     buffer = io.BytesIO()
     Image.new("RGB", (3000, 1500), "red").save(buffer, "PNG")
-    ((media_type, shown),) = fitted([buffer.getvalue()])
+    ((media_type, shown),) = fit_pictures([buffer.getvalue()])
     assert media_type == "image/png"
     with Image.open(io.BytesIO(shown)) as small:
         assert small.size == (1024, 512)
-    assert fitted([shown]) == [("image/png", shown)]
+    assert fit_pictures([shown]) == [("image/png", shown)]
 
 
 def test_remedies_are_for_errors_that_there_are() -> None:
@@ -682,7 +680,7 @@ def test_pictures_of_photographs_fit_into_a_message(count: int) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (600, 1400, 3), np.uint8)
     buffer = io.BytesIO()
     Image.fromarray(noise).save(buffer, "PNG")
-    shown = fitted([buffer.getvalue()] * count)
+    shown = fit_pictures([buffer.getvalue()] * count)
     assert len(shown) == count
     assert sum(len(data) for _, data in shown) <= MAX_BYTES
     sizes = {Image.open(io.BytesIO(data)).size for _, data in shown}
@@ -695,4 +693,4 @@ def test_small_pictures_stay_as_they_are() -> None:
     buffer = io.BytesIO()
     Image.new("RGB", (300, 200), "red").save(buffer, "PNG")
     overlay = encode_jpeg(np.zeros((200, 300, 3), np.uint8))
-    assert fitted([overlay, buffer.getvalue()]) == [("image/jpeg", overlay), ("image/png", buffer.getvalue())]
+    assert fit_pictures([overlay, buffer.getvalue()]) == [("image/jpeg", overlay), ("image/png", buffer.getvalue())]

@@ -32,8 +32,7 @@ from cow_service.errors import MllmUnavailable
 from cow_service.jobs.database import Database
 from cow_service.jobs.outages import Outages
 from cow_service.jobs.stage_cache import KeyLocks, StoredStep
-from cow_service.mcp.results import answer_result
-from cow_service.mcp.text import answer_text
+from cow_service.mcp.results import answer_text
 from cow_service.pipeline import answer
 from cow_service.records import Answer, Usage
 from cow_service.requests import AnswerRequest, Stage
@@ -252,7 +251,7 @@ def test_what_the_gate_saw_and_what_it_cost_is_shown_everywhere(
     found = told(service, imagine="auto")
     words = "A 3 of 3; agreed: not imagined"
     assert f"before looking: {words}" in answer_html(found, lambda _: None)
-    assert f"Before looking: {words}." in answer_text(answer_result(found, None))
+    assert f"Before looking: {words}." in answer_text(found, "")
     reused = found.model_copy(update={"usage_total": found.usage + COST})
     console = Console(width=200)
     console.print(_answer_table(reused))

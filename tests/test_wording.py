@@ -7,10 +7,8 @@ from typing import Any
 import pytest
 from sdk import SIMULATION
 
-from cow_service.client.display import simulation_html
-from cow_service.client.wording import outcome_words
-from cow_service.mcp.results import simulate_result
-from cow_service.mcp.text import simulation_text
+from cow_service.client.display import outcome_words, simulation_html
+from cow_service.mcp.results import simulation_text
 from cow_service.records import Asked, Outcome, Simulation
 
 FACTS = "The red ball bounces once and meets the blue mug after 1.1 s"
@@ -49,13 +47,7 @@ def simulation() -> Simulation:
 
 
 def test_a_tool_tells_contacts_probabilities_and_the_outcome(simulation: Simulation) -> None:
-    told = simulate_result(simulation, None)
-    assert (told.law, told.moving_until_s) == ("contact", 2.5)
-    assert [(one.a, one.b, one.time_s) for one in told.contacts] == [("red ball", "blue mug", 1.12)]
-    assert told.encounters[0].probability == 0.93
-    assert told.outcome is not None
-    assert (told.outcome.probability, told.outcome.sure, told.outcome.depends_on) == (0.93, True, ["speed", "heading"])
-    text = simulation_text(told)
+    text = simulation_text(simulation, "")
     for part in ("92% of the worlds", FACTS, "it depends on speed and heading", "red ball and blue mug at 1.12 s"):
         assert part in text
 

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from cow_service.cli.errors import printable
+from cow_service.cli.options import printable
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
-    from cow_service.client.questions import Question
+    from cow_service.client.batches import Question
     from cow_service.records import JobKind
 
 EXIT_SOME_FAILED = 3
@@ -115,7 +115,7 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
 
     Raises `InvalidRequest` for whatever the server would refuse, before it is asked anything.
     """
-    from cow_service.client.questions import questions  # noqa: PLC0415
+    from cow_service.client.batches import questions  # noqa: PLC0415
 
     items: list[dict[str, Any]] = []
     faults: list[str] = []
@@ -192,7 +192,7 @@ def _check(question: Question, kind: JobKind) -> None:
 
 def _print_summary(out: Path) -> int:
     """Prints what the folder holds of the batch; returns the exit code."""
-    from cow_service.client.wording import asked_words  # noqa: PLC0415
+    from cow_service.client.display import asked_words  # noqa: PLC0415
     from cow_service.records import Usage  # noqa: PLC0415
 
     results = out / "results.jsonl"

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
-from cow_service.cli.errors import printable
+from cow_service.cli.options import printable
 from cow_service.errors import CowError
 
 INSTALL = 'pip install "cow-service[evals]"'

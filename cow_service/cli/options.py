@@ -1,8 +1,9 @@
-"""Options that `simulate` and `answer` share, and the request that they make."""
+"""The options that `simulate` and `answer` share, the request that they make, and how errors are shown."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from enum import StrEnum
 from functools import wraps
@@ -11,10 +12,75 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import typer
+from typer.core import TyperGroup
 
-from cow_service.cli.errors import FileUnreadable
-from cow_service.cli.interventions import intervention_fields
-from cow_service.errors import InvalidRequest
+from cow_service.errors import CowError, InvalidRequest
+
+_GIVE_PLACE = (
+    "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME) for what moves, --other NAME=X0,Y0,X1,Y1 for the rest."
+)
+HINTS = {  # the options that an error's remedy asks for, by the error's code
+    "cannot-ground": _GIVE_PLACE,
+    "object-not-found": _GIVE_PLACE,
+    "cannot-read-direction": "Here: --direction DX,DY.",
+}
+
+
+class FileUnreadable(CowError):
+    """A file of the command line cannot be read."""
+
+    code, status = "file-unreadable", 0  # never on the wire
+
+
+class FolderNotWritable(CowError):
+    """The results cannot be written."""
+
+    code, status = "folder-not-writable", 0
+
+
+class Commands(TyperGroup):
+    """A group of commands whose errors are a few plain lines on standard error.
+
+    Exit code 1; 2 for bad settings.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs a command."""
+        try:
+            return super().invoke(ctx)
+        except CowError as error:
+            typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
+            typer.echo(printable(error.detail), err=True)
+            if error.code in HINTS:
+                typer.echo(HINTS[error.code], err=True)
+            for field in (field for field in error.errors if field.detail not in error.detail):
+                typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
+            raise typer.Exit(1) from error
+        except typer.BadParameter as error:
+            error.message = _own_words(error)
+            raise
+        except Exception as error:
+            from cow_service.settings import SettingsError  # noqa: PLC0415 - its import would slow down --help
+
+            if not isinstance(error, SettingsError):
+                raise
+            typer.secho(str(error), fg="red", err=True)
+            raise typer.Exit(2) from error
+
+
+def _own_words(error: typer.BadParameter) -> str:
+    """What is wrong with an option, without what the validator of typer puts before it ("Value error, ")."""
+    from pydantic import ValidationError  # noqa: PLC0415 - its import would slow down --help
+
+    if not isinstance(error.__cause__, ValidationError):
+        return error.message
+    raised = error.__cause__.errors()[0].get("ctx", {}).get("error")
+    return str(raised) if isinstance(raised, ValueError) else error.message
+
+
+def printable(text: str) -> str:
+    """The text without characters that control a terminal: control codes, escapes, marks of writing direction."""
+    return "".join(character if character.isprintable() or character == "\n" else "\ufffd" for character in text)
 
 
 class Format(StrEnum):
@@ -38,16 +104,38 @@ Question = Annotated[
 ]
 
 
+# Where an option stands in the request. Typer needs their declarations below before pydantic could be imported: a test
+# checks that their defaults are those of the fields.
+FIELDS = {
+    "point": "grounding/point",
+    "box": "grounding/bbox",
+    "name": "grounding/object",
+    "direction": "motion/direction",
+    "kind": "motion/kind",
+    "speed": "motion/speed",
+    "distance": "motion/distance",
+    "duration": "motion/duration",
+    "until": "motion/until",
+    "law": "motion/law",
+    "frames": "frames/policy",
+    "count": "frames/count",
+    "max_side": "frames/max_side",
+}
+_NUMBERS = {"point": 2, "box": 4, "direction": 2}  # how many an option takes, with commas between
+_SAME_NAME = ("ensemble", "reader", "generator", "num_frames", "fps", "seed")
+
+
 def request_body(
     point: Annotated[str | None, typer.Option(help="X,Y of a point on the object that moves, px.")] = None,
     box: Annotated[str | None, typer.Option(help="X0,Y0,X1,Y1 of the object that moves, px.")] = None,
     name: Annotated[
-        str | None, typer.Option("--object", help="What the object is called, with --point or --box.")
+        str | None, typer.Option("--object", help="What the object is called, with --point, --box or --trajectory.")
     ] = None,
     direction: Annotated[str | None, typer.Option(help="DX,DY of the motion, px, x right, y down.")] = None,
     kind: Annotated[
-        Kind, typer.Option(help="Kind of motion, with --direction (or alone for fall and static).")
-    ] = "linear",
+        Kind | None,
+        typer.Option(help="Kind of motion, with --direction (or alone for fall and static).", show_default="linear"),
+    ] = None,
     speed: Annotated[float | None, typer.Option(help="px/s.", show_default="0.26 widths/s")] = None,
     distance: Annotated[float | None, typer.Option(help="px, after which it is stopped.")] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds, after which it is stopped.")] = None,
@@ -55,9 +143,9 @@ def request_body(
     remove: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Taken away before the motion; may be repeated.")
     ] = None,
-    put: Annotated[
+    place: Annotated[
         list[str] | None,
-        typer.Option("--place", metavar="THING RELATION THING", help='Such as "apple into bowl"; may be repeated.'),
+        typer.Option(metavar="THING RELATION THING", help='Such as "apple into bowl"; may be repeated.'),
     ] = None,
     law: Annotated[
         Law | None,
@@ -95,46 +183,29 @@ def request_body(
     count: Annotated[int, typer.Option(help="How many of them.")] = 3,
     max_side: Annotated[int, typer.Option(help="Their longest side, px; 0 for the clip's own size.")] = 512,
 ) -> dict[str, Any]:
-    """The request's body, as far as both commands have it.
-
-    Raises `InvalidRequest` naming the option that cannot be read.
-    """
-    body: dict[str, Any] = {
-        "reader": reader,
-        "generator": generator,
-        "generator_options": dict(map(_name_and_value, option or [])),
-        "num_frames": num_frames,
-        "fps": fps,
-        "seed": seed,
-        "ensemble": ensemble,
-        "objects": [_other(text) for text in other or []],
-        "interventions": intervention_fields(remove or [], put or []),
-        "frames": {"policy": frames, "count": count, "max_side": max_side or None},
-    }
-    if point is not None or box is not None:
-        body["grounding"] = {
-            "object": name,
-            "point": None if point is None else _numbers("--point", point, 2),
-            "bbox": None if box is None else _numbers("--box", box, 4),
-        }
-    elif name is not None and trajectory is None:
-        raise InvalidRequest("--object goes with --point, --box or --trajectory; else the question names the object.")
-    if direction is not None or kind in ("fall", "static"):
-        body["motion"] = {
-            "direction": None if direction is None else _numbers("--direction", direction, 2),
-            "kind": kind,
-        }
-    elif kind != "linear":
-        raise InvalidRequest("--kind goes with --direction; without it the motion is read from the question.")
-    said = {"speed": speed, "distance": distance, "duration": duration, "until": until, "law": law}
-    if any(value is not None for value in said.values()):
-        given = {name: value for name, value in said.items() if value is not None}
-        body["motion"] = {**body.get("motion", {}), **given}
+    """The fields of the request that both commands have. Raises `InvalidRequest` naming the option that is wrong."""
+    given = locals()
+    body: dict[str, Any] = {option: given[option] for option in _SAME_NAME}
+    body["generator_options"] = dict(map(_name_and_value, option or []))
+    body["objects"] = [_other_object(text) for text in other or []]
+    removed = ({"kind": "remove", "object": thing} for thing in remove or [])
+    body["interventions"] = [*removed, *map(_placement, place or [])]
+    numbers = {each: _numbers(f"--{each}", given[each], size) for each, size in _NUMBERS.items() if given[each]}
+    for option_name, path in FIELDS.items():
+        value = numbers.get(option_name, given[option_name])
+        if value is not None:
+            record, _, field = path.partition("/")
+            body.setdefault(record, {})[field] = value
+    body["frames"]["max_side"] = max_side or None
     if trajectory is not None:
-        body["trajectory"] = path = _json(trajectory)
-        if name is not None and "grounding" not in body and isinstance(path, dict):
-            first_point = next(iter(cast("dict[str, Any]", path).get("points", [])), None)
-            body["grounding"] = {"object": name, "point": first_point}
+        body["trajectory"] = _json(trajectory)
+    if body.get("grounding", {}).keys() == {"object"}:
+        points = cast("dict[str, Any]", body.get("trajectory", {})).get("points")
+        if not points:
+            raise InvalidRequest(
+                "--object goes with --point, --box or --trajectory; else the question names the object."
+            )
+        body["grounding"]["point"] = points[0]
     return body
 
 
@@ -172,7 +243,24 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
     return values
 
 
-def _other(text: str) -> dict[str, object]:
+def _placement(text: str) -> dict[str, object]:
+    """What `--place` says, as an intervention."""
+    from cow_service.narration import PREPOSITIONS, RELATION_WORDS  # noqa: PLC0415 - it imports pydantic
+
+    words = "|".join(sorted(RELATION_WORDS, key=len, reverse=True))  # "in front of" before "in"
+    pattern = rf"\s*(?P<object>.+?)\s+(?P<relation>{words})\s+(?P<targets>.+?)\s*"
+    found = re.fullmatch(pattern, text, re.IGNORECASE)
+    if found is None:
+        raise InvalidRequest(
+            f"--place takes a thing, a relation ({', '.join(PREPOSITIONS)}) and what it is put to, such as "
+            f"'apple into bowl' or 'cube between mug and vase'; got '{text}'."
+        )
+    relation = RELATION_WORDS[found["relation"].lower()]
+    targets = re.split(r"\s+and\s+", found["targets"]) if relation == "between" else [found["targets"]]
+    return {"kind": "place", "object": found["object"], "relation": relation, "targets": targets}
+
+
+def _other_object(text: str) -> dict[str, object]:
     """Another object of the image, by its box or by a point on it."""
     name, _, place = text.rpartition("=")
     if not name.strip():

@@ -1,66 +1,153 @@
-"""`cow top`: what the processes on a server's job database do, once a second."""
+"""What `cow top` shows: the processes on a server's job database, once a second."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Iterable
+from datetime import datetime
 
-import typer
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
 
-if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-
-    from cow_service.client import Client
+from cow_service.cli.options import printable
+from cow_service.client import Client
+from cow_service.errors import CowError, InvalidRequest
+from cow_service.records import GpuMemory, ProcessInfo, WorkerInfo, WorkerJob, Workers
 
 REFRESH_SECONDS = 1.0
 TIMEOUT_SECONDS = 5.0  # that the server may say nothing
+BAR_WIDTH = 8  # characters
+ROLES = {"all": "server", "api": "API server", "worker": "worker"}
+ID_LENGTH = 8  # characters that are shown of a job's id
 
 
-def top(
-    url: Annotated[
-        str | None, typer.Option(help="The server.", show_default="COW_BASE_URL, http://127.0.0.1:8000")
-    ] = None,
-    once: Annotated[bool, typer.Option("--once", help="Print one picture, and end.")] = False,
-) -> None:
-    """Show processes, workers and queues of a server, until Ctrl-C.
-
-    Where standard output is no terminal, one picture is printed.
-    """
-    from rich.console import Console  # noqa: PLC0415 - rich and httpx would slow down --help
-
-    from cow_service.cli.top_tables import picture  # noqa: PLC0415
-    from cow_service.client import Client  # noqa: PLC0415
-    from cow_service.errors import InvalidRequest  # noqa: PLC0415
-
+def show_processes(url: str | None, *, once: bool) -> None:
+    """Shows a new picture each second, or one; one that cannot be had leaves the last one, and says why."""
     console = Console()
     try:
         client = Client(url, timeout=TIMEOUT_SECONDS, retries=0)
     except ValueError as error:
         raise InvalidRequest(f"{error}.") from error
     with client:
-        first = picture(client.workers(), client.base_url)
+        shown = picture(client.workers(), client.base_url)
         if once or not console.is_terminal:
-            console.print(first)
-        else:
-            _watch(console, client, first)
+            console.print(shown)
+            return
+        updated = time.monotonic()
+        try:
+            with Live(shown, console=console, screen=True, auto_refresh=False) as live:
+                while True:
+                    time.sleep(REFRESH_SECONDS)
+                    try:
+                        shown, updated = picture(client.workers(), client.base_url), time.monotonic()
+                        live.update(shown, refresh=True)
+                    except CowError as error:
+                        live.update(with_fault(shown, error.detail, time.monotonic() - updated), refresh=True)
+        except KeyboardInterrupt:
+            pass
 
 
-def _watch(console: Console, client: Client, shown: RenderableType) -> None:
-    """Shows a new picture each second; one that cannot be had leaves the last one, and says why."""
-    from rich.live import Live  # noqa: PLC0415
+def picture(found: Workers, url: str) -> RenderableType:
+    """Everything that a server reports, and what needs somebody."""
+    parts: list[RenderableType] = [_head(found, url), *_faults(found), Text(), _queues(found), Text()]
+    return Group(*parts, _processes(found.processes))
 
-    from cow_service.cli.top_tables import picture, with_fault  # noqa: PLC0415
-    from cow_service.errors import CowError  # noqa: PLC0415
 
-    seen = time.monotonic()
-    try:
-        with Live(shown, console=console, screen=True, auto_refresh=False) as live:
-            while True:
-                time.sleep(REFRESH_SECONDS)
-                try:
-                    shown, seen = picture(client.workers(), client.base_url), time.monotonic()
-                    live.update(shown, refresh=True)
-                except CowError as error:
-                    live.update(with_fault(shown, error.detail, time.monotonic() - seen), refresh=True)
-    except KeyboardInterrupt:
-        pass
+def with_fault(shown: RenderableType, fault: str, age: float) -> RenderableType:
+    """The last picture, `age` seconds old, and why there is no newer one."""
+    return Group(Text(printable(fault), style="red"), Text(f"As it was {_duration(age)} ago:", style="yellow"), shown)
+
+
+def _head(found: Workers, url: str) -> Text:
+    workers = [worker for process in found.processes for worker in process.workers]
+    text = Text(printable(url), style="bold")
+    counts = (
+        _number(len(found.processes), "process", "processes"),
+        f"{_number(len(workers), 'worker')} ({sum(bool(worker.jobs) for worker in workers)} busy)",
+        f"{sum(queue.queued for queue in found.queues)} queued",
+        datetime.now().astimezone().strftime("%H:%M:%S"),
+    )
+    return text.append("  " + ", ".join(counts), style="not bold")
+
+
+def _faults(found: Workers) -> Iterable[Text]:
+    for one in found.unserved:
+        what = f"workflow version {one.workflow_version}" if one.reason == "version" else f"queue {one.queue}"
+        told = f"{_number(one.jobs, 'job')} of {printable(what)}: no process takes them (see `cow doctor`)"
+        yield Text(told, style="red")
+
+
+def _queues(found: Workers) -> Table:
+    table = _table("queue", right=("queued", "running", "capacity", "oldest", "jobs/min"))
+    for queue in found.queues:
+        idle = not queue.queued and not queue.running
+        table.add_row(
+            Text(printable(queue.name)),
+            str(queue.queued),
+            str(queue.running),
+            str(queue.capacity),
+            "-" if queue.oldest_seconds is None else _duration(queue.oldest_seconds),
+            f"{queue.jobs_per_minute:.1f}",
+            style="dim" if idle else "red" if not queue.capacity else "",
+        )
+    return table
+
+
+def _processes(processes: Iterable[ProcessInfo]) -> RenderableType:
+    parts: list[RenderableType] = []
+    for process in processes:
+        takes = ", ".join(map(printable, process.queues)) or "nothing"
+        head = Text(f"{ROLES[process.role]} on {printable(process.host)}", style="bold")
+        head.append(f"  pid {process.pid}, COW {printable(process.version)}, takes {takes}", style="not bold dim")
+        parts.append(head)
+        if process.workers:
+            parts.append(_workers(process.workers))
+    return Group(*parts)
+
+
+def _workers(workers: Iterable[WorkerInfo]) -> Table:
+    table = _table("  worker", right=("pid", "memory", "done"), gap=1)
+    for name in ("job", "stage"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("progress", width=BAR_WIDTH + 5, no_wrap=True)
+    table.add_column("time", justify="right", no_wrap=True)
+    for worker in workers:
+        left = Text(f"  {printable(worker.name)}"), str(worker.pid), f"{worker.memory_mb:.0f} MB", str(worker.jobs_done)
+        rows = [_job(job) for job in worker.jobs] or [(Text("idle", style="dim"), Text(), Text(), "")]
+        for number, row in enumerate(rows):
+            table.add_row(*(left if number == 0 else ("", "", "", "")), *row)
+        for gpu in worker.gpus:
+            table.add_row(Text(f"    {printable(gpu.device)}", style="dim"), "", _gpu(gpu))
+    return table
+
+
+def _job(job: WorkerJob) -> tuple[Text, Text, RenderableType, str]:
+    named = f"{job.kind} {printable(job.id)[:ID_LENGTH]}" if job.id else job.kind
+    bar = Table.grid(padding=(0, 1))
+    bar.add_row(ProgressBar(total=1.0, completed=job.progress, width=BAR_WIDTH), f"{job.progress:4.0%}")
+    return Text(named), Text(printable(job.stage or "-")), bar, _duration(job.seconds)
+
+
+def _gpu(gpu: GpuMemory) -> str:
+    return f"{gpu.reserved_mb / 1e3:.1f}/{gpu.total_mb / 1e3:.0f} GB"
+
+
+def _table(first: str, right: Iterable[str], gap: int = 2) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0))
+    table.add_column(first, no_wrap=True)
+    for name in right:
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+def _number(number: int, one: str, several: str | None = None) -> str:
+    return f"{number} {one if number == 1 else several or one + 's'}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -13,64 +13,46 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cow_service.client import errors
-    from cow_service.client.async_client import AsyncClient
-    from cow_service.client.batches import Outcome
-    from cow_service.client.client import Client
-    from cow_service.client.errors import CowError
-    from cow_service.client.events import Event
-    from cow_service.client.handles import AsyncJobHandle, JobHandle
-    from cow_service.client.inputs import ImageLike
-    from cow_service.client.models import Models
-    from cow_service.client.questions import Question, QuestionLike
-    from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
-
-__all__ = [
-    "Answer",
-    "AsyncAnswer",
-    "AsyncClient",
-    "AsyncJobHandle",
-    "AsyncSimulation",
-    "Client",
-    "CowError",
-    "Event",
-    "ImageLike",
-    "JobHandle",
-    "Models",
-    "Outcome",
-    "Question",
-    "QuestionLike",
-    "Simulation",
-    "errors",
-]
+    from cow_service.client import errors as errors
+    from cow_service.client.async_client import AsyncClient as AsyncClient
+    from cow_service.client.async_connection import AsyncAnswer as AsyncAnswer
+    from cow_service.client.async_connection import AsyncJobHandle as AsyncJobHandle
+    from cow_service.client.async_connection import AsyncSimulation as AsyncSimulation
+    from cow_service.client.batches import BatchResult as BatchResult
+    from cow_service.client.display import Models as Models
+    from cow_service.client.errors import CowError as CowError
+    from cow_service.client.journal import Question as Question
+    from cow_service.client.journal import QuestionLike as QuestionLike
+    from cow_service.client.protocol import Event as Event
+    from cow_service.client.request import ImageLike as ImageLike
+    from cow_service.client.sync_client import Client as Client
+    from cow_service.client.sync_connection import Answer as Answer
+    from cow_service.client.sync_connection import JobHandle as JobHandle
+    from cow_service.client.sync_connection import Simulation as Simulation
 
 # Each is imported when it is first asked for: whoever uses one client need not wait for the rest.
 _MODULES = {
-    "Answer": "results",
-    "AsyncAnswer": "results",
-    "AsyncClient": "async_client",
-    "AsyncJobHandle": "handles",
-    "AsyncSimulation": "results",
-    "Client": "client",
-    "CowError": "errors",
-    "Event": "events",
-    "ImageLike": "inputs",
-    "JobHandle": "handles",
-    "Models": "models",
-    "Outcome": "batches",
-    "Question": "questions",
-    "QuestionLike": "questions",
-    "Simulation": "results",
+    "async_client": ("AsyncClient",),
+    "async_connection": ("AsyncAnswer", "AsyncJobHandle", "AsyncSimulation"),
+    "batches": ("BatchResult",),
+    "display": ("Models",),
+    "errors": ("CowError",),
+    "journal": ("Question", "QuestionLike"),
+    "protocol": ("Event",),
+    "request": ("ImageLike",),
+    "sync_client": ("Client",),
+    "sync_connection": ("Answer", "JobHandle", "Simulation"),
 }
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = ["errors", *_MODULE_OF]  # noqa: PLE0604 # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name == "errors":
         return import_module("cow_service.client.errors")
-    if name not in _MODULES:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
-    globals()[name] = value
+    globals()[name] = value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
     return value
 
 

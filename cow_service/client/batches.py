@@ -1,54 +1,46 @@
-"""Batches: what comes of each question, and which errors are about the question and which about the server."""
+"""Batches: what becomes of each question, and which errors are about the question and which about the server."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from contextlib import ExitStack
+from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar
 
-from cow_service.client.batch_progress import BatchProgress, progress_shown
+from cow_service import errors as problems
+from cow_service import records
 from cow_service.client.errors import BadResponse, ServerUnreachable, WaitTimeout, error_from
-from cow_service.client.job_request import JobRequest, job_request
-from cow_service.client.journal import Journal
-from cow_service.client.questions import Question, QuestionLike, questions
-from cow_service.client.results import Answer, AsyncAnswer, AsyncSimulation, Simulation
-from cow_service.client.steps import Blocking, Sleep, Steps
-from cow_service.errors import (
-    BodyTooSlow,
-    CowError,
-    ImageUnreadable,
-    MethodNotAllowed,
-    NotFound,
-    NotReady,
-    OriginNotAllowed,
-    QueueFull,
-    RateLimited,
-    ShuttingDown,
-    StorageUnavailable,
-    Unauthorized,
-)
+from cow_service.client.journal import Journal, Question, QuestionLike, questions
+from cow_service.client.options import CONCURRENCY
+from cow_service.client.progress import BatchProgress, progress_shown
+from cow_service.client.request import JobRequest, job_request
+from cow_service.errors import CowError
 from cow_service.records import JobKind
-
-if TYPE_CHECKING:
-    from cow_service.client.operations import Operations
 
 MAX_OUTAGE_SECONDS = 300.0  # without any response, after which a batch ends; it can be resumed
 RETRY_SECONDS = 2.0  # before a question is sent again that the server could not accept
-_FATAL = (Unauthorized, OriginNotAllowed, MethodNotAllowed, NotFound)  # every other question would meet it, too
-TRANSIENT = (ServerUnreachable, ShuttingDown, QueueFull, RateLimited, NotReady, StorageUnavailable, BodyTooSlow)
+# Every other question would meet these, too.
+_FATAL = (problems.Unauthorized, problems.OriginNotAllowed, problems.MethodNotAllowed, problems.NotFound)
+TRANSIENT = (
+    ServerUnreachable,
+    problems.ShuttingDown,
+    problems.QueueFull,
+    problems.RateLimited,
+    problems.NotReady,
+    problems.StorageUnavailable,
+    problems.BodyTooSlow,
+)
 
-R_co = TypeVar("R_co", bound=Simulation | Answer | AsyncSimulation | AsyncAnswer, covariant=True)
+R_co = TypeVar("R_co", bound=records.Simulation | records.Answer, covariant=True)
 
 
 @dataclass(frozen=True)
-class Outcome(Generic[R_co]):
-    """What came of one question: a result, or the error that it failed with."""
+class BatchResult(Generic[R_co]):
+    """What became of one question: a result, or the error that it failed with."""
 
     question: Question
     result: R_co | None
@@ -72,7 +64,7 @@ class Outcome(Generic[R_co]):
         return "succeeded" if self.succeeded else "failed"
 
     def line(self) -> dict[str, Any]:
-        """What is kept of it."""
+        """Its line of `results.jsonl`."""
         head = {"status": self.status, "seconds": round(self.seconds, 3)}
         if self.error is not None:
             problem = {"code": self.error.code, **self.error.as_problem()}
@@ -82,17 +74,6 @@ class Outcome(Generic[R_co]):
         if self.unsaved is not None:
             head["unsaved"] = self.unsaved.detail
         return {**head, "result": self.result.model_dump(mode="json")}
-
-
-def outcome_from(question: Question, line: Mapping[str, Any], read: Callable[[dict[str, Any]], R_co]) -> Outcome[R_co]:
-    """The outcome that a line of a journal keeps."""
-    if line["status"] == "succeeded":
-        return Outcome(question, read(line["result"]), None, line["seconds"])
-    error = error_from(line["problem"])
-    error.request_id = line["problem"].get("request_id")
-    if isinstance(error, WaitTimeout):
-        error.job_id = line["problem"].get("job_id", "")
-    return Outcome(question, None, error, line["seconds"])
 
 
 class OutageTimer:
@@ -137,18 +118,17 @@ class OutageTimer:
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """How the questions of one batch are asked (`Client.map`). Raises `ValueError` for what does not fit together."""
+    """How the questions of a batch are asked (`Client.map`). Raises `ValueError` for what does not fit together."""
 
-    kind: JobKind
-    concurrency: int
-    timeout: float | None
-    fresh: bool
-    minimal: bool
-    out: str | PathLike[str] | None
-    retry_failed: bool
-    only_new: bool
-    save: bool
-    progress: bool
+    concurrency: int = CONCURRENCY
+    timeout: float | None = None
+    fresh: bool = False
+    minimal: bool = False
+    out: str | PathLike[str] | None = None
+    retry_failed: bool = False
+    only_new: bool = False
+    save: bool = False
+    progress: bool = False
 
     def __post_init__(self) -> None:
         if self.concurrency < 1:
@@ -158,30 +138,28 @@ class BatchOptions:
 
 
 class Batch:
-    """One batch: its questions, how each is asked, and its outcomes. A context that holds the folder."""
+    """One batch: its questions, how each is asked, and its results. A context that holds the folder."""
 
-    def __init__(
-        self,
-        connection: Operations,
-        items: Iterable[QuestionLike],
-        defaults: Mapping[str, Any],
-        options: BatchOptions,
-    ) -> None:
-        self.concurrency = options.concurrency
-        self._connection, self._items, self._defaults, self._options = connection, items, defaults, options
-        self._journal: Journal | None = None
-        self._known: dict[str, Question] = {}  # questions with an earlier outcome that is to be yielded, by id
+    def __init__(self, items: Iterable[QuestionLike], kind: JobKind, options: Mapping[str, Any]) -> None:
+        """`options` has fields of `BatchOptions`; the others are fields of the request for questions without them."""
+        own = {field.name for field in fields(BatchOptions)}
+        self.options = BatchOptions(**{name: value for name, value in options.items() if name in own})
+        self.journal: Journal | None = None
+        self.outage = OutageTimer(on_change=self._show_outage)
+        self._items = items
+        self._kind: JobKind = kind
+        self._defaults = {name: value for name, value in options.items() if name not in own}
+        self._known: dict[str, Question] = {}  # questions with an earlier result that is to be yielded, by id
         self._progress = BatchProgress(len(items) if isinstance(items, Sized) else None)
         self._show: Callable[[], None] = lambda: None
-        self._outage = OutageTimer(on_change=self._waiting_for)
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         """Raises what `Journal` raises."""
-        options = self._options
+        options = self.options
         if options.out is not None:
-            self._journal = Journal(Path(options.out), options.kind, retry_failed=options.retry_failed)
-            self._stack.callback(self._journal.close)
+            self.journal = Journal(Path(options.out), self._kind, retry_failed=options.retry_failed)
+            self._stack.callback(self.journal.close)
         self._show = self._stack.enter_context(progress_shown(self._progress, options.progress))
         return self
 
@@ -189,85 +167,67 @@ class Batch:
         self._stack.close()
 
     def pending(self) -> Iterator[Question]:
-        """The questions without an outcome yet."""
-        journal = self._journal
+        """The questions without a result yet."""
         for question in questions(self._items, self._defaults):
-            if journal is None or not journal.has(question):
+            if self.journal is None or not self.journal.has(question):
                 yield question
             else:
-                if not self._options.only_new:
+                if not self.options.only_new:
                     self._known[question.id] = question
-                self._progress.count(journal.done[question.id][1] == "succeeded", earlier=True)
+                self._progress.count(self.journal.done[question.id][1] == "succeeded", earlier=True)
 
-    def ask(self, question: Question) -> Steps[Outcome[Any]]:
-        """The steps to the outcome of a question, which is written down.
-
-        Raises what no question could get past (`OutageTimer`).
-        """
-        began, timeout = time.monotonic(), self._options.timeout
-        while True:
-            result: Any = None
-            failed: CowError | None = None
-            try:
-                request = yield Blocking(partial(self._request, question))  # files are read, pictures encoded
-                result = yield from self._connection.complete_request(
-                    request,
-                    self._connection.endpoint.server_wait(timeout),
-                    timeout,
-                    lambda _: self._outage.reset(),
-                    cancel_abandoned=self._journal is None,  # with a journal, the next start asks for the job again
-                )
-                if self._journal is not None and self._options.save:
-                    yield from result.save_steps(self._journal.folder / "items" / question.folder)
-            except CowError as error:
-                failed = error
-                if isinstance(error, WaitTimeout):
-                    with suppress(CowError):
-                        yield from self._connection.cancel_job(error.job_id)
-            pause = None if failed is None else self._outage.pause_after(failed)
-            if pause is None:
-                self._outage.reset()
-                # Where its pictures failed to be saved, the result stands.
-                unanswered, unsaved = (failed, None) if result is None else (None, failed)
-                outcome = Outcome(question, result, unanswered, time.monotonic() - began, unsaved)
-                self._keep(outcome)
-                return outcome
-            yield Sleep(pause)
-
-    def count(self, outcome: Outcome[Any]) -> None:
-        """Shows that one more has come."""
-        self._progress.count(outcome.succeeded)
-        self._show()
-
-    def earlier_outcomes(self) -> Iterator[Outcome[Any]]:
-        """The outcomes that were there before."""
-        if self._journal is not None and self._known:
-            for line in self._journal.lines():
-                if line["id"] in self._known:
-                    read = partial(self._connection.result, self._options.kind)
-                    yield outcome_from(self._known[line["id"]], line, read)
-
-    def _request(self, question: Question) -> JobRequest:
+    def request(self, question: Question) -> JobRequest:
         """The request of a question, with a key that a batch which resumes after a kill uses again.
 
         Raises `ImageUnreadable` where its file cannot be read, and `InvalidRequest` where its image is none.
         """
-        kind, fresh, minimal = self._options.kind, self._options.fresh, self._options.minimal
+        fresh, minimal = self.options.fresh, self.options.minimal
         try:
-            request = job_request(kind, question.image, question.question, question.options, None, fresh, minimal)
+            request = job_request(self._kind, question.image, question.question, question.options, None, fresh, minimal)
         except OSError as error:
-            raise ImageUnreadable(f"'{question.image}' cannot be read: {error.strerror or error}.") from error
-        if self._journal is None:
+            raise problems.ImageUnreadable(f"'{question.image}' cannot be read: {error.strerror or error}.") from error
+        if self.journal is None:
             return request
-        return replace(request, key=self._journal.key(question, request.content, fresh=fresh))
+        return replace(request, key=self.journal.key(question, request.content, fresh=fresh))
 
-    def _keep(self, outcome: Outcome[Any]) -> None:
-        if self._journal is not None:
-            saved = self._options.save and outcome.succeeded
-            folder = {"folder": f"items/{outcome.question.folder}"} if saved else {}
-            self._journal.append(outcome.question, {**outcome.line(), **folder})
+    def folder_of(self, question: Question) -> Path | None:
+        """Where the pictures of a question are saved; None where they are not."""
+        if self.journal is None or not self.options.save:
+            return None
+        return self.journal.folder / "items" / question.folder
 
-    def _waiting_for(self, error: CowError | None) -> None:
+    def keep(
+        self, question: Question, result: R_co | None, failed: CowError | None, seconds: float
+    ) -> BatchResult[R_co]:
+        """The result of a question, which is written down; where only its pictures could not be saved, it stands."""
+        self.outage.reset()
+        error, unsaved = (failed, None) if result is None else (None, failed)
+        kept = BatchResult(question, result, error, seconds, unsaved)
+        if self.journal is not None:
+            folder = {"folder": f"items/{question.folder}"} if self.options.save and kept.succeeded else {}
+            self.journal.append(question, {**kept.line(), **folder})
+        return kept
+
+    def count(self, result: BatchResult[Any]) -> None:
+        """Shows that one more has come."""
+        self._progress.count(result.succeeded)
+        self._show()
+
+    def earlier_results(self, read: Callable[[JobKind, Any], R_co]) -> Iterator[BatchResult[R_co]]:
+        """The results of earlier runs, each read from its JSON."""
+        for line in self.journal.lines() if self.journal is not None and self._known else ():
+            if (question := self._known.get(line["id"])) is None:
+                continue
+            if line["status"] == "succeeded":
+                yield BatchResult(question, read(self._kind, line["result"]), None, line["seconds"])
+                continue
+            error = error_from(line["problem"])
+            error.request_id = line["problem"].get("request_id")
+            if isinstance(error, WaitTimeout):
+                error.job_id = line["problem"].get("job_id", "")
+            yield BatchResult(question, None, error, line["seconds"])
+
+    def _show_outage(self, error: CowError | None) -> None:
         note = "" if error is None else f"waiting for the server ({error.code})"
         if note != self._progress.note:
             self._progress.note = note

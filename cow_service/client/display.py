@@ -1,4 +1,4 @@
-"""Results in a notebook: overlay, video, filmstrip and answer as HTML, or as one picture."""
+"""Results in words, and in a notebook: overlay, video, filmstrip and answer as HTML, or as one picture."""
 
 from __future__ import annotations
 
@@ -6,15 +6,127 @@ import base64
 import io
 from collections.abc import Callable, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
-from cow_service.client.wording import band_words, contacts_words, encounters_words, gate_words, outcome_words
-from cow_service.records import Answer, Frame, Simulation, Verdict, Video
+from cow_service import records
+from cow_service.records import (
+    MEETINGS,
+    Answer,
+    BackendInfo,
+    Contact,
+    Encounter,
+    Frame,
+    Gate,
+    Outcome,
+    Simulation,
+    Trajectory,
+    Usage,
+    Verdict,
+    Video,
+)
+from cow_service.records.world import BAND_PERCENTILES
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
     from PIL import Image
+
+
+MAX_CONTACTS = 6  # that are named
+
+
+def asked_words(usage: Usage) -> str:
+    """What a multimodal LLM was asked."""
+    if not usage.calls:
+        return "none"
+    return f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out"
+
+
+def readiness_words(backend: BackendInfo) -> str:
+    """Whether a reader or generator can be used, and what is missing where it cannot."""
+    if backend.ready is None:
+        return "unknown"
+    return "yes" if backend.ready else f"needs {', '.join(backend.missing) or 'its weights'}"
+
+
+def gate_words(gate: Gate) -> str:
+    """What was answered before looking, and what came of it."""
+    votes = ", ".join(f"{name} {count}" for name, count in gate.votes.items()) or "no vote"
+    return f"{votes} of {gate.asked}; {gate.reason}: {'imagined' if gate.imagined else 'not imagined'}"
+
+
+def band_words(trajectory: Trajectory) -> str:
+    """What the band of an overlay says; empty where it has none."""
+    if trajectory.law != "contact" or not trajectory.ensemble:
+        return ""
+    low, high = BAND_PERCENTILES
+    return f"band: where {high - low}% of {trajectory.ensemble} worlds have it, across and down apart"
+
+
+def worlds(probability: float) -> str:
+    """A probability as people read it."""
+    return f"{probability:.0%} of the worlds"
+
+
+def encounter_words(encounter: Encounter, fps: float) -> str:
+    """What the mover does with the other object, when, and in how many worlds."""
+    sure = "" if encounter.probability is None else f" ({worlds(encounter.probability)})"
+    return f"{MEETINGS[encounter.kind]} {encounter.object} at {encounter.first_frame / fps:.1f} s{sure}"
+
+
+def encounters_words(trajectory: Trajectory) -> str:
+    """All that the mover encounters."""
+    met = [encounter_words(encounter, trajectory.fps) for encounter in trajectory.encounters]
+    return ", ".join(met) or ("meets nothing" if trajectory.encounters_known else "encounters were not computed")
+
+
+def first_contacts(trajectory: Trajectory) -> tuple[Contact, ...]:
+    """Those after the start that are told: a thing that comes to rest touches the floor many times."""
+    return tuple(contact for contact in trajectory.contacts if contact.time > 0)[:MAX_CONTACTS]
+
+
+def contacts_words(trajectory: Trajectory) -> str:
+    """Which two begin to touch, and when; empty where none do."""
+    return ", ".join(
+        f"{body_name(contact.a, trajectory)} and {body_name(contact.b, trajectory)} at {contact.time:.1f} s"
+        for contact in first_contacts(trajectory)
+    )
+
+
+def body_name(body: int | None, trajectory: Trajectory) -> str:
+    """What the body with that index is called; null is the floor."""
+    return "the floor" if body is None else trajectory.bodies[body].object
+
+
+def outcome_words(outcome: Outcome) -> str:
+    """What the question asks, as the world answers it, and how sure that is."""
+    parts = [outcome.facts.rstrip(".")] if outcome.facts else []
+    value = _value(outcome)
+    if value:
+        parts.append(value)
+    if not outcome.sure:
+        parts.append("not sure")
+    if outcome.depends_on:
+        parts.append(f"it depends on {' and '.join(outcome.depends_on)}")
+    elif outcome.robust and outcome.sure:
+        parts.append("robust")
+    return "; ".join(parts)
+
+
+def _value(outcome: Outcome) -> str:
+    sure = "" if outcome.probability is None else f", {worlds(outcome.probability)}"
+    if outcome.asked.form == "which-first":
+        return f"first: {outcome.first or 'none'}{sure}"
+    if outcome.asked.form == "how-many":
+        return "" if outcome.count is None else f"count: {outcome.count}{sure}"
+    if outcome.asked.form == "when" and outcome.time is not None:
+        band = "" if outcome.time_band is None else f" ({outcome.time_band[0]:.1f} to {outcome.time_band[1]:.1f} s)"
+        return f"after {outcome.time:.1f} s{band}{sure}"
+    if outcome.probability is None or outcome.asked.form in ("where", "what-happens"):  # the facts are the answer
+        return ""
+    return f"what is asked happens in {worlds(outcome.probability)}"
+
 
 GetBytes = Callable[[str], bytes | None]  # the bytes of an artifact by its digest, where they are available
 MAX_VIDEO_BYTES = 4 * 1024**2  # of a video that stands in the HTML: a notebook keeps it, a third larger, in its file
@@ -177,3 +289,127 @@ def _figure(inner: str, ratio: float, height: int, caption: str) -> str:
 
 def _warnings(warnings: Sequence[Any]) -> str:
     return "".join(f'<div style="{DIM_STYLE}">Note: {escape(str(warning))}</div>' for warning in warnings)
+
+
+HEADINGS = ("role", "name", "ready", "licence", "weights", "to make it ready")
+# Words break only where they are wider than their column: else those of narrow columns would.
+_CELL = "padding:3px 14px 3px 0;text-align:left;vertical-align:top;overflow-wrap:break-word"
+
+
+class Models(records.Models):
+    """Readers and generators, what each needs, and whether it is ready.
+
+    >>> [generator.name for generator in client.models().generators if generator.default]
+    ['cutout']
+    """
+
+    def __repr__(self) -> str:
+        rows = [
+            (role, _name(backend), one_line("; ".join((readiness_words(backend), *_commands(backend)))))
+            for role, backend in self._backends()
+        ]
+        widths = [max((len(row[column]) for row in rows), default=0) for column in (0, 1)]
+        return "\n".join(f"{role:<{widths[0]}}  {name:<{widths[1]}}  {said}" for role, name, said in rows)
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        head = "".join(f'<th style="{_CELL}">{heading}</th>' for heading in HEADINGS)
+        rows = "".join(f"<tr>{_cells(role, backend)}</tr>" for role, backend in self._backends())
+        table = f'<table style="border-collapse:collapse"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
+        table = f'<div style="overflow-x:auto">{table}</div>'
+        named = escape(", ".join(self.mllms)) or "none"
+        return f'<div style="{TEXT_STYLE}">{table}<div style="{DIM_STYLE}">COW_MLLM may name: {named}</div></div>'
+
+    def _backends(self) -> list[tuple[str, BackendInfo]]:
+        readers = [("reader", backend) for backend in self.readers]
+        return readers + [("generator", backend) for backend in self.generators]
+
+
+def _name(backend: BackendInfo) -> str:
+    return one_line(backend.name) + (" (default)" if backend.default else "")
+
+
+def _commands(backend: BackendInfo) -> tuple[str, ...]:
+    """The commands that bring what is missing."""
+    return tuple(filter(None, (backend.install, backend.pull)))
+
+
+def _cells(role: str, backend: BackendInfo) -> str:
+    name = f'<b>{escape(_name(backend))}</b><div style="{DIM_STYLE}">{escape(backend.summary)}</div>'
+    commands = "".join(f"<div><code>{escape(command)}</code></div>" for command in _commands(backend))
+    said = escape(readiness_words(backend)), escape(backend.licence or ""), escape(backend.weights or "none")
+    return "".join(f'<td style="{_CELL}">{cell}</td>' for cell in (role, name, *said, commands))
+
+
+class HeldFiles:
+    """The artifacts of one result, by their digests: downloaded once, then held.
+
+    They are no part of what a result says: results that say the same are equal.
+    """
+
+    def __init__(self) -> None:
+        self.held: dict[str, bytes] = {}
+        self.download_failed = False
+
+    def without_connection(self, sha256: str) -> ValueError:
+        """The error of an artifact that is neither held nor can be downloaded."""
+        return ValueError(f"This result comes from a file or another process: get {sha256} by `Client.artifact`.")
+
+    def write(self, folder: Path, result: Simulation | Answer) -> Path:
+        """Writes a result and its artifacts, which are held, into a folder, which is made if missing."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, sha256 in records.artifacts_of(result).items():
+            (folder / name).write_bytes(self.held[sha256])
+        for name, text in records.documents_of(result).items():
+            (folder / name).write_text(text, encoding="utf-8")
+        return folder
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, HeldFiles)
+
+    __hash__ = object.__hash__
+
+    def __deepcopy__(self, _: dict[int, Any]) -> Self:
+        return self  # bytes by their digests are the same for every copy
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A connection does not go into another process; what it has downloaded does.
+        return type(self), (), {"held": self.held}
+
+
+class SimulationView(Simulation):
+    """A simulation as a notebook and a terminal show it."""
+
+    def picture_bytes(self, sha256: str) -> bytes | None:
+        """The bytes of a picture or the video; None where they are not available."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        words = one_line(f"{self.grounding.object} {encounters_words(self.trajectory)}")
+        return f"<{type(self).__name__} {self.id}: {words}; {len(self.frames)} frames>"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        return simulation_html(self, self.picture_bytes)
+
+    def _repr_png_(self) -> bytes | None:
+        return filmstrip_png(self, self.picture_bytes)
+
+
+class AnswerView(Answer):
+    """An answer as a notebook and a terminal show it."""
+
+    simulation: SimulationView | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: nobody assigns it
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.id}: {one_line(describe_answer(self))}>"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        return answer_html(self, (lambda _: None) if self.simulation is None else self.simulation.picture_bytes)
+
+    def _repr_png_(self) -> bytes | None:
+        return None if self.simulation is None else self.simulation._repr_png_()  # pyright: ignore[reportPrivateUsage]

@@ -3,22 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
+    from cow_service import requests
     from cow_service.records import Law
-    from cow_service.requests import (
-        AskedRequest,
-        CameraRequest,
-        FramesRequest,
-        GroundingRequest,
-        InterventionRequest,
-        MotionRequest,
-        ObjectRequest,
-        OptionRequest,
-        Priority,
-        TrajectoryRequest,
-    )
 
 DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
 RETRIES = 5
@@ -33,14 +23,14 @@ class SimulateOptions(TypedDict, total=False):
     `law` stands for `motion.law`. The `mask` of an object may be whatever an image may be, and an array of booleans.
     """
 
-    options: Sequence[str] | Sequence[OptionRequest | Given] | None
-    grounding: GroundingRequest | Given | None
-    motion: MotionRequest | Given | None
-    trajectory: TrajectoryRequest | Given | None
-    objects: Sequence[ObjectRequest | Given] | None
-    interventions: Sequence[InterventionRequest | Given] | None
-    asked: AskedRequest | Given | None
-    camera: CameraRequest | Given | None
+    options: Sequence[str] | Sequence[requests.OptionRequest | Given] | None
+    grounding: requests.GroundingRequest | Given | None
+    motion: requests.MotionRequest | Given | None
+    trajectory: requests.TrajectoryRequest | Given | None
+    objects: Sequence[requests.ObjectRequest | Given] | None
+    interventions: Sequence[requests.InterventionRequest | Given] | None
+    asked: requests.AskedRequest | Given | None
+    camera: requests.CameraRequest | Given | None
     law: Law | None
     ensemble: int | None
     reader: str | None
@@ -49,9 +39,9 @@ class SimulateOptions(TypedDict, total=False):
     fps: float
     seed: int | None
     video: bool
-    frames: FramesRequest | Given
+    frames: requests.FramesRequest | Given
     generator_options: Given
-    priority: Priority
+    priority: requests.Priority
     webhook: str | None
 
 
@@ -63,3 +53,25 @@ class AnswerOptions(SimulateOptions, total=False):
     imagine_threshold: float
     baseline: bool
     votes: int
+
+
+class BatchSettings(TypedDict, total=False):
+    """How the questions of a batch are asked; `BatchOptions` has the defaults."""
+
+    concurrency: int
+    timeout: float | None
+    fresh: bool
+    minimal: bool
+    out: str | PathLike[str] | None
+    retry_failed: bool
+    only_new: bool
+    save: bool
+    progress: bool
+
+
+class SimulateBatchOptions(SimulateOptions, BatchSettings, total=False):
+    """Of a batch of simulations."""
+
+
+class AnswerBatchOptions(AnswerOptions, BatchSettings, total=False):
+    """Of a batch of answers."""

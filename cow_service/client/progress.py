@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Literal, TypeAlias
 
@@ -67,3 +70,97 @@ def _tqdm() -> Generator[Callable[[Job], None]]:
 def describe(job: Job) -> str:
     """The stage of a running job, else its status."""
     return job.stage if job.status == "running" and job.stage else job.status
+
+
+LINE_SECONDS = 30.0  # between two lines, where there is no terminal
+
+
+@dataclass
+class BatchProgress:
+    """How many questions are done, of how many, where that is known."""
+
+    total: int | None
+    succeeded: int = 0
+    failed: int = 0
+    earlier: int = 0  # of those, found in the folder
+    note: str = ""  # what the batch waits for, where it waits
+    began: float = field(default_factory=time.monotonic)
+
+    @property
+    def done(self) -> int:
+        """All that have an outcome."""
+        return self.succeeded + self.failed
+
+    def count(self, succeeded: bool, *, earlier: bool = False) -> None:
+        """One more is done."""
+        self.succeeded += succeeded
+        self.failed += not succeeded
+        self.earlier += earlier
+
+    @property
+    def rate(self) -> float:
+        """Questions done per second since the start."""
+        return (self.done - self.earlier) / max(time.monotonic() - self.began, 1e-6)
+
+    @property
+    def left(self) -> float | None:
+        """Seconds left at this rate; None where that is not known."""
+        if self.total is None or not self.rate:
+            return None
+        return (self.total - self.done) / self.rate
+
+    def __str__(self) -> str:
+        of = "" if self.total is None else f"/{self.total}"
+        left = "" if self.left is None else f", {duration(self.left)} left"
+        return f"{self.done}{of} done, {self.failed} failed, {pace(self.rate)}{left}{self.note and '; '}{self.note}"
+
+
+def pace(rate: float) -> str:
+    """A rate in words: per second where that is at least one, else per minute."""
+    return f"{rate:.1f}/s" if rate >= 1 else f"{rate * 60:.1f}/min"
+
+
+def duration(seconds: float) -> str:
+    """A time in words: 45 s, 3:20 min, 2:05 h."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+
+
+@contextmanager
+def progress_shown(state: BatchProgress, progress: bool) -> Generator[Callable[[], None]]:
+    """A bar or lines on standard error; yields the function to call when the state has changed."""
+    if not progress:
+        yield lambda: None
+    elif sys.stderr.isatty():
+        with _bar_batch_progress(state) as update:
+            yield update
+    else:
+        printed, note = time.monotonic(), state.note
+
+        def print_now_and_then() -> None:
+            nonlocal printed, note
+            if time.monotonic() - printed >= LINE_SECONDS or state.note != note:
+                printed, note = time.monotonic(), state.note
+                print(state, file=sys.stderr, flush=True)
+
+        yield print_now_and_then
+
+
+@contextmanager
+def _bar_batch_progress(state: BatchProgress) -> Generator[Callable[[], None]]:
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
+
+    columns = (BarColumn(bar_width=30), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(str(state), total=state.total)
+
+        def update() -> None:
+            bar.update(task, completed=state.done, description=str(state))
+
+        update()
+        yield update

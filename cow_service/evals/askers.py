@@ -20,9 +20,8 @@ from inspect_ai.model import (
     ModelOutput,
 )
 
-from cow_service.client import AsyncClient
+from cow_service.client import AsyncAnswer, AsyncClient
 from cow_service.client.errors import error_from
-from cow_service.client.results import AsyncAnswer
 from cow_service.errors import MllmUnavailable
 from cow_service.evals.asking import Asked, Case, Reply
 from cow_service.evals.imagination import REFUSALS, Imagination, Look, asked_once

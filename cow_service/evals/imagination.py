@@ -10,9 +10,8 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-from cow_service.client import AsyncClient
+from cow_service.client import AsyncClient, AsyncSimulation
 from cow_service.client.errors import Canceled
-from cow_service.client.results import AsyncSimulation
 from cow_service.errors import CannotGround, CannotReadDirection, CowError, InvalidRequest, MllmBadReply
 from cow_service.evals.items import Ask, Item, Pictures, question_text
 from cow_service.media.images import decode, encode_png, fit_within

@@ -13,7 +13,7 @@ from cow_service.media.artifacts import extension_of, media_type_of
 from cow_service.media.images import decode
 from cow_service.readers.options import split_options
 from cow_service.records import AnswerOption, Record
-from cow_service.records.base import Sha256
+from cow_service.records.world import Sha256
 
 Task = Literal["collision", "trajectory", "compatibility", "occlusion", "other"]
 TASKS: tuple[Task, ...] = ("collision", "trajectory", "compatibility", "occlusion", "other")

@@ -1,236 +1,205 @@
-"""What the tools return as data: the records of the service without the thousands of numbers of a trajectory."""
+"""What a tool returns: the service's record as data without its long lists, the same as text, and pictures."""
 
 from __future__ import annotations
 
+import base64
+import io
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from anyio import to_thread
+from mcp_types import CallToolResult, ImageContent, TextContent
+from PIL import Image
 
-from cow_service import records
-from cow_service.client.wording import body_name, first_contacts, outcome_words
-from cow_service.mcp.images import ARTIFACTS
-from cow_service.mcp.inputs import lean
-from cow_service.records import Doubt, EncounterKind, Law, MotionKind
+from cow_service.client import AsyncClient
+from cow_service.client.display import MAX_CONTACTS, body_name, first_contacts, gate_words, outcome_words, worlds
+from cow_service.mcp.arguments import ARTIFACTS, ToolName, inlined
+from cow_service.records import MEETINGS, Answer, Body, Encounter, Simulation, Verdict
+
+# What a model has no use for: thousands of numbers, and who made it how.
+_OF_OBJECT = {"mask": True, "prior": True, "source": True, "role": True}
+LEFT_OUT: dict[str, Any] = {
+    "grounding": {"mask": True, "prior": True, "interventions": True, "others": {"__all__": _OF_OBJECT}},
+    "motion": {
+        **dict.fromkeys(("trail", "steps", "others", "gravity", "down", "metres_per_pixel", "along_arrow"), True),
+        **dict.fromkeys(("depth_deviation", "speed_deviation"), True),
+    },
+    "trajectory": {
+        **dict.fromkeys(("units", "camera", "paths", "light", "anchors", "factual", "ensemble"), True),
+        "bodies": {"__all__": dict.fromkeys(Body.model_fields.keys() - {"object"}, True)},
+        "contacts": {"__all__": {"point": True, "impulse": True}},
+        "encounters": {"__all__": {"bbox": True, "body": True, "subject": True}},
+        "placement": {"probabilities": True},
+        "placed": {"__all__": {"probabilities": True}},
+    },
+    "frames": {"__all__": {"url": True}},
+    "factual_frames": True,
+    "generator": {"options": True, "revision": True, "steps": True},
+    "reader": {"prompts": True, "stages": True, "revision": True},
+    **dict.fromkeys(("status", "created_at", "question", "usage", "usage_total", "timings", "reused"), True),
+}
+LEFT_OUT_OF: dict[ToolName, dict[str, Any]] = {
+    "simulate": LEFT_OUT,
+    "answer": {
+        **dict.fromkeys(("status", "created_at", "question", "timings", "reused", "options_source"), True),
+        "simulation": LEFT_OUT,
+        "reader": LEFT_OUT["reader"],
+    },
+}
 
 
-class Result(BaseModel):
-    """Something that a tool returns; fields of the service's records that it does not have are left out."""
+def output_schema(tool: ToolName) -> dict[str, Any]:
+    """The JSON schema of what a tool returns as data."""
+    model = Simulation if tool == "simulate" else Answer
+    return inlined(model.model_json_schema(mode="serialization"), LEFT_OUT_OF[tool])
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+
+async def tool_result(result: Simulation | Answer, client: AsyncClient, base_url: str | None) -> CallToolResult:
+    """Downloads the pictures; `base_url` is the address of the server, where others can open it."""
+    simulation = result.simulation if isinstance(result, Answer) else result
+    pictures: list[ImageContent] = []
+    if simulation is not None:
+        names = (simulation.overlay.sha256, *(frame.sha256 for frame in simulation.frames))
+        fitted = await to_thread.run_sync(fit_pictures, [await client.artifact(sha256) for sha256 in names])
+        pictures = [ImageContent(data=base64.b64encode(data).decode(), mime_type=kind) for kind, data in fitted]
+    tool: ToolName = "answer" if isinstance(result, Answer) else "simulate"
+    data = result.model_dump(mode="json", exclude=LEFT_OUT_OF[tool])
+    shown = data["simulation"] if isinstance(result, Answer) else data
+    video = ""
+    if simulation is not None:
+        # A thing that comes to rest touches the floor many times.
+        contacts = shown["trajectory"]["contacts"]
+        shown["trajectory"]["contacts"] = [each for each in contacts if each["time"] > 0][:MAX_CONTACTS]
+    if simulation is not None and simulation.video is not None:
+        sha256, url = simulation.video.sha256, simulation.video.url
+        video = shown["video"]["url"] = ARTIFACTS + sha256 if base_url is None else base_url + url
+    text = answer_text(result, video) if isinstance(result, Answer) else simulation_text(result, video)
+    return CallToolResult(content=[TextContent(text=text), *pictures], structured_content=data)
 
 
-class Encounter(Result):
-    """The mover meets another thing: a hypothesis, computed from the image alone."""
+# Text
 
-    object: str
-    kind: EncounterKind = Field(
-        description="touches; occludes: the mover passes in front of it; occluded-by: the mover passes behind it."
+
+def simulation_text(simulation: Simulation, video: str) -> str:
+    """What moves, how, what it meets when; which picture is which; what to mind. `video` is where the clip is."""
+    lines = [*_simulation_lines(simulation, video), *_warning_lines(simulation.warnings)]
+    return "\n".join([*lines, _image_hint(simulation.image.sha256)])
+
+
+def answer_text(answer: Answer, video: str) -> str:
+    """The answer first, then what was imagined for it."""
+    lines = [f"Answer: {_verdict(answer)}."]
+    if answer.reasoning:
+        lines.append(f"Reasoning: {answer.reasoning}")
+    if sum(answer.votes.values()) > 1:
+        lines.append(f"Votes: {_votes(answer)}.")
+    if answer.gate is not None:
+        lines.append(f"Before looking: {gate_words(answer.gate)}.")
+    if answer.baseline is not None:
+        votes = f"; votes {_votes(answer.baseline)}" if sum(answer.baseline.votes.values()) > 1 else ""
+        lines.append(f"Without imagined frames: {_verdict(answer.baseline)}{votes}.")
+    warnings = list(answer.warnings)
+    if answer.simulation is not None:
+        lines += ["", "Imagined:", *_simulation_lines(answer.simulation, video)]
+        warnings += answer.simulation.warnings
+    else:
+        lines.append("Nothing was imagined: the answer is from the image alone.")
+    return "\n".join([*lines, *_warning_lines(warnings), _image_hint(answer.image.sha256)])
+
+
+def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
+    motion, trajectory, image = simulation.motion, simulation.trajectory, simulation.image
+    box = ", ".join(f"{side:.1f}" for side in simulation.grounding.bbox)
+    way = ""
+    if motion.direction is not None:
+        along = ", ".join(f"{part:.3g}" for part in motion.direction)
+        way = f"direction [{along}] (x right, y down), {motion.speed:.1f} px/s, "
+    yield motion.sentence
+    yield (
+        f"It is the {simulation.grounding.object} at [{box}] in the image of {image.width} x {image.height} px; "
+        f"{motion.kind}, {way}law {trajectory.law}."
     )
-    time_s: float = Field(description="When it begins, seconds from now.")
-    frame: int = Field(description="When it begins, frame of the clip.")
-    probability: float | None = Field(
-        description="Share of the simulated worlds in which it happens; null where they were not counted."
-    )
-    share: float | None = Field(description="Of an occlusion: the largest share that is covered.")
+    encounters = sorted(trajectory.encounters, key=lambda encounter: encounter.first_frame)
+    if encounters:
+        yield f"On its way (hypotheses) it {'; '.join(_encounter(each, trajectory.fps) for each in encounters)}."
+    elif simulation.encounters_known:
+        yield "It meets nothing on its way, as far as the image tells."
+    else:
+        yield "What it meets was not computed."
+    if contacts := first_contacts(trajectory):
+        touches = (
+            f"{body_name(contact.a, trajectory)} and {body_name(contact.b, trajectory)} at {contact.time:.2f} s"
+            for contact in contacts
+        )
+        yield f"Contacts: {'; '.join(touches)}."
+    if trajectory.outcome is not None and (summary := outcome_words(trajectory.outcome)):
+        yield f"Outcome (a hypothesis of the simulated world): {summary}."
+    if trajectory.moving_until is not None:
+        yield f"Nothing moves in the image from {trajectory.moving_until:.2f} s on."
+    if not all(trajectory.path.visible):
+        yield f"Its centre leaves the image at {trajectory.path.visible.index(False) / trajectory.fps:.2f} s."
+    frames = [f"frame {frame.index} ({frame.time:.2f} s)" for frame in simulation.frames]
+    yield f"Pictures, in this order: the image with box, direction and path drawn; {', '.join(frames)}."
+    if video:
+        yield f"Video: {video}"
+    yield f"Simulation {simulation.id}; generator {simulation.generator.name}, reader {simulation.reader.name}."
 
 
-class Contact(Result):
-    """Two things begin to touch in the likeliest world."""
-
-    a: str
-    b: str = Field(description="The other thing, or `the floor`.")
-    time_s: float
+def _encounter(encounter: Encounter, fps: float) -> str:
+    sure = "" if encounter.probability is None else f", {worlds(encounter.probability)}"
+    when = f"from {encounter.first_frame / fps:.2f} s (frame {encounter.first_frame}{sure})"
+    return f"{MEETINGS[encounter.kind]} {encounter.object} {when}"
 
 
-class Outcome(Result):
-    """What the question asks, as the simulated world answers it: a hypothesis with a probability."""
-
-    summary: str = Field(description="In words.")
-    probability: float | None = Field(description="That what is asked happens, or of the value below.")
-    first: str | None = Field(description="What is met first, where that is asked.")
-    count: int | None = Field(description="How many, where that is asked.")
-    time_s: float | None = Field(description="Seconds until it happens.")
-    sure: bool = Field(description="Whether the world is certain enough for an answer.")
-    robust: bool = Field(description="Whether at least 90% of the worlds give the answer.")
-    depends_on: list[Doubt] = Field(description="What the answer depends on, most first.")
+def _verdict(verdict: Verdict) -> str:
+    if verdict.answer is None:
+        return "not sure"
+    return verdict.answer if verdict.option is None else f"{verdict.answer} ({verdict.option})"
 
 
-class Frame(Result):
-    """One of the returned pictures, after the overlay and in this order."""
-
-    index: int = Field(description="Frame of the clip.")
-    time_s: float
-    sha256: str
-    width: int
-    height: int
+def _votes(verdict: Verdict) -> str:
+    return ", ".join(f"{answer}: {count}" for answer, count in verdict.votes.items())
 
 
-class Video(Result):
-    """The clip as mp4."""
-
-    sha256: str
-    uri: str = Field(description="The resource that holds it.")
-    url: str | None = Field(description="Its address on the COW server; null where that has none.")
-    fps: float
-    num_frames: int
-    width: int
-    height: int
+def _warning_lines(warnings: Iterable[str]) -> Iterable[str]:
+    return (f"Note: {warning}" for warning in dict.fromkeys(warnings))
 
 
-class SimulateResult(Result):
-    """What `simulate` returns."""
-
-    id: str
-    object: str = Field(description="What moves.")
-    bbox: list[float] = Field(description="Where it is now, [x0, y0, x1, y1], pixels of the image.")
-    motion: str = Field(description="How it moves, in a sentence.")
-    kind: MotionKind
-    direction: list[float] | None = Field(
-        description="Unit vector [dx, dy], x right, y down; null for a fall or a thing that stays."
-    )
-    speed: float = Field(description="Pixels per second at first.")
-    law: Law = Field(description="contact: floor, bounces, pushes; ballistic: straight through everything.")
-    leaves_at_s: float | None = Field(description="When its centre leaves the image; null where it stays inside.")
-    encounters: list[Encounter] = Field(description="What it meets on its way, in order of time.")
-    encounters_known: bool = Field(description="Whether an empty list of encounters means that it meets nothing.")
-    contacts: list[Contact] = Field(description="The first contacts, in order of time.")
-    moving_until_s: float | None = Field(
-        description="From when nothing moves in the image any more; null where it is not known or something still does."
-    )
-    outcome: Outcome | None = Field(description="Null where the question asks for nothing that the world can tell.")
-    frames: list[Frame]
-    video: Video | None
-    overlay_sha256: str = Field(description="The image with box, direction and path drawn: the first picture.")
-    image_sha256: str = Field(description="Give this as `image` to ask about the same image again.")
-    image_width: int = Field(description="Pixels.")
-    image_height: int = Field(description="Pixels.")
-    generator: str
-    reader: str
-    warnings: list[str] = Field(description="What was assumed or could be meant otherwise.")
+def _image_hint(sha256: str) -> str:
+    return f'To ask about this image again, give image="{sha256}".'
 
 
-class Verdict(Result):
-    """An answer without imagined frames, for comparison."""
+# Pictures
 
-    answer: str | None
-    option: str | None
-    not_sure: bool
-    votes: dict[str, int]
-
-
-class Usage(Result):
-    """What the multimodal LLM of the service was asked."""
-
-    calls: int
-    input_tokens: int
-    output_tokens: int
+MAX_SIDE_PX = 1024  # models do not see more
+MAX_BYTES = 500_000  # of all pictures of a result together: in base64 a third more, and clients refuse messages of 1 MB
+# Tried in turn when pictures are too large, as PNGs of photographs are: quality of JPEG, scale of the sides.
+_SMALLER = ((90, 1.0), (80, 1.0), (75, 0.75), (75, 0.5), (70, 0.35), (60, 0.25), (50, 0.15))
+_JPEG, _PNG = "image/jpeg", "image/png"
 
 
-class AnswerResult(Result):
-    """What `answer` returns."""
-
-    id: str
-    answer: str | None = Field(
-        description="A letter, or text where the question is open; null where it is not sure and no option says so."
-    )
-    option: str | None = Field(description="Text of the option with that letter.")
-    not_sure: bool
-    reasoning: str = Field(description="The answerer's own; empty where nobody reasons.")
-    votes: dict[str, int]
-    gate: records.Gate | None = Field(description="Of `imagine` auto: what decided whether to imagine.")
-    baseline: Verdict | None
-    warnings: list[str] = Field(description="What was assumed or could be meant otherwise.")
-    simulation: SimulateResult | None = Field(description="What was imagined; null where nothing was, or that failed.")
-    image_sha256: str = Field(description="Give this as `image` to ask about the same image again.")
-    reader: str
-    usage: Usage = Field(description="What it cost.")
-    usage_total: Usage = Field(description="What it would have cost if nothing had been known from earlier calls.")
+def fit_pictures(pictures: Sequence[bytes]) -> list[tuple[str, bytes]]:
+    """Media types and pictures of at most `MAX_SIDE_PX` on the longest side and `MAX_BYTES` together."""
+    fitted = [_fit(picture) for picture in pictures]
+    for quality, scale in _SMALLER:
+        if sum(len(data) for _, data in fitted) <= MAX_BYTES:
+            break
+        fitted = [(_JPEG, _shrink(picture, scale, "JPEG", quality=quality)) for picture in pictures]
+    return fitted
 
 
-def simulate_result(simulation: records.Simulation, base_url: str | None) -> SimulateResult:
-    """A simulation as a tool returns it; `base_url` is the address of its server, where that has one."""
-    motion, trajectory, video = simulation.motion, simulation.trajectory, simulation.video
-    hidden = [not visible for visible in trajectory.path.visible]
-    return SimulateResult(
-        id=simulation.id,
-        object=simulation.grounding.object,
-        bbox=_rounded(simulation.grounding.bbox, 1),
-        motion=motion.sentence,
-        kind=motion.kind,
-        direction=None if motion.direction is None else _rounded(motion.direction, 3),
-        speed=round(motion.speed, 1),
-        law=trajectory.law,
-        leaves_at_s=round(hidden.index(True) / trajectory.fps, 2) if any(hidden) else None,
-        encounters=[_encounter(e, trajectory.fps) for e in sorted(trajectory.encounters, key=lambda e: e.first_frame)],
-        encounters_known=simulation.encounters_known,
-        contacts=[_contact(contact, trajectory) for contact in first_contacts(trajectory)],
-        moving_until_s=None if trajectory.moving_until is None else round(trajectory.moving_until, 2),
-        outcome=None if trajectory.outcome is None else _outcome(trajectory.outcome),
-        frames=[Frame(time_s=round(frame.time, 2), **frame.model_dump()) for frame in simulation.frames],
-        video=None if video is None else _video(video, base_url),
-        overlay_sha256=simulation.overlay.sha256,
-        image_sha256=simulation.image.sha256,
-        image_width=simulation.image.width,
-        image_height=simulation.image.height,
-        generator=simulation.generator.name,
-        reader=simulation.reader.name,
-        warnings=list(simulation.warnings),
-    )
+def _fit(data: bytes) -> tuple[str, bytes]:
+    with Image.open(io.BytesIO(data)) as picture:
+        kind = "JPEG" if picture.format == "JPEG" else "PNG"
+        is_small = max(picture.size) <= MAX_SIDE_PX
+    return _JPEG if kind == "JPEG" else _PNG, data if is_small else _shrink(data, 1.0, kind)
 
 
-def answer_result(answer: records.Answer, base_url: str | None) -> AnswerResult:
-    """An answer as a tool returns it."""
-    own = {
-        "simulation": None if answer.simulation is None else simulate_result(answer.simulation, base_url),
-        "image_sha256": answer.image.sha256,
-        "reader": answer.reader.name,
-    }
-    return AnswerResult.model_validate(answer.model_dump(exclude={"simulation"}) | own)
-
-
-def output_schema(model: type[Result]) -> dict[str, Any]:
-    """The JSON schema of what a tool returns."""
-    return lean(model.model_json_schema(mode="serialization"))
-
-
-def _encounter(encounter: records.Encounter, fps: float) -> Encounter:
-    return Encounter(
-        object=encounter.object,
-        kind=encounter.kind,
-        time_s=round(encounter.first_frame / fps, 2),
-        frame=encounter.first_frame,
-        probability=_maybe(encounter.probability),
-        share=_maybe(encounter.share),
-    )
-
-
-def _contact(contact: records.Contact, trajectory: records.Trajectory) -> Contact:
-    return Contact(
-        a=body_name(contact.a, trajectory), b=body_name(contact.b, trajectory), time_s=round(contact.time, 2)
-    )
-
-
-def _outcome(outcome: records.Outcome) -> Outcome:
-    return Outcome(
-        summary=outcome_words(outcome),
-        probability=_maybe(outcome.probability),
-        first=outcome.first,
-        count=outcome.count,
-        time_s=_maybe(outcome.time),
-        sure=outcome.sure,
-        robust=outcome.robust,
-        depends_on=list(outcome.depends_on),
-    )
-
-
-def _video(video: records.Video, base_url: str | None) -> Video:
-    url = None if base_url is None else base_url + video.url
-    return Video(uri=ARTIFACTS + video.sha256, url=url, **video.model_dump(exclude={"url"}))
-
-
-def _maybe(value: float | None) -> float | None:
-    return None if value is None else round(value, 2)
-
-
-def _rounded(values: tuple[float, ...], digits: int) -> list[float]:
-    return [round(value, digits) for value in values]
+def _shrink(data: bytes, scale: float, kind: str, **options: int) -> bytes:
+    with Image.open(io.BytesIO(data)) as picture:
+        small = picture.convert("RGB")
+    side = scale * min(MAX_SIDE_PX, max(small.size))
+    small.thumbnail((side, side), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    small.save(buffer, kind, **options)
+    return buffer.getvalue()

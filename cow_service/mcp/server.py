@@ -1,53 +1,45 @@
 """The protocol's side: two tools, and the artifacts of their results as resources.
 
 The low-level server of the library takes arguments as they come: its high-level one leaves out those that it does not
-know, and tells wrong ones in pydantic's words.
+know, and reports wrong ones in pydantic's words.
 """
 
 from __future__ import annotations
 
 import base64
 import logging
-from collections.abc import Callable
+import math
+from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
-from anyio import to_thread
+import anyio
+import mcp_types as types
+from anyio.streams.memory import MemoryObjectReceiveStream
 from mcp.server.context import ServerRequestContext
 from mcp.server.lowlevel import Server
 from mcp.shared.exceptions import MCPError
-from mcp_types import (
-    INTERNAL_ERROR,
-    INVALID_PARAMS,
-    BlobResourceContents,
-    CallToolRequestParams,
-    CallToolResult,
-    ImageContent,
-    ListResourcesResult,
-    ListResourceTemplatesResult,
-    ListToolsResult,
-    PaginatedRequestParams,
-    ReadResourceRequestParams,
-    ReadResourceResult,
-    ResourceTemplate,
-    TextContent,
-    Tool,
-    ToolAnnotations,
-)
 
 from cow_service import __version__
-from cow_service.client import AsyncAnswer, AsyncClient, CowError
+from cow_service.client import AsyncAnswer, AsyncClient, AsyncSimulation, CowError, ImageLike
+from cow_service.client.progress import describe
 from cow_service.errors import InternalError
-from cow_service.mcp.errors import error_text
-from cow_service.mcp.images import ARTIFACTS, HELP_WITH_PATHS, HELP_WITHOUT_PATHS, digest_of, image_of
-from cow_service.mcp.inputs import INPUTS, ToolName, input_schema, parsed
-from cow_service.mcp.pictures import pictures_of
-from cow_service.mcp.progress import result_of
-from cow_service.mcp.results import AnswerResult, Result, SimulateResult, answer_result, output_schema, simulate_result
-from cow_service.mcp.text import answer_text, simulation_text
+from cow_service.mcp.arguments import (
+    ARTIFACTS,
+    HELP_WITH_PATHS,
+    HELP_WITHOUT_PATHS,
+    ToolName,
+    digest_of,
+    error_text,
+    image_of,
+    input_schema,
+    request_fields,
+)
+from cow_service.mcp.results import output_schema, tool_result
 from cow_service.media.artifacts import media_type_of
+from cow_service.records import Job
 
 INSTRUCTIONS = """\
 COW imagines what would happen in a picture. Use it for what-if questions about one still image in which something \
@@ -91,10 +83,10 @@ Example:
 """,
 }
 TITLES: dict[ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
-OUTPUTS: dict[ToolName, type[Result]] = {"simulate": SimulateResult, "answer": AnswerResult}
 # It only looks; asking again changes nothing, though a model that samples may answer otherwise; images may be fetched,
 # and shown to a provider's model.
 HINTS = {"read_only_hint": True, "destructive_hint": False, "idempotent_hint": True, "open_world_hint": True}
+MIN_STEP = 1e-4  # the protocol wants progress that grows, and a stage may begin without any
 
 log = logging.getLogger("cow_service")
 
@@ -110,6 +102,7 @@ class Caller:
 
 Connect: TypeAlias = Callable[[Caller], AbstractAsyncContextManager[AsyncClient]]
 Lifespan: TypeAlias = Callable[[Server[Any]], AbstractAsyncContextManager[Any]]
+Report: TypeAlias = Callable[[float, str], Awaitable[None]]  # the share that is done, 0 to 1, and the stage
 
 
 def create_server(connect: Connect, lifespan: Lifespan, *, paths: bool, links: bool) -> Server[Any]:
@@ -137,82 +130,73 @@ class _Tools:
     def __init__(self, connect: Connect, *, paths: bool, links: bool) -> None:
         self._connect, self._paths, self._links = connect, paths, links
         self._listed = [
-            Tool(
+            types.Tool(
                 name=name,
                 title=TITLES[name],
-                description=DESCRIPTIONS[name],
-                input_schema=input_schema(model, HELP_WITH_PATHS if paths else HELP_WITHOUT_PATHS),
-                output_schema=output_schema(OUTPUTS[name]),
-                annotations=ToolAnnotations(title=TITLES[name], **HINTS),
+                description=description,
+                input_schema=input_schema(name, HELP_WITH_PATHS if paths else HELP_WITHOUT_PATHS),
+                output_schema=output_schema(name),
+                annotations=types.ToolAnnotations(title=TITLES[name], **HINTS),
             )
-            for name, model in INPUTS.items()
+            for name, description in DESCRIPTIONS.items()
         ]
 
-    async def list(self, _: ServerRequestContext[Any], __: PaginatedRequestParams | None) -> ListToolsResult:
-        return ListToolsResult(tools=self._listed)
+    async def list(self, *_: Any) -> types.ListToolsResult:
+        return types.ListToolsResult(tools=self._listed)
 
-    async def call(self, context: ServerRequestContext[Any], params: CallToolRequestParams) -> CallToolResult:
+    async def call(
+        self, context: ServerRequestContext[Any], params: types.CallToolRequestParams
+    ) -> types.CallToolResult:
         """What a tool returns; an error is text in it, since that is where a model looks."""
-        if params.name not in INPUTS:
-            raise MCPError(code=INVALID_PARAMS, message=f"Unknown tool: {params.name[:80]!r}")
         tool = params.name
-        try:
-            return await self._run(tool, context, params.arguments or {})
-        except CowError as error:
-            log.info("%s failed: %s", tool, error.code)
-            return _failure(error)
-        except Exception:
-            log.exception("%s failed", tool)
-            return _failure(InternalError("The tool met an error that it did not foresee; its log has the trace."))
-
-    async def _run(
-        self, tool: ToolName, context: ServerRequestContext[Any], arguments: dict[str, Any]
-    ) -> CallToolResult:
-        given = parsed(INPUTS[tool], arguments)
+        if tool not in DESCRIPTIONS:
+            raise MCPError(code=types.INVALID_PARAMS, message=f"Unknown tool: {tool[:80]!r}")
 
         async def report(done: float, stage: str) -> None:
             await context.session.report_progress(done, 1.0, stage)
 
-        image = await to_thread.run_sync(partial(image_of, given.image, paths=self._paths))
-        async with self._connect(_caller(context)) as client:
-            result = await result_of(client, tool, image, given.question, given.request_fields(), report)
-            simulation = result.simulation if isinstance(result, AsyncAnswer) else result
-            pictures = [] if simulation is None else await pictures_of(simulation, client)
-            base_url = client.base_url if self._links else None
-        if isinstance(result, AsyncAnswer):
-            answer = answer_result(result, base_url)
-            return _success(answer, answer_text(answer), pictures)
-        simulated = simulate_result(result, base_url)
-        return _success(simulated, simulation_text(simulated), pictures)
+        try:
+            fields = request_fields(tool, params.arguments or {})
+            image = await anyio.to_thread.run_sync(partial(image_of, fields.pop("image"), paths=self._paths))
+            async with self._connect(_caller(context)) as client:
+                result = await result_of(client, tool, image, fields, report)
+                return await tool_result(result, client, client.base_url if self._links else None)
+        except CowError as error:
+            log.info("%s failed: %s", tool, error.code)
+            failure = error
+        except Exception:
+            log.exception("%s failed", tool)
+            failure = InternalError("The tool met an error that it did not foresee; its log has the trace.")
+        return types.CallToolResult(content=[types.TextContent(text=error_text(failure))], is_error=True)
 
-    async def resources(self, _: ServerRequestContext[Any], __: PaginatedRequestParams | None) -> ListResourcesResult:
-        return ListResourcesResult(resources=[])
+    async def resources(self, *_: Any) -> types.ListResourcesResult:
+        return types.ListResourcesResult(resources=[])
 
-    async def templates(
-        self, _: ServerRequestContext[Any], __: PaginatedRequestParams | None
-    ) -> ListResourceTemplatesResult:
-        artifact = ResourceTemplate(
+    async def templates(self, *_: Any) -> types.ListResourceTemplatesResult:
+        artifact = types.ResourceTemplate(
             uri_template=ARTIFACTS + "{sha256}",
             name="artifact",
             title="Pictures and videos of results",
             description="The bytes of a picture or video, by the SHA-256 that a result names it with.",
         )
-        return ListResourceTemplatesResult(resource_templates=[artifact])
+        return types.ListResourceTemplatesResult(resource_templates=[artifact])
 
-    async def read(self, context: ServerRequestContext[Any], params: ReadResourceRequestParams) -> ReadResourceResult:
+    async def read(
+        self, context: ServerRequestContext[Any], params: types.ReadResourceRequestParams
+    ) -> types.ReadResourceResult:
         uri = str(params.uri)
         sha256 = digest_of(uri)
         if sha256 is None:
-            raise MCPError(code=INVALID_PARAMS, message=f"There is no resource {uri[:200]!r}.")
+            raise MCPError(code=types.INVALID_PARAMS, message=f"There is no resource {uri[:200]!r}.")
         try:
             async with self._connect(_caller(context)) as client:
                 data = await client.artifact(sha256)
         except CowError as error:
-            code = INVALID_PARAMS if error.code == "artifact-not-found" else INTERNAL_ERROR
+            code = types.INVALID_PARAMS if error.code == "artifact-not-found" else types.INTERNAL_ERROR
             raise MCPError(code=code, message=error_text(error)) from error
         blob = base64.b64encode(data).decode()
         media_type = media_type_of(data) or "application/octet-stream"
-        return ReadResourceResult(contents=[BlobResourceContents(uri=uri, mime_type=media_type, blob=blob)])
+        return types.ReadResourceResult(contents=[types.BlobResourceContents(uri=uri, mime_type=media_type, blob=blob)])
 
 
 def _caller(context: ServerRequestContext[Any]) -> Caller:
@@ -226,11 +210,32 @@ def _caller(context: ServerRequestContext[Any]) -> Caller:
     return Caller((key.strip() or None) if scheme.lower() == "bearer" else None, address, forwarded)
 
 
-def _success(result: Result, text: str, pictures: list[ImageContent]) -> CallToolResult:
-    return CallToolResult(
-        content=[TextContent(text=text), *pictures], structured_content=result.model_dump(mode="json")
-    )
+async def result_of(
+    client: AsyncClient, tool: ToolName, image: ImageLike, fields: dict[str, Any], report: Report
+) -> AsyncSimulation | AsyncAnswer:
+    """The result of a tool's job. Raises what it failed with. A call that is canceled cancels its job."""
+    call: Callable[..., Awaitable[AsyncSimulation | AsyncAnswer]]
+    call = client.simulate if tool == "simulate" else client.answer
+    result: AsyncSimulation | AsyncAnswer | CowError | None = None
+    updates, updated = anyio.create_memory_object_stream[Job](math.inf)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(_report_all, updated, report)
+        with updates:
+            try:
+                result = await call(image, progress=updates.send_nowait, **fields)
+            except CowError as error:  # raised below: the group would wrap it
+                result = error
+    if isinstance(result, CowError):
+        raise result
+    assert result is not None
+    return result
 
 
-def _failure(error: CowError) -> CallToolResult:
-    return CallToolResult(content=[TextContent(text=error_text(error))], is_error=True)
+async def _report_all(jobs: MemoryObjectReceiveStream[Job], report: Report) -> None:
+    done, stage = -MIN_STEP, ""
+    with jobs:
+        async for job in jobs:
+            now = describe(job)
+            if job.progress > done or now != stage:
+                done, stage = max(job.progress, done + MIN_STEP), now
+                await report(done, stage)

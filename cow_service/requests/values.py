@@ -40,7 +40,7 @@ Whole = Annotated[int, BeforeValidator(_number)]
 Flag = Annotated[bool, Field(strict=True)]
 Words = Annotated[str, AfterValidator(writable), AfterValidator(_says_something)]
 Name = Annotated[str, Field(max_length=MAX_NAME)]
-# Of a long list the first wrong element is told: the others would fill the memory.
+# Of a long list only the first wrong element is reported: the others would fill the memory.
 Points = Annotated[tuple[tuple[Finite, Finite], ...], Field(fail_fast=True)]
 Flags = Annotated[tuple[Flag, ...], Field(fail_fast=True)]
 

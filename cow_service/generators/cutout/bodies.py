@@ -12,8 +12,7 @@ import numpy as np
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.physics.camera import NEAREST, FloorCamera
-from cow_service.records import FALLING_KINDS, BBox, Body, Path
-from cow_service.records.motion import Shape
+from cow_service.records import FALLING_KINDS, BBox, Body, Path, Shape
 from cow_service.vision.inpainting import push_pull
 from cow_service.vision.masks import Floats, Floats32, Image, Mask, hull, resized_mask, turning, window_of
 

@@ -1,0 +1,276 @@
+"""What both clients do without I/O: addresses and headers, when to retry, what events and responses mean."""
+
+from __future__ import annotations
+
+import email.utils
+import json
+import os
+import random
+import re
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC
+from typing import Any, Literal, TypeAlias, TypeVar, cast, get_args
+from urllib.parse import quote
+
+import httpx
+from httpx_sse import ServerSentEvent
+from pydantic import BaseModel, ValidationError
+
+from cow_service import __version__
+from cow_service.client.errors import (
+    BadResponse,
+    Canceled,
+    code_of,
+    error_from,
+    error_of,
+    unreachable,
+    with_request_id,
+)
+from cow_service.records import Job
+
+R = TypeVar("R", bound=BaseModel)
+DEFAULT_URL = "http://127.0.0.1:8000"
+STREAM_TIMEOUT_SECONDS = 60.0  # of silence in a stream of events; the server sends something every 15
+MAX_SERVER_WAIT_SECONDS = 10  # that the server holds one request for a result; then the job is polled
+FIRST_POLL_SECONDS, POLL_GROWTH, MAX_POLL_SECONDS = 0.1, 1.5, 2.0  # between two requests for the state of a job
+TIMEOUT_MARGIN_SECONDS = 1.0  # that a request may go on after the caller's timeout
+CANCEL_TIMEOUT_SECONDS = 5.0  # for each of the two requests that cancel the job of a caller who has left
+JOBS_PER_PAGE = 100
+MAX_FIRST_ATTEMPTS = 3  # connections refused by a server that has never answered
+OK, ACCEPTED, NO_CONTENT, NOT_FOUND = 200, 202, 204, 404
+_KEY = re.compile(r"[\x21-\x7e]+")
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A server: address, key and timeouts."""
+
+    base_url: str
+    api_key: str | None
+    timeout: httpx.Timeout
+
+    def server_wait(self, timeout: float | None) -> int:
+        """Seconds that the server may hold a request for a result (`Prefer: wait`): well within the read timeout."""
+        read = self.timeout.read
+        longest = MAX_SERVER_WAIT_SECONDS if read is None else min(MAX_SERVER_WAIT_SECONDS, int(read / 2))
+        return longest if timeout is None else min(longest, int(timeout))
+
+    @property
+    def stream_timeout(self) -> httpx.Timeout:
+        """Timeouts of a stream of events, in which the server may be silent for longer."""
+        return httpx.Timeout(
+            connect=self.timeout.connect, read=STREAM_TIMEOUT_SECONDS, write=self.timeout.write, pool=self.timeout.pool
+        )
+
+    def limited(self, seconds: float | None) -> httpx.Timeout:
+        """Timeouts of a request, none of them longer than so many seconds."""
+        if seconds is None:
+            return self.timeout
+        limits = self.timeout.as_dict().items()
+        return httpx.Timeout(**{name: seconds if limit is None else min(limit, seconds) for name, limit in limits})
+
+    def headers(self, headers: Mapping[str, str]) -> dict[str, str]:
+        """The headers of a request: its own, and those of every request."""
+        authorization = {} if self.api_key is None else {"Authorization": f"Bearer {self.api_key}"}
+        agent = {"User-Agent": f"cow-service/{__version__}", "Accept": "application/json, */*"}
+        return {**agent, **headers, **authorization}
+
+
+def endpoint_of(base_url: str | None, api_key: str | None, timeout: float | httpx.Timeout | None) -> Endpoint:
+    """The server of these arguments, else of COW_BASE_URL and COW_API_KEY, else the one on this machine.
+
+    Raises `ValueError` for what is no address, and for what is no key.
+    """
+    address = (base_url or os.environ.get("COW_BASE_URL") or DEFAULT_URL).rstrip("/")
+    if not address.startswith(("http://", "https://")):
+        raise ValueError(f"base_url must begin with http:// or https://, got {address!r}")
+    try:
+        url = httpx.URL(address)
+    except httpx.InvalidURL as error:
+        raise ValueError(f"base_url {address!r} is no address: {error}") from error
+    if not url.host or "%" in url.host or not 0 < (url.port or 80) < 65536 or url.query or url.fragment:
+        raise ValueError(f"base_url must be a host, maybe a port and a path, and nothing else, got {address!r}")
+    key = (os.environ.get("COW_API_KEY") if api_key is None else api_key) or None  # empty: none, whatever is set
+    if key is not None and not _KEY.fullmatch(key):
+        raise ValueError("api_key must be printable ASCII without spaces; has a line break been read with it?")
+    limit = timeout if isinstance(timeout, httpx.Timeout) else httpx.Timeout(timeout, connect=min(10, timeout or 10))
+    return Endpoint(address, key, limit)
+
+
+MAX_RETRY_AFTER_SECONDS = 60.0  # a server that asks for more is asked again after this time
+FIRST_BACKOFF_SECONDS, BACKOFF_GROWTH, MAX_BACKOFF_SECONDS = 0.5, 2.0, 8.0  # without a Retry-After
+# Refusals before a job is made. What a job has failed with is final: the same key would return it again.
+RETRYABLE_CODES = frozenset({"queue-full", "rate-limited", "shutting-down", "not-ready", "body-too-slow"})
+RETRYABLE_STATUS = frozenset({408, 425, 429, 502, 503, 504})  # of a proxy in front of the server
+_BROKEN_CONNECTION = (httpx.NetworkError, httpx.TimeoutException, httpx.RemoteProtocolError)
+
+
+def pause_before_retry(outcome: httpx.Response | httpx.HTTPError, attempts: int) -> float | None:
+    """Seconds to wait after so many attempts; None where another would have the same outcome."""
+    if isinstance(outcome, httpx.HTTPError):
+        return _backoff(attempts) if isinstance(outcome, _BROKEN_CONNECTION) else None
+    code = code_of(outcome)
+    if code not in RETRYABLE_CODES if code is not None else outcome.status_code not in RETRYABLE_STATUS:
+        return None
+    retry_after = _retry_after(outcome.headers.get("retry-after"))
+    if retry_after is None:
+        return _backoff(attempts)
+    return min(retry_after, MAX_RETRY_AFTER_SECONDS) + random.uniform(0, 0.25)
+
+
+def _backoff(attempts: int) -> float:
+    pause = min(FIRST_BACKOFF_SECONDS * BACKOFF_GROWTH ** (attempts - 1), MAX_BACKOFF_SECONDS)
+    return pause * random.uniform(0.75, 1.25)
+
+
+def _retry_after(header: str | None) -> float | None:
+    """The header `Retry-After`, a number or a date (RFC 9110), as seconds from now."""
+    if header is None:
+        return None
+    if header.isascii() and header.isdecimal():
+        return float(header)
+    try:
+        date = email.utils.parsedate_to_datetime(header)
+    except ValueError:
+        return None
+    # Without a zone it is the old asctime form, which is in GMT as well.
+    return max(0.0, (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp() - time.time())
+
+
+EventName: TypeAlias = Literal["queued", "running", "stage", "progress", "succeeded", "failed", "canceled", "deleted"]
+FINAL: frozenset[str] = frozenset({"succeeded", "failed", "canceled", "deleted"})
+
+
+@dataclass(frozen=True)
+class Event:
+    """One thing that happened to a job.
+
+    `number` is the same however often events are read, and None for `progress`, which is not repeated. `job` is the
+    job as it then was, without its result; None where it was deleted.
+    """
+
+    name: EventName
+    number: int | None
+    job: Job | None
+
+
+class EventCursor:
+    """The position of one reader in the events of a job, and its retries. Does no I/O."""
+
+    def __init__(self, after: int, retries: int) -> None:
+        self.position = after
+        self.ended = False
+        self._retries, self._attempts = retries, 0
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """The header that tells the server where to go on."""
+        return {"Last-Event-ID": str(self.position)} if self.position else {}
+
+    def take(self, sent: ServerSentEvent) -> Event | None:
+        """The event that was sent; None for one that came before, or whose kind this version does not know.
+
+        Raises `BadResponse` for one that cannot be read.
+        """
+        self._attempts = 0
+        if sent.event not in get_args(EventName):
+            return None
+        name = cast("EventName", sent.event)
+        # An event without an id of its own repeats the last one (the HTML standard's rule).
+        number = int(sent.id) if name != "progress" and sent.id.isdecimal() else None
+        try:
+            body = json.loads(sent.data)
+        except ValueError:
+            body = sent.data
+        job = read(Job, {**body, "result": None} if isinstance(body, dict) else body) if body != {} else None
+        self.ended = name in FINAL
+        if number is not None and number <= self.position:
+            return None
+        self.position = number or self.position
+        return Event(name, number, job)
+
+    def pause_after(self, outcome: httpx.Response | httpx.HTTPError) -> float:
+        """Seconds before the next connection, after one that broke, was refused or ended before the job.
+
+        Raises the error for which no other is made.
+        """
+        self._attempts += 1
+        if isinstance(outcome, httpx.Response) and outcome.status_code == NO_CONTENT:
+            self.ended = True
+            return 0.0
+        if isinstance(outcome, httpx.Response) and is_event_stream(outcome):
+            outcome = httpx.RemoteProtocolError("the stream ended before the job", request=outcome.request)
+        pause = pause_before_retry(outcome, self._attempts) if self._attempts <= self._retries else None
+        if pause is not None:
+            return pause
+        if isinstance(outcome, httpx.Response):
+            raise error_of(outcome)
+        raise unreachable(outcome) from outcome
+
+
+def is_event_stream(response: httpx.Response) -> bool:
+    """Whether a response is a stream of events."""
+    media_type = response.headers.get("content-type", "").partition(";")[0].strip().lower()
+    return response.status_code == OK and media_type == "text/event-stream"
+
+
+def read(model: type[R], body: Any) -> R:
+    """A record from JSON. Fields that only a later version of the server knows are left out."""
+    try:
+        return model.model_validate(body, extra="ignore", strict=False)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        place = ".".join(str(part) for part in wrong["loc"])
+        raise BadResponse(
+            f"The response is no {model.__name__} that this version reads ({place}: {wrong['msg']}): are server and "
+            "SDK of the same version?"
+        ) from error
+
+
+def object_in(response: httpx.Response) -> dict[str, Any]:
+    """The JSON object that a response holds."""
+    try:
+        body = response.json()
+    except ValueError:
+        body = None
+    if not isinstance(body, dict):
+        raise error_of(response)
+    return body
+
+
+def job_in(response: httpx.Response) -> Job:
+    """The job that a response holds, without its result: that is read where its kind is known."""
+    return read(Job, {**object_in(response), "result": None})
+
+
+def result_in(response: httpx.Response, job: Job) -> Any:
+    """The result that the response to a request for an ended job holds. Raises what the job failed with."""
+    body = object_in(response)
+    if job.status == "succeeded":
+        return body.get("result") or {}
+    canceled = job.status == "canceled"
+    error = Canceled(f"The job {job.id} was canceled.") if canceled else error_from(body.get("problem") or {})
+    raise with_request_id(error, response)
+
+
+def job_path(job_id: str) -> str:
+    """The path of a job on its server."""
+    return f"/jobs/{quote(job_id, safe='')}"
+
+
+class BaseJobHandle:
+    """What the handles of both clients have in common."""
+
+    def __init__(self, connection: Any, job: Job) -> None:
+        self._connection = connection
+        self.job = job
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.job.id}: {self.job.kind}, {self.job.status}>"
+
+    @property
+    def id(self) -> str:
+        """The job's id, by which `Client.job` finds it again."""
+        return self.job.id

@@ -1,0 +1,269 @@
+"""What calls send: images in any form, the fields of a request, and the body that they become."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import os
+import re
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import httpx
+from pydantic import BaseModel
+
+from cow_service.errors import FieldError, InvalidRequest
+from cow_service.records import Artifact, Frame, ImageInfo, JobKind, Record
+
+
+def to_json(value: Any) -> bytes:
+    """JSON of plain values, records and arrays."""
+    return json.dumps(value, default=plain, ensure_ascii=False, separators=(",", ":")).encode()
+
+
+def plain(value: Any) -> Any:
+    """What JSON can hold of a record, of a NumPy array or number, or of a time; tuples and lists stay."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", exclude_unset=True)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if hasattr(value, "isoformat"):
+        return (value if value.tzinfo else value.astimezone()).isoformat()
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, list | tuple | str | int | float):
+        return value
+    raise TypeError(f"{type(value).__name__} cannot be sent; give plain values, records or arrays")
+
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from PIL import Image
+
+    from cow_service.requests import ImageArtifact, ImageUrl
+
+    # A text is a path, or a URL where it begins with http://, https:// or data:. Arrays are RGB, see `encoded_array`.
+    ImageLike: TypeAlias = (
+        str
+        | os.PathLike[str]
+        | bytes
+        | bytearray
+        | memoryview
+        | Image.Image
+        | NDArray[np.uint8]
+        | Artifact
+        | Frame
+        | ImageInfo
+        | ImageArtifact
+        | ImageUrl
+        | Mapping[str, str]  # as it stands in a request
+    )
+else:
+    ImageLike = Any
+
+URLS = ("http://", "https://", "data:")
+_ALPHA_MODES = {"PA": "RGBA", "RGBa": "RGBA", "La": "LA"}  # modes with alpha that PNG lacks, and those that keep it
+
+
+def is_url(text: str) -> bool:
+    """Whether a text is a URL, and no path."""
+    return text[:8].lower().startswith(URLS)
+
+
+@dataclass(frozen=True)
+class Upload:
+    """An image to be sent as a file. It holds the bytes themselves, so that every attempt sends the same."""
+
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Reference:
+    """An image that the request names: a URL, a data URL or an artifact."""
+
+    json: str | dict[str, str]
+
+
+def image_input(image: ImageLike) -> Upload | Reference:
+    """How an image is sent.
+
+    Raises `OSError` where a file cannot be read, and `InvalidRequest` for anything that is no image.
+    """
+    if isinstance(image, str) and is_url(image):
+        return Reference(image if image[:5].lower() == "data:" else {"url": image})
+    if isinstance(image, str | os.PathLike):
+        return Upload(Path(image).read_bytes())
+    if isinstance(image, bytes | bytearray | memoryview):
+        return Upload(bytes(image))
+    if isinstance(image, Mapping | Record) and (reference := _reference(image)) is not None:
+        return reference
+    # Neither library is loaded for this: whoever has such an image has loaded it.
+    if hasattr(image, "__array_interface__") and hasattr(image, "dtype"):
+        return Upload(encoded_array(cast("NDArray[np.uint8]", image)))
+    if hasattr(image, "save") and hasattr(image, "mode"):
+        return Upload(encoded_picture(cast("Image.Image", image)))
+    raise _wrong(
+        f"got {type(image).__name__}; give a path, bytes, a PIL image, an array (height, width, 3) of uint8, a URL, or "
+        "an artifact"
+    )
+
+
+def _reference(image: Mapping[str, str] | Record) -> Reference | None:
+    from cow_service.requests import ImageArtifact, ImageUrl  # noqa: PLC0415 - not needed to import the SDK
+
+    if isinstance(image, Mapping):
+        return Reference(dict(image))
+    if isinstance(image, Artifact | Frame | ImageInfo):
+        return Reference({"artifact": image.sha256})
+    return Reference(image.model_dump()) if isinstance(image, ImageArtifact | ImageUrl) else None
+
+
+def encoded_array(array: NDArray[np.uint8]) -> bytes:
+    """PNG of an array: (height, width) grey, (height, width, 3) RGB or (height, width, 4) RGBA, uint8."""
+    from PIL import Image  # noqa: PLC0415
+
+    shape, kind = tuple(array.shape), str(array.dtype)
+    if kind != "uint8" or len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (3, 4)) or 0 in shape:
+        raise _wrong(
+            f"is an array {shape} of {kind}; give (height, width), or (height, width, 3 or 4), of uint8 in RGB"
+        )
+    return _png(Image.fromarray(array))
+
+
+def encoded_picture(picture: Image.Image) -> bytes:
+    """PNG of a PIL image, upright: its EXIF orientation is applied, and no EXIF sent."""
+    from PIL import ImageOps  # noqa: PLC0415
+
+    if 0 in picture.size or picture.mode in ("I", "F"):
+        raise _wrong(
+            f"is a PIL image {picture.size} of mode {picture.mode}; give one of at least one pixel, of 8 or 16 bits a "
+            "channel: of I and F nothing says what is white"
+        )
+    upright = ImageOps.exif_transpose(picture)
+    if upright.mode.startswith("I;16"):
+        upright = upright.convert("I").convert("I;16")
+    elif upright.mode in _ALPHA_MODES:
+        upright = upright.convert(_ALPHA_MODES[upright.mode])
+    elif upright.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
+        upright = upright.convert("RGB")
+    return _png(upright)
+
+
+def _png(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    # Speed matters more than size: it is sent once. An ICC profile would be that of the mode before conversion.
+    picture.save(buffer, "PNG", compress_level=1, icc_profile=None)
+    return buffer.getvalue()
+
+
+def _wrong(detail: str) -> InvalidRequest:
+    return InvalidRequest(f"`image` {detail}.", errors=(FieldError("/image", detail),))
+
+
+def request_fields(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields; those that are None are left out.
+
+    Raises `InvalidRequest` for two different laws, and what `image_input` raises for a mask.
+    """
+    fields = {name: value for name, value in options.items() if value is not None}
+    if "law" in fields:
+        fields["motion"] = _with_law(fields.get("motion"), fields.pop("law"))
+    if "grounding" in fields:
+        fields["grounding"] = _with_mask(fields["grounding"])
+    if "objects" in fields:
+        fields["objects"] = [_with_mask(given) for given in fields["objects"]]
+    return fields
+
+
+def _with_law(motion: Any, law: Any) -> dict[str, Any]:
+    given: dict[str, Any] = {} if motion is None else dict(plain(motion))
+    if given.get("law", law) != law:
+        detail = f"is {given['law']!r}, and `law` is {law!r}: give one of them"
+        raise InvalidRequest(f"`motion.law` {detail}.", errors=(FieldError("/motion/law", detail),))
+    return {**given, "law": law}
+
+
+def _with_mask(place: Any) -> Any:
+    """The place with its mask as JSON has it; unchanged where it has none."""
+    mask = place.get("mask") if isinstance(place, Mapping) else getattr(place, "mask", None)
+    if mask is None:
+        return place
+    if getattr(getattr(mask, "dtype", None), "kind", "") == "b":
+        mask = mask.astype("uint8") * 255
+    sent = image_input(mask)
+    json = f"data:image/png;base64,{base64.b64encode(sent.data).decode()}" if isinstance(sent, Upload) else sent.json
+    return {**plain(place), "mask": json}
+
+
+MINIMAL = "return=minimal"  # the preference of RFC 7240
+_KEY = re.compile(r"[\x21-\x7e]{1,255}")
+
+
+@dataclass(frozen=True)
+class JobRequest:
+    """A request for a simulation or an answer: the same bytes and idempotency key in every attempt."""
+
+    kind: JobKind
+    content: bytes
+    media_type: str
+    key: str
+    fresh: bool = False
+    minimal: bool = False  # the result without its long lists
+
+    def headers(self, prefer: str) -> dict[str, str]:
+        """The headers of an attempt; `prefer` says whether the server should wait for the result."""
+        return {
+            "Content-Type": self.media_type,
+            "Idempotency-Key": self.key,
+            "Prefer": f"{prefer}, {MINIMAL}" if self.minimal else prefer,
+            **({"Cache-Control": "no-cache"} if self.fresh else {}),
+        }
+
+
+def job_request(
+    kind: JobKind,
+    image: ImageLike,
+    question: str,
+    options: Mapping[str, Any],
+    key: str | None,
+    fresh: bool,
+    minimal: bool = False,
+) -> JobRequest:
+    """Encodes a request; without a key it gets a random one.
+
+    Raises what `image_input` and `request_fields` raise, and `InvalidRequest` for a key that no header can hold and for
+    text that cannot be encoded.
+    """
+    if key is not None and not _KEY.fullmatch(key):
+        detail = "takes 1 to 255 printable ASCII characters without spaces"
+        raise InvalidRequest(f"`idempotency_key` {detail}, got {key[:80]!r}.", errors=(FieldError("", detail),))
+    sent = image_input(image)
+    fields = request_fields(options)
+    try:
+        if isinstance(sent, Reference):
+            content = to_json({**fields, "image": sent.json, "question": question})
+            media_type = "application/json"
+        else:
+            content, media_type = _multipart(sent.data, question, fields)
+    except UnicodeEncodeError as error:
+        detail = f"holds half of a surrogate pair ({error.object[error.start]!r}), which is no text"
+        raise InvalidRequest(f"The request {detail}.", errors=(FieldError("", detail),)) from error
+    return JobRequest(kind, content, media_type, key or secrets.token_urlsafe(18), fresh, minimal)
+
+
+def _multipart(image: bytes, question: str, fields: Mapping[str, Any]) -> tuple[bytes, str]:
+    boundary = hashlib.sha256(image).hexdigest()[:32]  # the same in every attempt, and nothing the image holds
+    form = httpx.Request(
+        "POST",
+        "http://form",
+        files={"image": ("image", image, "application/octet-stream")},
+        data={"question": question, "request": to_json(fields).decode()},
+        headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
+    )
+    return form.read(), form.headers["content-type"]

@@ -1,0 +1,274 @@
+"""Arguments of the tools: fields of the service's requests, flat, because models fill in flat arguments best.
+
+Names, types and descriptions are those of `SimulateRequest` and `AnswerRequest`; the server checks the values.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+from cow_service.client import CowError, ImageLike
+from cow_service.errors import FieldError, InvalidRequest
+from cow_service.media.artifacts import media_type_of
+from cow_service.requests import AnswerRequest, ImageArtifact, SimulateRequest
+
+ToolName = Literal["simulate", "answer"]
+REQUESTS: dict[ToolName, type[SimulateRequest]] = {"simulate": SimulateRequest, "answer": AnswerRequest}
+# Arguments that stand deeper in a request. Every other argument is the field of its name.
+NESTED = {
+    "object": "grounding/object",
+    "bbox": "grounding/bbox",
+    "point": "grounding/point",
+    "direction": "motion/direction",
+    "motion_kind": "motion/kind",
+    "speed": "motion/speed",
+    "distance": "motion/distance",
+    "duration": "motion/duration",
+    "until": "motion/until",
+    "law": "motion/law",
+    "frames_policy": "frames/policy",
+    "frames_count": "frames/count",
+}
+# Fields that are no arguments: `interventions` are `remove` and `place`, the rest is for programs.
+_LEFT_OUT = {
+    *("grounding", "motion", "frames", "interventions", "trajectory", "camera", "ensemble", "fps"),
+    *("generator_options", "priority", "webhook"),
+}
+_LEFT_OUT_OF = {"simulate": {"options"}, "answer": {"video"}}
+_OF_OBJECTS = ("object", "bbox")
+_OF_PLACE = ("object", "relation", "targets")
+# `simulate` is for a caller who looks at the pictures.
+DEFAULTS: dict[ToolName, dict[str, Any]] = {"simulate": {"frames_policy": "events", "video": False}, "answer": {}}
+
+
+def input_schema(tool: ToolName, image: str) -> dict[str, Any]:
+    """The JSON schema of a tool's arguments; `image` says how an image may be given."""
+    fields = inlined(REQUESTS[tool].model_json_schema())["properties"]
+    intervention = fields["interventions"]["items"]["properties"]
+    properties: dict[str, Any] = {name: fields[name] for name in ("image", "question")}
+    for name, path in NESTED.items():
+        record, _, field = path.partition("/")
+        properties[name] = fields[record]["properties"][field]
+    properties |= {
+        "remove": {
+            "type": "array",
+            "items": {"type": "string"},
+            "description": "Things that are taken away before anything moves, in words.",
+        },
+        "place": {
+            "type": "array",
+            "items": _record_of(intervention, _OF_PLACE),
+            "description": "Things that are put somewhere: before anything else moves, or as all that happens.",
+        },
+    }
+    properties |= {name: field for name, field in fields.items() if name not in _LEFT_OUT | _LEFT_OUT_OF[tool]}
+    properties["objects"] = {
+        **properties["objects"],
+        "items": _record_of(fields["objects"]["items"]["properties"], _OF_OBJECTS),
+    }
+    properties["image"] = {"type": "string", "description": image}
+    for name, default in DEFAULTS[tool].items():
+        properties[name] = {**properties[name], "default": default}
+    required = ["image", "question"]
+    return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
+
+
+def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The request that the arguments of a call make. Null is as good as leaving one out.
+
+    Raises `InvalidRequest` for an unknown argument, and where `image` or `question` is missing.
+    """
+    known = input_schema(tool, "")["properties"]
+    faults = [
+        FieldError(f"/{name}", f"there is no such argument; there are: {', '.join(known)}")
+        for name in arguments
+        if name not in known
+    ]
+    faults += [
+        FieldError(f"/{name}", "is needed, as text")
+        for name in ("image", "question")
+        if not isinstance(arguments.get(name), str)
+    ]
+    if faults:
+        raise InvalidRequest("The arguments of the tool are not valid.", errors=tuple(faults))
+    request: dict[str, Any] = {}
+    given = DEFAULTS[tool] | {name: value for name, value in arguments.items() if value is not None}
+    for name, argument in given.items():
+        value = argument if known[name].get("type") == "string" else _parsed(argument)
+        if name in ("remove", "place"):
+            things = value if isinstance(value, list) else [value]
+            changes = [{"object": thing} if name == "remove" else thing for thing in things]
+            request.setdefault("interventions", []).extend(
+                {"kind": name, **change} if isinstance(change, Mapping) else change for change in changes
+            )
+        elif name in NESTED:
+            record, _, field = NESTED[name].partition("/")
+            request.setdefault(record, {})[field] = value
+        else:
+            request[name] = value
+    return request
+
+
+def inlined(
+    schema: dict[str, Any], exclude: Mapping[str, Any] | None = None, records: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """A JSON schema with each reference replaced, and without what costs a model's attention and says nothing.
+
+    That is titles, null (which may always be given) and defaults of null. `exclude` has fields that are left out, in
+    the form that `BaseModel.model_dump` takes.
+    """
+    exclude = exclude or {}
+    records = dict(schema.get("$defs", {})) if records is None else records
+    if (reference := schema.get("$ref")) is not None:
+        schema = records[reference.rpartition("/")[2]] | {key: each for key, each in schema.items() if key != "$ref"}
+    choices = [one for one in schema.get("anyOf", ()) if one != {"type": "null"}]
+    if len(choices) == 1:
+        merged = {key: each for key, each in schema.items() if key != "anyOf"}
+        return inlined(choices[0] | merged, exclude, records)
+    needless = ("$defs", "title") if schema.get("default", ...) is not None else ("$defs", "title", "default")
+    found = {key: each for key, each in schema.items() if key not in needless}
+    for key in ("anyOf", "oneOf", "prefixItems"):
+        if key in found:
+            found[key] = [inlined(one, exclude, records) for one in found[key]]
+    if isinstance(found.get("items"), dict):
+        found["items"] = inlined(found["items"], exclude.get("__all__"), records)
+    if "properties" in found:
+        kept = {name: one for name, one in found["properties"].items() if exclude.get(name) is not True}
+        found["properties"] = {name: inlined(one, exclude.get(name), records) for name, one in kept.items()}
+        found["required"] = [name for name in found.get("required", ()) if name in kept]
+    return found
+
+
+def _record_of(properties: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    return {"type": "object", "properties": {name: properties[name] for name in names}, "required": list(names)}
+
+
+def _parsed(value: Any) -> Any:
+    """Some clients write lists and numbers as JSON in a string."""
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+ARTIFACTS = "cow://artifacts/"
+_KEPT = (
+    "the 64-digit sha256 of the `image` in an earlier result, which asks about the same image again without sending it"
+)
+HELP_WITH_PATHS = f"The image: the absolute path of a PNG, JPEG or WebP file, a data URL, an http(s) URL, or {_KEPT}."
+HELP_WITHOUT_PATHS = (
+    f"The image (PNG, JPEG or WebP): a data URL (data:image/png;base64,...), an http(s) URL, or {_KEPT}. No path: this "
+    "server does not read files."
+)
+_DIGEST = re.compile(rf"(?:{ARTIFACTS})?([0-9a-f]{{64}})", re.IGNORECASE | re.ASCII)
+_SCHEME = re.compile(r"(data:|[a-z][a-z0-9+.-]*://)", re.IGNORECASE | re.ASCII)
+_SENT_AS_IS = ("data:", "http://", "https://")
+MAX_FILE_BYTES = 100_000_000  # servers take less
+_SIGNATURE_BYTES = 12  # that tell what a file is
+_MAX_SHOWN = 200  # characters of the caller's text in an error
+
+
+def image_of(text: str, *, paths: bool) -> ImageLike:
+    """What the SDK takes for an image; reads a file where it is one. `paths` says whether files may be named.
+
+    Raises `InvalidRequest`, also for a file that is no image: nothing else leaves the machine.
+    """
+    text = text.strip()
+    if digest := digest_of(text):
+        return ImageArtifact(artifact=digest)
+    scheme = found[0].lower() if (found := _SCHEME.match(text)) else None
+    if scheme in _SENT_AS_IS:
+        return scheme + text[len(scheme) :]
+    if not paths:
+        raise _wrong(
+            f"{_shown(text)} is no data URL, http(s) URL or SHA-256 digest; files of the server's machine are not read"
+        )
+    if scheme not in (None, "file://"):
+        raise _wrong(f"{_shown(text)} cannot be opened: give a path, a data URL, an http(s) URL or a digest")
+    return _read_image(Path(url2pathname(urlsplit(text).path)) if scheme else Path(text))
+
+
+def digest_of(text: str) -> str | None:
+    """The SHA-256 that a text names, as such or as a resource; None where it names none."""
+    found = _DIGEST.fullmatch(text)
+    return found and found[1].lower()
+
+
+def _read_image(path: Path) -> bytes:
+    try:
+        path = path.expanduser().absolute()
+        if not path.is_file():  # devices and pipes may never end
+            raise _wrong(f"there is no file {_shown(str(path))}; give an absolute path")
+        with path.open("rb") as file:
+            head = file.read(_SIGNATURE_BYTES)
+            if media_type_of(head) not in ("image/png", "image/jpeg", "image/webp"):
+                raise _wrong(f"{_shown(str(path))} is no PNG, JPEG or WebP")
+            rest = file.read(MAX_FILE_BYTES)
+            if len(head) + len(rest) > MAX_FILE_BYTES:
+                raise _wrong(f"{_shown(str(path))} is larger than {MAX_FILE_BYTES // 1_000_000} MB")
+            return head + rest
+    except (OSError, RuntimeError, ValueError) as error:  # no home folder; NUL in the name
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise _wrong(f"{_shown(str(path))} cannot be read: {why or type(error).__name__}") from error
+
+
+def _shown(text: str) -> str:
+    return repr(text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}...")
+
+
+def _wrong(detail: str) -> InvalidRequest:
+    return InvalidRequest("The image cannot be used.", errors=(FieldError("/image", detail),))
+
+
+_GIVE_PLACE = (
+    "Look at the image and call again with `bbox` [x0, y0, x1, y1] or `point` [x, y] of the thing that moves, in "
+    "pixels of the image, and `object`, its name; give other things that the question names in `objects`, each with "
+    "`object` and `bbox`."
+)
+_RETRY_LATER = "Call again in a while, with the same arguments."
+REMEDIES = {
+    "cannot-ground": _GIVE_PLACE,
+    "object-not-found": _GIVE_PLACE,
+    "cannot-read-direction": "Call again with `direction` [dx, dy] (x right, y down; [-1, 0] is to the left), or with "
+    '`motion_kind` "fall" where it is dropped.',
+    "artifact-not-found": "Send the image itself: the server keeps none of that digest for you.",
+    "image-url-not-allowed": "Give the image itself instead of its address. Which addresses are fetched is set by "
+    "COW_ALLOW_IMAGE_URLS of the server.",
+    "image-url-unreachable": "Check the address, or give the image itself.",
+    "unauthorized": "The person who set up this tool has to give it a valid key: COW_API_KEY in the environment of "
+    "`cow mcp`, or the header `Authorization: Bearer <key>` where it is reached over HTTP.",
+    "queue-full": _RETRY_LATER,
+    "rate-limited": _RETRY_LATER,
+    "shutting-down": _RETRY_LATER,
+    "not-ready": _RETRY_LATER,
+    "mllm-unavailable": "Call again in a while, or with another `reader` ('embedded' needs no model).",
+    "canceled": "Somebody canceled the job. Call again if it is still wanted.",
+}
+
+
+def error_text(error: CowError) -> str:
+    """An error as text from which a model can do better: the code, what was wrong, and what to do with these tools."""
+    lines = [f"{error.code}: {error.title}"]
+    # The detail says the same as the fields do, in words of the service's requests.
+    lines += [f"- {_argument_at(field.pointer)}: {field.detail}" for field in error.errors] or [error.detail]
+    if error.code in REMEDIES:
+        lines.append(f"What to do: {REMEDIES[error.code]}")
+    if error.request_id is not None:
+        lines.append(f"(request id {error.request_id})")
+    return "\n".join(lines)
+
+
+def _argument_at(pointer: str) -> str:
+    """The argument of a tool that a JSON Pointer into the service's request means."""
+    path = pointer.lstrip("/")
+    for name, known in NESTED.items():
+        if path == known or path.startswith(f"{known}/"):
+            return name + path.removeprefix(known)
+    of_record = [f"`{name}`" for name, known in NESTED.items() if path and known.startswith(f"{path}/")]
+    return ", ".join(of_record) or path or "arguments"

@@ -1,0 +1,51 @@
+"""Writes the blocking twins of the SDK's async modules: `make unasync`."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import unasync
+
+ROOT = Path(__file__).parents[1]
+CLIENT = ROOT / "cow_service" / "client"
+TWINS = {"async_client.py": "sync_client.py", "async_connection.py": "sync_connection.py"}
+NAMES = {
+    "AsyncAnswer": "Answer",
+    "AsyncClient": "Client",
+    "AsyncConnection": "Connection",
+    "AsyncFiles": "Files",
+    "AsyncJobHandle": "JobHandle",
+    "AsyncSimulation": "Simulation",
+    "async_client": "sync_client",
+    "async_connection": "sync_connection",
+    "async_io": "sync_io",
+    "aclose": "close",
+    "aclosing": "closing",
+    "aiter_sse": "iter_sse",
+    "aread": "read",
+}
+
+
+def twin_of(source: Path) -> str:
+    """The text of a module's twin: names and keywords by unasync, then the words of docstrings, then ruff."""
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder) / "async" / source.name
+        draft.parent.mkdir()
+        draft.write_text(source.read_text())
+        unasync.unasync_files([str(draft)], [unasync.Rule("/async/", "/sync/", NAMES)])
+        made = (Path(folder) / "sync" / source.name).read_text()
+    made = re.sub(r"Change `(.*)`: `make unasync` writes `.*` from it", r"Written by `make unasync` from `\1`", made)
+    made = re.sub(r"\bAsync(?=[A-Z])", "", re.sub(r"\b(async|await) ", "", made))
+    for command in (["check", "--fix", "--exit-zero"], ["format"]):
+        ruff = [sys.executable, "-m", "ruff", *command, "--quiet", "--stdin-filename", CLIENT / TWINS[source.name], "-"]
+        made = subprocess.run(ruff, input=made, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    return made
+
+
+if __name__ == "__main__":
+    for source, twin in TWINS.items():
+        (CLIENT / twin).write_text(twin_of(CLIENT / source))
