@@ -30,7 +30,7 @@ from cow_service.cli.main import app
 from cow_service.client import AsyncClient, Client, errors
 from cow_service.client.batches import OutageTimer, Question, questions
 from cow_service.client.journal import Journal
-from cow_service.client.progress import BatchProgress, duration, pace
+from cow_service.client.progress import BatchProgress, duration, rate_words
 
 COMMAND = [sys.executable, "-m", "cow_service.cli.main", "batch"]
 GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}
@@ -453,7 +453,7 @@ def test_progress_in_words() -> None:
     progress.count(False)
     assert str(progress) == "71/100 done, 1 failed, 2.1/s, 14 s left"
     assert [duration(s) for s in (59.4, 61, 3600, 7300)] == ["59 s", "1:01 min", "1:00 h", "2:01 h"]
-    assert [pace(r) for r in (2.04, 0.5)] == ["2.0/s", "30.0/min"]
+    assert [rate_words(r) for r in (2.04, 0.5)] == ["2.0/s", "30.0/min"]
 
 
 # The command
@@ -493,8 +493,8 @@ def test_the_command_tells_by_its_exit_code(server: Server, tmp_path: Path) -> N
     ("text", "options", "says"),
     [
         ("", (), "holds no questions"),
-        ("{", (), "questions.jsonl, line 1: no JSON"),
-        ("\n[]", (), "line 2: must be an object, got list"),
+        ("{", (), "questions.jsonl, line 1: it is not JSON"),
+        ("\n[]", (), "line 2: it must be an object, got list"),
         ('{"image": "a.png", "question": "?", "votes": 99}', (), "line 1: /votes: "),
         ('{"question": "?"}\n\n{"image": "a.png"}', (), "line 3: `question` is missing"),
         ('{"image": "a.png", "question": "?"}', (), "none of the 1 images is there"),

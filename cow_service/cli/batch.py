@@ -65,22 +65,31 @@ def batch(
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
     """
+    from cow_service.client import Client  # noqa: PLC0415
     from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
 
-    asked = _read(questions, _defaults(request), kind)
+    asked = _read(questions, _object_in(request or "{}", "--request"), kind)
     try:
-        _ask(
-            asked,
-            url,
-            out=out,
-            kind=kind,
-            concurrency=concurrency,
-            timeout=timeout,
-            save=save,
-            fresh=fresh,
-            minimal=minimal,
-            retry_failed=retry_failed,
-        )
+        client = Client(url)
+    except ValueError as error:
+        raise InvalidRequest(f"{error}.") from error
+    try:
+        with client:
+            for result in client.map(
+                asked,
+                kind=kind,
+                only_new=True,
+                progress=True,
+                out=out,
+                concurrency=concurrency,
+                timeout=timeout,
+                save=save,
+                fresh=fresh,
+                minimal=minimal,
+                retry_failed=retry_failed,
+            ):
+                if result.unsaved is not None:
+                    typer.echo(printable(f"{result.id}: not saved: {result.unsaved.detail}"), err=True)
     except KeyboardInterrupt:
         typer.echo(f"Interrupted. The same command goes on with it; {out / 'results.jsonl'} is whole.", err=True)
         sys.stderr.flush()
@@ -97,19 +106,6 @@ def batch(
     raise typer.Exit(_print_summary(out))
 
 
-def _ask(asked: list[Question], url: str | None, **options: Any) -> None:
-    from cow_service.client import Client  # noqa: PLC0415
-
-    try:
-        client = Client(url)
-    except ValueError as error:
-        raise InvalidRequest(f"{error}.") from error
-    with client:
-        for outcome in client.map(asked, only_new=True, progress=True, **options):
-            if outcome.unsaved is not None:
-                typer.echo(printable(f"{outcome.id}: not saved: {outcome.unsaved.detail}"), err=True)
-
-
 def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]:
     """The questions of a file; images are looked for beside it.
 
@@ -122,7 +118,7 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
         if line.strip():
             try:
-                item = _parsed(line)
+                item = _object_in(line, "it")
                 (question,) = questions([item], defaults, path.parent)
                 _check(question, kind)
                 items.append(item)
@@ -139,14 +135,14 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
     return asked
 
 
-def _parsed(line: bytes) -> dict[str, Any]:
+def _object_in(text: str | bytes, name: str) -> dict[str, Any]:
     try:
-        item = json.loads(line)
+        given = json.loads(text)
     except ValueError as error:
-        raise InvalidRequest(f"no JSON: {error}.") from error
-    if not isinstance(item, dict):
-        raise InvalidRequest(f"must be an object, got {type(item).__name__}.")
-    return item
+        raise InvalidRequest(f"{name} is not JSON: {error}.") from error
+    if not isinstance(given, dict):
+        raise InvalidRequest(f"{name} must be an object, got {type(given).__name__}.")
+    return given
 
 
 def _check_images(asked: list[Question], path: Path) -> None:
@@ -163,16 +159,6 @@ def _check_images(asked: list[Question], path: Path) -> None:
         names = ", ".join(file.name for file in missing[:MAX_FAILURES_SHOWN])
         warning = f"{len(missing)} of {len(files)} images {verb} not there: {names}"
         typer.echo(printable(warning + (", ..." if len(missing) > MAX_FAILURES_SHOWN else "")), err=True)
-
-
-def _defaults(text: str | None) -> dict[str, Any]:
-    try:
-        given = json.loads(text or "{}")
-    except ValueError as error:
-        raise InvalidRequest(f"--request is no JSON: {error}.") from error
-    if not isinstance(given, dict):
-        raise InvalidRequest(f"--request must be an object, got {type(given).__name__}.")
-    return given
 
 
 def _check(question: Question, kind: JobKind) -> None:

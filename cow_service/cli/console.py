@@ -7,7 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,7 +31,17 @@ from cow_service.errors import CowError, InvalidRequest
 from cow_service.jobs.inspection import unserved_jobs
 from cow_service.jobs.overview import remedy, told
 from cow_service.media.images import DecodedImage
-from cow_service.records import DIRECTED_KINDS, Answer, BackendInfo, Models, Simulation, Unserved, Verdict
+from cow_service.records import (
+    DIRECTED_KINDS,
+    Answer,
+    BackendInfo,
+    Models,
+    Simulation,
+    Unserved,
+    Verdict,
+    artifacts_of,
+    documents_of,
+)
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.requests.values import field_errors
 from cow_service.service import Service
@@ -77,7 +87,7 @@ def run_answer(service: Service, image: Path, body: dict[str, Any], out: Path | 
     request, decoded = read_request(service, image, body, AnswerRequest)
     with stages_shown(console) as show:
         answer = service.answer(request, show, decoded)
-    written = [] if out is None else _save_answer(service, answer, out)
+    written = [] if out is None else save(service, answer, out)
     if as_json:
         print(answer.model_dump_json(indent=2))
         return
@@ -152,16 +162,15 @@ def make_folder(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
 
 
-def save(service: Service, simulation: Simulation, out: Path) -> list[str]:
-    """Writes frames, video, overlay and simulation.json into a folder; returns their names."""
-    files = dict(simulation.pictures)
-    if simulation.video is not None:
-        files["video.mp4"] = simulation.video.sha256
+def save(service: Service, result: Simulation | Answer, out: Path) -> list[str]:
+    """Writes frames, video, overlay and the result as JSON into a folder; returns their names."""
+    artifacts, documents = artifacts_of(result), documents_of(result)
     with writable(out):
-        for name, sha256 in files.items():
+        for name, sha256 in artifacts.items():
             (out / name).write_bytes(service.artifacts.read(sha256))
-        (out / "simulation.json").write_text(simulation.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    return [*files, "simulation.json"]
+        for name, text in documents.items():
+            (out / name).write_text(text, encoding="utf-8")
+    return [*artifacts, *documents]
 
 
 def _save_formats(out: Path, formats: Sequence[str]) -> list[str]:
@@ -196,17 +205,12 @@ def print_models(models: Models, *, as_json: bool) -> None:
     table = Table("role", "name", "ready", "what it is", box=None, pad_edge=False)
     for role, backends in (("reader", models.readers), ("generator", models.generators)):
         for backend in backends:
-            table.add_row(
-                role, backend.name + (" (default)" if backend.default else ""), _readiness(backend), backend.summary
-            )
+            words = escape(readiness_words(backend))
+            ready = words if backend.ready is None else f"[{'green' if backend.ready else 'yellow'}]{words}[/]"
+            table.add_row(role, backend.name + (" (default)" if backend.default else ""), ready, backend.summary)
     console = Console()
     console.print(table)
     console.print(f"\nCOW_MLLM takes one of these, or provider:model: {', '.join(models.mllms)}", highlight=False)
-
-
-def _readiness(backend: BackendInfo) -> str:
-    words = escape(readiness_words(backend))
-    return words if backend.ready is None else f"[{'green' if backend.ready else 'yellow'}]{words}[/]"
 
 
 def _stage_lines(simulation: Simulation) -> dict[Stage, str]:
@@ -224,13 +228,6 @@ def _stage_lines(simulation: Simulation) -> dict[Stage, str]:
         "trajectory": f"{encounters_words(trajectory)}, law {trajectory.law}",
         "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
     }
-
-
-def _save_answer(service: Service, answer: Answer, out: Path) -> list[str]:
-    written = [] if answer.simulation is None else save(service, answer.simulation, out)
-    with writable(out):
-        (out / "answer.json").write_text(answer.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    return [*written, "answer.json"]
 
 
 def _answer_table(answer: Answer) -> Table:
@@ -310,14 +307,23 @@ def examine(service: Service) -> Report:
     except CowError as error:
         problem = f"{error.code}: {error.detail}"
     models = service.models()
-    unserved, jobs_problem = _unserved(service)
+    unserved: tuple[Unserved, ...] = ()
+    jobs_problem = None
+    try:
+        unserved = unserved_jobs(service.settings)
+    except CowError as error:
+        jobs_problem = f"{error.code}: {error.detail}"
+    installed = {distribution.name.lower(): distribution.version for distribution in distributions()}
+    folder = service.settings.data_dir
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
     return Report(
         cow=__version__,
         python=platform.python_version(),
         platform=f"{sys.platform} {platform.machine()}",
-        packages={name: _installed(name) for name in PACKAGES},
+        packages={name: installed.get(name) for name in PACKAGES},
         data_folder=str(service.settings.data_dir),
-        free_disk_gb=_free_disk(service),
+        free_disk_gb=round(shutil.disk_usage(folder).free / 1e9, 1),
         problem=problem,
         backends=[*models.readers, *models.generators],
         unserved=list(unserved),
@@ -354,25 +360,3 @@ def print_report(report: Report, *, as_json: bool) -> None:
         console.print(f"[red]{escape(report.jobs_problem)}[/]", highlight=False, soft_wrap=True)
     for one in report.unserved:
         console.print(f"[yellow]{escape(f'{told(one)} {remedy(one)}')}[/]", highlight=False, soft_wrap=True)
-
-
-def _unserved(service: Service) -> tuple[tuple[Unserved, ...], str | None]:
-    """Jobs that no process takes, or why that is not known."""
-    try:
-        return unserved_jobs(service.settings), None
-    except CowError as error:
-        return (), f"{error.code}: {error.detail}"
-
-
-def _installed(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _free_disk(service: Service) -> float | None:
-    folder = service.settings.data_dir
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return round(shutil.disk_usage(folder).free / 1e9, 1)

@@ -111,33 +111,16 @@ def run(
 
     Exit code 0: all were asked; 3: some failed, with their reasons in the report; 1: the run could not begin or go on.
     """
+    given = locals()
     _check_installed()
     from cow_service.evals.plan import Plan  # noqa: PLC0415
     from cow_service.evals.run import evaluate  # noqa: PLC0415
     from cow_service.evals.runs import REPORT  # noqa: PLC0415
 
     arms = [name.strip() for text in arm or ["never,always"] for name in text.split(",") if name.strip()]
-    plan = Plan(
-        data=data,
-        out=out,
-        mllm=mllm,
-        ask=ask or ("answer" if mllm is None else "prompt"),
-        arms=arms,
-        repeats=repeats,
-        subsets=tuple(subset or ()),
-        limit=limit,
-        seed=seed,
-        reader=reader,
-        generator=generator,
-        url=url,
-        base_url=base_url,
-        temperature=temperature,
-        max_tokens=max_tokens,
-        concurrency=concurrency,
-        skip_faulty=skip_faulty,
-        retry_failed=retry_failed,
-        log_images=log_images,
-    )
+    fields: dict[str, Any] = {name: given[name] for name in Plan.__dataclass_fields__.keys() & given.keys()}
+    fields |= {"ask": ask or ("answer" if mllm is None else "prompt"), "arms": arms, "subsets": tuple(subset or ())}
+    plan = Plan(**fields)
     priced = _priced(prices)
     try:
         done = evaluate(plan, lambda told: typer.echo(printable(told), err=True))

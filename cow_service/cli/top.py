@@ -15,7 +15,7 @@ from rich.text import Text
 from cow_service.cli.options import printable
 from cow_service.client import Client
 from cow_service.errors import CowError, InvalidRequest
-from cow_service.records import GpuMemory, ProcessInfo, WorkerInfo, WorkerJob, Workers
+from cow_service.records import ProcessInfo, WorkerInfo, WorkerJob, Workers
 
 REFRESH_SECONDS = 1.0
 TIMEOUT_SECONDS = 5.0  # that the server may say nothing
@@ -120,7 +120,11 @@ def _workers(workers: Iterable[WorkerInfo]) -> Table:
         for number, row in enumerate(rows):
             table.add_row(*(left if number == 0 else ("", "", "", "")), *row)
         for gpu in worker.gpus:
-            table.add_row(Text(f"    {printable(gpu.device)}", style="dim"), "", _gpu(gpu))
+            table.add_row(
+                Text(f"    {printable(gpu.device)}", style="dim"),
+                "",
+                f"{gpu.reserved_mb / 1e3:.1f}/{gpu.total_mb / 1e3:.0f} GB",
+            )
     return table
 
 
@@ -129,10 +133,6 @@ def _job(job: WorkerJob) -> tuple[Text, Text, RenderableType, str]:
     bar = Table.grid(padding=(0, 1))
     bar.add_row(ProgressBar(total=1.0, completed=job.progress, width=BAR_WIDTH), f"{job.progress:4.0%}")
     return Text(named), Text(printable(job.stage or "-")), bar, _duration(job.seconds)
-
-
-def _gpu(gpu: GpuMemory) -> str:
-    return f"{gpu.reserved_mb / 1e3:.1f}/{gpu.total_mb / 1e3:.0f} GB"
 
 
 def _table(first: str, right: Iterable[str], gap: int = 2) -> Table:

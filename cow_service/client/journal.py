@@ -245,10 +245,10 @@ class Journal:
     def _begin(self, kind: JobKind) -> str:
         path = self.folder / "batch.json"
         with contextlib.suppress(FileNotFoundError):
-            known = _parsed(path)
             try:
+                known = json.loads(path.read_bytes())
                 version, known_kind, secret = known["version"], known["kind"], str(known["secret"])
-            except (KeyError, TypeError) as error:
+            except (KeyError, TypeError, ValueError) as error:
                 raise InvalidRequest(f"'{path}' is not that of a batch: use another folder.") from error
             if version != VERSION or known_kind != kind:
                 raise InvalidRequest(
@@ -307,13 +307,6 @@ def _line(path: Path, number: int, text: bytes) -> dict[str, Any]:
             f"'{path}' is damaged in line {number}: take that line out; its question is then asked again."
         ) from error
     return line
-
-
-def _parsed(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
-    except ValueError:
-        return None
 
 
 def _replace(path: Path, data: bytes) -> None:

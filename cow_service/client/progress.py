@@ -1,4 +1,4 @@
-"""Progress of one job on the terminal or in a notebook: with rich, with tqdm, or by a function of one's own."""
+"""Progress of a job and of a batch, on the terminal or in a notebook: with rich, tqdm, or a function of one's own."""
 
 from __future__ import annotations
 
@@ -29,18 +29,9 @@ def reporting(progress: ProgressLike) -> Generator[Callable[[Job], None] | None]
     elif progress is not True and progress not in ("rich", "tqdm"):
         raise ValueError(f"progress must be True, False, 'rich', 'tqdm' or a function, got {progress!r}")
     else:
-        with _bar(progress) as report:
+        is_rich = progress == "rich" or (progress is True and find_spec("rich") is not None)
+        with _rich() if is_rich else _tqdm() as report:
             yield report
-
-
-@contextmanager
-def _bar(kind: Literal[True, "rich", "tqdm"]) -> Generator[Callable[[Job], None]]:
-    if kind is not True:
-        with _rich() if kind == "rich" else _tqdm() as report:
-            yield report
-        return
-    with _bar("rich" if find_spec("rich") else "tqdm") as report:
-        yield report
 
 
 @contextmanager
@@ -112,10 +103,12 @@ class BatchProgress:
     def __str__(self) -> str:
         of = "" if self.total is None else f"/{self.total}"
         left = "" if self.left is None else f", {duration(self.left)} left"
-        return f"{self.done}{of} done, {self.failed} failed, {pace(self.rate)}{left}{self.note and '; '}{self.note}"
+        return (
+            f"{self.done}{of} done, {self.failed} failed, {rate_words(self.rate)}{left}{self.note and '; '}{self.note}"
+        )
 
 
-def pace(rate: float) -> str:
+def rate_words(rate: float) -> str:
     """A rate in words: per second where that is at least one, else per minute."""
     return f"{rate:.1f}/s" if rate >= 1 else f"{rate * 60:.1f}/min"
 
@@ -136,7 +129,7 @@ def progress_shown(state: BatchProgress, progress: bool) -> Generator[Callable[[
     if not progress:
         yield lambda: None
     elif sys.stderr.isatty():
-        with _bar_batch_progress(state) as update:
+        with _batch_bar(state) as update:
             yield update
     else:
         printed, note = time.monotonic(), state.note
@@ -151,7 +144,7 @@ def progress_shown(state: BatchProgress, progress: bool) -> Generator[Callable[[
 
 
 @contextmanager
-def _bar_batch_progress(state: BatchProgress) -> Generator[Callable[[], None]]:
+def _batch_bar(state: BatchProgress) -> Generator[Callable[[], None]]:
     from rich.console import Console  # noqa: PLC0415
     from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 

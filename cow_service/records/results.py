@@ -1,4 +1,4 @@
-"""What a request comes to: frames, clip, simulation, answer, and who made them."""
+"""The results of a request: frames, simulation, answer; and what the service says of itself and of its jobs."""
 
 from __future__ import annotations
 
@@ -79,26 +79,6 @@ class GeneratorInfo(Record):
 class Clip(Record):
     """Stage 4: the frames chosen for reasoning, the whole clip as video where it is wanted, and the overlay."""
 
-    frames: tuple[Frame, ...]
-    factual_frames: tuple[Frame, ...] = Field(
-        default=(), description="The same frames of the scene as it is, where something is taken away or put elsewhere."
-    )
-    video: Video | None = None
-    overlay: Artifact
-    generator: GeneratorInfo
-
-
-class Simulation(Record):
-    """The whole way from image and question to frames: what `POST /simulate` returns."""
-
-    id: str
-    status: Literal["succeeded"] = "succeeded"
-    created_at: str = Field(description="RFC 3339, UTC.")
-    question: str
-    image: ImageInfo
-    grounding: Grounding
-    motion: Motion
-    trajectory: Trajectory
     frames: tuple[Frame, ...] = Field(description="The frames chosen for reasoning.")
     factual_frames: tuple[Frame, ...] = Field(
         default=(), description="The same frames of the scene as it is, where something is taken away or put elsewhere."
@@ -108,17 +88,37 @@ class Simulation(Record):
         description="JPEG of the input with box, point, arrow and path drawn, 1280 px at most on the longer side."
     )
     generator: GeneratorInfo
+
+
+class Result(Record):
+    """What simulations and answers have in common."""
+
+    id: str
+    status: Literal["succeeded"] = "succeeded"
+    created_at: str = Field(description="RFC 3339, UTC.")
+    question: str
+    image: ImageInfo
     reader: ReaderInfo
-    usage: Usage = Field(default=Usage(), description="What this request cost: not of stages that are `reused`.")
+    usage: Usage = Field(
+        default=Usage(), description="What this request cost, everything together, but not stages that are `reused`."
+    )
     usage_total: Usage = Field(
         default_factory=_usage_of,
         description="What it would have cost without reuse; of results of earlier versions, what it cost.",
     )
     timings: dict[str, float] = Field(description="Seconds per stage.")
     reused: tuple[str, ...] = Field(
-        default=(), description="Stages whose result was found again: an earlier request had asked for the same."
+        default=(), description="Stages whose cached result was used: an earlier request had asked for the same."
     )
     warnings: tuple[str, ...] = ()
+
+
+class Simulation(Clip, Result):
+    """The whole way from image and question to frames: what `POST /simulate` returns."""
+
+    grounding: Grounding
+    motion: Motion
+    trajectory: Trajectory
 
     @property
     def overlay_name(self) -> str:
@@ -215,40 +215,21 @@ class Gate(Record):
     )
 
 
-class Answer(Verdict):
+class Answer(Verdict, Result):
     """The way from image and question to an answer: what `POST /answer` returns."""
 
-    id: str
-    status: Literal["succeeded"] = "succeeded"
-    created_at: str = Field(description="RFC 3339, UTC.")
-    question: str
     options: tuple[AnswerOption, ...] = Field(description="From the request or the question; empty where it is open.")
     options_source: OptionsSource = Field(
         default="none",
         description="Where they stand: in the request, in the question with letters, or there as a list without (which "
         "get A, B, C...).",
     )
-    image: ImageInfo
     simulation: Simulation | None = Field(description="Null where nothing was imagined, or that failed.")
     simulation_problem: Problem | None = Field(default=None, description="Why imagining failed, where it did.")
     gate: Gate | None = Field(default=None, description="Of `imagine: auto`; else null.")
     baseline: Verdict | None = Field(
         description="The answer without frames, where it was asked for; of `imagine: auto`, that of the gate."
     )
-    reader: ReaderInfo
-    usage: Usage = Field(
-        description="What this request cost, everything together: gate, simulation, votes and baseline, but not stages "
-        "that are `reused`."
-    )
-    usage_total: Usage = Field(
-        default_factory=_usage_of,
-        description="What it would have cost without reuse; of results of earlier versions, what it cost.",
-    )
-    timings: dict[str, float] = Field(description="Seconds per stage.")
-    reused: tuple[str, ...] = Field(
-        default=(), description="Stages whose result was found again: an earlier request had asked for the same."
-    )
-    warnings: tuple[str, ...] = ()
 
 
 VIDEO_FILE = "video.mp4"
