@@ -16,7 +16,9 @@ from typer.testing import CliRunner
 
 from cow_service import __version__
 from cow_service.cli.main import app
+from cow_service.cli.options import FIELDS, request_body
 from cow_service.records import Models, Simulation
+from cow_service.requests import SimulateRequest
 
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 
@@ -247,3 +249,15 @@ def test_a_setting_that_is_not_json_is_named(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert "COW_CHECKPOINTS is not JSON" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_options_have_the_defaults_of_the_fields() -> None:
+    sent = request_body()
+    default = SimulateRequest(image="data:", question="?").model_dump(mode="json")
+    for name in ("ensemble", "num_frames", "fps", "seed", "reader", "generator"):
+        assert sent[name] == default[name]
+    for name in ("count", "max_side"):
+        assert sent["frames"][name] == default["frames"][name]
+    for path in FIELDS.values():
+        record, _, field = path.partition("/")
+        assert field in SimulateRequest.model_json_schema()["$defs"][f"{record.capitalize()}Request"]["properties"]

@@ -270,7 +270,7 @@ def test_the_server_introduces_itself_and_its_tools(here: tuple[Session, Path]) 
         assert not tool.annotations.destructive_hint
     given = {"image", "question", "object", "bbox", "point", "direction", "motion_kind", "speed", "num_frames", "seed"}
     given |= {"distance", "duration", "until", "remove", "place"}
-    given |= {"law", "objects", "frames_policy", "frames_count", "generator", "reader"}
+    given |= {"asked", "law", "objects", "frames_policy", "frames_count", "generator", "reader"}
     assert set(tools["simulate"].input_schema["properties"]) == given | {"video"}
     assert set(tools["answer"].input_schema["properties"]) == given | {
         "options", "votes", "baseline", "imagine", "imagine_votes", "imagine_threshold"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from cow_service.cli.options import printable
+from cow_service.cli.options import object_in, printable
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def batch(
     from cow_service.client import Client  # noqa: PLC0415
     from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
 
-    asked = _read(questions, _object_in(request or "{}", "--request"), kind)
+    asked = _read(questions, object_in(request or "{}", "--request"), kind)
     try:
         client = Client(url)
     except ValueError as error:
@@ -118,7 +118,7 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
         if line.strip():
             try:
-                item = _object_in(line, "it")
+                item = object_in(line, "it")
                 (question,) = questions([item], defaults, path.parent)
                 _check(question, kind)
                 items.append(item)
@@ -133,16 +133,6 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
     asked = list(questions(items, defaults, path.parent))
     _check_images(asked, path)
     return asked
-
-
-def _object_in(text: str | bytes, name: str) -> dict[str, Any]:
-    try:
-        given = json.loads(text)
-    except ValueError as error:
-        raise InvalidRequest(f"{name} is not JSON: {error}.") from error
-    if not isinstance(given, dict):
-        raise InvalidRequest(f"{name} must be an object, got {type(given).__name__}.")
-    return given
 
 
 def _check_images(asked: list[Question], path: Path) -> None:

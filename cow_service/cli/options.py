@@ -168,6 +168,15 @@ def request_body(
             dir_okay=False,
         ),
     ] = None,
+    fields: Annotated[
+        str | None,
+        typer.Option(
+            "--request",
+            metavar="JSON",
+            help='Other fields of the request: {"camera": {"pitch": 25}}.',
+            show_default="none",
+        ),
+    ] = None,
     reader: Annotated[str | None, typer.Option(help="Who looks at the image.", show_default="COW_READER")] = None,
     generator: Annotated[str | None, typer.Option(help="Who makes the frames.", show_default="COW_GENERATOR")] = None,
     option: Annotated[
@@ -198,15 +207,15 @@ def request_body(
             body.setdefault(record, {})[field] = value
     body["frames"]["max_side"] = max_side or None
     if trajectory is not None:
-        body["trajectory"] = _json(trajectory)
+        body["trajectory"] = object_in(read_file(trajectory), trajectory.name)
     if body.get("grounding", {}).keys() == {"object"}:
-        points = cast("dict[str, Any]", body.get("trajectory", {})).get("points")
+        points = body.get("trajectory", {}).get("points")
         if not points:
             raise InvalidRequest(
                 "--object goes with --point, --box or --trajectory; else the question names the object."
             )
         body["grounding"]["point"] = points[0]
-    return body
+    return body | object_in(fields or "{}", "--request")
 
 
 def with_request_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -229,6 +238,17 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise FileUnreadable(f"'{path}' cannot be read: {error.strerror}. Choose another file.") from error
+
+
+def object_in(text: str | bytes, name: str) -> dict[str, Any]:
+    """The JSON object that a text is. Raises `InvalidRequest` with the name of the text."""
+    try:
+        given = json.loads(text)
+    except ValueError as error:
+        raise InvalidRequest(f"{name} is not JSON: {error}.") from error
+    if not isinstance(given, dict):
+        raise InvalidRequest(f"{name} must be an object, got {type(given).__name__}.")
+    return given
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
@@ -279,10 +299,3 @@ def _name_and_value(given: str) -> tuple[str, object]:
         return name, json.loads(text)
     except ValueError:
         return name, text
-
-
-def _json(path: Path) -> object:
-    try:
-        return json.loads(read_file(path))
-    except ValueError as error:
-        raise InvalidRequest(f"{path.name} is not JSON: {error}.") from error
