@@ -140,10 +140,22 @@ def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], 
 
 
 def print_stages(console: Console, simulation: Simulation) -> None:
-    """Prints a line for each stage: its time and its result; and what touches what, and what comes of it."""
-    for stage, line in _stage_lines(simulation).items():
+    """Prints a line for each stage: its time and its result; then the contacts and the outcome."""
+    grounding, motion, trajectory = simulation.grounding, simulation.motion, simulation.trajectory
+    x, y = grounding.point
+    way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"
+    if motion.depth:
+        way += " and towards the camera" if motion.depth < 0 else " and away from the camera"
+    speed = f", {motion.speed:.0f} px/s" if motion.kind in DIRECTED_KINDS else ""
+    video = f", {simulation.video.num_frames}-frame video" if simulation.video else ""
+    lines = {
+        "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
+        "motion": f"{motion.kind}{way}{speed}, from {motion.cue}",
+        "trajectory": f"{encounters_words(trajectory)}, law {trajectory.law}",
+        "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
+    }
+    for stage, line in lines.items():
         console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {escape(line)}")
-    trajectory = simulation.trajectory
     if contacts := contacts_words(trajectory):
         console.print(f"[dim]contacts[/]: {escape(contacts)}")
     if trajectory.outcome is not None and (outcome := outcome_words(trajectory.outcome)):
@@ -211,23 +223,6 @@ def print_models(models: Models, *, as_json: bool) -> None:
     console = Console()
     console.print(table)
     console.print(f"\nCOW_MLLM takes one of these, or provider:model: {', '.join(models.mllms)}", highlight=False)
-
-
-def _stage_lines(simulation: Simulation) -> dict[Stage, str]:
-    """The result of each stage in one line."""
-    grounding, motion, trajectory = simulation.grounding, simulation.motion, simulation.trajectory
-    x, y = grounding.point
-    way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"
-    if motion.depth:
-        way += " and towards the camera" if motion.depth < 0 else " and away from the camera"
-    speed = f", {motion.speed:.0f} px/s" if motion.kind in DIRECTED_KINDS else ""
-    video = f", {simulation.video.num_frames}-frame video" if simulation.video else ""
-    return {
-        "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
-        "motion": f"{motion.kind}{way}{speed}, from {motion.cue}",
-        "trajectory": f"{encounters_words(trajectory)}, law {trajectory.law}",
-        "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
-    }
 
 
 def _answer_table(answer: Answer) -> Table:

@@ -15,7 +15,7 @@ from rich.text import Text
 from cow_service.cli.options import printable
 from cow_service.client import Client
 from cow_service.errors import CowError, InvalidRequest
-from cow_service.records import ProcessInfo, WorkerInfo, WorkerJob, Workers
+from cow_service.records import ProcessInfo, WorkerInfo, Workers
 
 REFRESH_SECONDS = 1.0
 TIMEOUT_SECONDS = 5.0  # that the server may say nothing
@@ -52,8 +52,13 @@ def show_processes(url: str | None, *, once: bool) -> None:
 
 def picture(found: Workers, url: str) -> RenderableType:
     """Everything that a server reports, and what needs somebody."""
-    parts: list[RenderableType] = [_head(found, url), *_faults(found), Text(), _queues(found), Text()]
-    return Group(*parts, _processes(found.processes))
+    faults: list[Text] = []
+    for one in found.unserved:
+        what = f"workflow version {one.workflow_version}" if one.reason == "version" else f"queue {one.queue}"
+        jobs = f"{_number(one.jobs, 'job')} of {printable(what)}"
+        faults.append(Text(f"{jobs}: no process takes them (see `cow doctor`)", style="red"))
+    parts = _head(found, url), *faults, Text(), _queues(found), Text(), _processes(found.processes)
+    return Group(*parts)
 
 
 def with_fault(shown: RenderableType, fault: str, age: float) -> RenderableType:
@@ -71,13 +76,6 @@ def _head(found: Workers, url: str) -> Text:
         datetime.now().astimezone().strftime("%H:%M:%S"),
     )
     return text.append("  " + ", ".join(counts), style="not bold")
-
-
-def _faults(found: Workers) -> Iterable[Text]:
-    for one in found.unserved:
-        what = f"workflow version {one.workflow_version}" if one.reason == "version" else f"queue {one.queue}"
-        told = f"{_number(one.jobs, 'job')} of {printable(what)}: no process takes them (see `cow doctor`)"
-        yield Text(told, style="red")
 
 
 def _queues(found: Workers) -> Table:
@@ -116,7 +114,13 @@ def _workers(workers: Iterable[WorkerInfo]) -> Table:
     table.add_column("time", justify="right", no_wrap=True)
     for worker in workers:
         left = Text(f"  {printable(worker.name)}"), str(worker.pid), f"{worker.memory_mb:.0f} MB", str(worker.jobs_done)
-        rows = [_job(job) for job in worker.jobs] or [(Text("idle", style="dim"), Text(), Text(), "")]
+        rows: list[tuple[Text, Text, RenderableType, str]] = []
+        for job in worker.jobs:
+            named = f"{job.kind} {printable(job.id)[:ID_LENGTH]}" if job.id else job.kind
+            bar = Table.grid(padding=(0, 1))
+            bar.add_row(ProgressBar(total=1.0, completed=job.progress, width=BAR_WIDTH), f"{job.progress:4.0%}")
+            rows.append((Text(named), Text(printable(job.stage or "-")), bar, _duration(job.seconds)))
+        rows = rows or [(Text("idle", style="dim"), Text(), Text(), "")]
         for number, row in enumerate(rows):
             table.add_row(*(left if number == 0 else ("", "", "", "")), *row)
         for gpu in worker.gpus:
@@ -126,13 +130,6 @@ def _workers(workers: Iterable[WorkerInfo]) -> Table:
                 f"{gpu.reserved_mb / 1e3:.1f}/{gpu.total_mb / 1e3:.0f} GB",
             )
     return table
-
-
-def _job(job: WorkerJob) -> tuple[Text, Text, RenderableType, str]:
-    named = f"{job.kind} {printable(job.id)[:ID_LENGTH]}" if job.id else job.kind
-    bar = Table.grid(padding=(0, 1))
-    bar.add_row(ProgressBar(total=1.0, completed=job.progress, width=BAR_WIDTH), f"{job.progress:4.0%}")
-    return Text(named), Text(printable(job.stage or "-")), bar, _duration(job.seconds)
 
 
 def _table(first: str, right: Iterable[str], gap: int = 2) -> Table:

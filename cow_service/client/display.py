@@ -16,7 +16,6 @@ from cow_service.records import (
     BackendInfo,
     Contact,
     Encounter,
-    Frame,
     Gate,
     Outcome,
     Simulation,
@@ -227,7 +226,7 @@ def _body(simulation: Simulation, get: GetBytes) -> str:
     if simulation.video is not None:
         large.append(_video(get(simulation.video.sha256), simulation.video))
     frames = [
-        _picture(get(frame.sha256), frame.width / frame.height, SMALL_PX, _caption(frame))
+        _picture(get(frame.sha256), frame.width / frame.height, SMALL_PX, f"frame {frame.index}, {frame.time:.2f} s")
         for frame in simulation.frames
     ]
     shown = _row(large) + _row(frames)
@@ -242,10 +241,6 @@ def _body(simulation: Simulation, get: GetBytes) -> str:
     if trajectory.moving_until is not None:
         told.append(f"Nothing moves in the image from {trajectory.moving_until:.1f} s on.")
     return shown + "".join(f"<div>{escape(text)}</div>" for text in told) + _warnings(simulation.warnings)
-
-
-def _caption(frame: Frame) -> str:
-    return f"frame {frame.index}, {frame.time:.2f} s"
 
 
 def _row(figures: Sequence[str]) -> str:
@@ -315,7 +310,13 @@ class Models(records.Models):
 
     def _repr_html_(self) -> str:
         head = "".join(f'<th style="{_CELL}">{heading}</th>' for heading in HEADINGS)
-        rows = "".join(f"<tr>{_cells(role, backend)}</tr>" for role, backend in self._backends())
+        rows = ""
+        for role, backend in self._backends():
+            name = f'<b>{escape(_name(backend))}</b><div style="{DIM_STYLE}">{escape(backend.summary)}</div>'
+            commands = "".join(f"<div><code>{escape(command)}</code></div>" for command in _commands(backend))
+            words = escape(readiness_words(backend)), escape(backend.licence or ""), escape(backend.weights or "none")
+            cells = "".join(f'<td style="{_CELL}">{cell}</td>' for cell in (role, name, *words, commands))
+            rows += f"<tr>{cells}</tr>"
         table = f'<table style="border-collapse:collapse"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
         table = f'<div style="overflow-x:auto">{table}</div>'
         named = escape(", ".join(self.mllms)) or "none"
@@ -333,13 +334,6 @@ def _name(backend: BackendInfo) -> str:
 def _commands(backend: BackendInfo) -> tuple[str, ...]:
     """The commands that bring what is missing."""
     return tuple(filter(None, (backend.install, backend.pull)))
-
-
-def _cells(role: str, backend: BackendInfo) -> str:
-    name = f'<b>{escape(_name(backend))}</b><div style="{DIM_STYLE}">{escape(backend.summary)}</div>'
-    commands = "".join(f"<div><code>{escape(command)}</code></div>" for command in _commands(backend))
-    said = escape(readiness_words(backend)), escape(backend.licence or ""), escape(backend.weights or "none")
-    return "".join(f'<td style="{_CELL}">{cell}</td>' for cell in (role, name, *said, commands))
 
 
 class HeldFiles:

@@ -80,7 +80,11 @@ def questions(
     same: dict[str, int] = {}
     for place, item in enumerate(items, 1):
         question = _read_item(item, place, defaults, folder)
-        question = replace(question, options=_sendable_fields(question.options, place))
+        try:
+            if _CONVERTED & question.options.keys():
+                question = replace(question, options=request_fields(question.options))
+        except CowError as error:
+            raise InvalidRequest(f"Question {place}: {error.detail}", errors=error.errors) from error
         if question.id == "":
             made = _checked(question, place).fingerprint[:16]
             times = same[made] = same.get(made, 0) + 1
@@ -111,14 +115,6 @@ def _read_item(item: Any, place: int, defaults: Mapping[str, Any], folder: Path 
     if folder is not None and isinstance(image, str) and not is_url(image):
         image, named = folder / image, image  # the same question, from wherever the folder is looked at
     return Question("" if own is None else str(own), image, question, {**defaults, **given}, meta, named)
-
-
-def _sendable_fields(options: Mapping[str, Any], place: int) -> Mapping[str, Any]:
-    """The fields of the request, with masks that JSON can hold. Raises `InvalidRequest` naming the question."""
-    try:
-        return request_fields(options) if _CONVERTED & options.keys() else options
-    except CowError as error:
-        raise InvalidRequest(f"Question {place}: {error.detail}", errors=error.errors) from error
 
 
 def _checked(question: Question, place: int) -> Question:
@@ -257,7 +253,12 @@ class Journal:
                 )
             return secret
         secret = secrets.token_hex(16)
-        _replace(path, json.dumps({"version": VERSION, "kind": kind, "secret": secret}, indent=2).encode() + b"\n")
+        beside = path.with_name(path.name + ".new")
+        with beside.open("wb") as file:
+            file.write(json.dumps({"version": VERSION, "kind": kind, "secret": secret}, indent=2).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
         return secret
 
     def _set_failures_aside(self) -> None:
@@ -307,12 +308,3 @@ def _line(path: Path, number: int, text: bytes) -> dict[str, Any]:
             f"'{path}' is damaged in line {number}: take that line out; its question is then asked again."
         ) from error
     return line
-
-
-def _replace(path: Path, data: bytes) -> None:
-    beside = path.with_name(path.name + ".new")
-    with beside.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)

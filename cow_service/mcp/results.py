@@ -180,19 +180,17 @@ _JPEG, _PNG = "image/jpeg", "image/png"
 
 def fit_pictures(pictures: Sequence[bytes]) -> list[tuple[str, bytes]]:
     """Media types and pictures of at most `MAX_SIDE_PX` on the longest side and `MAX_BYTES` together."""
-    fitted = [_fit(picture) for picture in pictures]
+    fitted: list[tuple[str, bytes]] = []
+    for data in pictures:
+        with Image.open(io.BytesIO(data)) as picture:
+            kind = "JPEG" if picture.format == "JPEG" else "PNG"
+            is_small = max(picture.size) <= MAX_SIDE_PX
+        fitted.append((_JPEG if kind == "JPEG" else _PNG, data if is_small else _shrink(data, 1.0, kind)))
     for quality, scale in _SMALLER:
         if sum(len(data) for _, data in fitted) <= MAX_BYTES:
             break
         fitted = [(_JPEG, _shrink(picture, scale, "JPEG", quality=quality)) for picture in pictures]
     return fitted
-
-
-def _fit(data: bytes) -> tuple[str, bytes]:
-    with Image.open(io.BytesIO(data)) as picture:
-        kind = "JPEG" if picture.format == "JPEG" else "PNG"
-        is_small = max(picture.size) <= MAX_SIDE_PX
-    return _JPEG if kind == "JPEG" else _PNG, data if is_small else _shrink(data, 1.0, kind)
 
 
 def _shrink(data: bytes, scale: float, kind: str, **options: int) -> bytes:

@@ -11,7 +11,6 @@ import sys
 from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
-from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import anyio
@@ -247,17 +246,10 @@ def with_own_keys(connect: Connect, *, everybody: bool) -> Connect:
 def protection(host: str, names: Sequence[str]) -> TransportSecuritySettings:
     """The allowed `Host` and `Origin` headers: a page may give its own name this address (DNS rebinding)."""
     given = [socket.gethostname() if host in WILDCARDS else host, *names]
-    hosts = dict.fromkeys([*LOOPBACK, *(f"[{name}]" if _is_ipv6(name) else name.lower() for name in given)])
+    hosts = dict.fromkeys([*LOOPBACK, *(f"[{name}]" if name.count(":") > 1 else name.lower() for name in given)])
     both = [form for name in hosts for form in (name, f"{name}:*")]
     return TransportSecuritySettings(
         enable_dns_rebinding_protection=True,
         allowed_hosts=both,
         allowed_origins=[f"{scheme}://{form}" for form in both for scheme in ("http", "https")],
     )
-
-
-def _is_ipv6(name: str) -> bool:
-    try:
-        return ip_address(name).version == 6
-    except ValueError:
-        return False
