@@ -162,7 +162,7 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers with commas between"),
         ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),
         ([QUESTION, "--distance", "-5"], 1, "motion.distance: Input should be greater than 0, got -5"),
-        ([QUESTION, "--kind", "projectile"], 1, "goes with --direction"),
+        ([QUESTION, "--kind", "projectile"], 1, "needs a `direction`"),
         ([QUESTION, "--object", "x"], 1, "goes with --point, --box or --trajectory"),
         ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: ati, cutout,"),
         ([QUESTION, "--option", "steps"], 1, "--option takes NAME=VALUE"),

@@ -115,34 +115,34 @@ def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, An
     return request
 
 
-def inlined(
-    schema: dict[str, Any], exclude: Mapping[str, Any] | None = None, records: dict[str, Any] | None = None
-) -> dict[str, Any]:
+def inlined(schema: dict[str, Any], exclude: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """A JSON schema with each reference replaced, and without what costs a model's attention and says nothing.
 
-    That is titles, null (which may always be given) and defaults of null. `exclude` has fields that are left out, in
-    the form that `BaseModel.model_dump` takes.
+    That is titles and defaults of null; in arguments also null itself, which may always be given. Of results, `exclude`
+    has the fields that are left out, in the form that `BaseModel.model_dump` takes.
     """
-    exclude = exclude or {}
-    records = dict(schema.get("$defs", {})) if records is None else records
-    if (reference := schema.get("$ref")) is not None:
-        schema = records[reference.rpartition("/")[2]] | {key: each for key, each in schema.items() if key != "$ref"}
-    choices = [one for one in schema.get("anyOf", ()) if one != {"type": "null"}]
-    if len(choices) == 1:
-        merged = {key: each for key, each in schema.items() if key != "anyOf"}
-        return inlined(choices[0] | merged, exclude, records)
-    needless = ("$defs", "title") if schema.get("default", ...) is not None else ("$defs", "title", "default")
-    found = {key: each for key, each in schema.items() if key not in needless}
-    for key in ("anyOf", "oneOf", "prefixItems"):
-        if key in found:
-            found[key] = [inlined(one, exclude, records) for one in found[key]]
-    if isinstance(found.get("items"), dict):
-        found["items"] = inlined(found["items"], exclude.get("__all__"), records)
-    if "properties" in found:
-        kept = {name: one for name, one in found["properties"].items() if exclude.get(name) is not True}
-        found["properties"] = {name: inlined(one, exclude.get(name), records) for name, one in kept.items()}
-        found["required"] = [name for name in found.get("required", ()) if name in kept]
-    return found
+    records = schema.get("$defs", {})
+
+    def walk(schema: dict[str, Any], left_out: Mapping[str, Any]) -> dict[str, Any]:
+        if (reference := schema.get("$ref")) is not None:
+            schema = records[reference.rpartition("/")[2]] | {key: one for key, one in schema.items() if key != "$ref"}
+        choices = [one for one in schema.get("anyOf", ()) if one != {"type": "null"}]
+        if len(choices) == 1 and exclude is None:
+            return walk(choices[0] | {key: one for key, one in schema.items() if key != "anyOf"}, left_out)
+        needless = {"$defs", "title"} | ({"default"} if schema.get("default", ...) is None else set[str]())
+        found = {key: one for key, one in schema.items() if key not in needless}
+        for key in ("anyOf", "oneOf", "prefixItems"):
+            if key in found:
+                found[key] = [walk(one, left_out) for one in found[key]]
+        if isinstance(found.get("items"), dict):
+            found["items"] = walk(found["items"], left_out.get("__all__", {}))
+        if "properties" in found:
+            kept = {name: one for name, one in found["properties"].items() if left_out.get(name) is not True}
+            found["properties"] = {name: walk(one, left_out.get(name, {})) for name, one in kept.items()}
+            found["required"] = [name for name in found.get("required", ()) if name in kept]
+        return found
+
+    return walk(schema, exclude or {})
 
 
 def _record_of(properties: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
