@@ -49,9 +49,9 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     if reading is None:
         names = (name for name in run.request.changed_names if not any(same_name(name, o.object) for o in given))
         reading = run.reader.ground(replace(run.reader_input("grounding"), known=given, sought=tuple(names)))
-    trail_named = run.question.trail_named or (reading.hints is not None and reading.hints.cue == "trail")
+    shows_trail = run.question.trail_named or (reading.hints is not None and reading.hints.cue == "trail")
     with run.cpu():
-        scene = run.scene_with(reading.bbox, trail_named)
+        scene = run.scene_with(reading.bbox, shows_trail)
         mask = _store_mask(run, scene.silhouette(reading.bbox) if reading.mask is None else reading.mask)
         drawings = _drawings_not_named(scene, run.question.drawings_named)
     mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
@@ -72,7 +72,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         interventions=interventions,
         prior=reading.prior,
         asked=reading.asked if run.request.asked is None else Asked(**dict(run.request.asked)),
-        trail_named=trail_named,
+        trail_named=run.question.trail_named,
         source=source,
     )
     return StageResult(

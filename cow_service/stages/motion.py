@@ -241,7 +241,7 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         reading = MotionReading("place", None, "request")
     else:
         with run.cpu():
-            given_reader = run.reader_input("motion", run.scene_of(grounding))
+            given_reader = run.reader_input("motion", run.scene_of(grounding, None if hints is None else hints.cue))
         reading, source = run.reader.read_motion(given_reader, grounding, hints), run.reader.source
         if run.request.motion is not None:
             reading = _with_lengths(reading, run.request.motion)
