@@ -15,9 +15,9 @@ from cow_service.generators.cutout import CutoutGenerator, CutoutOptions
 from cow_service.narration import facts_of
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding, Intervention, LocatedObject, Motion, Trajectory
-from cow_service.stages.bodies import obstacles_of
 from cow_service.stages.grounding import understood
 from cow_service.stages.motion import read_motion
+from cow_service.stages.reconstruction import obstacles_of
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
 

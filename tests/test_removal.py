@@ -18,6 +18,7 @@ from cow_service.generators.cutout import CutoutGenerator, create
 from cow_service.media.images import decode_own
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
+from cow_service.physics.ensemble import run_ensemble
 from cow_service.physics.events import find_world_events
 from cow_service.physics.outcome import Query
 from cow_service.physics.world import WorldInput, run_world
@@ -27,7 +28,7 @@ from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
-from cow_service.stages.trajectory import compute_trajectory, imagine
+from cow_service.stages.trajectory import compute_trajectory
 from cow_service.vision.masks import CroppedMask, Image
 
 RED, BLUE, GREEN = (200, 30, 30), (40, 60, 200), (40, 160, 60)
@@ -107,7 +108,7 @@ class TestWorlds:
             bodies = (mover, post, other)
             world = WorldInput(bodies, _moving(camera, half), known(camera), camera.size, 65, 16.0, taken=(taken,))
             asked = Asked(form="changes", relation="touches", target="post", negated=negated)
-            changed, factual = imagine(world, Query(asked, target=1), 9)
+            changed, factual = run_ensemble(world, Query(asked, target=1), 9)
             assert changed.decided is not None
             assert factual.query is not None
             assert (changed.decided.probability, changed.decided.sure) == (changes, True)

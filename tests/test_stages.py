@@ -19,7 +19,8 @@ from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
 from cow_service.stages.keys import KEY_FIELDS, key_of
 from cow_service.stages.motion import read_motion
-from cow_service.stages.trajectory import trajectory_of
+from cow_service.stages.reconstruction import Situation
+from cow_service.stages.trajectory import simulate_world
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.scene import Obstacle, Scene
 
@@ -53,7 +54,7 @@ def rolled(
     """The trajectory under the paper's law, whose paths are known in closed form."""
     request = run(scene, trajectory=path, num_frames=frames, fps=fps, ensemble=0).request
     ballistic = motion.model_copy(update={"law": "ballistic"})
-    return trajectory_of(scene, grounded(scene, **POINT), ballistic, obstacles, request)
+    return simulate_world(Situation(scene, grounded(scene, **POINT), ballistic, request, obstacles))
 
 
 def test_a_point_grounds_the_object_under_it(scene: Scene) -> None:

@@ -15,7 +15,8 @@ from runs import run_of
 from cow_service.records import Grounding, LocatedObject, ObjectPrior, Trajectory
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
-from cow_service.stages.trajectory import compute_trajectory, trajectory_of
+from cow_service.stages.reconstruction import Situation
+from cow_service.stages.trajectory import compute_trajectory, simulate_world
 from cow_service.vision.masks import CroppedMask, Image
 from cow_service.vision.scene import Obstacle, Scene
 
@@ -231,7 +232,7 @@ def seen(mover, others, prior: ObjectPrior | None = None, **request: Any) -> Tra
     grounding = Grounding(object="ball", bbox=mover, point=middle, prior=prior, others=tuple(named), source="request")
     SEEN.preset_mask(mover, lambda: masked(mover).full())
     obstacles = [Obstacle(other.object, other.bbox, masked(other.bbox)) for other in named]
-    return trajectory_of(SEEN, grounding, read_motion(run, grounding, None).value, obstacles, run.request)
+    return simulate_world(Situation(SEEN, grounding, read_motion(run, grounding, None).value, run.request, obstacles))
 
 
 BAD: dict[str, dict[str, Any]] = {

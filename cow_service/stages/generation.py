@@ -16,8 +16,8 @@ from cow_service.media.images import encode_jpeg, encode_png, fit_within
 from cow_service.media.overlay import Replaced, draw_overlay
 from cow_service.records import BBox, Clip, Frame, Grounding, Motion, PlacedBefore, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
-from cow_service.stages.bodies import obstacles_of
 from cow_service.stages.keys import StageResult
+from cow_service.stages.reconstruction import obstacles_of
 from cow_service.stages.run import Run
 from cow_service.vision.masks import Image, Mask
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from cow_service.errors import FieldError, InvalidRequest
-from cow_service.narration import bare_name, direction_words, same_name
+from cow_service.narration import bare_name, direction_words, place_words, same_name
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.physics.trail_fit import fit_throw, straight_direction
 from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
@@ -36,10 +36,9 @@ from cow_service.requests import (
     SimulateRequest,
     TrajectoryRequest,
 )
-from cow_service.stages.bodies import camera_of
 from cow_service.stages.grounding import placed_mover
 from cow_service.stages.keys import StageResult
-from cow_service.stages.placing import placing_sentence
+from cow_service.stages.reconstruction import camera_of
 from cow_service.stages.run import Run
 from cow_service.vision.scene import Scene
 from cow_service.vision.trails import Trail, trail_of
@@ -246,7 +245,11 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         if run.request.motion is not None:
             reading = _with_lengths(reading, run.request.motion)
     if placed is not None and reading.kind == "place":
-        reading = replace(reading, sentence=reading.sentence or placing_sentence(grounding, placed))
+        reading = replace(
+            reading,
+            sentence=reading.sentence
+            or f"The {bare_name(grounding.object)} is lifted, carried over and put {place_words(placed)}",
+        )
     if run.request.motion is not None and run.request.motion.others:
         reading = replace(reading, others=given_others(run.request.motion.others, grounding))
     reading, unused = _fitting(reading)

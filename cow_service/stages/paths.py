@@ -1,16 +1,22 @@
-"""Records of a world that was run: its camera, its bodies, their paths and contacts."""
+"""The trajectory of worlds that were run: camera, bodies, paths, contacts, placements."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from cow_service.errors import CannotGround
+from cow_service.narration import cannot_stay, place_words
+from cow_service.physics.ballistic import FreePath, latest, sampled
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit, FloorCamera
-from cow_service.physics.events import WorldEvents
+from cow_service.physics.ensemble import EnsembleResult
+from cow_service.physics.events import WorldEvents, encounters
+from cow_service.physics.placement import Placements
 from cow_service.physics.projection import (
     SeenPaths,
     points_inside,
@@ -18,17 +24,155 @@ from cow_service.physics.projection import (
     rotation_where_put,
     seen_paths,
     shares,
+    spread_anchors,
     states,
+    swept,
 )
 from cow_service.physics.world import Worlds
-from cow_service.records import BBox, Body, CameraDeviations, CameraEstimate, Contact, Path, Point
+from cow_service.records import (
+    BBox,
+    Body,
+    CameraDeviations,
+    CameraEstimate,
+    Contact,
+    Path,
+    PlacedBefore,
+    Placement,
+    Point,
+    Trajectory,
+)
 from cow_service.records.world import BAND_PERCENTILES
+from cow_service.stages.reconstruction import Situation, placed_before
 from cow_service.vision.masks import CroppedMask, Floats, turning
 
 UPRIGHT = 1.0  # degrees: with less, the box of what leans stays that of what stands upright
+MOVED = 0.5  # px: what moves less in the image stays where it is
+PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
+SETTLED = 0.25  # px per frame: what moves less is at rest
+LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
+MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are told
+FUTURE_DECIMALS, BAND_DECIMALS, POINT_DECIMALS = 1, 2, 3  # px: more digits say nothing and are half of a result
+STATE_DECIMALS, SCALE_DECIMALS, ROTATION_DECIMALS = 5, 6, 3  # m and m/s; of the size at first; degrees
+LEAST_STAYING = 0.5  # of the worlds: what stays in fewer where it is put is refused
 
 
-def shown_bodies(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[SeenBody, ...]:
+def record_trajectory(situation: Situation, result: EnsembleResult, path: FreePath | None) -> Trajectory:
+    """The record of one world that is shown, and of the ensemble around it; `path` is one that no contact changes.
+
+    Raises `CannotGround` for what does not stay where it is put.
+    """
+    world, shown, request = result.world, result.shown.worlds, situation.request
+    grounding, around = situation.grounding, None if result.ensemble is None else result.ensemble.worlds
+    camera, bodies = camera_record(world.fit, shown, around), _shown_bodies(world.bodies, shown)
+    if path is None:
+        paths = path_records(world.bodies, grounding.point, shown, situation.size, around)
+    else:
+        paths = (_free_record(world.bodies[0], situation, path),)
+    paths = _with_times(paths, result.shown.events)
+    light = shown.scene.light
+    return Trajectory(
+        law="contact" if path is None else "ballistic",
+        fps=request.fps,
+        camera=camera,
+        bodies=body_records(bodies, shown),
+        paths=paths,
+        contacts=contact_records(shown, FloorCamera.of(camera, *situation.size)),
+        light=(float(light[0, 0]), float(light[0, 1])) if world.fit.source == "shadow" else None,
+        moving_until=moving_until(paths, request.fps),
+        anchors=_anchors(bodies, situation, paths, shown),
+        encounters=encounters(
+            result.shown.events,
+            None if result.ensemble is None else result.ensemble.events,
+            bodies,
+            request.fps,
+            request.num_frames,
+            result.query is not None and result.query.asked.partly,
+        ),
+        encounters_known=situation.is_separated,
+        placement=None
+        if shown.placements is None
+        else _placement(grounding.object, shown.placements, None if around is None else around.placements),
+        placed=_placed_records(situation, result),
+        ensemble=request.ensemble,
+    )
+
+
+def _free_record(mover: SeenBody, situation: Situation, path: FreePath) -> Path:
+    """The mover's path as it was given, or as the ballistic law has it."""
+    given, times = situation.request.trajectory, np.arange(len(path.points)) / situation.request.fps
+    if given is not None and given.tracks is not None:
+        found = [sampled(np.array(track), given.fps, times) for track in given.tracks]
+    else:
+        start = np.array(situation.grounding.point)
+        found = tracks(mover, start, path.points, path.scale, np.zeros(len(times)))
+    seen = None
+    if given is not None and given.tracks_visible is not None:
+        frames = latest(given, times)
+        seen = tuple(tuple(track[frame] for frame in frames) for track in given.tracks_visible)
+    return Path(
+        states=tuple(tuple(state) for state in path.states.tolist()),
+        points=pairs(path.points),
+        visible=tuple(path.visible.tolist()),
+        scale=tuple(path.scale.tolist()),
+        tracks=tuple(pairs(track) for track in found),
+        tracks_visible=seen,
+    )
+
+
+def _anchors(
+    bodies: Sequence[SeenBody], situation: Situation, paths: Sequence[Path], worlds: Worlds
+) -> tuple[tuple[float, float], ...]:
+    """Points off every body and off the way of all that moves, unless the request gives them."""
+    given = situation.request.trajectory
+    if given is not None and given.anchors is not None:
+        return given.anchors
+    point = situation.grounding.point
+    starts = [
+        np.array(path.points[0] if was_put(path.body, worlds) else start_of(bodies, path.body, point)) for path in paths
+    ]
+    movable = swept([bodies[path.body].mask for path in paths], starts, paths)
+    for body in bodies:
+        body.mask.add_to(movable)
+    return spread_anchors(movable)
+
+
+# --- what was put somewhere
+
+
+def _placed_records(situation: Situation, result: EnsembleResult) -> tuple[PlacedBefore, ...]:
+    """What becomes of each thing that is put somewhere before the motion; nothing of the world as it is."""
+    world, shown = result.world, result.shown.worlds
+    interventions, found = placed_before(situation.grounding, situation.motion), list[PlacedBefore]()
+    for number, goal in enumerate(world.put_before):
+        each, placements = interventions[number], shown.before[number]
+        others = None if result.ensemble is None else result.ensemble.worlds.before[number]
+        placed = PlacedBefore(
+            **dict(_placement(each.object.object, placements, others)),
+            body=goal.body,
+            place=place_words(each),
+            visible=visible_share(world.bodies, goal.body, shown, world.size),
+            by_heading=goal.by_heading,
+        )
+        if not placements.stays[0] or (others is not None and np.mean(others.stays) < LEAST_STAYING):
+            raise CannotGround(f"{cannot_stay(placed)} Ask of another place, or of another thing.")
+        found.append(placed)
+    return tuple(found)
+
+
+def _placement(name: str, shown: Placements, ensemble: Placements | None) -> Placement:
+    counted = Counter(()) if ensemble is None else Counter(ensemble.results)
+    clearance, above_rim = (float(values[0]) for values in (shown.clearance, shown.above_rim))
+    return Placement(
+        object=name,
+        result=shown.results[0],
+        probabilities={result: count / counted.total() for result, count in sorted(counted.items())},
+        fits=None if ensemble is None else float(np.mean(ensemble.fits)),
+        clearance=clearance if math.isfinite(clearance) else None,
+        above_rim=above_rim if math.isfinite(above_rim) else None,
+    )
+
+
+def _shown_bodies(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[SeenBody, ...]:
     """Bodies of the image as the first draw has them when the motion begins."""
     return tuple(shown_body(body, index, worlds) for index, body in enumerate(bodies))
 
@@ -90,17 +234,11 @@ def _outline(mask: CroppedMask) -> Floats:
     return corners + np.array([mask.columns.start, mask.rows.start], np.float64)
 
 
-MOVED = 0.5  # px: what moves less in the image stays where it is
-PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
-SETTLED = 0.25  # px per frame: what moves less is at rest
-LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
-MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are told
-FUTURE_DECIMALS, BAND_DECIMALS, POINT_DECIMALS = 1, 2, 3  # px: more digits say nothing and are half of a result
-STATE_DECIMALS, SCALE_DECIMALS, ROTATION_DECIMALS = 5, 6, 3  # m and m/s; of the size at first; degrees
+# --- camera, bodies, paths and contacts
 
 
-def camera_record(fit: CameraFit, worlds: Worlds, around: Worlds | None) -> CameraEstimate:
-    """The camera of the first draw; how far its height varies is seen in an ensemble around it."""
+def camera_record(fit: CameraFit, worlds: Worlds, ensemble: Worlds | None) -> CameraEstimate:
+    """The camera of the first draw; how far its height varies is seen in an ensemble ensemble it."""
     cameras, deviation = worlds.scene.cameras, np.sqrt(np.diag(fit.covariance))
     right, up, _ = cameras.axes[0]
     focal = float(cameras.focal[0])
@@ -114,7 +252,7 @@ def camera_record(fit: CameraFit, worlds: Worlds, around: Worlds | None) -> Came
             focal=focal * float(deviation[1]),
             pitch=math.degrees(float(deviation[0])),
             roll=math.degrees(fit.roll_sigma),
-            height=0.0 if around is None else float(np.std(around.scene.cameras.height)),
+            height=0.0 if ensemble is None else float(np.std(ensemble.scene.cameras.height)),
         ),
     )
 
@@ -146,9 +284,9 @@ def body_records(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[Body, ...]
 
 
 def path_records(
-    bodies: Sequence[SeenBody], start: Point, worlds: Worlds, size: tuple[int, int], around: Worlds | None
+    bodies: Sequence[SeenBody], start: Point, worlds: Worlds, size: tuple[int, int], ensemble: Worlds | None
 ) -> tuple[Path, ...]:
-    """Paths of the mover, from its grounded point, and of what it set in motion; `around` are the ensemble's worlds.
+    """Paths of the mover, from its grounded point, and of what it set in motion; `ensemble` are the ensemble's worlds.
 
     `bodies` are as the image shows them; of what was put elsewhere, the path begins there.
     """
@@ -158,11 +296,11 @@ def path_records(
         seen = seen_paths(worlds, body)
         if body == 0 or float(np.linalg.norm(seen.points[0] - seen.points[0, :1], axis=1).max()) > moved:
             at = start_of(bodies, body, start)
-            records.append(_path(bodies[body], body, np.array(at), worlds, seen, size, around))
+            records.append(_path(bodies[body], body, np.array(at), worlds, seen, size, ensemble))
     return tuple(records)
 
 
-def with_times(paths: Sequence[Path], events: WorldEvents) -> tuple[Path, ...]:
+def _with_times(paths: Sequence[Path], events: WorldEvents) -> tuple[Path, ...]:
     """The paths with the times at which their bodies are set in motion and knocked over in the first draw."""
     found: list[Path] = []
     for path in paths:
@@ -179,7 +317,7 @@ def _path(
     worlds: Worlds,
     path: SeenPaths,
     size: tuple[int, int],
-    around: Worlds | None,
+    ensemble: Worlds | None,
 ) -> Path:
     # The body's centre as placed and where its silhouette is differ a little: what is drawn starts where it is.
     points, scale, turned = path.points[0], path.scale[0], rotation(worlds, body)
@@ -187,7 +325,7 @@ def _path(
     if worlds.seen is not None:
         seen = shown_body(seen, body, worlds)
         start, scale = points[0], scale / scale[0]
-    band, futures = _spread(around, body, points - path.points[0])
+    band, futures = _spread(ensemble, body, points - path.points[0])
     points, scale = np.round(points, POINT_DECIMALS), np.round(scale, SCALE_DECIMALS)
     turned = np.round(turned, ROTATION_DECIMALS)
     visible = np.all((points >= 0) & (points < np.array(size)), axis=1) & ~path.passed[0]
@@ -216,13 +354,15 @@ def tracks(seen: SeenBody, start: Floats, points: Floats, scale: Floats, turned:
     return found
 
 
-def _spread(around: Worlds | None, body: int, shift: Floats) -> tuple[tuple[BBox, ...], tuple[tuple[Point, ...], ...]]:
+def _spread(
+    ensemble: Worlds | None, body: int, shift: Floats
+) -> tuple[tuple[BBox, ...], tuple[tuple[Point, ...], ...]]:
     """The band of a body's path, and of the mover its futures; nothing without an ensemble."""
-    if around is None:
+    if ensemble is None:
         return (), ()
-    worlds = seen_paths(around, body).points
-    band = _band(worlds, around.every, shift)
-    return band, _futures(worlds, around.every, shift) if body == 0 else ()
+    worlds = seen_paths(ensemble, body).points
+    band = _band(worlds, ensemble.every, shift)
+    return band, _futures(worlds, ensemble.every, shift) if body == 0 else ()
 
 
 def _band(worlds: Floats, every: int, shift: Floats) -> tuple[BBox, ...]:
