@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the command line prints its help without records
     from cow_service.records import (
-        Contact,
         Encounter,
         EncounterKind,
         Intervention,
@@ -36,19 +35,16 @@ def direction_words(direction: Vector | None, depth: float) -> str:
 
     `direction` is in image pixels, x right, y down, of any length; `depth` as in `Motion`.
     """
-    flat = _flat_words(direction)
+    flat = ""
+    if direction is not None and math.hypot(*direction) > 0 and all(map(math.isfinite, direction)):
+        sector = round(math.atan2(-direction[1], direction[0]) / (math.pi / 8)) % 16
+        main, side = _QUARTERS[sector // 4]
+        words = (main, f"{main} and slightly {side}", f"{main} and {side}", f"{side} and slightly {main}")
+        flat = words[sector % 4]
     away = "away from the camera" if depth > 0 else "towards the camera"
     if not flat or abs(depth) >= ALONG_AXIS:
         return away if abs(depth) > IN_PLANE else flat
     return f"{flat} and {away}" if abs(depth) > IN_PLANE else flat
-
-
-def _flat_words(direction: Vector | None) -> str:
-    if direction is None or math.hypot(*direction) == 0 or not all(map(math.isfinite, direction)):
-        return ""
-    sector = round(math.atan2(-direction[1], direction[0]) / (math.pi / 8)) % 16
-    main, side = _QUARTERS[sector // 4]
-    return (main, f"{main} and slightly {side}", f"{main} and {side}", f"{side} and slightly {main}")[sector % 4]
 
 
 def same_name(one: str, other: str) -> bool:
@@ -103,17 +99,12 @@ _ENDS: dict[PlacementResult, str] = {
 }
 
 
-def placement_parts(placement: Placement) -> list[str]:
+def _placement_parts(placement: Placement) -> list[str]:
     """The parts of a sentence about it, after its name."""
     end = _ENDS[placement.result]
     if placement.result in ("inside", "sticks-out") and placement.above_rim:
         end = f"{end} with {round(100 * placement.above_rim)}% of its height above the rim"
     return ["is carried over", "is let go", end]
-
-
-def placement_share(placement: Placement) -> float | None:
-    """The share of the worlds with the result that is told; None without an ensemble."""
-    return placement.probabilities.get(placement.result, 0.0) if placement.probabilities else None
 
 
 def place_words(placed: Intervention) -> str:
@@ -159,18 +150,14 @@ ROLLED_ON = 0.25  # s after its last bounce, from which it is said to have rolle
 AT_REST = 1e-3  # m from where it starts, within which a body has not set out
 COVERED = 0.3  # share of what is hidden, from which it counts as hidden
 MAX_MET = 2  # encounters that are told one by one
+SIDEWAYS = 0.7  # of the speed in depth: from that on something moves to the side
 _KINDS: dict[str, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
-_NOT_MET: dict[str, str] = {
-    "touches": "does not touch {}",
-    "covers": "does not hide {}",
-    "covered": "is not hidden by {}",
-}
-_NOTHING_MET: dict[str, str] = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
-_BECOMES: dict[str, tuple[str, str]] = {
+_NOT_MET = {"touches": "does not touch {}", "covers": "does not hide {}", "covered": "is not hidden by {}"}
+_NOTHING_MET = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
+_BECOMES = {
     "tips": ("is knocked over", "is not knocked over"),
     "moves": ("is set in motion", "is not set in motion"),
 }
-SIDEWAYS = 0.7  # of the speed in depth: from that on something moves to the side
 
 
 def facts_of(mover: str, trajectory: Trajectory) -> str:
@@ -178,52 +165,29 @@ def facts_of(mover: str, trajectory: Trajectory) -> str:
 
     It tells of the likeliest world; the share of the ensemble that agrees is that of the outcome, where there is one.
     """
-    told, share = happening(mover, trajectory), _agreement(trajectory)
+    facts = _Facts(mover, trajectory)
+    share = facts.agreement()
     if share is None or not trajectory.ensemble:
-        return f"{told}."
-    agree = round(share * trajectory.ensemble)
-    return f"{told}; {agree} of {trajectory.ensemble} worlds agree."
+        return f"{facts.sentence()}."
+    return f"{facts.sentence()}; {round(share * trajectory.ensemble)} of {trajectory.ensemble} worlds agree."
 
 
-def happening(mover: str, trajectory: Trajectory) -> str:
-    """What happens in the likeliest world: a clause for the mover, then one for each other body that matters."""
-    clauses = [_clause(mover, 0, trajectory)]
-    clauses += [_clause(trajectory.bodies[body].object, body, trajectory) for body in _others_told(trajectory)]
-    became = _became(trajectory)
-    clauses += [became] if became else []
-    first, *rest = clauses
-    return "; ".join([first, *(clause[0].lower() + clause[1:] for clause in rest)])
+def facts_of_both(changes: Sequence[Intervention], mover: str, changed: Trajectory, factual: Trajectory) -> str:
+    """What happens where something is changed first, and in the scene as it is.
 
-
-def _clause(name: str, body: int, trajectory: Trajectory) -> str:
-    """How one body goes, what it meets, and how it ends."""
-    if body == 0 and trajectory.placement is not None:
-        return f"{named(name, 'The')} {_joined(placement_parts(trajectory.placement))}"
-    met = _told(trajectory, body)
-    parts = [*_motion(trajectory, body, met), *(_meeting(each, trajectory) for each in met)]
-    missed = _missed(trajectory, body, met)
-    parts += [missed] if missed else []
-    parts += _end(trajectory, body)
-    return f"{named(name, 'The')} {_joined(parts)}"
-
-
-def _others_told(trajectory: Trajectory) -> list[int]:
-    """The bodies beside the mover that are told of: whose encounter is asked about, and those that touch others."""
-    asked = asked_body(trajectory)
-    moving = [path.body for path in trajectory.paths[1:]]
-    meeting = [each.subject for each in trajectory.encounters if each.subject and each.kind == "touches"]
-    chosen = list[int](dict.fromkeys([*([asked] if asked else []), *meeting]))
-    return [body for body in chosen if body in moving or body == asked][:MAX_MET]
-
-
-def asked_body(trajectory: Trajectory) -> int | None:
-    """Which body it is whose encounter is asked about; None where nothing is asked or that body is not there."""
-    if trajectory.outcome is None:
-        return None
-    name = trajectory.outcome.subject
-    if name is None:
-        return 0
-    return next((i for i, body in enumerate(trajectory.bodies) if i and body.object == name), None)
+    As in: without the vase, the car slides to the right and meets the mug after 1.2 s; with it, ... Or: with the cup
+    next to the mug, the car slides to the right; without that change, ...
+    """
+    removed = [named(each.object.object, "the") for each in changes if each.kind == "remove"]
+    placed = [state_words(each) for each in changes if each.kind == "place"]
+    parts = [f"{word} {' and '.join(names)}" for word, names in (("without", removed), ("with", placed)) if names]
+    if placed:
+        back = "without that change" if len(changes) == 1 else "without these changes"
+    else:
+        back = "with it" if len(removed) == 1 else "with them"
+    told, otherwise = (_lowered(facts_of(mover, each).rstrip(".")) for each in (changed, factual))
+    given = " and ".join(parts)
+    return f"{given[0].upper()}{given[1:]}, {told}; {back}, {otherwise}."
 
 
 def named(name: str, article: str) -> str:
@@ -237,128 +201,29 @@ def named(name: str, article: str) -> str:
     return f"{article} {short}"
 
 
-def _joined(parts: Sequence[str]) -> str:
-    return " and ".join(parts) if len(parts) < 3 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+def _lowered(clause: str) -> str:
+    return clause[0].lower() + clause[1:]
 
 
-def _happened(encounter: Encounter) -> bool:
+def _has_happened(encounter: Encounter) -> bool:
     return encounter.kind == "touches" or encounter.share is None or encounter.share >= COVERED
 
 
-def _told(trajectory: Trajectory, body: int) -> list[Encounter]:
-    """The encounters of a body that are told, in their order: what is asked about, then the first ones."""
-    own = [each for each in trajectory.encounters if each.subject == body]
-    asked = _asked_about(trajectory) if body == asked_body(trajectory) else None
-    touched = {each.object for each in own if each.kind == "touches"}
-    rest = [each for each in own if each.kind == "touches" or each.object not in touched]
-    ordered = sorted(rest, key=lambda each: (each.kind != "touches", each.first_frame))
-    chosen = ([] if asked is None else [asked]) + [each for each in ordered if each is not asked]
-    return sorted(chosen[:MAX_MET], key=lambda each: each.first_frame)
-
-
-def _asked_about(trajectory: Trajectory) -> Encounter | None:
-    """The first encounter that the question asks for."""
-    outcome, body = trajectory.outcome, asked_body(trajectory)
-    if outcome is None or body is None or outcome.asked.relation not in _KINDS:
-        return None
-    kind = _KINDS[outcome.asked.relation]
-    partly = outcome.asked.partly
-    fitting = [each for each in trajectory.encounters if each.kind == kind and (partly or _happened(each))]
-    own = [each for each in fitting if each.subject == body and _is_meant(each.object, trajectory)]
-    if outcome.asked.target is not None:
-        pair = {trajectory.bodies[body].object, outcome.object} if trajectory.bodies else set[str | None]()
-        # Of two that both move, either may be the subject of the encounter.
-        other = [each for each in fitting if kind == "touches" and {_name_of(each, trajectory), each.object} == pair]
-        own = [each for each in own if each.object == outcome.object] or other
-    return min(own, key=lambda each: each.first_frame, default=None)
-
-
-def _is_meant(name: str, trajectory: Trajectory) -> bool:
-    """Whether a thing is one of those asked about, where the question names several."""
-    among = () if trajectory.outcome is None else trajectory.outcome.asked.among
-    return not among or name in among
-
-
-def _name_of(encounter: Encounter, trajectory: Trajectory) -> str:
-    return trajectory.bodies[encounter.subject].object if encounter.subject < len(trajectory.bodies) else ""
-
-
-def _path_of(trajectory: Trajectory, body: int) -> Path | None:
-    return next((path for path in trajectory.paths if path.body == body), None)
-
-
-def _became(trajectory: Trajectory) -> str:
-    """What becomes of the body whose fall or motion is asked about."""
-    outcome = trajectory.outcome
-    if outcome is None or outcome.asked.relation not in _BECOMES or (outcome.asked.target and not outcome.object):
-        return ""
-    does, does_not = _BECOMES[outcome.asked.relation]
-    by = "tipped_at" if outcome.asked.relation == "tips" else "moved_at"
-    found = [
-        (trajectory.bodies[path.body].object, getattr(path, by))
-        for path in trajectory.paths[1:]
-        if getattr(path, by) is not None and outcome.object in (None, trajectory.bodies[path.body].object)
-        and _is_meant(trajectory.bodies[path.body].object, trajectory)
-    ]  # fmt: skip
-    if not found and outcome.asked.among:
-        return ""
-    if not found:
-        return f"{named(outcome.object, 'the') if outcome.object else 'nothing'} {does_not if outcome.object else does}"
-    name, time = min(found, key=lambda each: each[1])
-    return f"{named(name, 'the')} {does} after {time:.1f} s"
-
-
-def _motion(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> list[str]:
-    """How a body goes until it meets something."""
-    path, record = _path_of(trajectory, body), trajectory.bodies[body] if trajectory.bodies else None
-    if path is None or _displaced(path) < MOVED:
-        return ["stays where it is"]
-    round_body = record is not None and record.shape == "sphere"
-    on = "rolls" if round_body else "slides"
-    first_touch = min((_time(each, trajectory) for each in met if each.kind == "touches"), default=math.inf)
-    bounces = [
-        contact.time
-        for contact in trajectory.contacts
-        if contact.a == body and contact.b is None and contact.impulse >= BOUNCE and 0 < contact.time < first_touch
-    ]
-    if bounces and body == 0:
-        times = {1: "once", 2: "twice"}.get(len(bounces), f"{len(bounces)} times")
-        return [f"bounces {times}", *([f"{on} on"] if first_touch - bounces[-1] > ROLLED_ON else [])]
-    if record is None:
-        verb = "moves"
-    elif record.support == "air":
-        rises = path.states[_set_out(path)][1] < path.states[0][1]
-        still = _across(path) < MOVED
-        return [("rises" if rises else "falls") if still else f"flies {_direction(path)}"]
-    else:
-        verb = on
-    if record is not None and not round_body and path.tipped_at is not None:
-        verb = "tips over and moves"
-    return [f"{verb} {_direction(path)}"]
-
-
-def _displaced(path: Path) -> float:
+def _distance_moved(path: Path) -> float:
     """The furthest that it gets from where it starts, m."""
-    start = path.states[0][:3]
-    return max(math.dist(start, state[:3]) for state in path.states)
+    return max(math.dist(path.states[0][:3], state[:3]) for state in path.states)
 
 
-def _across(path: Path) -> float:
-    """How far it gets to the side as it sets out, m: later it may bounce off what it meets."""
-    return abs(path.states[_set_out(path)][0] - path.states[0][0])
-
-
-def _set_out(path: Path) -> int:
-    """The frame by which it has set out: some time after the last one in which it is where it starts."""
-    last = len(path.states) - 1
-    still = next((i for i, state in enumerate(path.states) if math.dist(state[:3], path.states[0][:3]) > AT_REST), last)
-    return min(last, max(1, still - 1 + len(path.states) // 10))
+def _way_set_out(path: Path) -> tuple[float, float, float]:
+    """How far it gets to the right, down and away (m) as it sets out: later it may bounce off what it meets."""
+    first, last = path.states[0], len(path.states) - 1
+    still = next((i for i, state in enumerate(path.states) if math.dist(state[:3], first[:3]) > AT_REST), last)
+    then = path.states[min(last, max(1, still - 1 + len(path.states) // 10))]
+    return then[0] - first[0], then[1] - first[1], then[2] - first[2]
 
 
 def _direction(path: Path) -> str:
-    """The way that it sets out: later it may bounce off what it meets."""
-    first, then = path.states[0], path.states[_set_out(path)]
-    x, y, z = (then[axis] - first[axis] for axis in range(3))
+    x, y, z = _way_set_out(path)
     away = math.hypot(y, z)  # a floor that is looked down on rises in the image as it leads away
     if abs(x) >= SIDEWAYS * away:
         return "to the right" if x > 0 else "to the left"
@@ -367,120 +232,195 @@ def _direction(path: Path) -> str:
     return "away from the camera" if z > 0 else "towards the camera"
 
 
-def _contact_with(encounter: Encounter, trajectory: Trajectory) -> Contact | None:
-    pair = {encounter.subject, encounter.body}
-    return next((each for each in trajectory.contacts if each.b is not None and {each.a, each.b} == pair), None)
+class _Facts:
+    """The parts of a sentence about a trajectory."""
 
+    def __init__(self, mover: str, trajectory: Trajectory) -> None:
+        self._trajectory = trajectory
+        self._outcome = trajectory.outcome
+        self._names = [mover, *(body.object for body in trajectory.bodies[1:])]
+        self._paths = {path.body: path for path in reversed(trajectory.paths)}
+        self._subject = self._asked_body()
+        self._asked = self._asked_about()
 
-def _time(encounter: Encounter, trajectory: Trajectory) -> float:
-    """Seconds until an encounter begins."""
-    contact = _contact_with(encounter, trajectory) if encounter.kind == "touches" else None
-    return encounter.first_frame / trajectory.fps if contact is None else contact.time
+    def sentence(self) -> str:
+        """What happens in the likeliest world: a clause for the mover, then one for each other body that matters."""
+        meeting = [each.subject for each in self._trajectory.encounters if each.subject and each.kind == "touches"]
+        chosen = dict.fromkeys([*([self._subject] if self._subject else []), *meeting])
+        others = [body for body in chosen if body in self._paths or body == self._subject][:MAX_MET]
+        clauses = [self._clause(body) for body in (0, *others)]
+        became = self._became()
+        return "; ".join([clauses[0], *(_lowered(clause) for clause in (*clauses[1:], *([became] if became else [])))])
 
+    def agreement(self) -> float | None:
+        """The share of the worlds in which what the sentence says of the question, or of its first encounter, is so."""
+        outcome, placement, first = self._outcome, self._trajectory.placement, self._asked
+        if placement is not None:
+            return placement.probabilities.get(placement.result, 0.0) if placement.probabilities else None
+        if outcome is None or outcome.probability is None:
+            told = self._told(0)
+            return told[0].probability if told else None
+        asked = outcome.asked
+        if asked.relation not in _KINDS or asked.within is not None or asked.partly or asked.every:
+            return None
+        met = None if first is None else first.object
+        agreeing = {
+            "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,
+            "how-many": outcome.probability if self._count() == outcome.count else None,
+            "which-first": outcome.probability if outcome.first == met else None,
+            "when": (outcome.probability if outcome.time is None else None) if first is None else first.probability,
+        }
+        return agreeing.get(asked.form)
 
-def _meeting(encounter: Encounter, trajectory: Trajectory) -> str:
-    """What the mover does with another object, and when."""
-    name, time = named(encounter.object, "the"), f"{_time(encounter, trajectory):.1f} s"
-    share = "" if encounter.share is None else f"{round(100 * encounter.share)}%"
-    if encounter.kind == "occludes":
-        hidden = f" (hiding {share} of it)" if share else ""
-        return f"passes in front of {name}{hidden} from {time} on"
-    if encounter.kind == "occluded-by":
-        hidden = f" (which hides {share} of it)" if share else ""
-        return f"passes behind {name}{hidden} from {time} on"
-    return f"meets {_effect(encounter.body, trajectory)}{name} after {time}"
+    def _asked_body(self) -> int | None:
+        """Which body it is whose encounter is asked about; None where nothing is asked or that body is not there."""
+        if self._outcome is None:
+            return None
+        if self._outcome.subject is None:
+            return 0
+        return next((i for i, name in enumerate(self._names) if i and name == self._outcome.subject), None)
 
+    def _asked_about(self) -> Encounter | None:
+        """The first encounter that the question asks for."""
+        outcome, body, bodies = self._outcome, self._subject, self._trajectory.bodies
+        if outcome is None or body is None or outcome.asked.relation not in _KINDS:
+            return None
+        kind, partly = _KINDS[outcome.asked.relation], outcome.asked.partly
+        fitting = [e for e in self._trajectory.encounters if e.kind == kind and (partly or _has_happened(e))]
+        own = [each for each in fitting if each.subject == body and self._is_meant(each.object)]
+        if outcome.asked.target is not None:
+            # Of two that both move, either may be the subject of the encounter.
+            pair = {bodies[body].object, outcome.object} if bodies and kind == "touches" else None
+            other = [e for e in fitting if e.subject < len(bodies) and {bodies[e.subject].object, e.object} == pair]
+            own = [each for each in own if each.object == outcome.object] or other
+        return min(own, key=lambda each: each.first_frame, default=None)
 
-def _effect(body: int | None, trajectory: Trajectory) -> str:
-    """What becomes of a body that is met."""
-    path = next((each for each in trajectory.paths[1:] if each.body == body), None)
-    if body is None or path is None:
-        return ""
-    if path.tipped_at is not None:
-        return "and tips over "
-    return "and pushes " if _displaced(path) >= MOVED else ""
+    def _is_meant(self, name: str) -> bool:
+        """Whether a thing is one of those asked about, where the question names several."""
+        among = () if self._outcome is None else self._outcome.asked.among
+        return not among or name in among
 
+    def _count(self) -> int:
+        """How many things the body asked about meets in the way asked about."""
+        kind = None if self._outcome is None else _KINDS[self._outcome.asked.relation]
+        own = [e for e in self._trajectory.encounters if e.subject == self._subject and e.kind == kind]
+        return len({(each.body, each.object) for each in own if _has_happened(each) and self._is_meant(each.object)})
 
-def _missed(trajectory: Trajectory, body: int, met: Sequence[Encounter]) -> str:
-    """That what is asked about does not happen, or that nothing is touched; empty where either is not so."""
-    outcome, asked = trajectory.outcome, asked_body(trajectory)
-    if not trajectory.encounters_known:
-        return ""
-    touched = any(each.kind == "touches" for each in met)
-    if outcome is None or outcome.asked.relation not in _KINDS or (outcome.asked.target and not outcome.object):
-        return "" if body or touched else _NOTHING_MET["touches"]
-    if asked != body or _asked_about(trajectory) is not None:
-        return ""
-    if outcome.asked.partly and ((outcome.probability or 0.0) >= 0.5) != outcome.asked.negated:
-        name = named(outcome.object, "the") if outcome.object else "something"  # less than an encounter tells of
-        return f"hides a part of {name}" if outcome.asked.relation == "covers" else f"is partly hidden by {name}"
-    meant = [outcome.object] if outcome.object else outcome.asked.among
-    if not meant:
-        return _NOTHING_MET[outcome.asked.relation]
-    return _NOT_MET[outcome.asked.relation].format(" or ".join(named(each, "the") for each in meant))
+    def _told(self, body: int) -> list[Encounter]:
+        """The encounters of a body that are told, in their order: what is asked about, then the first ones."""
+        own = [each for each in self._trajectory.encounters if each.subject == body]
+        asked = [self._asked] if self._asked is not None and body == self._subject else []
+        touched = {each.object for each in own if each.kind == "touches"}
+        rest = [each for each in own if each.kind == "touches" or each.object not in touched]
+        ordered = sorted(rest, key=lambda each: (each.kind != "touches", each.first_frame))
+        chosen = asked + [each for each in ordered if not any(each is other for other in asked)]
+        return sorted(chosen[:MAX_MET], key=lambda each: each.first_frame)
 
+    def _clause(self, body: int) -> str:
+        """How one body goes, what it meets, and how it ends."""
+        placement = self._trajectory.placement
+        if body == 0 and placement is not None:
+            parts = _placement_parts(placement)
+        else:
+            met, path = self._told(body), self._paths.get(body)
+            going = ["stays where it is"]
+            if path is not None and _distance_moved(path) >= MOVED:
+                going = self._going(path, [self._time(each) for each in met if each.kind == "touches"])
+            parts = [*going, *(self._meeting(each) for each in met), *self._missed(body, met), *self._end(body, path)]
+        said = " and ".join(parts) if len(parts) < 3 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+        return f"{named(self._names[body], 'The')} {said}"
 
-def _end(trajectory: Trajectory, body: int) -> list[str]:
-    """How it ends, where the clip shows it."""
-    path, until = _path_of(trajectory, body), trajectory.moving_until
-    if path is None or until is None or _displaced(path) < MOVED:
-        return []
-    last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1) if body == 0 else -1
-    if not path.visible[last]:
-        return ["leaves the image"]
-    if body != 0 or last == trajectory.num_frames - 1:
-        return []
-    met = [each.b for each in trajectory.contacts if each.a == body and each.time <= until]
-    where = " on the floor" if met and met[-1] is None else ""
-    return [f"comes to rest{where} after {until:.1f} s"]
+    def _going(self, path: Path, touches: Sequence[float]) -> list[str]:
+        """How a body goes until it meets something."""
+        body = path.body
+        record = self._trajectory.bodies[body] if self._trajectory.bodies else None
+        is_round = record is not None and record.shape == "sphere"
+        on, first_touch = "rolls" if is_round else "slides", min(touches, default=math.inf)
+        bounces = [
+            contact.time
+            for contact in self._trajectory.contacts
+            if contact.a == body and contact.b is None and contact.impulse >= BOUNCE and 0 < contact.time < first_touch
+        ]
+        if bounces and body == 0:
+            times = {1: "once", 2: "twice"}.get(len(bounces), f"{len(bounces)} times")
+            return [f"bounces {times}", *([f"{on} on"] if first_touch - bounces[-1] > ROLLED_ON else [])]
+        if record is None:
+            return [f"moves {_direction(path)}"]
+        if record.support == "air":
+            x, y, _ = _way_set_out(path)
+            return [f"flies {_direction(path)}" if abs(x) >= MOVED else "rises" if y < 0 else "falls"]
+        if not is_round and path.tipped_at is not None:
+            on = "tips over and moves"
+        return [f"{on} {_direction(path)}"]
 
+    def _time(self, encounter: Encounter) -> float:
+        """Seconds until an encounter begins."""
+        pair = {encounter.subject, encounter.body}
+        met = (each.time for each in self._trajectory.contacts if each.b is not None and {each.a, each.b} == pair)
+        frame = encounter.first_frame / self._trajectory.fps
+        return next(met, frame) if encounter.kind == "touches" else frame
 
-def _agreement(trajectory: Trajectory) -> float | None:
-    """The share of the worlds in which what the sentence says of the question, or of its first encounter, is so."""
-    outcome = trajectory.outcome
-    if trajectory.placement is not None:
-        return placement_share(trajectory.placement)
-    if outcome is None or outcome.probability is None:
-        met = _told(trajectory, 0)
-        return met[0].probability if met else None
-    asked, first = outcome.asked, _asked_about(trajectory)
-    if asked.relation not in _KINDS or asked.within is not None or asked.partly or asked.every:
-        return None
-    agreeing: dict[str, float | None] = {
-        "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,
-        "how-many": outcome.probability if _count(trajectory) == outcome.count else None,
-        "which-first": outcome.probability if outcome.first == (None if first is None else first.object) else None,
-        "when": (outcome.probability if outcome.time is None else None) if first is None else first.probability,
-    }
-    return agreeing.get(asked.form)
+    def _meeting(self, encounter: Encounter) -> str:
+        """What a body does with another one, and when."""
+        name, time = named(encounter.object, "the"), f"{self._time(encounter):.1f} s"
+        share = "" if encounter.share is None else f"{round(100 * encounter.share)}%"
+        if encounter.kind == "occludes":
+            return f"passes in front of {name}{f' (hiding {share} of it)' if share else ''} from {time} on"
+        if encounter.kind == "occluded-by":
+            return f"passes behind {name}{f' (which hides {share} of it)' if share else ''} from {time} on"
+        path, effect = self._paths.get(encounter.body or 0) if encounter.body else None, ""
+        if path is not None and path.tipped_at is not None:
+            effect = "and tips over "
+        elif path is not None and _distance_moved(path) >= MOVED:
+            effect = "and pushes "
+        return f"meets {effect}{name} after {time}"
 
+    def _missed(self, body: int, met: Sequence[Encounter]) -> list[str]:
+        """That what is asked about does not happen, or that nothing is touched."""
+        outcome = self._outcome
+        if not self._trajectory.encounters_known:
+            return []
+        if outcome is None or outcome.asked.relation not in _KINDS or (outcome.asked.target and not outcome.object):
+            return [] if body or any(each.kind == "touches" for each in met) else [_NOTHING_MET["touches"]]
+        if self._subject != body or self._asked is not None:
+            return []
+        relation, meant = outcome.asked.relation, [outcome.object] if outcome.object else outcome.asked.among
+        if outcome.asked.partly and ((outcome.probability or 0.0) >= 0.5) != outcome.asked.negated:
+            name = named(outcome.object, "the") if outcome.object else "something"  # less than an encounter tells of
+            return [f"hides a part of {name}" if relation == "covers" else f"is partly hidden by {name}"]
+        if not meant:
+            return [_NOTHING_MET[relation]]
+        return [_NOT_MET[relation].format(" or ".join(named(each, "the") for each in meant))]
 
-def _count(trajectory: Trajectory) -> int:
-    """How many things the body asked about meets in the way asked about."""
-    outcome, body = trajectory.outcome, asked_body(trajectory)
-    kind = None if outcome is None else _KINDS[outcome.asked.relation]
-    own = [each for each in trajectory.encounters if each.subject == body and each.kind == kind]
-    return len({(each.body, each.object) for each in own if _happened(each) and _is_meant(each.object, trajectory)})
+    def _end(self, body: int, path: Path | None) -> list[str]:
+        """How it ends, where the clip shows it."""
+        trajectory, until = self._trajectory, self._trajectory.moving_until
+        if path is None or until is None or _distance_moved(path) < MOVED:
+            return []
+        last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1) if body == 0 else -1
+        if not path.visible[last]:
+            return ["leaves the image"]
+        if body != 0 or last == trajectory.num_frames - 1:
+            return []
+        met = [each.b for each in trajectory.contacts if each.a == body and each.time <= until]
+        where = " on the floor" if met and met[-1] is None else ""
+        return [f"comes to rest{where} after {until:.1f} s"]
 
-
-def facts_of_both(changes: Sequence[Intervention], mover: str, changed: Trajectory, factual: Trajectory) -> str:
-    """As in: without the vase, the car slides to the right and meets the mug after 1.2 s; with it, ...
-
-    Or: with the cup next to the mug, the car slides to the right; without that change, ...
-    """
-    removed = [named(each.object.object, "the") for each in changes if each.kind == "remove"]
-    placed = [state_words(each) for each in changes if each.kind == "place"]
-    without = [f"without {' and '.join(removed)}"] if removed else []
-    given = " and ".join([*without, *([f"with {' and '.join(placed)}"] if placed else [])])
-    if placed:
-        back = "without that change" if len(changes) == 1 else "without these changes"
-    else:
-        back = "with it" if len(removed) == 1 else "with them"
-    told, otherwise = _within(facts_of(mover, changed)), _within(facts_of(mover, factual))
-    return f"{given[0].upper()}{given[1:]}, {told}; {back}, {otherwise}."
-
-
-def _within(sentence: str) -> str:
-    """A sentence as a part of another one."""
-    bare = sentence.rstrip(".")
-    return bare[0].lower() + bare[1:]
+    def _became(self) -> str:
+        """What becomes of the body whose fall or motion is asked about."""
+        outcome = self._outcome
+        if outcome is None or outcome.asked.relation not in _BECOMES or (outcome.asked.target and not outcome.object):
+            return ""
+        does, does_not = _BECOMES[outcome.asked.relation]
+        found: list[tuple[float, str]] = []
+        for path in self._trajectory.paths[1:]:
+            name = self._names[path.body]
+            time = path.tipped_at if outcome.asked.relation == "tips" else path.moved_at
+            if time is not None and outcome.object in (None, name) and self._is_meant(name):
+                found.append((time, name))
+        if found:
+            time, name = min(found, key=lambda each: each[0])
+            return f"{named(name, 'the')} {does} after {time:.1f} s"
+        if outcome.asked.among:
+            return ""
+        return f"{named(outcome.object, 'the')} {does_not}" if outcome.object else f"nothing {does}"
