@@ -47,9 +47,7 @@ from cow_service.errors import (
     WeightsUnavailable,
 )
 from cow_service.readers.local import loading
-from cow_service.readers.local.batch_generator import BatchGenerator, PendingGeneration
-from cow_service.readers.local.conversation import conversation_of
-from cow_service.readers.local.decoding import BatchRow, Sampling
+from cow_service.readers.local.generation import BatchGenerator, BatchRow, PendingGeneration, Sampling, conversation_of
 from cow_service.readers.local.loading import device_map, load_local
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny

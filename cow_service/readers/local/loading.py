@@ -16,10 +16,9 @@ from pydantic_ai.settings import ModelSettings
 from transformers import AutoModelForImageTextToText, PreTrainedModel, ProcessorMixin
 
 from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
-from cow_service.readers.local.batch_generator import BatchGenerator
+from cow_service.readers.local.generation import BatchGenerator
 from cow_service.readers.local.model import LocalModel
-from cow_service.readers.local.processors import load_processor
-from cow_service.readers.local.tiny import make_tiny
+from cow_service.readers.local.tiny import load_processor, make_tiny
 from cow_service.readers.mllm.models import mllm_manifests
 from cow_service.records import Record
 from cow_service.settings import Settings

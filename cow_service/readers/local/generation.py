@@ -1,0 +1,472 @@
+"""Messages of pydantic-ai as turns of a chat template, with their images. Knows no model and no tensor."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from llguidance import LLMatcher, LLTokenizer
+from llguidance.hf import from_tokenizer
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic_ai.exceptions import UserError
+from pydantic_ai.messages import (
+    BinaryContent,
+    CachePoint,
+    ModelMessage,
+    ModelResponse,
+    SystemPromptPart,
+    TextContent,
+    TextPart,
+    ThinkingPart,
+    UserPromptPart,
+)
+from torch import Tensor
+from transformers import (
+    GenerationConfig,
+    LogitsProcessor,
+    LogitsProcessorList,
+    PreTrainedModel,
+    PreTrainedTokenizerFast,
+    ProcessorMixin,
+    StoppingCriteria,
+    StoppingCriteriaList,
+)
+
+from cow_service.errors import ImageUnreadable
+from cow_service.media.images import decode
+
+Role = Literal["system", "user", "assistant"]
+Turn = dict[str, Any]  # as chat templates take it: {"role": ..., "content": [{"type": "text", "text": ...}, ...]}
+
+
+@dataclass(frozen=True)
+class Conversation:
+    """All that was said up to the reply that is wanted. `images` are in the order of their places in the turns."""
+
+    turns: tuple[Turn, ...]
+    images: tuple[Image.Image, ...]
+
+
+def conversation_of(
+    messages: Iterable[ModelMessage], instructions: Sequence[str], special_tokens: Sequence[str]
+) -> Conversation:
+    """The conversation of prepared messages. Text that spells one of the special tokens is not taken for it.
+
+    Raises `UserError` for what such a model cannot be given (tools, files other than images), and the errors of
+    `images.decode`.
+    """
+    builder = _Builder(_token_breaker(special_tokens))
+    for text in instructions:
+        builder.add_text("system", text)
+    for message in messages:
+        role: Role = "assistant" if isinstance(message, ModelResponse) else "user"
+        for part in message.parts:
+            if isinstance(part, SystemPromptPart):
+                # Templates take a system turn at the start only.
+                opening = all(turn["role"] == "system" for turn in builder.turns)
+                builder.add_text("system" if opening else "user", part.content)
+            elif isinstance(part, UserPromptPart):
+                for item in [part.content] if isinstance(part.content, str) else part.content:
+                    builder.add(role, item)
+            elif not isinstance(part, ThinkingPart):
+                builder.add(role, part)
+    return Conversation(tuple(builder.turns), tuple(builder.images))
+
+
+class _Builder:
+    """Turns as they grow: what one role says in a row is one turn, and texts that meet are one text."""
+
+    def __init__(self, break_tokens: Callable[[str], str]) -> None:
+        self.turns: list[Turn] = []
+        self.images: list[Image.Image] = []
+        self._break_tokens = break_tokens
+
+    def add(self, role: Role, item: object) -> None:
+        """Text or an image. Raises `UserError` for anything else."""
+        if isinstance(item, str):
+            self.add_text(role, item)
+        elif isinstance(item, TextContent | TextPart):
+            self.add_text(role, item.content)
+        elif isinstance(item, BinaryContent) and item.is_image:
+            self._content(role).append({"type": "image"})
+            self.images.append(Image.fromarray(decode(item.data).pixels))
+        elif not isinstance(item, CachePoint):
+            raise UserError(f"A model in this process takes text and images (as bytes), not a {type(item).__name__}.")
+
+    def add_text(self, role: Role, text: str) -> None:
+        content = self._content(role)
+        if content and content[-1]["type"] == "text":
+            text = content.pop()["text"] + "\n" + text
+        # Joined first: a special token could otherwise come about where two texts meet.
+        content.append({"type": "text", "text": self._break_tokens(text)})
+
+    def _content(self, role: Role) -> list[dict[str, str]]:
+        if not self.turns or self.turns[-1]["role"] != role:
+            self.turns.append({"role": role, "content": []})
+        return self.turns[-1]["content"]
+
+
+def _token_breaker(special_tokens: Sequence[str]) -> Callable[[str], str]:
+    """Puts a space into every special token that a text spells, or a question could end its turn or claim an image."""
+    longest_first = sorted((token for token in special_tokens if len(token) > 1), key=len, reverse=True)
+    if not longest_first:
+        return lambda text: text
+    found = re.compile("|".join(map(re.escape, longest_first)))
+    return lambda text: found.sub(lambda match: f"{match[0][0]} {match[0][1:]}", text)
+
+
+# One space after commas and colons, as most JSON in training data has it. Free whitespace would let a model write
+# line breaks up to the limit of tokens.
+_LAYOUT: Any = {"whitespace_flexible": False, "item_separator": ", ", "key_separator": ": "}
+_BY_NAME = ("properties", "$defs", "definitions")  # what they hold is schemas by names that may be anything
+_AS_IT_IS = ("allOf", "enum", "const", "default", "examples")  # parts of one object, and values
+
+
+class Grammars:
+    """Grammars of JSON schemas over one tokenizer, for a model with `vocabulary` logits."""
+
+    def __init__(self, tokenizer: PreTrainedTokenizerFast, vocabulary: int, ends: Sequence[int]) -> None:
+        self._tokens: LLTokenizer = from_tokenizer(tokenizer, n_vocab=vocabulary, eos_token=list(ends))
+
+    def grammar(self, schema: Mapping[str, Any]) -> str:
+        """The grammar of the JSON texts that a schema allows, without properties that it does not name.
+
+        Raises `UserError` for a schema that is wrong or that says what cannot be held to, such as `uniqueItems`.
+        """
+        grammar = LLMatcher.grammar_from_json_schema(json.dumps(_closed(schema)), overrides=_LAYOUT)
+        is_error, messages = LLMatcher.validate_grammar_with_warnings(grammar, self._tokens)
+        if is_error:
+            raise UserError(f"Replies cannot be held to this JSON schema: {messages[0]}")
+        return grammar
+
+    def matcher(self, grammar: str) -> LLMatcher:
+        """A new reader of a reply, at its start."""
+        return LLMatcher(self._tokens, grammar)
+
+
+def _closed(schema: Any) -> Any:
+    """The schema with no other properties than those it names: a model could invent some up to the limit of tokens."""
+    if isinstance(schema, list):
+        return [_closed(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    found = {
+        key: {name: _closed(part) for name, part in value.items()} if key in _BY_NAME else _closed(value)
+        for key, value in schema.items()
+        if key not in _AS_IT_IS
+    }
+    found |= {key: value for key, value in schema.items() if key in _AS_IT_IS}
+    return {"additionalProperties": False, **found} if "properties" in found else found
+
+
+Finish = Literal["stop", "length"]
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How tokens are chosen. Temperature 0 takes the likeliest; without a seed, replies differ from call to call."""
+
+    temperature: float = 0.0
+    top_p: float = 1.0
+    top_k: int = 0  # 0: no limit
+    seed: int | None = None
+
+
+class BatchRow:
+    """One reply of a batch while it is written. It knows no other row, and not how it came to be in the batch.
+
+    `on_end` is called once, when the reply is complete. Where the reply begins with a thought, `thought_end` is the
+    token that ends it, and the grammar holds from there.
+    """
+
+    def __init__(
+        self,
+        sampling: Sampling,
+        limit: int,
+        ends: Sequence[int],
+        matcher: LLMatcher | None,
+        on_end: Callable[[BatchRow, Finish], None],
+        is_canceled: Callable[[], bool],
+        thought_end: int | None = None,
+    ) -> None:
+        self.thought: list[int] = []
+        self.tokens: list[int] = []
+        self._finished = False
+        self._matcher = matcher
+        self._is_canceled = is_canceled
+        self._thought_end = thought_end  # None once the thought is over
+        self._sampling = sampling
+        self._limit = limit
+        self._ends = frozenset(ends)
+        self._on_end = on_end
+        self._random: torch.Generator | None = None
+
+    def done(self) -> bool:
+        """Whether nothing more is to be written."""
+        return self._finished or self._is_canceled()
+
+    def allowed(self, vocabulary: int) -> NDArray[np.bool_] | None:
+        """[vocabulary]: the tokens with which the reply can go on. None for all."""
+        if self._matcher is None:
+            return None
+        if self._thought_end is not None:
+            thinking = np.ones(vocabulary, dtype=np.bool_)
+            thinking[list(self._ends)] = False  # the reply is still to come
+            return thinking
+        # llguidance's own function for tensors needs a C++ compiler at run time.
+        bits = np.frombuffer(self._matcher.compute_bitmask(), np.uint8)
+        return np.unpackbits(bits, count=vocabulary, bitorder="little").astype(np.bool_)
+
+    def choose(self, logits: Tensor) -> Tensor | None:
+        """A token id, [], from the allowed logits, [vocabulary]; None where the likeliest will do."""
+        if self._sampling.temperature == 0:
+            return None
+        logits = logits / self._sampling.temperature
+        if self._sampling.top_k > 0:
+            least = logits.topk(min(self._sampling.top_k, len(logits))).values[-1]
+            logits = logits.masked_fill(logits < least, -torch.inf)
+        chances = logits.softmax(-1)
+        if self._sampling.top_p < 1:
+            ordered, order = chances.sort(descending=True)
+            # What comes before a token decides about it, so that the likeliest always stays.
+            chances = chances.index_fill(0, order[ordered.cumsum(0) - ordered >= self._sampling.top_p], 0.0)
+        if self._random is None:
+            self._random = torch.Generator(logits.device)
+            if self._sampling.seed is None:
+                self._random.seed()
+            else:
+                self._random.manual_seed(self._sampling.seed)
+        return chances.multinomial(1, generator=self._random)[0]
+
+    def take(self, token: int) -> None:
+        """Adds the chosen token, and ends the reply where that completes it or reaches its limit.
+
+        Raises `RuntimeError` where the grammar does not go on, which its mask makes impossible.
+        """
+        if token in self._ends:
+            self._end("stop")
+            return
+        if self._thought_end is not None:
+            self.thought.append(token)
+            if token == self._thought_end:
+                self._thought_end = None
+        else:
+            self.tokens.append(token)
+            if self._matcher is not None and not self._matcher.consume_token(token):
+                raise RuntimeError(f"The grammar of a reply broke down: {self._matcher.get_error()}")
+        if self._matcher is not None and self._matcher.is_stopped():
+            self._end("stop")
+        elif len(self.thought) + len(self.tokens) >= self._limit:
+            self._end("stop" if self._complete() else "length")
+
+    def _complete(self) -> bool:
+        return self._thought_end is None and self._matcher is not None and self._matcher.is_accepting()
+
+    def _end(self, finish: Finish) -> None:
+        self._finished = True
+        self._on_end(self, finish)
+
+
+class RowSampler(LogitsProcessor):
+    """Leaves to each row of a batch the one token that it has chosen; to rows that are over, the padding."""
+
+    def __init__(self, rows: Sequence[BatchRow], padding: int) -> None:
+        self._rows = rows
+        self._padding = padding
+
+    def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:
+        """`scores` is [rows, vocabulary]; what is returned is 0 at each row's token and minus infinity elsewhere."""
+        scores = scores.masked_fill(~self._allowed(scores), -torch.inf)
+        chosen = scores.argmax(-1)
+        for i, row in enumerate(self._rows):
+            if not row.done() and (token := row.choose(scores[i])) is not None:
+                chosen[i] = token
+        tokens: list[int] = chosen.tolist()
+        for i, row in enumerate(self._rows):
+            if row.done():
+                tokens[i] = self._padding
+            else:
+                row.take(tokens[i])
+        only = torch.tensor(tokens, device=scores.device)[:, None]
+        return torch.full_like(scores, -torch.inf).scatter_(1, only, 0.0)
+
+    def _allowed(self, scores: Tensor) -> Tensor:
+        """[rows, vocabulary], bool: the tokens with which each grammar can go on. Without a grammar, all."""
+        allowed = np.ones(tuple(scores.shape), dtype=np.bool_)
+        for i, row in enumerate(self._rows):
+            if not row.done() and (tokens := row.allowed(scores.shape[1])) is not None:
+                allowed[i] = tokens
+        return torch.from_numpy(allowed).to(scores.device)
+
+
+class RowsDone(StoppingCriteria):
+    """Ends the rows that are complete, and those that nobody waits for any more."""
+
+    def __init__(self, rows: Sequence[BatchRow]) -> None:
+        self._rows = rows
+
+    def __call__(self, input_ids: Tensor, scores: Any, **kwargs: Any) -> Any:
+        """[rows], bool."""
+        return torch.tensor([row.done() for row in self._rows], device=input_ids.device)
+
+
+# With the one, the chat templates of models that think open a reply; the other is the token that ends the thought.
+_THOUGHT_START, _THOUGHT_END = "<think>", "</think>"
+
+
+@dataclass(frozen=True)
+class GenerationRequest:
+    """What a reply is wanted for. `limit` is the most tokens that it may have; `grammar`, what it is held to."""
+
+    conversation: Conversation
+    sampling: Sampling
+    limit: int
+    grammar: str | None = None
+
+
+@dataclass(frozen=True)
+class Generation:
+    """What was written. With the finish `length` it was cut off, and is no whole JSON.
+
+    `thought` is what the model wrote for itself before, where its chat template opens a thought.
+    """
+
+    text: str
+    thought: str
+    finish: Finish
+    input_tokens: int
+    output_tokens: int
+
+
+@dataclass(frozen=True, eq=False)
+class PendingGeneration:
+    """A request and its reply to come. Canceling the future ends the reply at the next token.
+
+    The future is never marked as running: such a future could no longer be canceled.
+    """
+
+    request: GenerationRequest
+    future: Future[Generation] = field(default_factory=Future[Generation])
+
+    def resolve(self, generation: Generation) -> None:
+        """Ends it with its reply, unless it was canceled."""
+        with suppress(InvalidStateError):
+            self.future.set_result(generation)
+
+    def fail(self, error: BaseException) -> None:
+        """Ends it with an error, unless it was canceled."""
+        with suppress(InvalidStateError):
+            self.future.set_exception(error)
+
+
+class BatchGenerator:
+    """A model of images and text with its processor, as transformers has them."""
+
+    def __init__(self, model: PreTrainedModel, processor: ProcessorMixin) -> None:
+        self._model: Any = model
+        self._model.eval().requires_grad_(False)
+        self._processor: Any = processor
+        self._tokenizer: PreTrainedTokenizerFast = self._processor.tokenizer
+        advice = model.generation_config or GenerationConfig()
+        self.default_sampling = _sampling_of(advice)
+        ends = advice.eos_token_id
+        self._ends = _as_tuple(self._tokenizer.eos_token_id if ends is None else ends)
+        padding = self._tokenizer.pad_token_id
+        self._padding: int = self._ends[0] if padding is None else _as_tuple(padding)[0]
+        # Else the checkpoint's advice on sampling would be mixed into every call, after ours.
+        self._model.generation_config = self._config()
+        self.special_tokens = tuple(self._tokenizer.get_added_vocab())
+        self.grammars = Grammars(self._tokenizer, self._model.get_output_embeddings().weight.shape[0], self._ends)
+
+    @property
+    def is_float32(self) -> bool:
+        """Whether it computes in full precision."""
+        return self._model.dtype == torch.float32
+
+    @property
+    def device(self) -> torch.device:
+        """Where its inputs go."""
+        return self._model.device
+
+    def generate(self, batch: Sequence[PendingGeneration]) -> None:
+        """Writes all replies at once; each future has its result as soon as that reply is complete.
+
+        Raises `ImageUnreadable` for an image that the model's processor refuses, and whatever the model raises.
+        """
+        conversations = [pending.request.conversation for pending in batch]
+        texts: list[str] = [
+            self._processor.apply_chat_template(list(each.turns), add_generation_prompt=True, tokenize=False)
+            for each in conversations
+        ]
+        inputs = self._inputs(texts, [list(each.images) for each in conversations])
+        counts: list[int] = inputs["attention_mask"].sum(-1).tolist()
+        rows = [self._row(*row) for row in zip(batch, texts, counts, strict=True)]
+        self._model.generate(
+            **inputs,
+            generation_config=self._config(
+                do_sample=False, max_new_tokens=max(pending.request.limit for pending in batch)
+            ),
+            logits_processor=LogitsProcessorList([RowSampler(rows, self._padding)]),
+            stopping_criteria=StoppingCriteriaList([RowsDone(rows)]),
+        )
+
+    def _config(self, **rest: Any) -> GenerationConfig:
+        return GenerationConfig(eos_token_id=list(self._ends), pad_token_id=self._padding, **rest)
+
+    def _inputs(self, texts: list[str], images: list[list[Any]]) -> Mapping[str, Any]:
+        try:
+            # Replies grow on the right, so that padding belongs on the left.
+            inputs = self._processor(
+                text=texts,
+                images=images if any(images) else None,
+                padding=True,
+                padding_side="left",
+                add_special_tokens=False,  # the template has written those that belong there
+                return_tensors="pt",
+            )
+        except ValueError as error:
+            if not any(images):
+                raise
+            raise ImageUnreadable(f"The multimodal LLM does not take such an image: {error}.") from error
+        return inputs.to(self._model.device, dtype=self._model.dtype)
+
+    def _row(self, pending: PendingGeneration, text: str, input_tokens: int) -> BatchRow:
+        request, thinks = pending.request, text.rstrip().endswith(_THOUGHT_START)
+        return BatchRow(
+            request.sampling,
+            request.limit,
+            self._ends,
+            None if request.grammar is None else self.grammars.matcher(request.grammar),
+            on_end=partial(self._resolve, pending, input_tokens),
+            is_canceled=pending.future.done,
+            thought_end=self._tokenizer.get_vocab().get(_THOUGHT_END) if thinks else None,
+        )
+
+    def _resolve(self, pending: PendingGeneration, input_tokens: int, row: BatchRow, finish: Finish) -> None:
+        thought = self._decoded(row.thought).removesuffix(_THOUGHT_END).strip()
+        output_tokens = len(row.thought) + len(row.tokens)
+        pending.resolve(Generation(self._decoded(row.tokens), thought, finish, input_tokens, output_tokens))
+
+    def _decoded(self, tokens: list[int]) -> str:
+        return str(self._tokenizer.decode(tokens, skip_special_tokens=True, clean_up_tokenization_spaces=False))
+
+
+def _sampling_of(advice: GenerationConfig) -> Sampling:
+    if not advice.do_sample:
+        return Sampling()
+    given = {name: getattr(advice, name) for name in ("temperature", "top_p", "top_k")}
+    known: dict[str, Any] = {"temperature": 1.0} | {name: value for name, value in given.items() if value is not None}
+    return Sampling(**known)
+
+
+def _as_tuple(ids: Any) -> tuple[int, ...]:
+    return (ids,) if isinstance(ids, int) else tuple(ids)
