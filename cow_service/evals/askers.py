@@ -1,4 +1,4 @@
-"""Messages with pictures, as a model is sent them and as Inspect's viewer shows them."""
+"""The two ways of asking: a multimodal LLM itself through Inspect, or the service's own `/answer`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from inspect_ai.model import (
 from cow_service.client import AsyncAnswer, AsyncClient
 from cow_service.client.errors import error_from
 from cow_service.errors import MllmUnavailable
-from cow_service.evals.asking import Asked, Case, Reply
-from cow_service.evals.imagination import REFUSALS, Imagination, Look, asked_once
+from cow_service.evals.asking import Case, CaseReplies, Reply
+from cow_service.evals.imagination import REFUSALS, Evidence, Imagination, asked_once, evidence_of
 from cow_service.evals.items import Pictures
 from cow_service.media.artifacts import media_type_of
 from cow_service.readers.prompts import load_prompt
@@ -41,12 +41,12 @@ def message(digests: Iterable[str], text: str, pictures: Pictures) -> ChatMessag
     return ChatMessageUser(content=content)
 
 
-def conversation(case: Case, asked: Asked, overlay: str | None, pictures: Pictures) -> list[ChatMessage]:
+def conversation(case: Case, asked: CaseReplies, overlay: str | None, pictures: Pictures) -> list[ChatMessage]:
     """What a viewer shows: what was asked last, every reply, and in the first repeat the overlay.
 
     What `/answer` sends by itself is not known here: in its place stand the image, the frames and the question.
     """
-    frames = [digest for look in asked.looks for digest in look.frames]
+    frames = [digest for found in asked.evidence for digest in found.frames]
     sent: tuple[ChatMessage, ...] = asked.messages or (message((case.item.image, *frames), case.question, pictures),)
     shown: list[ChatMessage] = [*sent, *(ChatMessageAssistant(content=reply.text) for reply in asked.replies)]
     if overlay is not None and case.repeat == 1:
@@ -65,7 +65,7 @@ PROMPT = "eval-question"
 
 
 @dataclass(frozen=True)
-class ByPrompt:
+class PromptAsker:
     """Asks a model. Every reply is kept as soon as it has come, and never asked for again in the same run."""
 
     model: Model
@@ -73,24 +73,22 @@ class ByPrompt:
     pictures: Pictures
     key: str  # of the run: replies of other runs are not taken
 
-    async def __call__(self, case: Case) -> Asked:
+    async def __call__(self, case: Case) -> CaseReplies:
         """Imagines where the arm says so, and asks. Raises `MllmUnavailable`, and what a simulation failed with."""
-        first = await self._first(case) if case.arm.gated else ()
-        if first and not _wants_more(case, first):
-            return Asked(first)
+        first: tuple[Reply, ...] = ()
+        if case.arm.gated:
+            alone = self._messages(case, Evidence())
+            first = tuple([await self._ask(case, alone, f"first {vote}") for vote in range(GATE_VOTES)])
+            if not _wants_more(case, first):
+                return CaseReplies(first)
         trials = range(case.arm.tries)
-        looks = tuple([await self.imagination.look(case.item, case.arm.shown, trial) for trial in trials])
+        evidence = tuple([await self.imagination.evidence(case.item, case.arm.shown, trial) for trial in trials])
         replies: list[Reply] = []
         messages: list[ChatMessage] = []
-        for trial, look in enumerate(looks):
-            messages = self._messages(case, look)
+        for trial, found in enumerate(evidence):
+            messages = self._messages(case, found)
             replies.append(await self._ask(case, messages, f"look {trial}"))
-        return Asked((*first, *replies), looks, len(first), tuple(messages))
-
-    async def _first(self, case: Case) -> tuple[Reply, ...]:
-        """The answers from the image alone."""
-        messages = self._messages(case, Look())
-        return tuple([await self._ask(case, messages, f"first {vote}") for vote in range(GATE_VOTES)])
+        return CaseReplies((*first, *replies), evidence, len(first), tuple(messages))
 
     async def _ask(self, case: Case, messages: list[ChatMessage], purpose: str) -> Reply:
         # The repeat is part of the key by itself: it is Inspect's epoch.
@@ -103,14 +101,14 @@ class ByPrompt:
             raise MllmUnavailable(f"{self.model} gave no reply: {told}") from error
         return Reply(output.completion, _usage(output), output.time or 0.0)
 
-    def _messages(self, case: Case, look: Look) -> list[ChatMessage]:
+    def _messages(self, case: Case, evidence: Evidence) -> list[ChatMessage]:
         """One message: pictures, then the question."""
-        with_image = case.arm.with_image or not look.frames
-        shown = "image-and-facts" if look.facts else "nothing"
-        if look.frames:
+        with_image = case.arm.with_image or not evidence.frames
+        shown = "image-and-facts" if evidence.facts else "nothing"
+        if evidence.frames:
             shown = "image-and-frames" if with_image else "frames"
-        text = load_prompt(PROMPT).render(question=case.question, shown=shown, facts=look.facts)
-        digests = (*((case.item.image,) if with_image else ()), *look.frames)
+        text = load_prompt(PROMPT).render(question=case.question, shown=shown, facts=evidence.facts)
+        digests = (*((case.item.image,) if with_image else ()), *evidence.frames)
         return [message(digests, text, self.pictures)]
 
 
@@ -134,7 +132,7 @@ def _usage(output: ModelOutput) -> Usage:
 
 
 @dataclass(frozen=True)
-class ByAnswer:
+class AnswerAsker:
     """Asks a server. The same run never asks the same twice: requests have idempotency keys."""
 
     client: AsyncClient
@@ -142,18 +140,13 @@ class ByAnswer:
     options: Mapping[str, Any]  # fields of the requests
     key: str  # of the run
 
-    async def __call__(self, case: Case) -> Asked:
+    async def __call__(self, case: Case) -> CaseReplies:
         """Asks, once per try of the arm."""
         imagine = "never" if case.arm.shown == "nothing" else "auto" if case.arm.gated else "always"
-        replies: list[Reply] = []
-        looks: list[Look] = []
-        for trial in range(case.arm.tries):
-            reply, look = await self._ask(case, imagine, trial)
-            replies.append(reply)
-            looks.append(look)
-        return Asked(tuple(replies), tuple(looks))
+        asked = [await self._ask(case, imagine, trial) for trial in range(case.arm.tries)]
+        return CaseReplies(tuple(reply for reply, _ in asked), tuple(found for _, found in asked))
 
-    async def _ask(self, case: Case, imagine: Literal["always", "auto", "never"], trial: int) -> tuple[Reply, Look]:
+    async def _ask(self, case: Case, imagine: Literal["always", "auto", "never"], trial: int) -> tuple[Reply, Evidence]:
         options: Any = {**self.options, **({"seed": trial} if trial else {})}
         image = self.pictures.path(case.item.image)
 
@@ -162,31 +155,17 @@ class ByAnswer:
 
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))
         answer = await asked_once(ask, *parts)
-        look = await self._look(answer)
-        # Usage and stages are of everything together: what is not of the simulation stands with the reply.
-        seconds = max(0.0, sum(answer.timings.values()) - look.seconds)
-        return Reply(_text(answer), answer.usage_total, seconds), look
-
-    async def _look(self, answer: AsyncAnswer) -> Look:
-        """What the answer rests on. Raises the fault for which nothing was imagined, where it is no refusal."""
+        found = Evidence()
         if answer.simulation_problem is not None:
             problem = error_from(answer.simulation_problem.model_dump())
             if not isinstance(problem, REFUSALS):
                 raise problem
-            return Look(refusal=problem)
-        simulation = answer.simulation
-        if simulation is None:
-            return Look()
-        for digest in simulation.pictures.values():
-            self.pictures.add_made(await self.client.artifact(digest))
-        outcome = simulation.trajectory.outcome
-        return Look(
-            frames=tuple(frame.sha256 for frame in simulation.frames),
-            overlay=simulation.overlay.sha256,
-            probability=None if outcome is None else outcome.probability,
-            seconds=sum(simulation.timings.values()),
-            simulated=True,
-        )
+            found = Evidence(refusal=problem)
+        elif answer.simulation is not None:
+            found = await evidence_of(answer.simulation, self.client, self.pictures)
+        # Usage and stages are of everything together: what is not of the simulation stands with the reply.
+        seconds = max(0.0, sum(answer.timings.values()) - found.seconds)
+        return Reply(_text(answer), answer.usage_total, seconds), found
 
 
 def _text(answer: AsyncAnswer) -> str:

@@ -1,4 +1,4 @@
-"""Which option a reply chooses: as this service reads replies, and as the paper's public scripts do."""
+"""One question, asked once: the order of its options, what its replies choose, and what is observed of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from itertools import permutations
 from typing import Any, Protocol
 
-from cow_service.evals.imagination import NO_USAGE, Arm, Look
+from cow_service.evals.imagination import NO_USAGE, Arm, Evidence
 from cow_service.evals.items import Item, Observation, question_text
 from cow_service.readers.mllm.answer import read_answer
 from cow_service.readers.mllm.replies import ReplyError
@@ -30,6 +30,7 @@ DIFFERENCES = (
 )
 # What stands behind the word "answer" and a colon, up to the next quotation mark.
 _ANNOUNCED = re.compile(r"""["']?[Aa]nswer["']?\s*:\s*["']?([^"']+)""")
+BETWEEN_REPLIES = "\n\n"
 MOST_LISTED = 5  # options, of which all orders are listed
 _PAPER_FORMS = tuple(map(re.compile, (r"\(([a-j])\)", r"^([a-j])$", r"([a-j])\.", r"^([a-j])\)")))
 
@@ -52,20 +53,6 @@ def _draws(*parts: object) -> random.Random:
     return random.Random(int.from_bytes(digest, "big"))
 
 
-def shown_options(item: Item, order: Sequence[int]) -> tuple[AnswerOption, ...]:
-    """The options as the question shows them: the letters stay in their places, the texts change theirs."""
-    return tuple(
-        AnswerOption(letter=option.letter, text=item.options[place].text)
-        for option, place in zip(item.options, order, strict=True)
-    )
-
-
-def in_data_order(item: Item, order: Sequence[int], letter: str | None) -> str | None:
-    """The letter, in the data's order, of the option that is shown with a letter; None where none is."""
-    places = {option.letter: place for option, place in zip(item.options, order, strict=True)}
-    return item.options[places[letter]].letter if letter in places else None
-
-
 def read_reply(reply: str, options: Sequence[AnswerOption]) -> str | None:
     """The letter of the shown option that a reply chooses; None where it chooses none, or several."""
     try:
@@ -81,27 +68,16 @@ def read_as_paper(reply: str) -> str | None:
     full stop, else its first character where that is a letter.
     """
     found = _ANNOUNCED.findall(reply)
-    said = found[-1] if found else _literal_answer(reply)
-    if said is None:
+    try:  # else what a Python literal between the outer braces says
+        literal = None if found else ast.literal_eval(reply[reply.find("{") : reply.rfind("}") + 1])
+        said = found[-1] if literal is None else str(literal["Answer"])
+    except (ValueError, SyntaxError, TypeError, KeyError, MemoryError, RecursionError, IndexError):
         return None
     text = said.strip().lower()
     letters = (match[1] for form in _PAPER_FORMS if (match := form.search(text)))
     first = text[0] if text[:1].isalpha() else None
     letter = next(letters, first)
     return None if letter is None else letter.upper()
-
-
-def _literal_answer(reply: str) -> str | None:
-    """What a Python literal between the outer braces says under `Answer`."""
-    try:
-        value = ast.literal_eval(reply[reply.find("{") : reply.rfind("}") + 1])
-        return str(value["Answer"])
-    except (ValueError, SyntaxError, TypeError, KeyError, MemoryError, RecursionError):
-        return None
-
-
-BETWEEN_REPLIES = "\n\n"
-_YES, _NO = ("yes", "true"), ("no", "false")
 
 
 @dataclass(frozen=True)
@@ -120,12 +96,23 @@ class Case:
 
     @property
     def options(self) -> tuple[AnswerOption, ...]:
-        """As they are shown."""
-        return shown_options(self.item, self.order)
+        """As they are shown: the letters stay in their places, the texts change theirs."""
+        return tuple(
+            AnswerOption(letter=option.letter, text=self.item.options[place].text)
+            for option, place in zip(self.item.options, self.order, strict=True)
+        )
 
     def read(self, reply: str) -> str | None:
-        """The letter, in the data's order, that a reply chooses."""
-        return in_data_order(self.item, self.order, read_reply(reply, self.options))
+        """The letter, in the data's order, that a reply chooses; None where it chooses none, or several."""
+        return self._in_data_order(read_reply(reply, self.options))
+
+    def read_as_paper(self, reply: str) -> str | None:
+        """The same by the rules of the paper's public scripts."""
+        return self._in_data_order(read_as_paper(reply))
+
+    def _in_data_order(self, letter: str | None) -> str | None:
+        places = {option.letter: place for option, place in zip(self.item.options, self.order, strict=True)}
+        return self.item.options[places[letter]].letter if letter in places else None
 
 
 @dataclass(frozen=True)
@@ -138,47 +125,47 @@ class Reply:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What came of a case: its replies, the first of which were given before anything was imagined, and the looks."""
+class CaseReplies:
+    """The replies to a case, first those given before anything was imagined, and what was shown."""
 
     replies: tuple[Reply, ...]
-    looks: tuple[Look, ...] = ()
+    evidence: tuple[Evidence, ...] = ()
     before: int = 0  # replies from the image alone that decided whether to imagine
     messages: tuple[Any, ...] = field(default=(), compare=False)  # as they were sent last, for the log
 
 
-class Asking(Protocol):
+class Asker(Protocol):
     """A way of asking."""
 
-    async def __call__(self, case: Case) -> Asked:
+    async def __call__(self, case: Case) -> CaseReplies:
         """Asks. Raises the `CowError` for which there is no reply."""
         ...
 
 
-def observed(case: Case, asked: Asked) -> Observation:
+def observation_of(case: Case, asked: CaseReplies) -> Observation:
     """The observation of a case. Of several replies the most frequent answer counts, of equals the first given."""
     item = case.item
     deciding = asked.replies[asked.before :] or asked.replies
     chosen = leading([case.read(reply.text) for reply in deciding])
-    look = asked.looks[0] if asked.looks else Look()
-    usage = sum((part.usage for part in (*asked.replies, *asked.looks)), NO_USAGE)
-    imagining = sum(each.seconds for each in asked.looks)
-    refusal = next((each.refusal for each in asked.looks if each.refusal is not None), None)
+    first_shown = asked.evidence[0] if asked.evidence else Evidence()
+    usage = sum((part.usage for part in (*asked.replies, *asked.evidence)), NO_USAGE)
+    imagining = sum(each.seconds for each in asked.evidence)
+    refusal = next((each.refusal for each in asked.evidence if each.refusal is not None), None)
     return Observation(
         **place_of(case),
         reply=BETWEEN_REPLIES.join(reply.text for reply in asked.replies),
         read=chosen,
-        read_as_paper=leading([_as_paper(case, reply.text) for reply in deciding]),
+        read_as_paper=leading([case.read_as_paper(reply.text) for reply in deciding]),
         calls=usage.calls,
         input_tokens=usage.input_tokens,
         output_tokens=usage.output_tokens,
         seconds=imagining + sum(reply.seconds for reply in asked.replies),
         imagining_seconds=imagining,
-        imaginations=sum(each.simulated for each in asked.looks),
+        imaginations=sum(each.simulated for each in asked.evidence),
         refusal=None if refusal is None else refusal.code,
-        frames=tuple(digest for each in asked.looks for digest in each.frames),
-        overlay=look.overlay,
-        probability=look.probability,
+        frames=tuple(digest for each in asked.evidence for digest in each.frames),
+        overlay=first_shown.overlay,
+        probability=first_shown.probability,
         happens=happens(item),
     )
 
@@ -207,9 +194,5 @@ def leading(letters: Sequence[str | None]) -> str | None:
 
 def happens(item: Item) -> bool | None:
     """Whether what is asked happens, by the truth; None where the right option is neither yes nor no."""
-    said = plain(next(option.text for option in item.options if option.letter == item.answer)).split()[:1]
-    return True if said and said[0] in _YES else False if said and said[0] in _NO else None
-
-
-def _as_paper(case: Case, text: str) -> str | None:
-    return in_data_order(case.item, case.order, read_as_paper(text))
+    said = plain(next(option.text for option in item.options if option.letter == item.answer))
+    return {"yes": True, "true": True, "no": False, "false": False}.get(said.partition(" ")[0])

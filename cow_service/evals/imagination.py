@@ -1,4 +1,4 @@
-"""What a question is asked with: the arms that an evaluation compares."""
+"""What is shown beside a question in each arm of an evaluation, and the simulations that it takes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import hashlib
 import re
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 from cow_service.client import AsyncClient, AsyncSimulation
@@ -21,6 +21,13 @@ from cow_service.records import DIRECTED_KINDS, Motion, Simulation, Usage
 
 Shown = Literal["nothing", "simulation", "still", "wrong-direction", "facts", "oracle"]
 MAX_TRIES = 16
+MAX_INTERRUPTS = 20  # of one run, each of which may have canceled the same job
+NO_USAGE = Usage()
+STEEP = 0.05  # of a unit vector
+# What an image and a question may come to: nothing is imagined, and the question is asked without. All else is a fault.
+REFUSALS = (CannotGround, CannotReadDirection, MllmBadReply)
+_ENDS = ("distance", "duration", "until")
+Result = TypeVar("Result")
 _BEST_OF = re.compile(r"best-of-(\d+)")
 
 
@@ -41,21 +48,18 @@ class Arm:
         return ("prompt", "answer") if plain else ("prompt",)
 
 
-ARMS: dict[str, tuple[Arm, str]] = {
-    arm.name: (arm, meaning)
-    for arm, meaning in (
-        (Arm("never"), "the image alone"),
-        (Arm("always", "simulation"), "the image and frames of its imagined future"),
-        (Arm("auto", "simulation", gated=True), "the same where three answers from the image alone disagree"),
-        (
-            Arm("best-of-3", "simulation", tries=3),
-            "three simulations, each with its own seed: the most frequent answer",
-        ),
-        (Arm("placebo-still", "still"), "the first image again in place of each frame"),
-        (Arm("placebo-direction", "wrong-direction"), "frames of a simulation in the opposite direction"),
-        (Arm("encounters", "facts"), "the image, and what the simulation found in words; no frames"),
-        (Arm("frames-only", "simulation", with_image=False), "the frames without the image"),
-        (Arm("oracle", "oracle"), "the image and pictures of what really happens"),
+ARMS: dict[str, Arm] = {
+    arm.name: arm
+    for arm in (
+        Arm("never"),
+        Arm("always", "simulation"),
+        Arm("auto", "simulation", gated=True),  # where three answers from the image alone disagree
+        Arm("best-of-3", "simulation", tries=3),  # each with its own seed
+        Arm("placebo-still", "still"),  # the first image again in place of each frame
+        Arm("placebo-direction", "wrong-direction"),
+        Arm("encounters", "facts"),  # in words; no frames
+        Arm("frames-only", "simulation", with_image=False),
+        Arm("oracle", "oracle"),  # pictures of what really happens
     )
 }
 
@@ -69,7 +73,7 @@ def arm_of(name: str) -> Arm:
         raise InvalidRequest(
             f"There is no arm '{name}': there are {', '.join(ARMS)}, and best-of-K for K from 2 to {MAX_TRIES}."
         )
-    return ARMS[name][0]
+    return ARMS[name]
 
 
 def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[Arm, ...]:
@@ -79,7 +83,7 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
         raise InvalidRequest(f"Name at least one arm: {', '.join(ARMS)}.")
     for arm in arms:
         if ask not in arm.asks:
-            there = ", ".join(name for name, (each, _) in ARMS.items() if ask in each.asks)
+            there = ", ".join(each.name for each in ARMS.values() if ask in each.asks)
             raise InvalidRequest(
                 f"The service's own /answer has no arm '{arm.name}', only {there}: use --ask prompt with --mllm."
             )
@@ -90,10 +94,6 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
             f"none, such as {without[0].row}."
         )
     return arms
-
-
-MAX_INTERRUPTS = 20  # of one run, each of which may have canceled the same job
-Result = TypeVar("Result")
 
 
 async def asked_once(ask: Callable[[str], Awaitable[Result]], *parts: str) -> Result:
@@ -110,15 +110,8 @@ async def asked_once(ask: Callable[[str], Awaitable[Result]], *parts: str) -> Re
     raise Canceled(f"The same job was canceled {MAX_INTERRUPTS} times.")
 
 
-NO_USAGE = Usage()
-# What an image and a question may come to: nothing is imagined, and the question is asked without. All else is a fault.
-STEEP = 0.05  # of a unit vector
-_ENDS = ("distance", "duration", "until")
-REFUSALS = (CannotGround, CannotReadDirection, MllmBadReply)
-
-
 @dataclass(frozen=True)
-class Look:
+class Evidence:
     """What there is to show beside the image of an item. It holds no pixels."""
 
     frames: tuple[str, ...] = ()  # digests
@@ -140,29 +133,32 @@ class Imagination:
         self._pictures = pictures
         self._options = dict(options)
         self._key = key
-        self._looks: dict[tuple[str, Shown, int], asyncio.Task[Look]] = {}
+        self._found: dict[tuple[str, Shown, int], asyncio.Task[Evidence]] = {}
 
-    async def look(self, item: Item, shown: Shown, trial: int = 0) -> Look:
+    async def evidence(self, item: Item, shown: Shown, trial: int = 0) -> Evidence:
         """What to show of an item. `trial` counts simulations of the same, which differ by their seed.
 
-        Raises the `CowError` for which a simulation failed, but for refusals: those are part of the look.
+        Raises the `CowError` for which a simulation failed, but for refusals: those are part of the evidence.
         """
         place = item.id, shown, trial
-        if place not in self._looks:
-            self._looks[place] = asyncio.ensure_future(self._make(item, shown, trial))
+        if place not in self._found:
+            self._found[place] = asyncio.ensure_future(self._make(item, shown, trial))
         try:
-            return await asyncio.shield(self._looks[place])
+            return await asyncio.shield(self._found[place])
         except CowError:
-            self._looks.pop(place, None)
+            self._found.pop(place, None)
             raise
 
-    async def _make(self, item: Item, shown: Shown, trial: int) -> Look:
+    async def _make(self, item: Item, shown: Shown, trial: int) -> Evidence:
         if shown == "nothing":
-            return Look()
+            return Evidence()
         if shown == "oracle":
-            return Look(frames=item.oracle)
+            return Evidence(frames=item.oracle)
         if shown == "still":
-            return Look(frames=(self._still(item),) * self._options["frames"]["count"])
+            # The image itself, as large as a frame.
+            pixels = decode(self._pictures.read(item.image)).pixels
+            still = self._pictures.add_made(encode_png(fit_within(pixels, self._options["frames"]["max_side"])))
+            return Evidence(frames=(still,) * self._options["frames"]["count"])
         begun = time.monotonic()
         try:
             simulation = await self._simulate(item, trial, {})
@@ -172,8 +168,11 @@ class Imagination:
                 usage, seconds = usage + simulation.usage_total, seconds + sum(simulation.timings.values())
         except REFUSALS as refusal:
             usage = Usage.model_validate(refusal.usage or {})
-            return Look(refusal=refusal, usage=usage, seconds=time.monotonic() - begun)
-        return await self._seen(simulation, shown, usage, seconds)
+            return Evidence(refusal=refusal, usage=usage, seconds=time.monotonic() - begun)
+        found = replace(await evidence_of(simulation, self._client, self._pictures), usage=usage, seconds=seconds)
+        if shown == "facts":
+            return replace(found, frames=(), facts=_facts(simulation))
+        return replace(found, probability=None) if shown == "wrong-direction" else found
 
     async def _simulate(self, item: Item, trial: int, changes: Mapping[str, Any]) -> AsyncSimulation:
         options: Any = {**self._options, **({"seed": trial} if trial else {}), **changes}
@@ -184,25 +183,19 @@ class Imagination:
 
         return await asked_once(ask, self._key, item.id, item.image, str(sorted(options.items())))
 
-    async def _seen(self, simulation: AsyncSimulation, shown: Shown, usage: Usage, seconds: float) -> Look:
-        """The look of a simulation; its pictures are kept."""
-        for digest in simulation.pictures.values():
-            self._pictures.add_made(await self._client.artifact(digest))
-        outcome = simulation.trajectory.outcome
-        return Look(
-            frames=() if shown == "facts" else tuple(frame.sha256 for frame in simulation.frames),
-            overlay=simulation.overlay.sha256,
-            facts=_facts(simulation) if shown == "facts" else (),
-            probability=None if outcome is None or shown == "wrong-direction" else outcome.probability,
-            usage=usage,
-            seconds=seconds,
-            simulated=True,
-        )
 
-    def _still(self, item: Item) -> str:
-        """The image itself, as large as a frame."""
-        pixels = decode(self._pictures.read(item.image)).pixels
-        return self._pictures.add_made(encode_png(fit_within(pixels, self._options["frames"]["max_side"])))
+async def evidence_of(simulation: AsyncSimulation, client: AsyncClient, pictures: Pictures) -> Evidence:
+    """What a simulation gives to show; its pictures are kept."""
+    for digest in simulation.pictures.values():
+        pictures.add_made(await client.artifact(digest))
+    outcome = simulation.trajectory.outcome
+    return Evidence(
+        frames=tuple(frame.sha256 for frame in simulation.frames),
+        overlay=simulation.overlay.sha256,
+        probability=None if outcome is None else outcome.probability,
+        seconds=sum(simulation.timings.values()),
+        simulated=True,
+    )
 
 
 def _facts(simulation: Simulation) -> tuple[str, ...]:

@@ -18,8 +18,8 @@ from inspect_ai.scorer import Score, Scorer, Target, mean, scorer, std
 from inspect_ai.solver import Generate, Solver, TaskState, solver
 
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
-from cow_service.evals.askers import ByAnswer, ByPrompt, conversation
-from cow_service.evals.asking import Asking, Case, observed, order_of
+from cow_service.evals.askers import AnswerAsker, PromptAsker, conversation
+from cow_service.evals.asking import Asker, Case, observation_of, order_of
 from cow_service.evals.imagination import Arm, check_arms
 from cow_service.evals.items import Ask, Item, Observation, Pictures, RunInfo, question_text
 from cow_service.evals.loaders import CAUSALSPATIAL, load
@@ -114,7 +114,7 @@ def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
         except Exception:
             count(arm, None)
             raise
-        seen = observed(case, asked)
+        seen = observation_of(case, asked)
         count(arm, seen)
         state.store.set(OBSERVATION, seen.model_dump(mode="json"))
         state.messages = conversation(case, asked, seen.overlay, _shared().pictures)
@@ -132,11 +132,11 @@ def _shared() -> Session:
     return shared
 
 
-def _asking(ask: Ask) -> Asking:
+def _asking(ask: Ask) -> Asker:
     shared = _shared()
     if ask == "answer":
-        return ByAnswer(shared.client(), shared.pictures, shared.options, shared.key)
-    return ByPrompt(get_model(), shared.imagination(), shared.pictures, shared.reply_key)
+        return AnswerAsker(shared.client(), shared.pictures, shared.options, shared.key)
+    return PromptAsker(get_model(), shared.imagination(), shared.pictures, shared.reply_key)
 
 
 @scorer(metrics={"right": [mean(), std()], "abstained": [mean()], "unreadable": [mean()]})

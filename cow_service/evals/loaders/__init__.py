@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,10 +17,13 @@ from cow_service.evals.loaders.formats import (
     subset_shards,
     table_rows,
 )
-from cow_service.evals.loaders.hub import CAUSALSPATIAL, download, is_hub_name
-from cow_service.evals.loaders.rows import Collected, RowFault, collect, digest_of, refuse_broken, refuse_faults
+from cow_service.evals.loaders.rows import MAX_SHOWN, Collected, RowFault, collect, digest_of, refuse_faults
 
 __all__ = ["CAUSALSPATIAL", "SUBSETS", "Collected", "RowFault", "digest_of", "load"]
+
+
+CAUSALSPATIAL = "Mwxinnn/CausalSpatial"
+_HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+", re.ASCII)
 
 
 def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_faulty: bool = False) -> Collected:
@@ -33,10 +37,11 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
     if unknown:
         raise InvalidRequest(f"There is no subset '{unknown[0]}': CausalSpatial has {', '.join(SUBSETS)}.")
     path = Path(data)
-    if not path.exists() and is_hub_name(data):
-        path = download(data)
+    if not path.exists() and _HUB_NAME.fullmatch(data):
+        path = _download(data)
     found, published = _found(path, data, subsets or SUBSETS, pictures, skip_faulty)
-    refuse_broken(found)
+    if found.broken:
+        raise InvalidRequest("\n".join(found.broken[:MAX_SHOWN]) + ".")
     absent = [subset for subset in subsets if published and not subset_shards(path, [subset])]
     if absent:
         raise InvalidRequest(f"'{data}' has no subset '{absent[0]}': a folder of that name with Parquet files.")
@@ -64,3 +69,18 @@ def _found(
         f"(*/meta.json with image.jpg), a file ({', '.join(READERS)}), or the name of a data set, such as "
         f"{CAUSALSPATIAL}."
     )
+
+
+def _download(name: str) -> Path:
+    """The folder of a data set, from the hub (HF_ENDPOINT) or the cache of its library (HF_HOME)."""
+    from huggingface_hub import snapshot_download  # noqa: PLC0415
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError  # noqa: PLC0415
+
+    try:
+        return Path(snapshot_download(name, repo_type="dataset", allow_patterns=["*.parquet", "**/*.parquet"]))
+    except (HfHubHTTPError, LocalEntryNotFoundError, OSError, ValueError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise InvalidRequest(
+            f"The data set '{name}' is no folder here, and could not be had from the hub: {reason}. Download it where "
+            "the network reaches the hub, and name the folder."
+        ) from error

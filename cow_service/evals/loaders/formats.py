@@ -1,4 +1,4 @@
-"""Rows of Parquet files."""
+"""The forms of data sets: CausalSpatial as published, scenes with truth, and JSON Lines, CSV, TSV or Parquet tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import json
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -69,12 +70,11 @@ def scene_rows(folder: Path) -> Iterator[Row | RowFault]:
 
 def oracle_frames(scene: Path) -> list[bytes]:
     """Pictures of what really happens, in the order of their numbers; empty where there are none."""
-    return [path.read_bytes() for path in sorted(scene.glob(FUTURE), key=_number)]
 
+    def number(path: Path) -> tuple[int, str]:
+        return int("".join(filter(str.isdigit, path.stem)) or 0), path.name
 
-def _number(path: Path) -> tuple[int, str]:
-    digits = "".join(c for c in path.stem if c.isdigit())
-    return int(digits or 0), path.name
+    return [path.read_bytes() for path in sorted(scene.glob(FUTURE), key=number)]
 
 
 # What a column means, by its names; those of VLMEvalKit are among them.
@@ -98,7 +98,7 @@ Numbered = tuple[str, dict[str, Any]] | RowFault  # where a row stands, and its 
 
 
 def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Row | RowFault]:
-    """The rows of a file. Columns that mean nothing are faults, unless they are ignored."""
+    """The rows of a file of one's own. Columns that mean nothing are faults, unless they are ignored."""
     told: set[str] = set()
     try:
         for numbered in READERS[path.suffix.lower()](path):
@@ -106,50 +106,38 @@ def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Row | Ro
                 yield numbered
                 continue
             place, fields = numbered
-            unknown = [name for name in fields if not _is_known(name)]
-            if unknown and not ignore_columns:
-                for name in (name for name in unknown if name not in told):
-                    told.add(name)
-                    yield RowFault(f"{place}: {_unknown(name)}")
-                continue
-            yield _row(path, place, fields)
+            known = (*_NAMES, *IGNORED, *LETTERS)
+            unknown = [] if ignore_columns else [name for name in fields if name not in known]
+            for name in unknown:
+                if name not in told:
+                    close = difflib.get_close_matches(name, _NAMES, 1)
+                    columns = f"known are {', '.join(COLUMNS)}, and A, B, C... for options."
+                    hint = f"did you mean `{close[0]}`?" if close else columns
+                    yield RowFault(f"{place}: unknown column `{name}`: {hint}")
+            told.update(unknown)
+            if not unknown:
+                yield _table_row(path, place, fields)
     except RowFault as fault:
         yield fault
 
 
-def _is_known(name: str) -> bool:
-    return name in _NAMES or name in IGNORED or (len(name) == 1 and name in LETTERS)
-
-
-def _unknown(name: str) -> str:
-    close = difflib.get_close_matches(name, _NAMES, 1)
-    hint = f"did you mean `{close[0]}`?" if close else f"known are {', '.join(COLUMNS)}, and A, B, C... for options."
-    return f"unknown column `{name}`: {hint}"
-
-
-def _row(path: Path, place: str, fields: dict[str, Any]) -> Row | RowFault:
+def _table_row(path: Path, place: str, fields: dict[str, Any]) -> Row | RowFault:
     values = {_NAMES[name]: value for name, value in fields.items() if name in _NAMES and value not in (None, "")}
-    missing = [name for name in REQUIRED if name not in values]
-    if missing:
-        return RowFault(f"{place}: has no {' and no '.join(f'`{name}`' for name in missing)}")
     try:
-        image = _image(values["image"], path.parent)
-        options = _options(values.get("options"), fields)
+        _require(values, REQUIRED)
+        image = _image(values.pop("image"), path.parent)
+        options = _options(values.pop("options", None), fields)
     except RowFault as fault:
         return RowFault(f"{place}: {fault}")
-    named = str(values.get("id", place.rpartition(" ")[2]))
-    return Row(
-        place=place,
-        id=named,
-        source_id=named,
-        image=image,
-        question=str(values["question"]),
-        answer=str(values["answer"]),
-        options=options,
-        task=None if values.get("task") is None else str(values["task"]),
-        level=None if values.get("level") is None else str(values["level"]),
-        scene=None if values.get("scene") is None else str(values["scene"]),
-    )
+    named = str(values.pop("id", place.rpartition(" ")[2]))
+    texts: dict[str, Any] = {name: str(value) for name, value in values.items()}
+    return Row(place=place, id=named, source_id=named, image=image, options=options, **texts)
+
+
+def _require(fields: dict[str, Any], names: Sequence[str]) -> None:
+    missing = [name for name in names if fields.get(name) in (None, "")]
+    if missing:
+        raise RowFault(f"has no {' and no '.join(f'`{name}`' for name in missing)}")
 
 
 def _options(given: Any, fields: dict[str, Any]) -> list[str] | None:
@@ -208,45 +196,31 @@ def _json_lines(path: Path) -> Iterator[Numbered]:
             yield RowFault(f"{place}: must be an object, got {type(fields).__name__}")
 
 
-def _separated(delimiter: str) -> Callable[[Path], Iterator[Numbered]]:
-    def rows(path: Path) -> Iterator[Numbered]:
-        csv.field_size_limit(sys.maxsize)  # a field may hold a picture
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, delimiter=delimiter, strict=True)
-            yield from _numbered(path, reader)
-
-    return rows
-
-
-def _numbered(path: Path, reader: Iterable[list[str]]) -> Iterator[Numbered]:
+def _separated(path: Path, delimiter: str) -> Iterator[Numbered]:
+    csv.field_size_limit(sys.maxsize)  # a field may hold a picture
     names: list[str] = []
     number = 0
     try:
-        for number, cells in enumerate(reader, 1):
-            if not names:
-                names = [name.strip() for name in cells]
-                continue
-            if cells and len(cells) != len(names):
-                yield RowFault(
-                    f"{path.name}, row {number}: has {len(cells)} cells for {len(names)} columns; was the file written "
-                    "to its end?"
-                )
-            elif cells:
-                yield f"{path.name}, row {number}", dict(zip(names, cells, strict=True))
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            for number, cells in enumerate(csv.reader(file, delimiter=delimiter, strict=True), 1):
+                place = f"{path.name}, row {number}"
+                if not names:
+                    names = [name.strip() for name in cells]
+                elif cells and len(cells) != len(names):
+                    yield RowFault(
+                        f"{place}: has {len(cells)} cells for {len(names)} columns; was the file written to its end?"
+                    )
+                elif cells:
+                    yield place, dict(zip(names, cells, strict=True))
     except (csv.Error, UnicodeDecodeError) as error:
         raise FileFault(f"{path.name}, row {number + 1}: {error}; was the file written to its end?") from error
 
 
-def _parquet(path: Path) -> Iterator[Numbered]:
-    for number, fields in enumerate(parquet_rows(path)):
-        yield f"{path.name}, row {number}", fields
-
-
 READERS: dict[str, Callable[[Path], Iterator[Numbered]]] = {
     ".jsonl": _json_lines,
-    ".csv": _separated(","),
-    ".tsv": _separated("\t"),
-    ".parquet": _parquet,
+    ".csv": partial(_separated, delimiter=","),
+    ".tsv": partial(_separated, delimiter="\t"),
+    ".parquet": lambda path: ((f"{path.name}, row {number}", row) for number, row in enumerate(parquet_rows(path))),
 }
 
 
@@ -287,9 +261,10 @@ def _rows(folder: Path, subsets: Sequence[str], abstaining: dict[str, str]) -> I
 
 def _published_row(folder: Path, subset: str, unique: str, place: str, fields: dict[str, Any]) -> Row | RowFault:
     """A row. One that lacks what the others have is a fault."""
-    missing = [name for name in ("id", "question", "answer", "image") if fields.get(name) in (None, "")]
-    if missing:
-        return RowFault(f"{place}: has no {' and no '.join(f'`{name}`' for name in missing)}")
+    try:
+        _require(fields, ("id", "question", "answer", "image"))
+    except RowFault as fault:
+        return RowFault(f"{place}: {fault}")
     source = str(fields["id"])
     level = _LEVEL.search(source)
     real = subset == "realworld"
@@ -315,12 +290,10 @@ def _shared_ids(items: Sequence[Item]) -> list[str]:
     counts = Counter((item.id.partition("/")[0], item.source_id) for item in items)
     shared: Counter[str] = Counter()
     for (subset, _), count in counts.items():
-        shared[subset] += count if count > 1 else 0
-    return [
-        f"{subset}: {count} rows share their id with others; items are told apart by subset, shard and row."
-        for subset, count in shared.items()
-        if count
-    ]
+        if count > 1:
+            shared[subset] += count
+    told = "rows share their id with others; items are told apart by subset, shard and row."
+    return [f"{subset}: {count} {told}" for subset, count in shared.items()]
 
 
 def _without_abstain(items: Sequence[Item], abstaining: dict[str, str]) -> list[str]:
@@ -336,8 +309,6 @@ def _without_abstain(items: Sequence[Item], abstaining: dict[str, str]) -> list[
                 f"{subset}: {len(none)} rows have no option that abstains, though `not_sure` names one; in {right} of "
                 "them that option is the right answer. It counts as an answer like any other."
             )
-        if len(none) < len(of_subset):
-            notes.append(
-                f"{subset}: in {len(of_subset) - len(none)} rows another option abstains than `not_sure` says."
-            )
+        if others := len(of_subset) - len(none):
+            notes.append(f"{subset}: in {others} rows another option abstains than `not_sure` says.")
     return notes

@@ -6,7 +6,6 @@ import hashlib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -61,25 +60,21 @@ def item_of(row: Row, pictures: Pictures) -> Item:
     parts, options = _wording(row)
     image = _picture(row.image, "image", pictures)
     abstain = not_sure_option(options)
-    return _checked(
-        id=row.id,
-        row=row.place,
-        source_id=row.source_id,
-        image=image,
-        question=parts,
-        options=options,
-        answer=_answer(row.answer, options),
-        abstain=None if abstain is None else abstain.letter,
-        task=task_of(row.task),
-        level=row.level or UNKNOWN_LEVEL,
-        scene=row.scene or image,
-        oracle=tuple(_picture(each, "oracle frame", pictures) for each in row.oracle),
-    )
-
-
-def _checked(**fields: Any) -> Item:
     try:
-        return Item(**fields)
+        return Item(
+            id=row.id,
+            row=row.place,
+            source_id=row.source_id,
+            image=image,
+            question=parts,
+            options=options,
+            answer=_answer(row.answer, options),
+            abstain=None if abstain is None else abstain.letter,
+            task=task_of(row.task),
+            level=row.level or UNKNOWN_LEVEL,
+            scene=row.scene or image,
+            oracle=tuple(_picture(each, "oracle frame", pictures) for each in row.oracle),
+        )
     except ValidationError as error:
         first = error.errors()[0]
         raise RowFault(f"`{'.'.join(map(str, first['loc']))}` cannot be used: {first['msg']}") from error
@@ -87,8 +82,7 @@ def _checked(**fields: Any) -> Item:
 
 def task_of(name: str | None) -> Task:
     """The task that a data set's name means; `other` where it is none of ours."""
-    words = re.findall(r"[a-z]+", (name or "").lower())
-    for word in words:
+    for word in re.findall(r"[a-z]+", (name or "").lower()):
         if word in _TASKS:
             return _TASKS[word]
     return "other"
@@ -181,12 +175,6 @@ def collect(rows: Iterable[Row | RowFault], pictures: Pictures, *, repeated_rows
     if repeated_rows and len(asked) < len(found.items):
         found.notes.append(f"{len(found.items) - len(asked)} rows ask the same of the same picture as another row.")
     return found
-
-
-def refuse_broken(found: Collected) -> None:
-    """Raises `InvalidRequest` that names every file that cannot be read to its end: rows are missing."""
-    if found.broken:
-        raise InvalidRequest("\n".join(found.broken[:MAX_SHOWN]) + ".")
 
 
 def refuse_faults(found: Collected) -> None:
