@@ -1,4 +1,4 @@
-"""What is asked: an item is one question on one image, with its options and its truth."""
+"""What is asked and what comes of it: an item is one question on one image, with its options and its truth."""
 
 from __future__ import annotations
 
@@ -93,17 +93,18 @@ class Pictures:
 
     def add(self, data: bytes) -> str:
         """Keeps a picture; returns its digest. Raises what `decode` raises for what is none."""
-        digest = hashlib.sha256(data).hexdigest()
-        if digest not in self._known:
+        if hashlib.sha256(data).hexdigest() not in self._known:
             decode(data)
-            self._write(digest, data)
-        return digest
+        return self.add_made(data)
 
     def add_made(self, data: bytes) -> str:
         """The same for a picture that the service made."""
         digest = hashlib.sha256(data).hexdigest()
         if digest not in self._known:
-            self._write(digest, data)
+            path = self.folder / f"{digest}.{extension_of(media_type_of(data) or 'image/png')}"
+            partial = path.with_name(f".{digest}.partial")
+            partial.write_bytes(data)
+            self._known[digest] = partial.replace(path)
         return digest
 
     def path(self, digest: str) -> Path:
@@ -113,13 +114,6 @@ class Pictures:
     def read(self, digest: str) -> bytes:
         """What a picture holds. Raises `KeyError` for one that was not added."""
         return self.path(digest).read_bytes()
-
-    def _write(self, digest: str, data: bytes) -> None:
-        path = self.folder / f"{digest}.{extension_of(media_type_of(data) or 'image/png')}"
-        partial = path.with_name(f".{digest}.partial")
-        partial.write_bytes(data)
-        partial.replace(path)
-        self._known[digest] = path
 
 
 Ask = Literal["prompt", "answer"]

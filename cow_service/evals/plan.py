@@ -1,4 +1,4 @@
-"""What took part in an evaluation, and in which version."""
+"""What is to be asked, checked before anything is, and as the record of the run."""
 
 from __future__ import annotations
 
@@ -24,23 +24,6 @@ from cow_service.settings import load_settings
 
 PACKAGES = ("inspect-ai", "numpy", "opencv-python-headless", "rapier3d", "scipy", "torch", "diffusers", "openai")
 PROMPTS = ("eval-question", "identify", "locate", "scale", "answer-from-image", "answer-with-frames")
-
-
-def versions() -> dict[str, str]:
-    """Of this service, of Python, of the packages that are installed, and of the prompts."""
-    found = {"cow-service": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    for name in PROMPTS:
-        prompt = load_prompt(name)
-        digest = hashlib.sha256(prompt.body.encode()).hexdigest()
-        found[f"prompts/{name}"] = f"{prompt.version} (sha256 {digest})"
-    return found
-
-
 # Providers that Inspect and the server in this process both know, and where both look for the key.
 KEYS = {"openai": "OPENAI_API_KEY", "anthropic": "ANTHROPIC_API_KEY", "google": "GOOGLE_API_KEY"}
 MAX_TOKENS = 8192  # of a reply, as in the paper
@@ -144,13 +127,15 @@ def merged(before: RunInfo | None, wanted: RunInfo, *, again: bool) -> RunInfo:
     """A run that goes on, with more arms or repeats perhaps. Raises `InvalidRequest` where the rest is not the same."""
     if before is None:
         return wanted
-    for name in _SAME:
-        was, is_now = getattr(before, name), getattr(wanted, name)
+    same = [(name.replace("_", " "), getattr(before, name), getattr(wanted, name)) for name in _SAME]
+    prompts = [name for name in wanted.versions if name.startswith("prompts/")]
+    same += [(name, before.versions.get(name), wanted.versions[name]) for name in prompts]
+    for name, was, is_now in same:
         if was != is_now:
-            raise _other(name.replace("_", " "), was, is_now)
-    for name in (name for name in wanted.versions if name.startswith("prompts/")):
-        if before.versions.get(name) != wanted.versions[name]:
-            raise _other(name, before.versions.get(name), wanted.versions[name])
+            raise InvalidRequest(
+                f"The folder holds a run with another {name} ({was}, not {is_now}): give --out another folder, or the "
+                "same arguments as before."
+            )
     arms = (*before.arms, *(arm for arm in wanted.arms if arm not in before.arms))
     newer = [f"{name} {version}" for name, version in wanted.versions.items() if before.versions.get(name) != version]
     notes = (f"Gone on with {', '.join(newer)}.",) if newer else ()
@@ -164,8 +149,16 @@ def merged(before: RunInfo | None, wanted: RunInfo, *, again: bool) -> RunInfo:
     return before.model_copy(update=changes)
 
 
-def _other(name: str, was: object, is_now: object) -> InvalidRequest:
-    return InvalidRequest(
-        f"The folder holds a run with another {name} ({was}, not {is_now}): give --out another folder, or the same "
-        "arguments as before."
-    )
+def versions() -> dict[str, str]:
+    """Of this service, of Python, of the packages that are installed, and of the prompts."""
+    found = {"cow-service": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    for name in PROMPTS:
+        prompt = load_prompt(name)
+        digest = hashlib.sha256(prompt.body.encode()).hexdigest()
+        found[f"prompts/{name}"] = f"{prompt.version} (sha256 {digest})"
+    return found

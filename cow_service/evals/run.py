@@ -1,4 +1,7 @@
-"""The tasks, solver and scorer for Inspect: `inspect eval cow_service/causalspatial -T data=FOLDER -T arm=always`."""
+"""Carries out an evaluation; and its task, solver and scorer for Inspect.
+
+`inspect eval cow_service/causalspatial -T data=FOLDER -T arm=always` runs one arm without `cow eval`.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,16 @@ import os
 import secrets
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from typing import Any
 
 import rich
-from inspect_ai import Epochs, Task, task
+from inspect_ai import Epochs, Task, eval_set, task
 from inspect_ai.dataset import MemoryDataset, Sample
 from inspect_ai.model import GenerateConfig, ModelOutput, get_model
 from inspect_ai.scorer import Score, Scorer, Target, mean, scorer, std
 from inspect_ai.solver import Generate, Solver, TaskState, solver
 
+from cow_service.client import Client
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
 from cow_service.evals.askers import AnswerAsker, PromptAsker, conversation
 from cow_service.evals.asking import Asker, Case, observation_of, order_of
@@ -24,8 +27,20 @@ from cow_service.evals.imagination import Arm, check_arms
 from cow_service.evals.items import Ask, Item, Observation, Pictures, RunInfo, question_text
 from cow_service.evals.loaders import CAUSALSPATIAL, load
 from cow_service.evals.plan import MAX_TOKENS, Plan, check_plan, info_of, merged, request_options, server_settings
-from cow_service.evals.runs import CACHE, ITEM, LOGS, OBSERVATION, PICTURES, EvalRun, read_info, read_run, write_run
-from cow_service.evals.session import Session, active_session, count, own_folder, session
+from cow_service.evals.runs import (
+    CACHE,
+    ITEM,
+    LOGS,
+    OBSERVATION,
+    PICTURES,
+    EvalRun,
+    forget_failures,
+    read_info,
+    read_observations,
+    read_run,
+    write_run,
+)
+from cow_service.evals.session import Progress, active_session, own_folder, session
 from cow_service.readers.prompts import load_prompt
 
 
@@ -46,22 +61,13 @@ def causalspatial(
 
     `subsets` are separated by commas. Without `url` a server runs in the process. Raises `InvalidRequest`.
     """
-    items = _prepared[-1] if _prepared else _loaded(data, subsets, limit, url, reader, generator)
+    shared = active_session()
+    if shared is not None and shared.items is not None:  # loaded and checked before, whatever `data` says
+        items = shared.items
+    else:
+        items = _loaded(data, subsets, limit, url, reader, generator)
     (one,) = check_arms([arm], ask, items)
     return arm_task(items, one, ask, repeats, seed)
-
-
-_prepared: list[Sequence[Item]] = []
-
-
-@contextmanager
-def prepared(items: Sequence[Item]) -> Generator[None]:
-    """Tasks that are made meanwhile have these items, whatever `data` says: they were loaded and checked before."""
-    _prepared.append(items)
-    try:
-        yield
-    finally:
-        _prepared.pop()
 
 
 def _loaded(
@@ -109,34 +115,27 @@ def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
         item = Item.model_validate(state.metadata[ITEM])
         (one,) = check_arms([arm], ask, [item])
         case = Case(item, one, state.epoch, order_of(item, seed, state.epoch))
+        shared = active_session()
+        if shared is None:
+            raise RuntimeError("The solver runs in tasks of `causalspatial` alone.")
+        client, imagination = shared.clients()
+        asker: Asker = PromptAsker(get_model(), imagination, shared.pictures, shared.reply_key)
+        if ask == "answer":
+            asker = AnswerAsker(client, shared.pictures, shared.options, shared.key)
         try:
-            asked = await _asking(ask)(case)
+            asked = await asker(case)
         except Exception:
-            count(arm, None)
+            shared.count(arm, None)
             raise
         seen = observation_of(case, asked)
-        count(arm, seen)
+        shared.count(arm, seen)
         state.store.set(OBSERVATION, seen.model_dump(mode="json"))
-        state.messages = conversation(case, asked, seen.overlay, _shared().pictures)
+        state.messages = conversation(case, asked, seen.overlay, shared.pictures)
         state.output = ModelOutput.from_content(str(state.model), asked.replies[-1].text)
         state.completed = True
         return state
 
     return solve
-
-
-def _shared() -> Session:
-    shared = active_session()
-    if shared is None:
-        raise RuntimeError("The solver runs in tasks of `causalspatial` alone.")
-    return shared
-
-
-def _asking(ask: Ask) -> Asker:
-    shared = _shared()
-    if ask == "answer":
-        return AnswerAsker(shared.client(), shared.pictures, shared.options, shared.key)
-    return PromptAsker(get_model(), shared.imagination(), shared.pictures, shared.reply_key)
 
 
 @scorer(metrics={"right": [mean(), std()], "abstained": [mean()], "unreadable": [mean()]})
@@ -166,7 +165,10 @@ def evaluate(plan: Plan, tell: Callable[[str], None]) -> EvalRun:
     written, and the `CowError` for which no server can be used.
     """
     check_plan(plan)
-    pictures = _pictures(plan.out)
+    try:
+        pictures = Pictures(plan.out / PICTURES)
+    except OSError as error:
+        raise StorageUnavailable(f"'{plan.out}' cannot be written: {error.strerror or error}.") from error
     found = load(plan.data, pictures, subsets=plan.subsets, skip_faulty=plan.skip_faulty)
     items = found.items[: plan.limit]
     arms = check_arms(plan.arms, plan.ask, items)
@@ -174,54 +176,29 @@ def evaluate(plan: Plan, tell: Callable[[str], None]) -> EvalRun:
         tell(told)
     settings, model = server_settings(plan), _model(plan)
     wanted = info_of(plan, items, found, arms)
-    _prepare_inspect(plan.out)
-    again = plan.retry_failed and _forget_failures(plan.out / LOGS) > 0
+    # Inspect keeps replies in the folder: a reply that has come is never asked for again.
+    os.environ["INSPECT_CACHE_DIR"] = str((plan.out / CACHE).resolve())
+    logs = plan.out / LOGS
+    again = plan.retry_failed and logs.is_dir() and forget_failures(logs) > 0
     info = merged(read_info(plan.out), wanted, again=again)
     write_run(plan.out, info, items)
     _ask(plan, info, items, model, settings)
     return read_run(plan.out)
 
 
-def _pictures(out: Path) -> Pictures:
-    try:
-        return Pictures(out / PICTURES)
-    except OSError as error:
-        raise StorageUnavailable(f"'{out}' cannot be written: {error.strerror or error}.") from error
-
-
-def _forget_failures(logs: Path) -> int:
-    from cow_service.evals.runs import forget_failures  # noqa: PLC0415 - Inspect takes a second to import
-
-    return forget_failures(logs) if logs.is_dir() else 0
-
-
-def _prepare_inspect(out: Path) -> None:
-    """Replies are kept in the folder: a reply that has come is never asked for again."""
-    os.environ["INSPECT_CACHE_DIR"] = str((out / CACHE).resolve())
-
-
 def _ask(plan: Plan, info: RunInfo, items: Sequence[Item], model: Any, settings: dict[str, Any]) -> None:
     """Asks what there is no reply to yet. Raises the `CowError` for which that cannot begin."""
-    from inspect_ai import Epochs, eval_set  # noqa: PLC0415
-
-    from cow_service.evals.runs import read_observations  # noqa: PLC0415
-    from cow_service.evals.session import (  # noqa: PLC0415
-        Count,
-        Progress,
-        session,
-        shown,
-    )
-
     logs = plan.out / LOGS
     logs.mkdir(exist_ok=True)
-    progress = Progress({arm: Count(len(items) * info.repeats) for arm in info.arms})
-    progress.add_earlier([each for each in read_observations(logs) if not (plan.retry_failed and each.failure)])
+    progress = Progress(info.arms, len(items) * info.repeats)
+    progress.add_earlier(each for each in read_observations(logs) if not (plan.retry_failed and each.failure))
     if not progress.left:
         return
     keys = f"{info.token} {info.rounds}", info.token
     with session(plan.out, plan.url, info.settings["requests"], *keys, **settings) as shared:
         _check_server(shared.url, plan)
-        with prepared(items), shown(progress), _quiet_inspect():
+        shared.items, shared.progress = items, progress
+        with progress.shown(), _quiet_inspect():
             _, ended = eval_set(
                 tasks=[
                     causalspatial(data=info.data_digest, arm=arm, ask=plan.ask, seed=plan.seed) for arm in info.arms
@@ -261,8 +238,6 @@ def _quiet_inspect() -> Generator[None]:
 
 def _model(plan: Plan) -> Any:
     """The model of Inspect that answers. Raises `InvalidRequest` where its provider cannot be used."""
-    from inspect_ai.model import get_model  # noqa: PLC0415
-
     if plan.ask == "answer":
         return get_model("none/none")
     try:
@@ -274,18 +249,14 @@ def _model(plan: Plan) -> Any:
 
 def _check_server(url: str, plan: Plan) -> None:
     """Raises the `CowError` for which the server cannot be asked, or not so."""
-    from cow_service.client import Client  # noqa: PLC0415
-
     try:
         with Client(url, retries=0) as client:
             models = client.models()
     except CowError as error:
         error.detail = f"The server at {url} cannot be asked. {error.detail}"
         raise
-    for option, name, known in (
-        ("reader", plan.reader, models.readers),
-        ("generator", plan.generator, models.generators),
-    ):
+    wanted = ("reader", plan.reader, models.readers), ("generator", plan.generator, models.generators)
+    for option, name, known in wanted:
         backend = next((each for each in known if each.name == name), None)
         if name is not None and backend is None:
             raise InvalidRequest(f"--{option} {name}: the server has only {', '.join(each.name for each in known)}.")

@@ -1,8 +1,8 @@
-"""What a folder of results holds: the names of its files and folders."""
+"""A folder of results: what was asked, and what came of it, which stands in Inspect's logs alone."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,56 +35,6 @@ REPORT = "report"
 _NOT_READ = {"messages", "events", "attachments", "output", "store", "timelines"}
 _CANCELED = "CancelledError("  # how Inspect writes down what an interrupt cut off
 MAX_FAILURE = 500  # characters
-
-
-def read_observations(folder: Path) -> list[Observation]:
-    """The observations of all logs of a folder; of a question that was asked again, the last."""
-    found: dict[tuple[str, str, int], Observation] = {}
-    for log in read_logs(folder):
-        for sample in log.samples or ():
-            each = _observation(log, sample)
-            if each is not None:
-                place = each.arm, each.item, each.repeat
-                before = found.get(place)
-                if before is None or before.failure is not None or each.failure is None:
-                    found[place] = each
-    return list(found.values())
-
-
-def read_logs(folder: Path) -> Iterator[EvalLog]:
-    """The logs of a folder, the oldest first, without pictures."""
-    for info in list_eval_logs(str(folder), descending=False):
-        yield read_eval_log(info, exclude_fields=_NOT_READ)
-
-
-def _observation(log: EvalLog, sample: EvalSample) -> Observation | None:
-    """What came of a sample; None where it was canceled."""
-    for score in (sample.scores or {}).values():
-        if score.metadata and OBSERVATION in score.metadata:
-            return Observation.model_validate(score.metadata[OBSERVATION])
-    if sample.error is None or (log.status == "cancelled" and sample.error.message.startswith(_CANCELED)):
-        return None
-    arguments: dict[str, Any] = log.plan.steps[0].params
-    item = Item.model_validate(sample.metadata[ITEM])
-    order = order_of(item, arguments["seed"], sample.epoch)
-    case = Case(item, arm_of(arguments["arm"]), sample.epoch, order)
-    return Observation(**place_of(case), failure=sample.error.message[:MAX_FAILURE])
-
-
-def forget_failures(folder: Path) -> int:
-    """Marks what failed, so that it is asked again; returns how many there were."""
-    count = 0
-    for info in list_eval_logs(str(folder)):
-        log = read_eval_log(info)
-        failed = [sample.uuid for sample in log.samples or () if sample.error is not None and sample.uuid]
-        if failed:
-            why = ProvenanceData(author="cow eval", reason="asked again: --retry-failed")
-            write_eval_log(invalidate_samples(log, failed, why), info.name)
-            count += len(failed)
-    return count
-
-
-ITEM, OBSERVATION = "item", "observation"  # where a sample of a log holds them
 
 
 @dataclass(frozen=True)
@@ -135,4 +85,49 @@ def read_run(folder: Path) -> EvalRun:
 
 def _unreadable(folder: Path, name: str, error: Exception) -> InvalidRequest:
     reason = str(error).splitlines()[0]
-    return InvalidRequest(f"'{folder}' holds no whole run: {name} cannot be read ({reason}). EvalRun `cow eval` again.")
+    return InvalidRequest(f"'{folder}' holds no whole run: {name} cannot be read ({reason}). Run `cow eval` again.")
+
+
+def read_observations(folder: Path) -> list[Observation]:
+    """The observations of all logs of a folder; of a question that was asked again, the last."""
+    found: dict[tuple[str, str, int], Observation] = {}
+    for info in list_eval_logs(str(folder), descending=False):  # the oldest first
+        log = read_eval_log(info, exclude_fields=_NOT_READ)
+        for sample in log.samples or ():
+            each = _observation(log, sample)
+            if each is not None:
+                place = each.arm, each.item, each.repeat
+                before = found.get(place)
+                if before is None or before.failure is not None or each.failure is None:
+                    found[place] = each
+    return list(found.values())
+
+
+def _observation(log: EvalLog, sample: EvalSample) -> Observation | None:
+    """What came of a sample; None where it was canceled."""
+    for score in (sample.scores or {}).values():
+        if score.metadata and OBSERVATION in score.metadata:
+            return Observation.model_validate(score.metadata[OBSERVATION])
+    if sample.error is None or (log.status == "cancelled" and sample.error.message.startswith(_CANCELED)):
+        return None
+    arguments: dict[str, Any] = log.plan.steps[0].params
+    item = Item.model_validate(sample.metadata[ITEM])
+    order = order_of(item, arguments["seed"], sample.epoch)
+    case = Case(item, arm_of(arguments["arm"]), sample.epoch, order)
+    return Observation(**place_of(case), failure=sample.error.message[:MAX_FAILURE])
+
+
+def forget_failures(folder: Path) -> int:
+    """Marks what failed, so that it is asked again; returns how many there were."""
+    count = 0
+    for info in list_eval_logs(str(folder)):
+        log = read_eval_log(info)
+        failed = [sample.uuid for sample in log.samples or () if sample.error is not None and sample.uuid]
+        if failed:
+            why = ProvenanceData(author="cow eval", reason="asked again: --retry-failed")
+            write_eval_log(invalidate_samples(log, failed, why), info.name)
+            count += len(failed)
+    return count
+
+
+ITEM, OBSERVATION = "item", "observation"  # where a sample of a log holds them

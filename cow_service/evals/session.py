@@ -1,13 +1,14 @@
-"""What every task of an evaluation shares: the server that it asks, and where its pictures are kept."""
+"""What every task of an evaluation shares: the server that it asks, where its pictures are kept, and its progress."""
 
 from __future__ import annotations
 
 import asyncio
 import tempfile
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,15 @@ from rich.table import Table
 
 from cow_service.client import AsyncClient
 from cow_service.evals.imagination import Imagination
-from cow_service.evals.items import Observation, Pictures
+from cow_service.evals.items import Item, Observation, Pictures
 from cow_service.evals.runs import PICTURES, SERVER
 from cow_service.observability import logging
 from cow_service.service import Service
 from cow_service.settings import load_settings
 
 LOG = "server.log"
+LINES_EVERY = 15.0  # seconds, where nothing can be redrawn
+REDRAWN = 4  # times a second
 TIMEOUT = 600.0  # seconds that a server may say nothing: an MLLM of its own may think for long
 
 
@@ -36,17 +39,17 @@ class Session:
     key: str  # of the run and its round: names its requests
     reply_key: str  # of the run: names its replies
     options: Mapping[str, Any]  # fields of the requests for simulations and answers
+    items: Sequence[Item] | None = None  # of its tasks; None: each task loads its own
+    progress: Progress | None = None
     _clients: dict[int, tuple[AsyncClient, Imagination]] = field(default_factory=dict)
 
-    def client(self) -> AsyncClient:
-        """For the running event loop."""
-        return self._of_loop()[0]
+    def count(self, arm: str, seen: Observation | None) -> None:
+        """Counts a question that has just been asked, where progress is shown; None: it failed."""
+        if self.progress is not None:
+            self.progress.add(arm, seen)
 
-    def imagination(self) -> Imagination:
+    def clients(self) -> tuple[AsyncClient, Imagination]:
         """For the running event loop; all arms share its simulations."""
-        return self._of_loop()[1]
-
-    def _of_loop(self) -> tuple[AsyncClient, Imagination]:
         loop = id(asyncio.get_running_loop())
         if loop not in self._clients:
             client = AsyncClient(self.url, timeout=TIMEOUT)
@@ -108,131 +111,89 @@ def own_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="cow-eval-"))
 
 
-LINES_EVERY = 15.0  # seconds, where nothing can be redrawn
-REDRAWN = 4  # times a second
-
-
 @dataclass
-class Count:
-    """Of one arm."""
+class ArmCount:
+    """How far one arm is."""
 
     total: int
     done: int = 0
     right: int = 0
     failed: int = 0
 
+    @property
+    def share_right(self) -> str:
+        """Of those with a reply; empty where there are none."""
+        answered = self.done - self.failed
+        return f"{self.right / answered:.1%}" if answered else ""
 
-@dataclass
+
 class Progress:
-    """Counts of all arms. What was done before the process began counts as done, and not for the rate."""
+    """Rate, time left and accuracy so far of every arm, on standard error.
 
-    counts: dict[str, Count]
-    begun: float = field(default_factory=time.monotonic)
-    done_here: int = 0
+    What was done before the process began counts as done, and not for the rate.
+    """
+
+    def __init__(self, arms: Iterable[str], questions: int) -> None:
+        self._counts = {arm: ArmCount(questions) for arm in arms}
+        self._begun = self._told_at = time.monotonic()
+        self._done_here = 0
+        self._console = Console(stderr=True)
 
     def add(self, arm: str, seen: Observation | None) -> None:
         """Counts a question that has just been asked; None: it failed."""
-        self.done_here += 1
+        self._done_here += 1
         self._count(arm, seen)
+        if not self._console.is_terminal and time.monotonic() - self._told_at > LINES_EVERY:
+            self._told_at = time.monotonic()
+            self._print_line()
 
-    def add_earlier(self, observations: Sequence[Observation]) -> None:
+    def add_earlier(self, observations: Iterable[Observation]) -> None:
         """Counts what an earlier process has asked."""
         for each in observations:
-            if each.arm in self.counts:
-                self._count(each.arm, each if each.failure is None else None)
-
-    def _count(self, arm: str, seen: Observation | None) -> None:
-        count = self.counts[arm]
-        count.done += 1
-        count.failed += seen is None
-        count.right += seen is not None and seen.right
-
-    @property
-    def rate(self) -> float:
-        """Questions per second since the process began."""
-        return self.done_here / max(time.monotonic() - self.begun, 1e-9)
-
-    @property
-    def seconds_left(self) -> float | None:
-        """At this rate; None before the first question was answered."""
-        return self.left / self.rate if self.done_here else None
+            self._count(each.arm, each if each.failure is None else None)
 
     @property
     def left(self) -> int:
         """Questions that have not been asked."""
-        return sum(count.total - count.done for count in self.counts.values())
+        return sum(count.total - count.done for count in self._counts.values())
 
-    def table(self) -> Table:
-        """A row per arm, and the rate and time left below."""
-        table = Table(box=None, pad_edge=False, show_footer=True)
-        done = sum(count.done for count in self.counts.values())
-        total = sum(count.total for count in self.counts.values())
-        footers = ("", f"{done} of {total}", f"{self.rate:.1f}/s", f"{_clock(self.seconds_left)} left")
-        for name, footer in zip(("arm", "asked", "right", "failed"), footers, strict=True):
-            table.add_column(name, footer=footer, justify="left" if name == "arm" else "right")
-        for arm, count in self.counts.items():
-            answered = count.done - count.failed
-            share = f"{count.right / answered:.1%}" if answered else ""
-            table.add_row(arm, f"{count.done} of {count.total}", share, str(count.failed or ""))
-        return table
-
-    def line(self) -> str:
-        """The same in one line."""
-        parts: list[str] = []
-        for arm, count in self.counts.items():
-            answered = count.done - count.failed
-            share = f" {count.right / answered:.1%} right" if answered else ""
-            failed = f", {count.failed} failed" if count.failed else ""
-            parts.append(f"{arm} {count.done}/{count.total}{share}{failed}")
-        return f"{'; '.join(parts)}; {self.rate:.1f}/s, {_clock(self.seconds_left)} left"
-
-
-def _clock(seconds: float | None) -> str:
-    if seconds is None:
-        return "?"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
-class _Shown:
-    """Where progress is shown just now."""
-
-    progress: Progress | None = None
-    live: Live | None = None
-    console: Console | None = None
-    last_line: float = 0.0
-
-    def update(self, progress: Progress) -> None:
-        if self.live is not None:
-            self.live.update(progress.table())
-        elif self.console is not None and time.monotonic() - self.last_line > LINES_EVERY:
-            self.last_line = time.monotonic()
-            self.console.print(progress.line(), soft_wrap=True, highlight=False)
-
-
-_shown = _Shown()
-
-
-@contextmanager
-def shown(progress: Progress) -> Generator[None]:
-    """Shows progress meanwhile: redrawn in a terminal, else a line now and then."""
-    _shown.console = Console(stderr=True)
-    _shown.progress = progress
-    _shown.last_line = time.monotonic()
-    try:
-        if _shown.console.is_terminal:
-            with Live(progress.table(), console=_shown.console, refresh_per_second=REDRAWN) as _shown.live:
+    @contextmanager
+    def shown(self) -> Generator[None]:
+        """Shows the progress meanwhile: redrawn in a terminal, else a line now and then."""
+        if self._console.is_terminal:
+            with Live(get_renderable=self._table, console=self._console, refresh_per_second=REDRAWN):
                 yield
         else:
             yield
-            _shown.console.print(progress.line(), soft_wrap=True, highlight=False)
-    finally:
-        _shown.progress = _shown.live = _shown.console = None
+            self._print_line()
 
+    def _count(self, arm: str, seen: Observation | None) -> None:
+        if count := self._counts.get(arm):
+            count.done += 1
+            count.failed += seen is None
+            count.right += seen is not None and seen.right
 
-def count(arm: str, seen: Observation | None) -> None:
-    """Counts a question that has just been asked, where progress is shown; None: it failed."""
-    if _shown.progress is not None and arm in _shown.progress.counts:
-        _shown.progress.add(arm, seen)
-        _shown.update(_shown.progress)
+    def _pace(self) -> tuple[str, str]:
+        """Questions per second since the process began, and the time left at this rate."""
+        rate = self._done_here / max(time.monotonic() - self._begun, 1e-9)
+        left = str(timedelta(seconds=round(self.left / rate))) if rate else "?"
+        return f"{rate:.1f}/s", f"{left} left"
+
+    def _table(self) -> Table:
+        table = Table(box=None, pad_edge=False, show_footer=True)
+        done, total = (sum(getattr(count, name) for count in self._counts.values()) for name in ("done", "total"))
+        footers = ("", f"{done} of {total}", *self._pace())
+        for name, footer in zip(("arm", "asked", "right", "failed"), footers, strict=True):
+            table.add_column(name, footer=footer, justify="left" if name == "arm" else "right")
+        for arm, count in self._counts.items():
+            table.add_row(arm, f"{count.done} of {count.total}", count.share_right, str(count.failed or ""))
+        return table
+
+    def _print_line(self) -> None:
+        parts: list[str] = []
+        for arm, count in self._counts.items():
+            right = f" {count.share_right} right" if count.share_right else ""
+            failed = f", {count.failed} failed" if count.failed else ""
+            parts.append(f"{arm} {count.done}/{count.total}{right}{failed}")
+        text = f"{'; '.join(parts)}; {', '.join(self._pace())}"
+        self._console.print(text, soft_wrap=True, highlight=False)
