@@ -1,10 +1,15 @@
-"""Messages of pydantic-ai as turns of a chat template, with their images. Knows no model and no tensor."""
+"""Replies of a model of transformers, a batch at a time: its conversation, its grammar, and how each token is chosen.
+
+`generate` of transformers has one set of sampling settings and one source of randomness for a whole batch. Here the
+choice is made in a logits processor, row by row, and `generate` is left with the one token that was chosen. So rows of
+any settings and schemas share a batch, and a seed gives the same reply in whatever company it is written.
+"""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -44,7 +49,15 @@ from transformers import (
 from cow_service.errors import ImageUnreadable
 from cow_service.media.images import decode
 
+# One space after commas and colons, as most JSON in training data has it. Free whitespace would let a model write
+# line breaks up to the limit of tokens.
+_LAYOUT: Any = {"whitespace_flexible": False, "item_separator": ", ", "key_separator": ": "}
+_BY_NAME = ("properties", "$defs", "definitions")  # what they hold is schemas by names that may be anything
+_AS_IT_IS = ("allOf", "enum", "const", "default", "examples")  # parts of one object, and values
+# With the one, the chat templates of models that think open a reply; the other is the token that ends the thought.
+_THOUGHT_START, _THOUGHT_END = "<think>", "</think>"
 Role = Literal["system", "user", "assistant"]
+Finish = Literal["stop", "length"]
 Turn = dict[str, Any]  # as chat templates take it: {"role": ..., "content": [{"type": "text", "text": ...}, ...]}
 
 
@@ -124,13 +137,6 @@ def _token_breaker(special_tokens: Sequence[str]) -> Callable[[str], str]:
     return lambda text: found.sub(lambda match: f"{match[0][0]} {match[0][1:]}", text)
 
 
-# One space after commas and colons, as most JSON in training data has it. Free whitespace would let a model write
-# line breaks up to the limit of tokens.
-_LAYOUT: Any = {"whitespace_flexible": False, "item_separator": ", ", "key_separator": ": "}
-_BY_NAME = ("properties", "$defs", "definitions")  # what they hold is schemas by names that may be anything
-_AS_IT_IS = ("allOf", "enum", "const", "default", "examples")  # parts of one object, and values
-
-
 class Grammars:
     """Grammars of JSON schemas over one tokenizer, for a model with `vocabulary` logits."""
 
@@ -168,9 +174,6 @@ def _closed(schema: Any) -> Any:
     return {"additionalProperties": False, **found} if "properties" in found else found
 
 
-Finish = Literal["stop", "length"]
-
-
 @dataclass(frozen=True)
 class Sampling:
     """How tokens are chosen. Temperature 0 takes the likeliest; without a seed, replies differ from call to call."""
@@ -181,6 +184,7 @@ class Sampling:
     seed: int | None = None
 
 
+@dataclass(eq=False)
 class BatchRow:
     """One reply of a batch while it is written. It knows no other row, and not how it came to be in the batch.
 
@@ -188,63 +192,53 @@ class BatchRow:
     token that ends it, and the grammar holds from there.
     """
 
-    def __init__(
-        self,
-        sampling: Sampling,
-        limit: int,
-        ends: Sequence[int],
-        matcher: LLMatcher | None,
-        on_end: Callable[[BatchRow, Finish], None],
-        is_canceled: Callable[[], bool],
-        thought_end: int | None = None,
-    ) -> None:
-        self.thought: list[int] = []
-        self.tokens: list[int] = []
-        self._finished = False
-        self._matcher = matcher
-        self._is_canceled = is_canceled
-        self._thought_end = thought_end  # None once the thought is over
-        self._sampling = sampling
-        self._limit = limit
-        self._ends = frozenset(ends)
-        self._on_end = on_end
-        self._random: torch.Generator | None = None
+    sampling: Sampling
+    limit: int
+    ends: Collection[int]
+    matcher: LLMatcher | None
+    on_end: Callable[[BatchRow, Finish], None]
+    is_canceled: Callable[[], bool]
+    thought_end: int | None = None  # None once the thought is over
+    thought: list[int] = field(default_factory=list[int])
+    tokens: list[int] = field(default_factory=list[int])
+    _is_finished: bool = False
+    _random: torch.Generator | None = None
 
     def done(self) -> bool:
         """Whether nothing more is to be written."""
-        return self._finished or self._is_canceled()
+        return self._is_finished or self.is_canceled()
 
     def allowed(self, vocabulary: int) -> NDArray[np.bool_] | None:
         """[vocabulary]: the tokens with which the reply can go on. None for all."""
-        if self._matcher is None:
+        if self.matcher is None:
             return None
-        if self._thought_end is not None:
+        if self.thought_end is not None:
             thinking = np.ones(vocabulary, dtype=np.bool_)
-            thinking[list(self._ends)] = False  # the reply is still to come
+            thinking[list(self.ends)] = False  # the reply is still to come
             return thinking
         # llguidance's own function for tensors needs a C++ compiler at run time.
-        bits = np.frombuffer(self._matcher.compute_bitmask(), np.uint8)
+        bits = np.frombuffer(self.matcher.compute_bitmask(), np.uint8)
         return np.unpackbits(bits, count=vocabulary, bitorder="little").astype(np.bool_)
 
     def choose(self, logits: Tensor) -> Tensor | None:
         """A token id, [], from the allowed logits, [vocabulary]; None where the likeliest will do."""
-        if self._sampling.temperature == 0:
+        if self.sampling.temperature == 0:
             return None
-        logits = logits / self._sampling.temperature
-        if self._sampling.top_k > 0:
-            least = logits.topk(min(self._sampling.top_k, len(logits))).values[-1]
+        logits = logits / self.sampling.temperature
+        if self.sampling.top_k > 0:
+            least = logits.topk(min(self.sampling.top_k, len(logits))).values[-1]
             logits = logits.masked_fill(logits < least, -torch.inf)
         chances = logits.softmax(-1)
-        if self._sampling.top_p < 1:
+        if self.sampling.top_p < 1:
             ordered, order = chances.sort(descending=True)
             # What comes before a token decides about it, so that the likeliest always stays.
-            chances = chances.index_fill(0, order[ordered.cumsum(0) - ordered >= self._sampling.top_p], 0.0)
+            chances = chances.index_fill(0, order[ordered.cumsum(0) - ordered >= self.sampling.top_p], 0.0)
         if self._random is None:
             self._random = torch.Generator(logits.device)
-            if self._sampling.seed is None:
+            if self.sampling.seed is None:
                 self._random.seed()
             else:
-                self._random.manual_seed(self._sampling.seed)
+                self._random.manual_seed(self.sampling.seed)
         return chances.multinomial(1, generator=self._random)[0]
 
     def take(self, token: int) -> None:
@@ -252,28 +246,26 @@ class BatchRow:
 
         Raises `RuntimeError` where the grammar does not go on, which its mask makes impossible.
         """
-        if token in self._ends:
+        if token in self.ends:
             self._end("stop")
             return
-        if self._thought_end is not None:
+        if self.thought_end is not None:
             self.thought.append(token)
-            if token == self._thought_end:
-                self._thought_end = None
+            if token == self.thought_end:
+                self.thought_end = None
         else:
             self.tokens.append(token)
-            if self._matcher is not None and not self._matcher.consume_token(token):
-                raise RuntimeError(f"The grammar of a reply broke down: {self._matcher.get_error()}")
-        if self._matcher is not None and self._matcher.is_stopped():
+            if self.matcher is not None and not self.matcher.consume_token(token):
+                raise RuntimeError(f"The grammar of a reply broke down: {self.matcher.get_error()}")
+        if self.matcher is not None and self.matcher.is_stopped():
             self._end("stop")
-        elif len(self.thought) + len(self.tokens) >= self._limit:
-            self._end("stop" if self._complete() else "length")
-
-    def _complete(self) -> bool:
-        return self._thought_end is None and self._matcher is not None and self._matcher.is_accepting()
+        elif len(self.thought) + len(self.tokens) >= self.limit:
+            complete = self.thought_end is None and self.matcher is not None and self.matcher.is_accepting()
+            self._end("stop" if complete else "length")
 
     def _end(self, finish: Finish) -> None:
-        self._finished = True
-        self._on_end(self, finish)
+        self._is_finished = True
+        self.on_end(self, finish)
 
 
 class RowSampler(LogitsProcessor):
@@ -285,7 +277,11 @@ class RowSampler(LogitsProcessor):
 
     def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:
         """`scores` is [rows, vocabulary]; what is returned is 0 at each row's token and minus infinity elsewhere."""
-        scores = scores.masked_fill(~self._allowed(scores), -torch.inf)
+        allowed = np.ones(tuple(scores.shape), dtype=np.bool_)
+        for i, row in enumerate(self._rows):
+            if not row.done() and (tokens_allowed := row.allowed(scores.shape[1])) is not None:
+                allowed[i] = tokens_allowed
+        scores = scores.masked_fill(~torch.from_numpy(allowed).to(scores.device), -torch.inf)
         chosen = scores.argmax(-1)
         for i, row in enumerate(self._rows):
             if not row.done() and (token := row.choose(scores[i])) is not None:
@@ -299,14 +295,6 @@ class RowSampler(LogitsProcessor):
         only = torch.tensor(tokens, device=scores.device)[:, None]
         return torch.full_like(scores, -torch.inf).scatter_(1, only, 0.0)
 
-    def _allowed(self, scores: Tensor) -> Tensor:
-        """[rows, vocabulary], bool: the tokens with which each grammar can go on. Without a grammar, all."""
-        allowed = np.ones(tuple(scores.shape), dtype=np.bool_)
-        for i, row in enumerate(self._rows):
-            if not row.done() and (tokens := row.allowed(scores.shape[1])) is not None:
-                allowed[i] = tokens
-        return torch.from_numpy(allowed).to(scores.device)
-
 
 class RowsDone(StoppingCriteria):
     """Ends the rows that are complete, and those that nobody waits for any more."""
@@ -317,10 +305,6 @@ class RowsDone(StoppingCriteria):
     def __call__(self, input_ids: Tensor, scores: Any, **kwargs: Any) -> Any:
         """[rows], bool."""
         return torch.tensor([row.done() for row in self._rows], device=input_ids.device)
-
-
-# With the one, the chat templates of models that think open a reply; the other is the token that ends the thought.
-_THOUGHT_START, _THOUGHT_END = "<think>", "</think>"
 
 
 @dataclass(frozen=True)
@@ -377,7 +361,9 @@ class BatchGenerator:
         self._processor: Any = processor
         self._tokenizer: PreTrainedTokenizerFast = self._processor.tokenizer
         advice = model.generation_config or GenerationConfig()
-        self.default_sampling = _sampling_of(advice)
+        given = {name: getattr(advice, name) for name in ("temperature", "top_p", "top_k")}
+        known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        self.default_sampling = Sampling(**{"temperature": 1.0, **known}) if advice.do_sample else Sampling()
         ends = advice.eos_token_id
         self._ends = _as_tuple(self._tokenizer.eos_token_id if ends is None else ends)
         padding = self._tokenizer.pad_token_id
@@ -458,14 +444,6 @@ class BatchGenerator:
 
     def _decoded(self, tokens: list[int]) -> str:
         return str(self._tokenizer.decode(tokens, skip_special_tokens=True, clean_up_tokenization_spaces=False))
-
-
-def _sampling_of(advice: GenerationConfig) -> Sampling:
-    if not advice.do_sample:
-        return Sampling()
-    given = {name: getattr(advice, name) for name in ("temperature", "top_p", "top_k")}
-    known: dict[str, Any] = {"temperature": 1.0} | {name: value for name, value in given.items() if value is not None}
-    return Sampling(**known)
 
 
 def _as_tuple(ids: Any) -> tuple[int, ...]:

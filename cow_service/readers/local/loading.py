@@ -13,12 +13,20 @@ from typing import Any, Literal
 import torch
 from pydantic import Field, ValidationError
 from pydantic_ai.settings import ModelSettings
-from transformers import AutoModelForImageTextToText, PreTrainedModel, ProcessorMixin
+from transformers import (
+    AutoConfig,
+    AutoModelForImageTextToText,
+    AutoProcessor,
+    PreTrainedConfig,
+    PreTrainedModel,
+    ProcessorMixin,
+)
+from transformers.models.auto.processing_auto import PROCESSOR_MAPPING
 
 from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
 from cow_service.readers.local.generation import BatchGenerator
 from cow_service.readers.local.model import LocalModel
-from cow_service.readers.local.tiny import load_processor, make_tiny
+from cow_service.readers.local.tiny import make_tiny, still
 from cow_service.readers.mllm.models import mllm_manifests
 from cow_service.records import Record
 from cow_service.settings import Settings
@@ -111,7 +119,7 @@ def _from_folder(
 ) -> tuple[PreTrainedModel, ProcessorMixin]:
     """The model and processor of a checkpoint. Opens safetensors only: a pickle can run code."""
     _check(folder, manifest)
-    processor = load_processor(folder)
+    processor = _load_processor(folder)
     dtype: Any = options.dtype if options.dtype == "auto" else getattr(torch, options.dtype)
     loaded: Any = AutoModelForImageTextToText.from_pretrained(
         folder,
@@ -131,6 +139,17 @@ def _from_folder(
                 f"The checkpoint '{folder.name}' {what} {listed(names, MAX_LISTED)}. Download it again."
             )
     return model, processor
+
+
+def _load_processor(folder: Path) -> ProcessorMixin:
+    """The processor of a checkpoint's folder. Raises what transformers raises."""
+    config: PreTrainedConfig = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
+    if type(config) not in PROCESSOR_MAPPING:
+        return AutoProcessor.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
+    kind: Any = PROCESSOR_MAPPING[type(config)]
+    # PIL's image processors everywhere: with torchvision's the same image would give other numbers where that is
+    # installed.
+    return still(kind).from_pretrained(folder, local_files_only=True, trust_remote_code=False, backend="pil")
 
 
 def _check(folder: Path, manifest: Manifest) -> None:

@@ -1,4 +1,4 @@
-"""Generates replies for calls from any thread; those that wait together are written as one batch."""
+"""The multimodal LLM of this process as a model of pydantic-ai, which the reader asks like any provider's."""
 
 from __future__ import annotations
 

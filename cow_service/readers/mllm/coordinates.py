@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import InternalError, InvalidRequest
-from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number
+from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number, number
 from cow_service.records import BBox, Point
 from cow_service.weights.manifests import Coordinates, Family, ImageSize
 
@@ -110,7 +110,7 @@ class CoordinateFrame:
         """The JSON schema of one coordinate."""
         units = self.coordinates.units
         highest = max(self.seen) if units == "pixels" else int(self._full[0])
-        return {"type": "number" if units == "fractions" else "integer", "minimum": 0, "maximum": highest}
+        return number(0, highest, "number" if units == "fractions" else "integer")
 
     def point(self, written: object) -> Point:
         """A point in pixels. Raises `ReplyError` where two numbers inside the image are not what was written."""

@@ -6,6 +6,7 @@ fails.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from pydantic import PlainValidator, ValidationInfo, WithJsonSchema
 
 from cow_service.readers.base import Quantity, SpeedWord, Unit
 from cow_service.readers.mllm.coordinates import HUGE, NUMBER, CoordinateFrame
-from cow_service.readers.mllm.replies import Schema, is_none, is_number, one_of, text_of, words
+from cow_service.readers.mllm.replies import Schema, is_none, is_number, number, one_of, text_of, words
 from cow_service.records import Shape
 
 SIZE_DEVIATION = 0.3  # of the size
@@ -109,17 +110,22 @@ def estimate(expected: str, schema: Schema, read: Callable[[object, ValidationIn
     return PlainValidator(validated), WithJsonSchema(schema)
 
 
-def word_of(known: Mapping[str, Any]) -> Callable[[object, ValidationInfo], Any]:
-    """Reads one of some words."""
-    return lambda written, _: known.get(text_of(written).lower().strip(" ."))
+def _word(known: Mapping[str, Any]) -> tuple[Any, Any]:
+    """The annotations of one of some words; the values of `known` are the words, its keys their synonyms, too."""
+    words_known = tuple(dict.fromkeys(known.values()))
+    return estimate(
+        f"one of {', '.join(words_known)}",
+        one_of(*words_known),
+        lambda written, _: known.get(text_of(written).lower().strip(" .")),
+    )
 
 
-def _metres(least: float, most: float) -> Callable[[object, ValidationInfo], float | None]:
+def _metres(what: str, least: float, most: float) -> tuple[Any, Any]:
     def read(written: object, _: ValidationInfo) -> float | None:
         metres = metres_of(written)
         return metres if metres is not None and least <= metres <= most else None
 
-    return read
+    return estimate(f"a {what} from {least:g} to {most:g} m", number(least, most), read)
 
 
 def _support(written: object, info: ValidationInfo) -> str | None:
@@ -132,43 +138,31 @@ def _depth_degrees(written: object, info: ValidationInfo) -> float | None:
 
     What the reply says of the sense besides gives a number without sign its own; it cannot turn one round.
     """
-    degrees, camera = _degrees(written), info.data.get("camera")
-    if degrees is None or not -90 <= degrees <= 90 or (camera == "away" and degrees < 0):
+    text, camera = text_of(written).lower().strip(" ."), info.data.get("camera")
+    found = _DEPTH.fullmatch(text)
+    if is_number(written):
+        degrees = float(written) if abs(written) < HUGE else math.nan
+    elif text in _ACROSS:
+        degrees = 0.0
+    elif found is not None and (found["degrees"] or found["sense"]):
+        degrees = _DEGREES[found["much"] or ""] if found["degrees"] is None else float(found["degrees"])
+        if found["sense"] is not None:
+            degrees = abs(degrees) if found["sense"] == "away" else -abs(degrees)
+    else:
+        return None
+    if not -90 <= degrees <= 90 or (camera == "away" and degrees < 0):
         return None
     return -abs(degrees) if camera == "towards" else degrees
 
 
-Size = Annotated[
-    float | None,
-    *estimate(
-        f"a length from {SIZES[0]:g} to {SIZES[1]:g} m",
-        {"type": "number", "minimum": SIZES[0], "maximum": SIZES[1]},
-        _metres(*SIZES),
-    ),
-]
-Height = Annotated[
-    float | None,
-    *estimate(
-        f"a height from 0 to {HEIGHTS[1]:g} m",
-        {"type": "number", "minimum": HEIGHTS[0], "maximum": HEIGHTS[1]},
-        _metres(*HEIGHTS),
-    ),
-]
+Size = Annotated[float | None, *_metres("length", *SIZES)]
+Height = Annotated[float | None, *_metres("height", *HEIGHTS)]
 Support = Annotated[str | None, *estimate("`floor`, `air` or another object", words(MAX_SUPPORT), _support)]
-KnownShape = Annotated[
-    Shape | None, *estimate(f"one of {', '.join(get_args(Shape))}", one_of(*get_args(Shape)), word_of(SHAPES))
-]
-KnownSpeed = Annotated[
-    SpeedWord | None,
-    *estimate(f"one of {', '.join(get_args(SpeedWord))}", one_of(*get_args(SpeedWord)), word_of(SPEEDS)),
-]
+KnownShape = Annotated[Shape | None, *_word(SHAPES)]
+KnownSpeed = Annotated[SpeedWord | None, *_word(SPEEDS)]
 DepthDegrees = Annotated[
     float | None,
-    *estimate(
-        "an angle from -90 (towards the camera) to 90 (away)",
-        {"type": "integer", "minimum": -90, "maximum": 90},
-        _depth_degrees,
-    ),
+    *estimate("an angle from -90 (towards the camera) to 90 (away)", number(-90, 90, "integer"), _depth_degrees),
 ]
 
 
@@ -240,18 +234,3 @@ def _content_words(text: str) -> list[str]:
 def _is_open(written: object) -> bool:
     """Whether a field says nothing."""
     return is_none(written) or text_of(written).lower() == "unknown"
-
-
-def _degrees(written: object) -> float | None:
-    if is_number(written):
-        return float(written) if abs(written) < HUGE else None
-    text = text_of(written).lower().strip(" .")
-    if text in _ACROSS:
-        return 0.0
-    found = _DEPTH.fullmatch(text)
-    if found is None or not (found["degrees"] or found["sense"]):
-        return None
-    number = _DEGREES[found["much"] or ""] if found["degrees"] is None else float(found["degrees"])
-    if found["sense"] is None:
-        return number
-    return abs(number) if found["sense"] == "away" else -abs(number)

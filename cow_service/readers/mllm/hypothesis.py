@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,10 +47,9 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
     """What the simulation found, as inputs of the prompt; encounters only where there is no outcome to tell."""
     simulation = imagined.simulation
     trajectory, mover = simulation.trajectory, simulation.grounding.object
-    facts = _outcome_words(trajectory, mover)
     changed = _changed(simulation)
-    if trajectory.factual is not None:
-        facts = _of_both(trajectory, trajectory.factual, mover, changed)
+    worlds = {"": trajectory} if trajectory.factual is None else {changed: trajectory, AS_IT_IS: trajectory.factual}
+    facts = _facts(worlds, _one_line(mover))
     return {
         "sentence": simulation.motion.sentence,
         "times": ", ".join(f"{frame.time:.2f} s" for frame in simulation.frames),
@@ -71,39 +72,23 @@ def _changed(simulation: Simulation) -> str:
     return f"With {' and '.join(told)}" if told else ""
 
 
-def _of_both(changed: Trajectory, factual: Trajectory, mover: str, named: str) -> tuple[str, ...]:
-    """The outcomes of both worlds, the facts of both in one line."""
-    if changed.outcome is None or factual.outcome is None:
-        return ()
-    lines = [_one_line(changed.outcome.facts)] if changed.outcome.facts else []
-    for trajectory, where in ((changed, named), (factual, AS_IT_IS)):
-        told = _probability(trajectory, mover)
-        lines += [f"{where}, {told[0].lower()}{told[1:]}"] if told else []
-    return (*lines, *_dependence(changed.outcome))
+def _facts(worlds: Mapping[str, Trajectory], mover: str) -> tuple[str, ...]:
+    """The facts of the outcome, how probable they are in each world, and what they rest on; empty without an outcome.
 
-
-def _outcome_words(trajectory: Trajectory, mover: str) -> tuple[str, ...]:
-    """The facts of the outcome, how probable they are and what they rest on; empty where there are none."""
-    outcome = trajectory.outcome
-    if outcome is None:
+    `worlds` by what they are called, the one that is asked about first: its facts tell of both.
+    """
+    outcome = next(iter(worlds.values())).outcome
+    if outcome is None or any(each.outcome is None for each in worlds.values()):
         return ()
     lines = [_one_line(outcome.facts)] if outcome.facts else []
-    told = _probability(trajectory, mover)
-    return (*lines, *([told] if told else []), *_dependence(outcome))
-
-
-def _probability(trajectory: Trajectory, mover: str) -> str:
-    """How probable the outcome is, in a sentence; empty where nothing tells."""
-    outcome = trajectory.outcome
-    if outcome is None or outcome.probability is None:
-        return ""
-    return f"{_share(outcome.probability, trajectory.ensemble)}: {_event(outcome, _one_line(mover))}."
-
-
-def _dependence(outcome: Outcome) -> tuple[str, ...]:
-    if not outcome.depends_on:
-        return ()
-    return (f"It depends most on {', '.join(DOUBTS[doubt] for doubt in outcome.depends_on)}.",)
+    for name, trajectory in worlds.items():
+        found = trajectory.outcome
+        if found is not None and found.probability is not None:
+            told = f"{_share(found.probability, trajectory.ensemble)}: {_event(found, mover)}."
+            lines.append(f"{name}, {told[0].lower()}{told[1:]}" if name else told)
+    if outcome.depends_on:
+        lines.append(f"It depends most on {', '.join(DOUBTS[doubt] for doubt in outcome.depends_on)}.")
+    return tuple(lines)
 
 
 def _event(outcome: Outcome, mover: str) -> str:

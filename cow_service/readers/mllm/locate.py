@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -52,6 +53,7 @@ from cow_service.readers.mllm.replies import (
     name_of,
     name_words,
     nullable,
+    number,
     one_of,
     schema_of,
     text_of,
@@ -123,7 +125,8 @@ def _line(written: object, info: ValidationInfo) -> tuple[Point, Point] | None:
 
 
 def _cue(written: object) -> Cue | None:
-    return next((cue for word, cue in _CUE_WORDS.items() if word in text_of(written).lower()), None)
+    said = text_of(written).lower()
+    return next((cue for word, cue in _CUE_WORDS.items() if word in said), None)
 
 
 class SeenObject(Reply):
@@ -385,8 +388,13 @@ def read_line(values: Sequence[object], said: str, context: ReadingContext) -> L
         lines = [Line.model_validate({"direction": list(corners.groups())}, context=context)]
     if not lines:
         raise ReplyError("`direction` is missing; give two points on the line of the motion, or null")
-    if any(not _same_way(line, lines[0]) for line in lines):
-        raise ReplyError("several directions are given; give one")
+    for one, other in itertools.pairwise(lines):
+        if one.direction is None or other.direction is None:
+            same = one.direction == other.direction and one.camera == other.camera
+        else:
+            same = all(math.dist(*ends) <= LEAST_LENGTH for ends in zip(one.direction, other.direction, strict=True))
+        if not same:
+            raise ReplyError("several directions are given; give one")
     line = _one_depth(max(lines, key=lambda line: (line.cue is not None, line.camera is not None)))
     if line.direction is not None and line.camera is not None and not _leads(line.direction, line.camera):
         raise ReplyError(
@@ -429,12 +437,6 @@ def _one_depth(line: Line) -> Line:
     return line
 
 
-def _same_way(one: Line, other: Line) -> bool:
-    if one.direction is None or other.direction is None:
-        return one.direction == other.direction and one.camera == other.camera
-    return all(math.dist(a, b) <= LEAST_LENGTH for a, b in zip(one.direction, other.direction, strict=True))
-
-
 def _leads(ends: tuple[Point, Point], camera: CameraSense) -> bool:
     """Whether a line in the image can be that of something that moves straight towards or away from the camera."""
     (x0, y0), (x1, y1) = ends
@@ -473,7 +475,7 @@ class Scale(Reply):
     metres: Annotated[
         float | None,
         PlainValidator(_reference_length),
-        WithJsonSchema(nullable({"type": "number", "minimum": SIZES[0], "maximum": SIZES[1]})),
+        WithJsonSchema(nullable(number(*SIZES))),
     ]
     ends: Annotated[tuple[Point, Point] | None, PlainValidator(_reference_ends), _COORDINATES]
     down: Annotated[Vector, PlainValidator(_down), WithJsonSchema(nullable(one_of(*DOWN)))]

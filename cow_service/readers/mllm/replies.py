@@ -122,6 +122,11 @@ def one_of(*values: str) -> Schema:
     return {"type": "string", "enum": list(values)}
 
 
+def number(least: float, most: float, kind: str = "number") -> Schema:
+    """The schema of a number between two limits."""
+    return {"type": kind, "minimum": least, "maximum": most}
+
+
 def nullable(schema: Schema) -> Schema:
     """That, or null."""
     return {"anyOf": [schema, {"type": "null"}]}
