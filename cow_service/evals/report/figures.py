@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.text import Annotation, Text
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
-from matplotlib.transforms import Bbox
 
 from cow_service.evals.items import TASKS
 from cow_service.evals.report.summary import BASELINE, ArmSummary
@@ -36,15 +33,8 @@ SQUARE = 5.2  # inches
 LARGEST = 420.0  # area of the marker of the fullest bin, points²
 SMALLEST = 14.0
 COUNTED = 2  # curves, at most, whose markers have their counts beside them
-COST_PANEL, COST_WIDTH = 3.3, 7.5  # inches
+COST_PANEL, COST_WIDTH = 2.9, 7.5  # inches
 RANGE_FOR_LOG = 12.0  # between the dearest and the cheapest arm
-# Where a label may stand, in points from its marker: near ones first.
-PLACES = [
-    (across * (far + 2 if down == 0 else far), down * far)
-    for far in (7, 14, 24, 36, 50, 66, 84)
-    for across, down in ((1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1), (0, 1), (0, -1))
-]
-LEADER = 16  # points: a label that is further away has a line to its marker
 STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans", "Verdana", "sans-serif"],
@@ -133,6 +123,14 @@ def _add_legend(figure: Figure, entries: Sequence[tuple[Line2D, str]], **options
         text.set_text(name)
 
 
+def _add_arm_legend(figure: Figure, styles: Mapping[str, ArmStyle], width: float) -> None:
+    """Above the panels, in as many columns as fit a figure of this width in inches."""
+    entries = [(Line2D([], [], **style.marked()), short(name)) for name, style in styles.items()]
+    fitting = int(width * LEGEND_WIDTH / 10 / (max(len(name) for _, name in entries) + 6))
+    columns = min(max(1, fitting), len(entries))
+    _add_legend(figure, entries, loc="outside upper left", ncols=columns, columnspacing=1.4, handletextpad=0.3)
+
+
 def _draw_right_answers(axes: Axes, x: float, tpr: Spread, style: ArmStyle, size: float, **whisker: Any) -> None:
     """The share of right answers of an arm, with its deviation over the repeats."""
     if tpr.sd is not None:
@@ -141,7 +139,6 @@ def _draw_right_answers(axes: Axes, x: float, tpr: Spread, style: ArmStyle, size
 
 
 def _percent_axis(axes: Axes, low: float, high: float) -> None:
-    """Right answers on the y axis, with lines to read them by."""
     axes.set_ylim(low, high)
     axes.set_ylabel("Right answers (%)")
     axes.grid(axis="y")
@@ -228,13 +225,9 @@ def draw_rates(summaries: Sequence[ArmSummary]) -> Figure | None:
     panels, styles = _rate_panels(summaries), arm_styles(summaries)
     most = max(len(groups) for _, groups in panels)
     width = min(WIDEST, max(NARROWEST, most * max(1.0, PER_ARM * (len(summaries) + 1)) + MARGIN))
-    names = [short(name) for name in styles]
-    rows = 1 + len(names) * (max(map(len, styles)) + 6) // round(11 * width)
+    rows = 1 + len(styles) * (max(map(len, styles)) + 6) // round(11 * width)
     figure = Figure(figsize=(width, (RATE_PANEL + 0.1) * len(panels) + 0.25 * rows + 0.5), layout="constrained")
-    handles = [Line2D([], [], **style.marked()) for style in styles.values()]
-    columns = max(1, int(width * LEGEND_WIDTH / 10 / (max(map(len, names)) + 6)))
-    options = {"ncols": min(columns, len(names)), "columnspacing": 1.4, "handletextpad": 0.3}
-    _add_legend(figure, list(zip(handles, names, strict=True)), loc="outside upper left", **options)
+    _add_arm_legend(figure, styles, width)
     grid = figure.subplots(len(panels), squeeze=False)
     for axes, (title, groups) in zip(grid[:, 0], panels, strict=True):
         axes.set_title(title)
@@ -377,31 +370,20 @@ def draw_cost(summaries: Sequence[ArmSummary]) -> Figure | None:
             shown.append((measure, values))
     if not shown:
         return None
-    figure = Figure(figsize=(COST_WIDTH, COST_PANEL * len(shown) + 0.2), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    figure = Figure(figsize=(COST_WIDTH, COST_PANEL * len(shown) + 0.6), layout="constrained")
     grid = figure.subplots(len(shown), squeeze=False)
     styles = arm_styles(summaries)
-    labels = [_draw_cost_panel(axes, *panel, styles) for axes, panel in zip(grid[:, 0], shown, strict=True)]
-    canvas.draw()
-    # Labels are placed once the axes have their size; they must not change it again.
-    figure.set_layout_engine("none")
-    for axes, found in zip(grid[:, 0], labels, strict=True):
-        _place_labels(axes, found, canvas)
+    _add_arm_legend(figure, styles, COST_WIDTH)
+    for axes, (measure, found) in zip(grid[:, 0], shown, strict=True):
+        _draw_cost_panel(axes, measure, found, styles)
     return figure
 
 
 def _draw_cost_panel(
-    axes: Axes, measure: Measure, found: Sequence[tuple[ArmSummary, float]], styles: dict[str, ArmStyle]
-) -> list[Annotation]:
-    """The panel, and its labels, which are still to be placed."""
-    labels: list[Annotation] = []
-    leader: dict[str, Any] = {"arrowstyle": "-", "color": DIM, "linewidth": 0.6, "shrinkA": 0, "shrinkB": 4}
+    axes: Axes, measure: Measure, found: Sequence[tuple[ArmSummary, float]], styles: Mapping[str, ArmStyle]
+) -> None:
     for each, value in found:
-        tpr = each.rates.tpr
-        _draw_right_answers(axes, value, tpr, styles[each.name], 8, linewidth=1.2, capsize=2)
-        text: dict[str, Any] = {"fontsize": 8, "va": "center", "zorder": 4, "arrowprops": leader}
-        place = value, 100 * tpr.mean
-        labels.append(axes.annotate(short(each.name, 34), place, PLACES[0], textcoords="offset points", **text))
+        _draw_right_answers(axes, value, each.rates.tpr, styles[each.name], 8, linewidth=1.2, capsize=2)
     values = [value for _, value in found]
     if min(values) > 0 and max(values) / min(values) > RANGE_FOR_LOG:
         axes.set_xscale("log")
@@ -419,40 +401,6 @@ def _draw_cost_panel(
     highest = max(100 * (tpr.mean + (tpr.sd or 0)) for tpr in spreads)
     _percent_axis(axes, max(-3, lowest - 12), min(103, highest + 12))
     axes.grid()
-    return labels
-
-
-def _place_labels(axes: Axes, labels: Sequence[Annotation], canvas: FigureCanvasAgg) -> None:
-    """Each label at the first place where it covers no marker and no other label, and stays in the panel."""
-    renderer = cast(Any, canvas).get_renderer()
-    panel = axes.get_window_extent(renderer)
-    reach = 6 * axes.figure.dpi / 72
-    markers = [axes.transData.transform(label.xy) for label in labels]
-    taken = [Bbox.from_extents(*(at - reach), *(at + reach)) for at in markers]
-
-    def faults(label: Annotation, place: tuple[float, float]) -> int:
-        text = _moved(label, place, renderer)
-        inside = text.x0 >= panel.x0 and text.x1 <= panel.x1 and text.y0 >= panel.y0 and text.y1 <= panel.y1
-        return sum(text.overlaps(other) for other in taken) + (not inside)
-
-    for label in labels:
-        free = (place for place in PLACES if not faults(label, place))
-        best = next(free, None) or min(PLACES, key=lambda place: faults(label, place))
-        taken.append(_moved(label, best, renderer))
-
-
-def _moved(label: Annotation, place: tuple[float, float], renderer: Any) -> Bbox:
-    """The box of the label's text, without the line to the marker, after the label was put to a place."""
-    across, down = place
-    label.set_position(place)
-    label.set(
-        ha="center" if across == 0 else "left" if across > 0 else "right",
-        va="center" if down == 0 else "bottom" if down > 0 else "top",
-    )
-    if label.arrow_patch is not None:
-        label.arrow_patch.set_visible(max(abs(across), abs(down)) > LEADER)
-    label.update_positions(renderer)
-    return Text.get_window_extent(label, renderer)
 
 
 DRAWINGS = {"gains": draw_gains, "rates": draw_rates, "calibration": draw_calibration, "cost": draw_cost}
