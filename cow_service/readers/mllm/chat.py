@@ -99,7 +99,11 @@ def completion_of(response: ModelResponse, model: str) -> dict[str, Any]:
     if thoughts:
         message["reasoning_content"] = "".join(thoughts)
     if calls:
-        message["tool_calls"] = [_called(call) for call in calls]
+        functions = [{"name": call.tool_name, "arguments": call.args_as_json_str()} for call in calls]
+        message["tool_calls"] = [
+            {"id": call.tool_call_id, "type": "function", "function": function}
+            for call, function in zip(calls, functions, strict=True)
+        ]
     usage = response.usage
     finish = FINISHED.get(response.finish_reason or "stop", "stop")
     return {
@@ -116,11 +120,6 @@ def completion_of(response: ModelResponse, model: str) -> dict[str, Any]:
             "total_tokens": usage.input_tokens + usage.output_tokens,
         },
     }
-
-
-def _called(call: ToolCallPart) -> dict[str, Any]:
-    function = {"name": call.tool_name, "arguments": call.args_as_json_str()}
-    return {"id": call.tool_call_id, "type": "function", "function": function}
 
 
 def _setting(name: str, value: Any) -> Any:
@@ -162,7 +161,10 @@ def _messages(body: dict[str, Any]) -> Iterator[ModelMessage]:
         elif role == "user":
             yield ModelRequest([UserPromptPart(content)])
         elif role == "assistant":
-            calls = [_call(call, pointer) for call in _list_of(given, "tool_calls")]
+            calls: list[ToolCallPart] = []
+            for call in _list_of(given, "tool_calls"):
+                name = _at(call, pointer + "/tool_calls", "function", "name")
+                calls.append(ToolCallPart(name, call["function"].get("arguments"), call.get("id", "")))
             tools |= {call.tool_call_id: call.tool_name for call in calls}
             texts = [TextPart(text)] if (text := _text(content, pointer)) else []
             yield ModelResponse([*texts, *calls])
@@ -171,11 +173,6 @@ def _messages(body: dict[str, Any]) -> Iterator[ModelMessage]:
             yield ModelRequest([ToolReturnPart(tools.get(call, "tool"), _text(content, pointer), call)])
         else:
             raise _wrong(pointer + "/role", f"messages of the role {str(role)[:40]!r} cannot be sent to this MLLM")
-
-
-def _call(call: Any, pointer: str) -> ToolCallPart:
-    function = _at(call, pointer + "/tool_calls", "function")
-    return ToolCallPart(_at(function, pointer + "/tool_calls", "name"), function.get("arguments"), call.get("id", ""))
 
 
 def _contents(content: Any, pointer: str) -> Iterator[UserContent]:

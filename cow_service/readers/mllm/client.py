@@ -309,12 +309,15 @@ class RetryingModel(WrapperModel):
             # The text is read by our own tolerant rules all the same: a server may ignore the schema.
             output = OutputObjectDefinition(self._schema, "reply")
             parameters = replace(parameters, output_mode="native", output_object=output)
-        retrying = AsyncRetrying(
-            retry=retry_if_exception(_is_transient),
-            wait=_backoff,
-            stop=lambda state: stop_before_delay(self._budget)(state) or _is_unreachable(state),
-            reraise=True,
-        )
+
+        def is_over(state: RetryCallState) -> bool:
+            """Whether the budget ends before the next attempt, or the address has long accepted no connection."""
+            error = state.outcome.exception() if state.outcome else None
+            refused = isinstance(error, ModelConnectionError) and error.phase == "connect"
+            unreachable = refused and (state.seconds_since_start or 0.0) > CONNECT_SECONDS
+            return unreachable or stop_before_delay(self._budget)(state)
+
+        retrying = AsyncRetrying(retry=retry_if_exception(_is_transient), wait=_backoff, stop=is_over, reraise=True)
         return await retrying(self._attempt, messages, model_settings, parameters)
 
     async def _attempt(
@@ -354,13 +357,6 @@ def _is_transient(error: BaseException) -> bool:
     if isinstance(error, ModelHTTPError) and error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
         return error.status_code in _RETRIED_STATUS
     return isinstance(error, ModelAPIError) and not isinstance(error, _NEVER_RETRIED)
-
-
-def _is_unreachable(state: RetryCallState) -> bool:
-    """Whether the address has accepted no connection for a while."""
-    error = state.outcome.exception() if state.outcome else None
-    refused = isinstance(error, ModelConnectionError) and error.phase == "connect"
-    return refused and (state.seconds_since_start or 0.0) > CONNECT_SECONDS
 
 
 def _backoff(state: RetryCallState) -> float:

@@ -234,7 +234,8 @@ def read_identified(reply: str) -> Identified | None:
     if names:
         if all(map(_ABSENT.fullmatch, names)):
             return None
-    elif _ABSENT.fullmatch(said) or any(_says_none(value) for value in values):
+    # A value that has the field says so there, any other as a whole.
+    elif _ABSENT.fullmatch(said) or any(is_none(first_of({"": v} | fields_of(v), *_NAMES, "")) for v in values):
         return None
     else:
         raise ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
@@ -272,12 +273,6 @@ def _consistent(found: Identified) -> Identified:
     others = tuple(name for name in found.others if name_words(name) != mover)
     kind = None if found.kind == "place" and not placed else found.kind
     return found.model_copy(update={"others": others, "asked": asked, "kind": kind})
-
-
-def _says_none(value: object) -> bool:
-    fields = fields_of(value)
-    key = next((key for key in _NAMES if key in fields), None)
-    return is_none(value) if key is None else is_none(fields[key])
 
 
 def _in_prose(said: str) -> list[str]:
