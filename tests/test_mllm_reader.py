@@ -211,8 +211,13 @@ def test_without_hints_the_motion_is_asked_for_with_the_box_that_is_known(
     assert reader.read_motion(given, grounding(source), None).direction is not None
     assert given.calls.prompts.keys() == prompts | {"looking"}
     assert given.calls.usage.calls == len(mllm.asked) == len(prompts)
+    schema = mllm.asked[-1]["response_format"]["json_schema"]["schema"]
+    assert "bbox_2d" not in schema["properties"]
     assert "in the box [" in mllm.text(-1)
-    assert "bbox_2d" not in mllm.asked[-1]["response_format"]["json_schema"]["schema"]["properties"]
+    mllm.say(json.dumps(BALL | {"also_moving": [{"object": "cup", "kind": "fall"}]}), json.dumps(PLACE))
+    motion = reader.read_motion(given, grounding(source), None)
+    assert motion.others == ()
+    assert "'cup' moves, too, and was left out" in motion.warnings[0]
 
 
 def test_a_motion_that_the_request_gives_is_not_asked_for(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:

@@ -33,7 +33,7 @@ from cow_service.readers.mllm.identify import Change, Identified, identify_call
 from cow_service.readers.mllm.locate import Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import UNKNOWN, configure, resolve_model, upstream_of
 from cow_service.readers.mllm.replies import name_words
-from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
+from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,
     FALLING_KINDS,
@@ -147,6 +147,10 @@ class MllmReader:
             identified = self._client.complete(identify_call(given.question, image, self._reasoning), given)
             located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
             warnings = () if located is None else located.warnings
+            known = {name_words(each.object) for each in grounding.others}
+            lost = [each.object for each in hints.also if name_words(each.object) not in known]
+            hints = hints.model_copy(update={"also": tuple(each for each in hints.also if each.object not in lost)})
+            warnings += tuple(f"'{name}' moves, too, and was left out: it has no place. {GIVE_OBJECT}" for name in lost)
         kind = hints.kind or DEFAULT_KIND
         others = _located_others(hints.also, grounding.others)
         reading = MotionReading(kind, None, "text", sentence=hints.sentence, warnings=warnings, others=others)
