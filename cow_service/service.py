@@ -142,18 +142,14 @@ class Service:
         if self.settings.role != "api":  # else workers have what it lacks
             _check_modules(reader, errors.ReaderUnavailable)
             _check_modules(name, errors.GeneratorUnavailable)
-        limits = self._limits(name)
+        limits: Limits | None = None  # where only the generator itself knows them, and it is not loaded
+        if name in self._generator_limits:
+            limits = self._generator_limits[name].load()()
+        elif self.generators.is_made(name) or name == self.settings.generator:
+            limits = self._generator(name)
         if limits is not None:
             check_request(limits, request)
         return reader, name
-
-    def _limits(self, name: str) -> Limits | None:
-        """What a generator takes of a request; None where only the generator itself knows, which is not loaded."""
-        if name in self._generator_limits:
-            return self._generator_limits[name].load()()
-        if self.generators.is_made(name) or name == self.settings.generator:
-            return self._generator(name)
-        return None
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""

@@ -101,7 +101,12 @@ def install_problem_handlers(app: FastAPI) -> None:
         response = respond(_translated(error, request), request.scope)
         response.headers.update(error.headers or {})
         if response.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-            response.headers["Allow"] = ", ".join(sorted(_methods(request)))
+            # Several routes may have the address, of which the framework names the first one's methods.
+            routers = (getattr(each, "original_router", None) for each in app.routes)
+            routes = [*app.routes, *(route for router in routers if router is not None for route in router.routes)]
+            fitting = (route for route in routes if route.matches(request.scope)[0] is not Match.NONE)
+            methods = {method for route in fitting for method in getattr(route, "methods", None) or ()}
+            response.headers["Allow"] = ", ".join(sorted(methods))
         return response
 
     @app.exception_handler(ClientDisconnect)
@@ -136,11 +141,3 @@ def _translated(error: HTTPException, request: Request) -> errors.CowError:
     if HTTPStatus.BAD_REQUEST <= error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
         return errors.MalformedBody(f"{error.detail}.")
     return errors.InternalError(f"{error.detail}.")
-
-
-def _methods(request: Request) -> set[str]:
-    """What the address takes: several routes may have it, of which the framework names the first one's methods."""
-    routers = (getattr(each, "original_router", None) for each in request.app.routes)
-    routes = [*request.app.routes, *(route for router in routers if router is not None for route in router.routes)]
-    fitting = (route for route in routes if route.matches(request.scope)[0] is not Match.NONE)
-    return {method for route in fitting for method in getattr(route, "methods", None) or ()}

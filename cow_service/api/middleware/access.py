@@ -196,7 +196,10 @@ class Origins:
         headers = Headers(scope=scope)
         host = headers.get("host", "").lower()
         for origin in headers.getlist("origin"):
-            if origin not in self._allowed and "*" not in self._allowed and not _is_own(origin.lower(), host):
+            scheme, _, place = origin.lower().partition("://")
+            port = _DEFAULT_PORTS.get(scheme, "")
+            is_own = bool(place) and place == (host.removesuffix(port) if port else host)
+            if origin not in self._allowed and "*" not in self._allowed and not is_own:
                 return OriginNotAllowed(
                     f"A page of '{origin[:200]}' may not use this server. Its operator can list that origin in "
                     "COW_CORS_ORIGINS."
@@ -217,10 +220,3 @@ class Origins:
         except ValueError:
             return False
         return True
-
-
-def _is_own(origin: str, host: str) -> bool:
-    """Whether a page was served under the very name and port that it asks."""
-    scheme, _, place = origin.partition("://")
-    port = _DEFAULT_PORTS.get(scheme, "")
-    return bool(place) and place == (host.removesuffix(port) if port else host)

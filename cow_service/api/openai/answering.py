@@ -47,7 +47,6 @@ class ParsedChat:
     pointers: dict[str, str]  # by field of the request: JSON Pointers into the chat
     warnings: tuple[str, ...]  # what of it has no effect
     max_tokens: int | None
-    stream: bool
     with_usage: bool
 
 
@@ -80,7 +79,6 @@ def parse_chat(chat: chats.Chat, model: Answerer) -> ParsedChat:
         pointers=pointers,
         warnings=tuple(_warnings(chat, place)),
         max_tokens=min(limits, default=None),
-        stream=chat.stream,
         with_usage=chat.with_usage,
     )
 

@@ -6,7 +6,7 @@ import asyncio
 import json
 import re
 from collections.abc import AsyncGenerator, AsyncIterator, Generator
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any, cast
@@ -76,19 +76,26 @@ class Forwarder:
             headers["Authorization"] = f"Bearer {upstream.key}"
         url = f"{upstream.base_url}/chat/completions"
         request = self._pool().build_request("POST", url, content=content, headers=headers)
-        async with self._slot():
+        try:
+            async with asyncio.timeout(self._budget):
+                await self._slots.acquire()
+        except TimeoutError as error:
+            raise MllmUnavailable(
+                f"{self._permits} chats were being answered (COW_MLLM_CONCURRENCY), and none of them ended within "
+                f"{self._budget:g} s (COW_MLLM_BUDGET). Ask with fewer threads."
+            ) from error
+        async with AsyncExitStack() as stack:
+            stack.callback(self._slots.release)
             with _translated():
                 response = await self._pool().send(request, stream=True)
-            try:
-                streams = response.headers.get("content-type", "").startswith("text/event-stream")
-                if response.status_code == HTTPStatus.OK and streams:
-                    yield Events(_events(response))
-                else:
-                    with _translated():
-                        await response.aread()
-                    yield _whole(response, upstream)
-            finally:
-                await response.aclose()
+            stack.push_async_callback(response.aclose)
+            is_stream = response.headers.get("content-type", "").startswith("text/event-stream")
+            if response.status_code == HTTPStatus.OK and is_stream:
+                yield Events(_events(response))
+            else:
+                with _translated():
+                    await response.aread()
+                yield _whole(response, upstream)
 
     def _pool(self) -> httpx.AsyncClient:
         if self._client is None:
@@ -98,21 +105,6 @@ class Forwarder:
                 headers={"User-Agent": f"cow-service/{__version__}"},
             )
         return self._client
-
-    @asynccontextmanager
-    async def _slot(self) -> AsyncGenerator[None]:
-        try:
-            async with asyncio.timeout(self._budget):
-                await self._slots.acquire()
-        except TimeoutError as error:
-            raise MllmUnavailable(
-                f"{self._permits} chats were being answered (COW_MLLM_CONCURRENCY), and none of them ended within "
-                f"{self._budget:g} s (COW_MLLM_BUDGET). Ask with fewer threads."
-            ) from error
-        try:
-            yield
-        finally:
-            self._slots.release()
 
 
 @contextmanager

@@ -171,14 +171,11 @@ class WhatIf:
         """Why nothing was imagined, where the chat goes on without. Raises what the caller is to hear instead."""
         own = {"/image": self.image.url_pointer, "/question": f"/messages/{self.message}/content"}
         located = locate_in_chat(error, own)
-        if any(self._is_given(field.pointer) for field in located.errors) or not isinstance(error, PASSED_OVER):
+        given = {f"/{EXTENSION}/{name}" for name in self.given}
+        is_own = any("/".join(field.pointer.split("/")[:3]) in given for field in located.errors)
+        if is_own or not isinstance(error, PASSED_OVER):
             raise located from error
         return _nothing_imagined(error.code, error.detail, Usage.model_validate(error.usage or {}))
-
-    def _is_given(self, pointer: str) -> bool:
-        """Whether that is a field of `cow`, and one that the caller gave."""
-        steps = pointer.split("/")[1:3]
-        return steps[:1] == [EXTENSION] and not self.given.isdisjoint(steps[1:])
 
 
 def find_what_if(chat: Chat, answerer: Answerer) -> WhatIf | ChatImagination:

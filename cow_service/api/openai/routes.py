@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from cow_service import errors
 from cow_service.api.body import read_object
 from cow_service.api.openai import records
-from cow_service.api.openai.answering import FIELDS_OF_CHAT, ParsedChat, answer_events, completion_of, parse_chat
+from cow_service.api.openai.answering import FIELDS_OF_CHAT, answer_events, completion_of, parse_chat
 from cow_service.api.openai.chats import EXTENSION, Chat, ChatRequest, ResponsesRequest, as_json, locate_in_chat
 from cow_service.api.openai.forwarding import Whole
 from cow_service.api.openai.proxy import Proxy, preferences_without_key
@@ -22,8 +22,8 @@ from cow_service.api.openai.responses import as_response, chat_fields, response_
 from cow_service.api.openai.stream import EventsResponse, Streamed
 from cow_service.api.problems import MEDIA_TYPE, OPENAI_ROOT, ChatProblem, documented
 from cow_service.api.routes.simulate import ACCEPTED, FAILURES, PREFERENCES
-from cow_service.api.submission import Submission, Submitter, from_app, json_response
-from cow_service.errors import BodyTypeUnsupported, CowError, shortened
+from cow_service.api.submission import Submitter, from_app, json_response
+from cow_service.errors import BodyTypeUnsupported, shortened
 from cow_service.requests import AnswerRequest
 from cow_service.requests.values import SHOWN_CHARACTERS
 
@@ -78,29 +78,25 @@ class Completer:
         reader = await to_thread.run_sync(self.service.chat_reader, answerer.reader)
         if reader is not None:
             return await self._proxy.complete(request, chat, answerer, reader)
-        submission = self._submitter.submission(request, "answer")
+        submitter = self._submitter
+        submission = submitter.submission(request, "answer")
         if not stored:
             submission = replace(submission, prefer=preferences_without_key(request))
-        parsed = await self._submitter.in_thread(partial(parse_chat, chat, answerer))
+        parsed = await submitter.in_thread(partial(parse_chat, chat, answerer))
         try:
-            return await self._answer(request, submission, parsed)
-        except CowError as error:
+            if chat.stream:
+                created_at = await submitter.submit(submission, parsed.request, None)
+                return Streamed(
+                    answer_events(submitter, submission, parsed, created_at),
+                    locate=lambda error: locate_in_chat(error, parsed.pointers),
+                    leave=partial(submitter.leave, submission, created_at),
+                )
+            result = await submitter.result(request, submission, parsed.request, None)
+            if result is None:
+                return await submitter.accepted(submission)
+            return Whole(await to_thread.run_sync(completion_of, parsed, result))
+        except errors.CowError as error:
             raise locate_in_chat(error, parsed.pointers) from error
-
-    async def _answer(self, request: Request, submission: Submission, chat: ParsedChat) -> Whole | Streamed | Response:
-        """The reply of a job. Errors point into its `AnswerRequest`."""
-        submitter = self._submitter
-        if chat.stream:
-            created_at = await submitter.submit(submission, chat.request, None)
-            return Streamed(
-                answer_events(submitter, submission, chat, created_at),
-                locate=lambda error: locate_in_chat(error, chat.pointers),
-                leave=partial(submitter.leave, submission, created_at),
-            )
-        result = await submitter.result(request, submission, chat.request, None)
-        if result is None:
-            return await submitter.accepted(submission)
-        return Whole(await to_thread.run_sync(completion_of, chat, result))
 
 
 ChatCompleter = Annotated[Completer, from_app("completer")]

@@ -186,12 +186,9 @@ def _send(request: Request, file: StaticFile, headers: dict[str, str]) -> Respon
     headers = headers | {"ETag": file.etag}
     if is_known(request, file.etag):
         return Response(status_code=304, headers=headers)
-    if file.media_type != MEDIA_TYPES[".jpg"] and _takes_gzip(request.headers.get("accept-encoding", "")):
+    # Not with a weight of nought (RFC 9110, section 12.5.3).
+    accepted = (item.partition(";") for item in request.headers.get("accept-encoding", "").lower().split(","))
+    gzips = any(name.strip() == "gzip" and weight.replace(" ", "") not in NO_GZIP for name, _, weight in accepted)
+    if gzips and file.media_type != MEDIA_TYPES[".jpg"]:
         return Response(file.compressed, headers=headers | {"Content-Encoding": "gzip"}, media_type=file.media_type)
     return Response(file.body, headers=headers, media_type=file.media_type)
-
-
-def _takes_gzip(accepted: str) -> bool:
-    """Whether `Accept-Encoding` lists gzip, and not with a weight of nought (RFC 9110, section 12.5.3)."""
-    items = (item.partition(";") for item in accepted.lower().split(","))
-    return any(name.strip() == "gzip" and weight.replace(" ", "") not in NO_GZIP for name, _, weight in items)
