@@ -8,8 +8,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import unasync
-
 ROOT = Path(__file__).parents[1]
 CLIENT = ROOT / "cow_service" / "client"
 TWINS = {"async_client.py": "sync_client.py", "async_connection.py": "sync_connection.py"}
@@ -32,6 +30,8 @@ NAMES = {
 
 def twin_of(source: Path) -> str:
     """The text of a module's twin: names and keywords by unasync, then the words of docstrings, then ruff."""
+    import unasync
+
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "async" / source.name
         draft.parent.mkdir()

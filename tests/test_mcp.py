@@ -264,7 +264,7 @@ def test_the_server_introduces_itself_and_its_tools(here: tuple[Session, Path]) 
         assert tool.input_schema["required"] == ["image", "question"]
         assert all("description" in argument for argument in tool.input_schema["properties"].values())
         assert "path" in tool.input_schema["properties"]["image"]["description"]
-        assert "nothing bounces" in (tool.description or "")
+        assert "hypotheses with probabilities" in (tool.description or "")
         assert tool.annotations is not None
         assert tool.annotations.read_only_hint
         assert not tool.annotations.destructive_hint

@@ -234,12 +234,11 @@ def check_port(settings: Settings) -> None:
             try:
                 probe.bind(address)
             except OSError as error:
-                raise SettingsError(f"Bad settings: COW_PORT={port}: {_reason(error, host)}") from error
-
-
-def _reason(error: OSError, host: str) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return f"another program listens there, at {host}. Choose another with --port; --port 0 takes a free one."
-    if error.errno == errno.EACCES:
-        return "only the system's administrator may listen there. Choose a --port above 1023."
-    return f"{error.strerror}. See --host and --port."
+                reason = f"{error.strerror}. See --host and --port."
+                if error.errno == errno.EADDRINUSE:
+                    reason = (
+                        f"another program listens there, at {host}. Choose another with --port; 0 takes a free one."
+                    )
+                elif error.errno == errno.EACCES:
+                    reason = "only the system's administrator may listen there. Choose a --port above 1023."
+                raise SettingsError(f"Bad settings: COW_PORT={port}: {reason}") from error

@@ -81,7 +81,7 @@ def encounters_words(trajectory: Trajectory) -> str:
 
 
 def first_contacts(trajectory: Trajectory) -> tuple[Contact, ...]:
-    """Those after the start that are told: a thing that comes to rest touches the floor many times."""
+    """The first contacts after the start: a thing that comes to rest touches the floor many times."""
     return tuple(contact for contact in trajectory.contacts if contact.time > 0)[:MAX_CONTACTS]
 
 
@@ -233,14 +233,14 @@ def _body(simulation: Simulation, get: GetBytes) -> str:
     said = simulation.motion.sentence
     if simulation.encounters_known:
         said += f" It {encounters_words(trajectory)}."
-    told = [said]
+    lines = [said]
     if contacts := contacts_words(trajectory):
-        told.append(f"Contacts: {contacts}.")
+        lines.append(f"Contacts: {contacts}.")
     if trajectory.outcome is not None and (outcome := outcome_words(trajectory.outcome)):
-        told.append(f"Outcome: {outcome}.")
+        lines.append(f"Outcome: {outcome}.")
     if trajectory.moving_until is not None:
-        told.append(f"Nothing moves in the image from {trajectory.moving_until:.1f} s on.")
-    return shown + "".join(f"<div>{escape(text)}</div>" for text in told) + _warnings(simulation.warnings)
+        lines.append(f"Nothing moves in the image from {trajectory.moving_until:.1f} s on.")
+    return shown + "".join(f"<div>{escape(text)}</div>" for text in lines) + _warnings(simulation.warnings)
 
 
 def _row(figures: Sequence[str]) -> str:

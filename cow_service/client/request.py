@@ -173,20 +173,16 @@ def request_fields(options: Mapping[str, Any]) -> dict[str, Any]:
     """
     fields = {name: value for name, value in options.items() if value is not None}
     if "law" in fields:
-        fields["motion"] = _with_law(fields.get("motion"), fields.pop("law"))
+        law, motion = fields.pop("law"), dict(plain(fields.get("motion") or {}))
+        if motion.get("law", law) != law:
+            detail = f"is {motion['law']!r}, and `law` is {law!r}: give one of them"
+            raise InvalidRequest(f"`motion.law` {detail}.", errors=(FieldError("/motion/law", detail),))
+        fields["motion"] = {**motion, "law": law}
     if "grounding" in fields:
         fields["grounding"] = _with_mask(fields["grounding"])
     if "objects" in fields:
         fields["objects"] = [_with_mask(given) for given in fields["objects"]]
     return fields
-
-
-def _with_law(motion: Any, law: Any) -> dict[str, Any]:
-    given: dict[str, Any] = {} if motion is None else dict(plain(motion))
-    if given.get("law", law) != law:
-        detail = f"is {given['law']!r}, and `law` is {law!r}: give one of them"
-        raise InvalidRequest(f"`motion.law` {detail}.", errors=(FieldError("/motion/law", detail),))
-    return {**given, "law": law}
 
 
 def _with_mask(place: Any) -> Any:

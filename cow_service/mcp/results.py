@@ -14,7 +14,7 @@ from PIL import Image
 from cow_service.client import AsyncClient
 from cow_service.client.display import MAX_CONTACTS, body_name, first_contacts, gate_words, outcome_words, worlds
 from cow_service.mcp.arguments import ARTIFACTS, ToolName, inlined
-from cow_service.records import MEETINGS, Answer, Body, Encounter, Simulation, Verdict
+from cow_service.records import MEETINGS, Answer, Body, Simulation, Verdict
 
 # What a model has no use for: thousands of numbers, and who made it how.
 _OF_OBJECT = {"mask": True, "prior": True, "source": True, "role": True}
@@ -120,8 +120,13 @@ def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
         f"{motion.kind}, {way}law {trajectory.law}."
     )
     encounters = sorted(trajectory.encounters, key=lambda encounter: encounter.first_frame)
-    if encounters:
-        yield f"On its way (hypotheses) it {'; '.join(_encounter(each, trajectory.fps) for each in encounters)}."
+    meetings: list[str] = []
+    for each in encounters:
+        sure = "" if each.probability is None else f", {worlds(each.probability)}"
+        when = f"from {each.first_frame / trajectory.fps:.2f} s (frame {each.first_frame}{sure})"
+        meetings.append(f"{MEETINGS[each.kind]} {each.object} {when}")
+    if meetings:
+        yield f"On its way (hypotheses) it {'; '.join(meetings)}."
     elif simulation.encounters_known:
         yield "It meets nothing on its way, as far as the image tells."
     else:
@@ -143,12 +148,6 @@ def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
     if video:
         yield f"Video: {video}"
     yield f"Simulation {simulation.id}; generator {simulation.generator.name}, reader {simulation.reader.name}."
-
-
-def _encounter(encounter: Encounter, fps: float) -> str:
-    sure = "" if encounter.probability is None else f", {worlds(encounter.probability)}"
-    when = f"from {encounter.first_frame / fps:.2f} s (frame {encounter.first_frame}{sure})"
-    return f"{MEETINGS[encounter.kind]} {encounter.object} {when}"
 
 
 def _verdict(verdict: Verdict) -> str:

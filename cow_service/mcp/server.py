@@ -48,10 +48,9 @@ returns imagined frames for you to look at; `answer` returns an answer with its 
 the thing goes rather than guess, from an image and a question in plain English."""
 
 LIMITS = """\
-Limits: one thing moves, everything else stays; its velocity is constant but for gravity, through what it meets: \
-nothing bounces, breaks, rolls or is pushed. Encounters come from silhouettes in the picture (what stands lower is \
-taken to be nearer): hypotheses, not measurements. `warnings` say what was assumed. Where the thing or its direction \
-is not found, the error says what was seen and which arguments to add."""
+Limits: what happens is computed in a small physical world that is estimated from the picture, many times within what \
+the picture leaves open: hypotheses with probabilities, not measurements. Nothing breaks or bends. `warnings` say what \
+was assumed. Where the thing or its direction is not found, the error says what was seen and which arguments to add."""
 
 DESCRIPTIONS: dict[ToolName, str] = {
     "simulate": f"""\

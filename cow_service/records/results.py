@@ -312,7 +312,7 @@ class Job(Record):
         description="Jobs that are taken before it, while it is queued and asked for by its id; null otherwise.",
     )
     expected_wait: float | None = Field(
-        default=None, ge=0, description="Seconds until it is taken, at the pace of the last minutes; null if not known."
+        default=None, ge=0, description="Seconds until it is taken, at the rate of the last minutes; null if not known."
     )
     generator: str = Field(description="Who makes its frames.")
     result: Simulation | Answer | None = Field(default=None, description="Of a succeeded job, but not in lists.")

@@ -83,7 +83,9 @@ def field_errors(
     """One for each place of a pydantic error's `errors()`; `placed` says where a JSON Pointer stands in the request."""
     fields: dict[str, FieldError] = {}
     for item in found:
-        pointer = placed("".join("/" + pointer_part(part) for part in _location(item["loc"])))
+        # Without the names of union branches and validators, which callers cannot see.
+        parts = [p for p in item["loc"] if not str(p).startswith(_HIDDEN) and p not in _UNION_BRANCHES]
+        pointer = placed("".join("/" + pointer_part(part) for part in parts))
         fields.setdefault(pointer, FieldError(pointer, _with_value(str(item["msg"]), item["input"])))
     return tuple(fields.values())
 
@@ -97,8 +99,3 @@ def _with_value(message: str, value: Any) -> str:
     if isinstance(value, str) and len(value) > SHOWN_CHARACTERS:
         return f"{reason}, got {len(value)} characters"
     return f"{reason}, got {shortened(json.dumps(value), SHOWN_CHARACTERS)}"
-
-
-def _location(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
-    """A pydantic location without the names of union branches and validators, which callers cannot see."""
-    return tuple(p for p in loc if not (isinstance(p, str) and (p.startswith(_HIDDEN) or p in _UNION_BRANCHES)))
