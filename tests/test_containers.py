@@ -14,11 +14,11 @@ from worlds import energy, rigid
 
 from cow_service.physics.draws import COLUMN, likeliest
 from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, hollow_of, run_worlds
-from cow_service.physics.placement import Put, classify
+from cow_service.physics.placement import PlacementGoal, classify
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.openings import SeenOpening, measure_opening
 
-INTO = Put("into", (1,))
+INTO = PlacementGoal("into", (1,))
 HALF, HEIGHT = 0.2, 0.1  # m: half the width and half the height of the container
 
 

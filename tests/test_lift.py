@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import FloorCamera, prior
 from cow_service.physics.draws import ensemble, likeliest
+from cow_service.physics.layout import lay_out
 from cow_service.physics.lift import BOX_SIDE, Cameras, above, in_the_air
-from cow_service.physics.placing import place
 from cow_service.physics.projection import seen_paths
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import MetresPerPixel, Motion, ObjectPrior
@@ -170,7 +170,7 @@ class TestPlacedScene:
     def test_a_camera_that_looks_up_sees_bodies_in_the_air(self) -> None:
         bodies = body((300, 150, 340, 190), "sphere"), body((100, 100, 200, 260), "cylinder")
         for draws in (likeliest(), ensemble(50)):
-            scene = place(bodies, motion(), known(TrueCamera(pitch=-35), 0.1), (640, 400), draws)
+            scene = lay_out(bodies, motion(), known(TrueCamera(pitch=-35), 0.1), (640, 400), draws)
             assert not any(placed.stands for placed in scene.bodies)
             for placed in scene.bodies:
                 assert np.isfinite(placed.centre).all()
@@ -179,7 +179,7 @@ class TestPlacedScene:
 
     def test_a_foot_above_the_horizon_is_in_the_air_and_nobody_elses_concern(self) -> None:
         bodies = body((300, 250, 340, 290), "sphere"), body((100, 10, 140, 40), "box"), body((500, 240, 540, 300))
-        scene = place(bodies, motion(), known(TrueCamera(pitch=8)), (640, 400), likeliest())
+        scene = lay_out(bodies, motion(), known(TrueCamera(pitch=8)), (640, 400), likeliest())
         assert [placed.stands for placed in scene.bodies] == [True, False, True]
         assert scene.bodies[1].centre[0, 1] > scene.cameras.height[0]
 
@@ -190,7 +190,7 @@ class TestPlacedScene:
         bodies = body(ball, "sphere"), body(camera.box(outline("cylinder", (-0.6, 4.0), 0.15, 0.5)), "cylinder")
         scale = camera.positions(np.array([[0.2, half, 3.0]]))[0, 2] / camera.focal
         there = motion().model_copy(update={"metres_per_pixel": MetresPerPixel(value=scale, source="reference")})
-        scene = place(bodies, there, known(camera), camera.size, likeliest())
+        scene = lay_out(bodies, there, known(camera), camera.size, likeliest())
         assert scene.cameras.height[0] == pytest.approx(1.2, rel=0.03)
         assert scene.bodies[0].centre[0] == pytest.approx((0.2, half, 3.0), abs=0.05)
         assert scene.bodies[1].centre[0, [0, 2]] == pytest.approx((-0.6, 4.0), abs=0.1)
@@ -203,8 +203,8 @@ class TestPlacedScene:
         seen = seen_paths(worlds, 0).points[0]
         step = (seen[10] - seen[3]) / np.linalg.norm(seen[10] - seen[3])
         assert step == pytest.approx(direction, abs=0.02)
-        assert worlds.scene.velocity[0, 1] == 0
-        speed = float(np.linalg.norm(worlds.scene.velocity[0]))
+        assert worlds.layout.velocity[0, 1] == 0
+        speed = float(np.linalg.norm(worlds.layout.velocity[0]))
         assert speed == pytest.approx(100 * METRES), "speeds are along the floor, at the first depth"
 
     @pytest.mark.parametrize("roll", [-15.0, 0.0, 8.0])
@@ -228,7 +228,7 @@ class TestPlacedScene:
             known_height = np.array([0.0, 0.0, math.log(radii) - fit.mean[2], 0.0, 0.0])
             fit = replace(fit, mean=fit.mean + known_height, covariance=fit.covariance * np.diag([1, 1, 1e-4, 1, 1]))
         asked_about = 1 if asked else None
-        scene = place(bodies, motion("fall", gravity=(0, 9.81 / METRES)), fit, (640, 400), ensemble(100), asked_about)
+        scene = lay_out(bodies, motion("fall", gravity=(0, 9.81 / METRES)), fit, (640, 400), ensemble(100), asked_about)
         return scene.bodies[0].centre[:, 2] - scene.bodies[1].centre[:, 2]
 
     def test_what_is_let_go_hangs_over_what_is_asked_about_in_most_worlds(self) -> None:
@@ -246,7 +246,7 @@ class TestPlacedScene:
 
     def test_every_draw_of_an_ensemble_is_placed(self) -> None:
         bodies = body((280, 240, 330, 290), "sphere"), body((400, 200, 470, 300)), body((100, 150, 180, 260), "cone")
-        scene = place(bodies, motion("linear", (1.0, 0.0), 100), known(TrueCamera(), 0.1), (640, 400), ensemble(50))
+        scene = lay_out(bodies, motion("linear", (1.0, 0.0), 100), known(TrueCamera(), 0.1), (640, 400), ensemble(50))
         for placed in scene.bodies:
             assert placed.centre.shape == (50, 3)
             assert np.isfinite(placed.centre).all()
@@ -304,6 +304,8 @@ class TestSupports:
         b = body((320, 180, 420, 260), "box", "b", ObjectPrior(stands_on="a"))
         itself = body((20, 180, 120, 260), "box", "c", ObjectPrior(stands_on="c"))
         for bodies in ([a, b, itself], [itself, b, a]):
-            scene = place(bodies, motion("linear", (1.0, 0.0), 50), known(TrueCamera(), 0.1), (640, 400), ensemble(10))
+            scene = lay_out(
+                bodies, motion("linear", (1.0, 0.0), 50), known(TrueCamera(), 0.1), (640, 400), ensemble(10)
+            )
             assert all(np.isfinite(placed.centre).all() for placed in scene.bodies)
         assert supports_of([itself]) == [None]

@@ -18,7 +18,7 @@ from cow_service.generators.cutout import CutoutGenerator, create
 from cow_service.media.images import decode_own
 from cow_service.physics.draws import ensemble
 from cow_service.physics.engine import RigidShape, run_worlds
-from cow_service.physics.placement import Put, settle
+from cow_service.physics.placement import PlacementGoal, settle
 from cow_service.records import Clip, Trajectory
 from cow_service.settings import Settings
 from cow_service.stages.generation import generate
@@ -275,7 +275,7 @@ def test_what_stays_where_it_is_put_begins_at_rest(
     under = RigidShape(target, width, width, height, (0.0, height, 3.0))
     thing = RigidShape(shape, half, half, tall, (2.5, tall, 3.0))
     opening = SeenOpening(0.9, 0.05, 0.7, None, False, has_edge=True) if relation == "into" else None
-    places = Put(relation, (1,), opening, body=2)
+    places = PlacementGoal(relation, (1,), opening, body=2)
     draws = ensemble(3)
     settled = settle((places,), ((mover, under, thing),) * 3, draws, 24.0)
     stay = [shapes for shapes, stays in zip(settled.shapes, settled.placements[0].stays, strict=True) if stays]

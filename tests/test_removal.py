@@ -87,7 +87,7 @@ class TestWorlds:
         table = _drawn("table", "box", camera.box(outline("box", (0.6, 3.2), 0.4, 0.4)))
         still = _moving(camera, half).model_copy(update={"kind": "static", "direction": None, "speed": 0.0})
         world = WorldInput(tuple(bodies), still, known(camera), camera.size, 33, 16.0, taken=(table,))
-        assert run_world(world.as_it_is(), likeliest()).scene.supports[1] == 2
+        assert run_world(world.as_it_is(), likeliest()).layout.supports[1] == 2
         fallen, kept = run_world(world, likeliest()), run_world(world.as_it_is(), likeliest())
         assert fallen.runs[0].positions[1, 0, 1] == pytest.approx(kept.runs[0].positions[1, 0, 1])
         assert fallen.runs[0].positions[1, -1, 1] < fallen.runs[0].positions[1, 0, 1] - 0.3

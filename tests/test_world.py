@@ -10,7 +10,7 @@ from floors import TrueCamera, known, outline
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.events import Events, encounters, find_events, find_world_events
+from cow_service.physics.events import Events, encounters, find_world_events
 from cow_service.physics.projection import rotation, seen_paths, states
 from cow_service.physics.world import WorldInput, Worlds, run_world
 from cow_service.records import MetresPerPixel, Motion
@@ -53,7 +53,7 @@ def happened(bodies, motion: Motion, draws=None, every: int = 1, doubt: float = 
     world = WorldInput(tuple(bodies), motion, known(CAMERA, doubt), CAMERA.size, FRAMES, FPS)
     rows = likeliest() if draws is None else draws
     worlds = run_world(world, rows, every)
-    return worlds, find_events(worlds, bodies, FPS, rows)
+    return worlds, find_world_events(worlds, bodies, FPS, rows, CAMERA.size).of[0]
 
 
 def kinds(events: Events, body: int = 1) -> set[str]:
@@ -123,7 +123,7 @@ class TestFalling:
                 CAMERA.size, FRAMES, FPS,
             )  # fmt: skip
             worlds = run_world(world, likeliest())
-            events = find_events(worlds, world.bodies, FPS, likeliest())
+            events = find_world_events(worlds, world.bodies, FPS, likeliest(), CAMERA.size).of[0]
             assert ("touches" in kinds(events)) == hit
             if hit:
                 assert events.times["touches"][0, 1] == pytest.approx(math.sqrt(2 * 0.6 / 9.81), abs=0.1)
@@ -152,9 +152,9 @@ class TestOnATable:
         table = drawn("table", "box", CAMERA.box(outline("box", (-0.6, 3.0), 0.5, 0.4)))
         mover = ball(-0.6, 3.0, above=0.4)
         worlds, events = happened([mover, table], moving(mover, 3.0, above=0.4))
-        assert worlds.scene.supports == (1, None)
+        assert worlds.layout.supports == (1, None)
         assert not events.eligible[1]
         heights = worlds.runs[0].positions[0, :, 1]
         # Of a table the box alone is known: its near edge looks wider, so that its far one is taken to be farther.
         assert heights[0] == pytest.approx(0.4 + HALF, rel=0.25)
-        assert heights[-1] == pytest.approx(float(worlds.scene.bodies[0].half_height[0]), rel=0.1), "on the floor"
+        assert heights[-1] == pytest.approx(float(worlds.layout.bodies[0].half_height[0]), rel=0.1), "on the floor"

@@ -76,26 +76,21 @@ def course_of(motion: Motion, velocities: Sequence[Floats], speed: float, clip: 
     Legs before the last that have no length of their own share what is left of the clip's seconds.
     """
     extents = [(motion.distance, motion.duration), *((step.distance, step.duration) for step in motion.steps)]
-    seconds = [_seconds(distance, duration, speed) for distance, duration in extents]
+    seconds = [
+        min(
+            math.inf if distance is None or speed <= 0 else distance / speed,
+            math.inf if duration is None else duration,
+        )
+        for distance, duration in extents
+    ]
     if seconds == [math.inf] and motion.until != "contact":
         return None
     if not all(map(math.isfinite, seconds[:-1])):
         open_ones = sum(not math.isfinite(each) for each in seconds)
         share = max(0.0, clip - sum(filter(math.isfinite, seconds))) / open_ones
         seconds = [*(each if math.isfinite(each) else share for each in seconds[:-1]), seconds[-1]]
-    legs = [Leg(length, _triple(velocity)) for length, velocity in zip(seconds, velocities, strict=True)]
-    return Course(tuple(legs), motion.until == "contact")
-
-
-def _seconds(distance: float | None, duration: float | None, speed: float) -> float:
-    """How long a leg takes; infinite where nothing limits it."""
-    for_distance = math.inf if distance is None or speed <= 0 else distance / speed
-    return min(for_distance, math.inf if duration is None else duration)
-
-
-def _triple(velocity: Floats) -> tuple[float, float, float]:
-    x, y, z = velocity.tolist()
-    return x, y, z
+    pairs = zip(seconds, (velocity.tolist() for velocity in velocities), strict=True)
+    return Course(tuple(Leg(length, (x, y, z)) for length, (x, y, z) in pairs), motion.until == "contact")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cow_service.records import BBox, LocatedObject, ObjectPrior, Shape, Source
+from cow_service.records import BBox, ObjectPrior, Shape, Source
 from cow_service.vision.masks import CroppedMask
 
 ON_TOP = 0.72  # of a support's height in the image, from its upper edge: a foot below that stands before it
@@ -68,19 +68,16 @@ class SeenBody:
 
 def supports_of(bodies: Sequence[SeenBody]) -> list[int | None]:
     """For each body the one that it stands on, by what is said of it or by where its foot is; None: the floor."""
-    return [_support(body, bodies) for body in bodies]
-
-
-def _support(body: SeenBody, bodies: Sequence[SeenBody]) -> int | None:
-    said = None if body.prior is None else body.prior.stands_on
-    if said in ("floor", "air"):
-        return None
-    if said is not None:
+    found: list[int | None] = []
+    for body in bodies:
+        said = None if body.prior is None else body.prior.stands_on
         named = [i for i, other in enumerate(bodies) if other is not body and other.name == said]
-        if named:
-            return named[0]
-    under = [i for i, other in enumerate(bodies) if other is not body and _carries(other, body)]
-    return min(under, key=lambda i: bodies[i].bbox[3]) if under else None
+        if said in ("floor", "air") or named:
+            found.append(named[0] if said not in ("floor", "air") else None)
+            continue
+        under = [i for i, other in enumerate(bodies) if other is not body and _carries(other, body)]
+        found.append(min(under, key=lambda i: bodies[i].bbox[3]) if under else None)
+    return found
 
 
 def _carries(support: SeenBody, body: SeenBody) -> bool:
@@ -89,28 +86,19 @@ def _carries(support: SeenBody, body: SeenBody) -> bool:
     What stands behind a thing ends at its upper edge; what stands on it has some of its top to either side.
     """
     x, y = body.foot
-    x0, y0, x1, y1 = support.bbox
-    width, height = x1 - x0, y1 - y0
+    (x0, y0, x1, y1), (left, top, right, _) = support.bbox, body.bbox
     possible = (
         support.shape in ("box", "cylinder")
-        and width > WIDER * (body.bbox[2] - body.bbox[0])
+        and x1 - x0 > WIDER * (right - left)
         and x0 < x < x1
-        and y0 < y < y0 + ON_TOP * height
-        and body.bbox[1] < y0
+        and y0 < y < y0 + ON_TOP * (y1 - y0)
+        and top < y0
     )
     if not possible:
         return False
-    tops = [_upper_edge(support.mask, column) for column in (body.bbox[0] - BESIDE, body.bbox[2] + BESIDE)]
-    return min(y - top for top in tops) > SHOWN * (body.bbox[2] - body.bbox[0])
-
-
-def _upper_edge(mask: CroppedMask, column: float) -> float:
-    """The upper row (px) of a mask in a column; infinite outside it."""
-    at = int(column) - mask.columns.start
-    rows = np.nonzero(mask.patch[:, at])[0] if 0 <= at < mask.patch.shape[1] else np.zeros(0)
-    return float(rows[0] + mask.rows.start) if len(rows) else math.inf
-
-
-def seen_body(located: LocatedObject, mask: CroppedMask, shape: Shape, confidence: float) -> SeenBody:
-    """A body of an object that a reader or a request located."""
-    return SeenBody(located.object, located.bbox, mask, shape, located.source or "embedded", confidence, located.prior)
+    shown, mask = math.inf, support.mask
+    for column in (left - BESIDE, right + BESIDE):
+        at = int(column) - mask.columns.start
+        rows = np.nonzero(mask.patch[:, at])[0] if 0 <= at < mask.patch.shape[1] else np.zeros(0)
+        shown = min(shown, y - (float(rows[0] + mask.rows.start) if len(rows) else math.inf))
+    return shown > SHOWN * (right - left)

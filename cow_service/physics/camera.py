@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -175,7 +176,9 @@ class CameraFit:
 
 def prior(roll: float = 0.0) -> CameraFit:
     """What is known of the camera before anything is measured."""
-    return CameraFit(*_prior(), roll, ROLL_SIGMA, "prior")
+    mean = np.array([PITCH, math.log(FOCAL_WIDTHS), math.log(HEIGHT_RADII), *SLANT])
+    sigma = np.array([PITCH_SIGMA, FOCAL_SIGMA, HEIGHT_SIGMA, *SLANT_SIGMA])
+    return CameraFit(mean, np.diag(sigma**2), roll, ROLL_SIGMA, "prior")
 
 
 def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, int]) -> CameraFit | None:
@@ -196,14 +199,9 @@ def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, in
     parameters = start.mean.copy()
     drop = (shadow.centre[1] - (ball[1] + ball[3]) / 2) / model.radius / math.cos(parameters[0])
     parameters[2] = math.log(max(drop, 1.2))
-    slopes = np.zeros((10, 5))
-    for _ in range(MAX_ITERATIONS):
-        now = residuals(parameters)
-        slopes = np.stack([(residuals(parameters + step) - now) / 1e-5 for step in 1e-5 * np.eye(5)], axis=1)
-        move = np.clip(np.linalg.lstsq(slopes, -now, rcond=None)[0], -0.3, 0.3)
-        parameters = np.clip(parameters + move, LOWEST, HIGHEST)
-        if float(np.abs(move).max()) < 1e-4:
-            break
+    parameters, slopes = gauss_newton(
+        residuals, parameters, step=1e-5, most=0.3, least=1e-4, iterations=MAX_ITERATIONS, bounds=(LOWEST, HIGHEST)
+    )
     cost = float((residuals(parameters)[:5] ** 2).sum())
     if cost > MAX_COST:
         return None
@@ -211,10 +209,30 @@ def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, in
     return CameraFit(parameters, covariance, start.roll, start.roll_sigma, "shadow")
 
 
-def _prior() -> tuple[Floats, Floats]:
-    mean = np.array([PITCH, math.log(FOCAL_WIDTHS), math.log(HEIGHT_RADII), *SLANT])
-    sigma = np.array([PITCH_SIGMA, FOCAL_SIGMA, HEIGHT_SIGMA, *SLANT_SIGMA])
-    return mean, np.diag(sigma**2)
+def gauss_newton(
+    residuals: Callable[[Floats], Floats],
+    parameters: Floats,
+    *,
+    step: float,
+    most: float,
+    least: float,
+    iterations: int,
+    bounds: tuple[Floats | float, Floats | float] = (-math.inf, math.inf),
+) -> tuple[Floats, Floats]:
+    """Parameters [P] of least squared residuals [N], and the slopes [N, P] of these by differences over a `step`.
+
+    A parameter moves by `most` at a time, within the bounds, until none moves by `least`.
+    """
+    slopes = np.zeros((0, len(parameters)))
+    for _ in range(iterations):
+        now = residuals(parameters)
+        steps = step * np.eye(len(parameters))
+        slopes = np.stack([(residuals(parameters + each) - now) / step for each in steps], axis=1)
+        move = np.clip(np.linalg.lstsq(slopes, -now, rcond=None)[0], -most, most)
+        parameters = np.clip(parameters + move, *bounds)
+        if float(np.abs(move).max()) < least:
+            break
+    return parameters, slopes
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,11 @@ def likeliest() -> Floats:
 
 def ensemble(count: int) -> Floats:
     """Rows [count, P] by Latin hypercube sampling: of each parameter every quantile occurs once."""
-    quantiles = np.array([NormalDist().inv_cdf((i + 0.5) / count) for i in range(count)])
+    normal = np.array([NormalDist().inv_cdf((i + 0.5) / count) for i in range(count)])
     rng = np.random.default_rng(0)  # the same request must give the same worlds
-    return np.stack([rng.permutation(quantiles) for _ in NAMES], axis=1)
+    return np.stack([rng.permutation(normal) for _ in NAMES], axis=1)
+
+
+def quantiles(normal: Floats) -> Floats:
+    """Shares 0..1 [K] of standard normal draws [K] that lie below each."""
+    return np.array([NormalDist().cdf(z) for z in normal])

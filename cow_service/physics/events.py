@@ -19,6 +19,11 @@ from cow_service.vision.masks import Floats, Mask
 NEVER = math.inf
 DISPLACED = 0.1  # of a body's half width: what is displaced less was not set in motion
 TIPPED = math.radians(45)  # an upright axis that leans more has tipped over
+COVERED = 0.3  # share of a silhouette from which it counts as covered
+ANY_PART = 0.06  # share from which a part of it is covered: less is an inexact outline
+COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
+KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
+PerKind = dict[EncounterKind, Floats]  # [K, B] each
 
 
 def set_off(shapes: Sequence[RigidShape], run: WorldRun) -> dict[int, float]:
@@ -70,28 +75,10 @@ def times_landed(worlds: Worlds) -> Floats:
     return times
 
 
-def times_gone(paths: Sequence[SeenPaths], size: tuple[int, int], worlds: Worlds) -> Floats:
-    """[K, B]: when the middle of each body leaves an image of a size (width, height; px), or passes the camera (s)."""
-    outside: list[Mask] = []
-    for path in paths:
-        inside = np.all((path.points >= 0) & (path.points < np.array(size)), axis=2)
-        outside.append(~inside | path.passed)
-    return _first(np.stack(outside, axis=1), worlds)
-
-
 def _first(happens: Mask, worlds: Worlds) -> Floats:
     """[K, B]: the time (s) of the first recorded frame in which something is so [K, B, F]."""
     clock = np.arange(happens.shape[2]) * (worlds.every / worlds.fps)
     return np.where(happens, clock, NEVER).min(axis=2)
-
-
-__all__ = ["COVERED", "KINDS", "NEVER", "Events", "WorldEvents", "encounters", "find_events", "find_world_events"]
-
-COVERED = 0.3  # share of a silhouette from which it counts as covered
-ANY_PART = 0.06  # share from which a part of it is covered: less is an inexact outline
-COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
-KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
-PerKind = dict[EncounterKind, Floats]  # [K, B] each
 
 
 @dataclass(frozen=True)
@@ -104,12 +91,12 @@ class Events:
     partly: PerKind  # as times, where any part is covered
     subject: int = 0  # the body that meets the others
 
-    def happens(self, kind: EncounterKind) -> Mask:
-        """[K, B]."""
-        return np.isfinite(self.times[kind])
+    def share(self, kind: EncounterKind, body: int) -> float:
+        """Of the draws, in which the encounter happens."""
+        return float(np.isfinite(self.times[kind])[:, body].mean())
 
 
-class PerSubject(dict[int, Events]):
+class _Lazily(dict[int, Events]):
     """The events of each body, found when first asked for."""
 
     def __init__(self, find: Callable[[int], Events]) -> None:
@@ -117,8 +104,7 @@ class PerSubject(dict[int, Events]):
         self._find = find
 
     def __missing__(self, subject: int) -> Events:
-        self[subject] = self._find(subject)
-        return self[subject]
+        return self.setdefault(subject, self._find(subject))
 
 
 @dataclass(frozen=True)
@@ -141,20 +127,17 @@ def find_world_events(
     started = set_off(worlds.shapes[0], worlds.runs[0])
     order = tuple(sorted(started, key=lambda body: (body != 0, started[body])))
     paths = [seen_paths(worlds, body) for body in range(len(bodies))]
+    inside = [np.all((path.points >= 0) & (path.points < np.array(size)), axis=2) & ~path.passed for path in paths]
+    outside = ~np.stack(inside, axis=1)
     return WorldEvents(
-        of=PerSubject(lambda subject: _events_of(subject, worlds, bodies, fps, draws, paths)),
+        of=_Lazily(lambda subject: _events_of(subject, worlds, bodies, fps, draws, paths)),
         moved=times_moved(worlds),
         tipped=times_tipped(worlds),
-        gone=times_gone(paths, size, worlds),
+        gone=_first(outside, worlds),
         landed=times_landed(worlds),
         placed=None if worlds.placements is None else worlds.placements.times,
         order=order,
     )
-
-
-def find_events(worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, subject: int = 0) -> Events:
-    """The events of one body in every draw [K, P]. What it stands on at the start is no encounter."""
-    return _events_of(subject, worlds, bodies, fps, draws, [seen_paths(worlds, body) for body in range(len(bodies))])
 
 
 def _events_of(
@@ -162,7 +145,7 @@ def _events_of(
 ) -> Events:
     enough = COVERED * np.exp(COVERED_SIGMA * draws[:, COLUMN["outline"]])[:, None]
     eligible, count = np.ones(len(bodies), bool), len(bodies)
-    on = worlds.scene.supports[subject]
+    on = worlds.layout.supports[subject]
     eligible[[0, subject, *([] if on is None else [on])]] = False
     times: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
     partly: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
@@ -172,7 +155,7 @@ def _events_of(
     path, step = paths[subject], worlds.every / fps
     clock = np.arange(path.depth.shape[1]) * step
     for other in range(count):
-        if other in (subject, on) or other in worlds.scene.loads_of(subject):
+        if other in (subject, on) or other in worlds.layout.loads_of(subject):
             continue
         found = shares(bodies[subject].mask, path, bodies[other].mask, paths[other])
         before = clock[None] <= times["touches"][:, other : other + 1] + step
@@ -192,7 +175,7 @@ def _touches(subject: int, worlds: Worlds, count: int, on: int | None) -> Floats
         for meeting in run.meetings:
             if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
                 other = meeting.b if meeting.a == subject else meeting.a
-                if other != on and other not in worlds.scene.loads_of(subject):
+                if other != on and other not in worlds.layout.loads_of(subject):
                     times[k, other] = min(times[k, other], meeting.time)
     return times
 
@@ -227,11 +210,7 @@ def encounters(
                         kind=kind,
                         first_frame=min(frame, num_frames - 1),
                         share=None if kind == "touches" else float(events.shares[kind][0, body]),
-                        probability=_probability(ensemble, subject, kind, body),
+                        probability=None if ensemble is None else ensemble.of[subject].share(kind, body),
                     )
                 )
     return tuple(sorted(found, key=lambda encounter: encounter.first_frame))
-
-
-def _probability(ensemble: WorldEvents | None, subject: int, kind: EncounterKind, body: int) -> float | None:
-    return None if ensemble is None else float(ensemble.of[subject].happens(kind)[:, body].mean())

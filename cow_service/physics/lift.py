@@ -44,17 +44,13 @@ class Cameras:
 
     def at_height(self, height: Floats) -> Cameras:
         """The same cameras at other heights [K] (m)."""
-        return Cameras(self.width, self.height_px, self.focal, self.axes, height)
-
-    def part(self, rows: slice) -> Cameras:
-        """The cameras of some draws."""
-        return Cameras(self.width, self.height_px, self.focal[rows], self.axes[rows], self.height[rows])
+        return replace(self, height=height)
 
     def repeated(self, count: int, draw: int = 0) -> Cameras:
         """The camera of one draw so many times."""
         one = slice(draw, draw + 1)
         focal, axes, height = (np.repeat(values[one], count, axis=0) for values in (self.focal, self.axes, self.height))
-        return Cameras(self.width, self.height_px, focal, axes, height)
+        return replace(self, focal=focal, axes=axes, height=height)
 
     def rays(self, point: tuple[float, float] | Floats) -> Floats:
         """Rays [K, 3] through an image point (px), or through one each [K, 2]: right, up and ahead, of depth 1."""
@@ -71,13 +67,17 @@ class Cameras:
         points = position[..., :2] * (self.focal[steps] / z)[..., None]
         return points + np.array([self.width / 2, self.height_px / 2]), position[..., 2]
 
+    def coordinates(self, positions: Floats) -> Floats:
+        """Coordinates [K, 3] above the floor, of positions seen from the camera: right, up and ahead."""
+        return positions + np.stack([np.zeros(len(self.height)), self.height, np.zeros(len(self.height))], axis=1)
+
     def depth(self, coordinates: Floats) -> Floats:
         """Depths [K] (m) of coordinates [K, 3]."""
         return self.project(coordinates)[1]
 
 
 @dataclass(frozen=True)
-class Placed:
+class LiftedBody:
     """A body where the draws have it."""
 
     shape: Shape
@@ -87,12 +87,7 @@ class Placed:
     stands: bool  # on the floor or on another body; else it is in the air
     depth_share: float = 1.0  # how deep it is along the line of sight, of its width
 
-    def part(self, rows: slice) -> Placed:
-        """As some draws have it."""
-        centre, *halves = (values[rows] for values in (self.centre, self.half_width, self.half_height))
-        return replace(self, centre=centre, half_width=halves[0], half_height=halves[1])
-
-    def repeated(self, count: int) -> Placed:
+    def repeated(self, count: int) -> LiftedBody:
         """As the first draw has it, so many times."""
         centre, *halves = (np.repeat(v[:1], count, axis=0) for v in (self.centre, self.half_width, self.half_height))
         return replace(self, centre=centre, half_width=halves[0], half_height=halves[1])
@@ -111,7 +106,7 @@ def above(
     plane: Floats,
     depth_share: float = 1.0,
     taper: float = 1.0,
-) -> Placed | None:
+) -> LiftedBody | None:
     """A body that stands on a horizontal plane at a height [K] (m); None where its foot lies at or above the horizon.
 
     The foot is the middle of the box's lower edge; the body's middle lies half its depth there further away, which is
@@ -123,20 +118,22 @@ def above(
     if shape == "sphere":
         rays, radius = cameras.rays(((x0 + x1) / 2, (y0 + y1) / 2)), (x1 - x0 + y1 - y0) / 4
         sink = radius / cameras.focal - rays[:, 1]
-        if not _all_meet(sink, height):
+        if not (sink[0] > HORIZON and height[0] > 0):
             return None
-        z = height / _safe(sink)
+        z = height / np.maximum(sink, HORIZON)
         half = z * radius / cameras.focal
-        return Placed(shape, rays * z[:, None] + _raised(cameras.height), half, half, True)
+        return LiftedBody(shape, cameras.coordinates(rays * z[:, None]), half, half, True)
     foot = y1 + FOOT_SIGMA * (y1 - y0) * draws[:, COLUMN["foot"]]
     rays = cameras.rays(np.stack([np.full(len(foot), (x0 + x1) / 2), foot], axis=1))
-    if not _all_meet(-rays[:, 1], height):
+    if not (-rays[0, 1] > HORIZON and height[0] > 0):  # the likeliest ray meets the plane at no sane distance
         return None
-    near = rays[:, [0, 2]] * (height / _safe(-rays[:, 1]))[:, None]
+    near = rays[:, [0, 2]] * (height / np.maximum(-rays[:, 1], HORIZON))[:, None]
     distance = np.linalg.norm(near, axis=1)
     way = near / distance[:, None]
     half, tall, centre = np.zeros(len(foot)), np.zeros(len(foot)), np.zeros((len(foot), 3))
     wide = (x1 - x0) / (2 * cameras.focal)
+    upper = cameras.rays(((x0 + x1) / 2, y0))
+    slope = upper[:, 1] / np.maximum(np.linalg.norm(upper[:, [0, 2]], axis=1), 1e-6)
     for _ in range(5):
         middle = near + way * (half * depth_share * taper)[:, None]
         # What is seen from above is widest at its top, which is nearer; a cone is at its foot.
@@ -144,39 +141,19 @@ def above(
         depth = cameras.depth(np.stack([middle[:, 0], widest, middle[:, 1]], axis=1))
         half = wide / np.sqrt(1 + wide**2) * np.maximum(depth, 1e-3 * height)
         deep = half * depth_share
-        tall = _half_height(cameras, bbox, shape, distance + deep * taper, deep, plane)
+        # The upper edge of the box is the far rim of a top that is seen from above, else the near one.
+        rim = np.zeros(len(deep)) if shape == "cone" else np.where(slope < 0, deep, -deep)
+        top = cameras.height + slope * np.maximum(distance + deep * taper + rim, 1e-3)
+        tall = np.clip((top - plane) / 2, SLIMMEST * deep, TALLEST * deep)
         centre = np.stack([middle[:, 0], plane + tall, middle[:, 1]], axis=1)
-    return Placed(shape, centre, half * stretch, tall, True, depth_share)
+    return LiftedBody(shape, centre, half * stretch, tall, True, depth_share)
 
 
-def in_the_air(cameras: Cameras, bbox: BBox, shape: Shape, depth: Floats) -> Placed:
+def in_the_air(cameras: Cameras, bbox: BBox, shape: Shape, depth: Floats) -> LiftedBody:
     """A body at depths [K] (m), as wide and high as its box."""
     x0, y0, x1, y1 = bbox
     rays = cameras.rays(((x0 + x1) / 2, (y0 + y1) / 2))
     half, tall = ((x1 - x0) * depth / cameras.focal / 2, (y1 - y0) * depth / cameras.focal / 2)
     if shape == "sphere":
         half = tall = (half + tall) / 2
-    return Placed(shape, rays * depth[:, None] + _raised(cameras.height), half, tall, False)
-
-
-def _half_height(cameras: Cameras, bbox: BBox, shape: Shape, distance: Floats, half: Floats, plane: Floats) -> Floats:
-    """Half heights [K] by the upper edge of the box: the far rim of a top seen from above, else the near one."""
-    rays = cameras.rays(((bbox[0] + bbox[2]) / 2, bbox[1]))
-    slope = rays[:, 1] / np.maximum(np.linalg.norm(rays[:, [0, 2]], axis=1), 1e-6)
-    rim = np.zeros(len(half)) if shape == "cone" else np.where(slope < 0, half, -half)
-    top = cameras.height + slope * np.maximum(distance + rim, 1e-3)
-    return np.clip((top - plane) / 2, SLIMMEST * half, TALLEST * half)
-
-
-def _all_meet(sink: Floats, height: Floats) -> bool:
-    """Whether the likeliest ray falls on the plane at a sane distance."""
-    return bool(sink[0] > HORIZON and height[0] > 0)
-
-
-def _safe(sink: Floats) -> Floats:
-    return np.maximum(sink, HORIZON)
-
-
-def _raised(height: Floats) -> Floats:
-    """[K, 3]: what takes positions seen from the camera to coordinates above the floor."""
-    return np.stack([np.zeros(len(height)), height, np.zeros(len(height))], axis=1)
+    return LiftedBody(shape, cameras.coordinates(rays * depth[:, None]), half, tall, False)

@@ -53,12 +53,15 @@ class Decided:
 def decide(query: Query, ensemble: WorldEvents, draws: Floats) -> Decided:
     """The answer of an ensemble with draws [K, P]."""
     asked, answers = query.asked, answers_of(query, ensemble)
-    answer, probability = _most(answers)
+    answer, count = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))
+    probability = shown = count / len(answers)
     times = _happens(query, ensemble)
     times = times[np.isfinite(times)]
-    shown = asked.form in ("whether", "when")
+    if asked.form in ("whether", "when"):  # that what is asked happens, or, where it is negated, does not
+        happens = probability if answer else 1 - probability
+        shown = 1 - happens if asked.negated else happens
     return Decided(
-        probability=_said(asked, answer, probability) if shown else probability,
+        probability=shown,
         sure=probability >= SURE,
         robust=probability >= ROBUST,
         depends_on=_depends_on(np.array([found == answer for found in answers]), draws),
@@ -83,11 +86,6 @@ def decide_change(query: Query, changed: WorldEvents, factual: WorldEvents, draw
     )
 
 
-def majority(query: Query, ensemble: WorldEvents) -> int:
-    """What most worlds of an ensemble answer, as `answers_of`."""
-    return _most(answers_of(query, ensemble))[0]
-
-
 def answers_of(query: Query, events: WorldEvents) -> list[int]:
     """Per draw: 1 or 0 for whether and when, the body that is met first or -1, or how many are met.
 
@@ -108,18 +106,6 @@ def _happens(query: Query, events: WorldEvents) -> Floats:
     return times[:, list(query.among)].max(axis=1) if query.asked.every and query.among else times.min(axis=1)
 
 
-def _most(answers: Sequence[int]) -> tuple[int, float]:
-    """The most frequent answer, and its share."""
-    answer, count = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))
-    return answer, count / len(answers)
-
-
-def _said(asked: Asked, answer: int, probability: float) -> float:
-    """That what is asked happens, or, where it is negated, does not."""
-    happens = probability if answer else 1 - probability
-    return 1 - happens if asked.negated else happens
-
-
 def _per_body(query: Query, events: WorldEvents) -> Floats:
     """[K, B]: when it first happens with each body that is meant.
 
@@ -127,27 +113,20 @@ def _per_body(query: Query, events: WorldEvents) -> Floats:
     """
     relation, of_subject = query.asked.relation, events.of[query.subject]
     bodies = np.arange(len(of_subject.eligible))
-    if relation == "leaves":
-        return _in_time(query, np.where(bodies[None] == query.subject, events.gone, NEVER))
-    if relation == "lands":
-        return _in_time(query, np.where(bodies[None] == query.subject, events.landed, NEVER))
-    if relation == "inside":
+    if query.target is not None:
+        meant = bodies == query.target
+    else:
+        meant = np.isin(bodies, query.among) if query.among else of_subject.eligible
+    if relation in ("leaves", "lands"):
+        times, meant = events.gone if relation == "leaves" else events.landed, bodies == query.subject
+    elif relation == "inside":
         times = np.full_like(events.moved, NEVER) if events.placed is None else events.placed[:, None]
     elif relation in ("tips", "moves"):
         times = events.tipped if relation == "tips" else events.moved
     else:
         kinds = of_subject.partly if query.asked.partly else of_subject.times
         times = kinds[KIND_OF[relation]]
-    if query.target is not None:
-        meant = bodies == query.target
-    else:
-        meant = np.isin(bodies, query.among) if query.among else of_subject.eligible
-    return _in_time(query, np.where(meant[None], times, NEVER))
-
-
-def _in_time(query: Query, times: Floats) -> Floats:
-    """What happens later than asked about does not happen."""
-    limit = query.asked.within
+    times, limit = np.where(meant[None], times, NEVER), query.asked.within
     return times if limit is None else np.where(times <= limit, times, NEVER)
 
 

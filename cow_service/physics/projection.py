@@ -37,11 +37,11 @@ class SeenPaths:
 def seen_paths(worlds: Worlds, body: int) -> SeenPaths:
     """A body's path in the image of every draw."""
     positions = np.stack([run.positions[body] for run in worlds.runs])
-    points, depth = worlds.scene.cameras.project(positions)
+    points, depth = worlds.layout.cameras.project(positions)
     before, first = None, depth[:, :1]
     if worlds.seen is not None:
         shown = np.array([bodies[body].position for bodies in worlds.seen])
-        before, first = worlds.scene.cameras.project(shown[:, None])
+        before, first = worlds.layout.cameras.project(shown[:, None])
         before = before[:, 0]
     first = np.maximum(first, 1e-9)
     return SeenPaths(points, depth, first / np.maximum(depth, PASSED * first), depth <= PASSED * first, before)
@@ -49,7 +49,7 @@ def seen_paths(worlds: Worlds, body: int) -> SeenPaths:
 
 def states(worlds: Worlds, body: int) -> Floats:
     """[F, 6] metres and m/s in the frame of the camera, of the first draw."""
-    cameras, run = worlds.scene.cameras, worlds.runs[0]
+    cameras, run = worlds.layout.cameras, worlds.runs[0]
     position = run.positions[body] - np.array([0.0, cameras.height[0], 0.0])
     return np.hstack([position @ cameras.axes[0], run.velocities[body] @ cameras.axes[0]])
 
@@ -60,13 +60,19 @@ def rotation(worlds: Worlds, body: int) -> Floats:
     A sphere turns by its spin about the line of sight. Of anything else the upright axis is followed: what turns about
     it looks the same.
     """
-    run, cameras = worlds.runs[0], worlds.scene.cameras
+    run, cameras = worlds.runs[0], worlds.layout.cameras
     turns = run.turns[body]
     if worlds.shapes[0][body].shape == "sphere":
         sight = run.positions[body] - np.array([0.0, cameras.height[0], 0.0])
         sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
         # Right, up and ahead are a left-handed frame: there a positive turn about the line of sight is anticlockwise.
-        about = -np.einsum("fi,fi->f", _steps(turns), sight[1:])
+        before, after = turns[:-1], turns[1:]
+        axis = before[:, 3:] * after[:, :3] - after[:, 3:] * before[:, :3] + np.cross(before[:, :3], after[:, :3])
+        half = np.einsum("fi,fi->f", before, after)
+        axis = axis * np.where(half < 0, -1.0, 1.0)[:, None]
+        length = np.linalg.norm(axis, axis=1)
+        steps = axis * (2 * np.arctan2(length, np.abs(half)) / np.maximum(length, 1e-12))[:, None]  # rotation vectors
+        about = -np.einsum("fi,fi->f", steps, sight[1:])
         return np.concatenate([[0.0], np.degrees(np.cumsum(about))])
     return _leaned(worlds, run.positions[body], turns)
 
@@ -86,28 +92,16 @@ def rotation_where_put(worlds: Worlds, body: int) -> float:
 def _leaned(worlds: Worlds, positions: Floats, turns: Floats) -> Floats:
     """Degrees [F], clockwise, that an upright axis has leaned since the first of positions [F, 3] and turns [F, 4]."""
     upright = np.tile(np.array([0.0, 1.0, 0.0]), (len(turns), 1))
-    leaning, plumb = (np.unwrap(_lean(worlds, positions, axis)) for axis in (turned(turns, upright[0]), upright))
+    cameras, leans = worlds.layout.cameras, list[Floats]()
+    step = 1e-3 * float(cameras.height[0])
+    for axis in (turned(turns, upright[0]), upright):
+        points, _ = cameras.repeated(1).project((positions + np.stack([axis, -axis]) * step)[None])
+        way = points[0, 0] - points[0, 1]
+        leans.append(np.unwrap(np.arctan2(way[:, 0], -way[:, 1])))
+    leaning, plumb = leans
     angle = np.unwrap(leaning - plumb)
     # Verticals lean in the image as they come to its side; close to the camera they lean without bounds.
     return np.degrees(angle - angle[0] + np.clip(plumb - plumb[0], -MOST_LEAN, MOST_LEAN))
-
-
-def _lean(worlds: Worlds, positions: Floats, axis: Floats) -> Floats:
-    """Radians [F] by which directions [F, 3] at positions [F, 3] lean to the right in the image of the first draw."""
-    step = 1e-3 * float(worlds.scene.cameras.height[0])
-    points, _ = worlds.scene.cameras.part(slice(0, 1)).project((positions + np.stack([axis, -axis]) * step)[None])
-    way = points[0, 0] - points[0, 1]
-    return np.arctan2(way[:, 0], -way[:, 1])
-
-
-def _steps(turns: Floats) -> Floats:
-    """Rotation vectors [F - 1, 3] that lead from each quaternion of [F, 4] (x, y, z, w) to the next."""
-    before, after = turns[:-1], turns[1:]
-    axis = before[:, 3:] * after[:, :3] - after[:, 3:] * before[:, :3] + np.cross(before[:, :3], after[:, :3])
-    half = np.einsum("fi,fi->f", before, after)
-    axis = axis * np.where(half < 0, -1.0, 1.0)[:, None]
-    length = np.linalg.norm(axis, axis=1)
-    return axis * (2 * np.arctan2(length, np.abs(half)) / np.maximum(length, 1e-12))[:, None]
 
 
 def turned(turns: Floats, vector: Floats) -> Floats:
@@ -134,8 +128,16 @@ class Shares:
 def shares(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path: SeenPaths) -> Shares:
     """By the silhouettes of the image; what is nearer covers what is farther."""
     covers, covered = np.zeros(path.depth.shape), np.zeros(path.depth.shape)
-    seen = ~path.passed & ~other_path.passed
-    meet = _boxes_meet(subject, path, other, other_path) & seen
+    boxes: list[tuple[Floats, Floats]] = []  # upper left and lower right corners [K, F, 2]
+    for mask, along in ((subject, path), (other, other_path)):
+        x0, y0, x1, y1 = mask.bbox
+        low, high = (
+            along.points + (np.array(corner) - along.seen[:, None]) * along.scale[..., None]
+            for corner in ((x0, y0), (x1, y1))
+        )
+        boxes.append((low, high))
+    (low, high), (other_low, other_high) = boxes
+    meet = np.all((low < other_high) & (high > other_low), axis=2) & ~path.passed & ~other_path.passed
     nearer = path.depth < other_path.depth
     _fill(covers, meet & nearer, subject, path, other, other_path)
     _fill(covered, meet & ~nearer, other, other_path, subject, path)
@@ -149,58 +151,25 @@ def _fill(
     draws, frames = np.nonzero(where)
     if not len(draws):
         return
-    points = _sample(back)
-    for start in range(0, len(draws), CHUNK):
-        k, f = draws[start : start + CHUNK], frames[start : start + CHUNK]
-        there = _moved(points, back_path, k, f)
-        found[k, f] = _inside(front, _moved_back(there, front_path, k, f))
-
-
-def _moved(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:
-    """Points [S, 2] of the image, where a path has them [N, S, 2] in draws and frames [N]."""
-    first, now, scale = path.seen[k], path.points[k, f], path.scale[k, f][:, None, None]
-    return now[:, None] + (points[None] - first[:, None]) * scale
-
-
-def _moved_back(points: Floats, path: SeenPaths, k: Indices, f: Indices) -> Floats:
-    """Where points [N, S, 2] of draws and frames [N] were at the first frame."""
-    first, now, scale = path.seen[k], path.points[k, f], path.scale[k, f][:, None, None]
-    return first[:, None] + (points - now[:, None]) / scale
-
-
-def _boxes_meet(subject: CroppedMask, path: SeenPaths, other: CroppedMask, other_path: SeenPaths) -> Mask:
-    """[K, F]: the boxes of the moved silhouettes meet."""
-    (low, high), (other_low, other_high) = _corners(subject, path), _corners(other, other_path)
-    return np.all((low < other_high) & (high > other_low), axis=2)
-
-
-def _corners(mask: CroppedMask, path: SeenPaths) -> tuple[Floats, Floats]:
-    """Upper left and lower right corners [K, F, 2] of the box of a moved silhouette."""
-    x0, y0, x1, y1 = mask.bbox
-    low, high = (
-        path.points + (np.array(corner) - path.seen[:, None]) * path.scale[..., None] for corner in ((x0, y0), (x1, y1))
-    )
-    return low, high
-
-
-def _sample(mask: CroppedMask) -> Floats:
-    """Points [S, 2] (px) spread evenly over a mask."""
-    rows, columns = np.nonzero(mask.patch)
-    if not len(rows):
-        return np.array([[mask.columns.start + 0.5, mask.rows.start + 0.5]])
+    rows, columns = np.nonzero(back.patch) if back.area else (np.zeros(1, int), np.zeros(1, int))
     # Every n-th pixel of a raster lines up in columns; a golden-ratio sequence does not.
     order = np.argsort(np.modf(np.arange(len(rows)) * 0.6180339887498949)[0])[:SAMPLES]
-    return np.stack([columns[order] + mask.columns.start + 0.5, rows[order] + mask.rows.start + 0.5], axis=1)
+    points = np.stack([columns[order] + back.columns.start + 0.5, rows[order] + back.rows.start + 0.5], axis=1)
+    height, width = front.patch.shape
+    for start in range(0, len(draws), CHUNK):
+        k, f = draws[start : start + CHUNK], frames[start : start + CHUNK]
 
+        def ends(path: SeenPaths, k: Indices = k, f: Indices = f) -> tuple[Floats, Floats, Floats]:
+            return path.seen[k][:, None], path.points[k, f][:, None], path.scale[k, f][:, None, None]
 
-def _inside(mask: CroppedMask, points: Floats) -> Floats:
-    """Share [N] of points [N, S, 2] (px) that lie in a mask."""
-    height, width = mask.patch.shape
-    x = np.floor(points[..., 0]).astype(np.int64) - mask.columns.start
-    y = np.floor(points[..., 1]).astype(np.int64) - mask.rows.start
-    seen = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    found = mask.patch[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] & seen
-    return np.asarray(found.mean(axis=1), np.float64)
+        (first, now, scale), (front_first, front_now, front_scale) = ends(back_path), ends(front_path)
+        there = now + (points[None] - first) * scale
+        at = front_first + (there - front_now) / front_scale  # where the body in front has these points
+        x = np.floor(at[..., 0]).astype(np.int64) - front.columns.start
+        y = np.floor(at[..., 1]).astype(np.int64) - front.rows.start
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        covered = front.patch[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] & inside
+        found[k, f] = covered.mean(axis=1)
 
 
 WORKING_SIDE = 320  # px: paths are swept at this size

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cow_service.physics.camera import CameraFit, axes_of
+from cow_service.physics.camera import CameraFit, axes_of, gauss_newton
 from cow_service.vision.masks import Floats
 from cow_service.vision.trails import Position
 
@@ -49,23 +49,15 @@ def fit_throw(positions: Sequence[Position], camera: CameraFit, size: tuple[int,
     if len(positions) < 3:
         return None
     problem = _Problem.of(positions, camera, size)
-    parameters = problem.start()
-    slopes = np.zeros((1, 1))
-    for _ in range(MAX_ITERATIONS):
-        now = problem.residuals(parameters)
-        slopes = np.stack(
-            [(problem.residuals(parameters + step) - now) / 1e-6 for step in 1e-6 * np.eye(len(parameters))], axis=1
-        )
-        move = np.linalg.lstsq(slopes, -now, rcond=None)[0]
-        parameters = parameters + np.clip(move, -0.5, 0.5)
-        if float(np.abs(move).max()) < 1e-5:
-            break
+    parameters, slopes = gauss_newton(
+        problem.residuals, problem.start(), step=1e-6, most=0.5, least=1e-5, iterations=MAX_ITERATIONS
+    )
     rest = problem.residuals(parameters)[: 3 * len(positions)]
     cost = float((rest**2).sum()) / max(1, 3 * len(positions) - FREE)
     if not np.isfinite(cost) or cost > MAX_COST:
         return None
     covariance = np.asarray(np.linalg.inv(slopes.T @ slopes), np.float64) * max(1.0, cost / GOOD_COST)
-    return problem.told(parameters, covariance)
+    return problem.result(parameters, covariance)
 
 
 def straight_direction(positions: Sequence[Position]) -> tuple[float, float]:
@@ -144,7 +136,7 @@ class _Problem:
         log_speed = math.log(max(float(velocity @ velocity), 1e-12)) / 2 - parameters[6] / 2
         return np.array([log_speed, math.atan2(seen[1], seen[0]), turn])
 
-    def told(self, parameters: Floats, covariance: Floats) -> TrailFit:
+    def result(self, parameters: Floats, covariance: Floats) -> TrailFit:
         """The throw with its deviations, by first order."""
         log_speed, angle, turn = now = self.throw(parameters)
         steps = 1e-5 * np.eye(len(parameters))

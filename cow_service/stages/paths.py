@@ -69,7 +69,7 @@ def record_trajectory(situation: Situation, result: EnsembleResult, path: FreePa
     else:
         paths = (_free_record(world.bodies[0], situation, path),)
     paths = _with_times(paths, result.shown.events)
-    light = shown.scene.light
+    light = shown.layout.light
     return Trajectory(
         law="contact" if path is None else "ballistic",
         fps=request.fps,
@@ -143,7 +143,7 @@ def _placed_records(situation: Situation, result: EnsembleResult) -> tuple[Place
     """What becomes of each thing that is put somewhere before the motion; nothing of the world as it is."""
     world, shown = result.world, result.shown.worlds
     interventions, found = placed_before(situation.grounding, situation.motion), list[PlacedBefore]()
-    for number, goal in enumerate(world.put_before):
+    for number, goal in enumerate(world.placed_before):
         each, placements = interventions[number], shown.before[number]
         others = None if result.ensemble is None else result.ensemble.worlds.before[number]
         placed = PlacedBefore(
@@ -194,7 +194,7 @@ def was_put(index: int, worlds: Worlds) -> bool:
     path = seen_paths(worlds, index)
     away = float(np.linalg.norm(path.points[0, 0] - path.seen[0]))
     led = worlds.shapes[0][index].follows is not None
-    return index in worlds.scene.put or (away > PUSHED and not led)
+    return index in worlds.layout.put or (away > PUSHED and not led)
 
 
 def visible_share(bodies: Sequence[SeenBody], index: int, worlds: Worlds, size: tuple[int, int]) -> float:
@@ -208,7 +208,7 @@ def visible_share(bodies: Sequence[SeenBody], index: int, worlds: Worlds, size: 
     hidden = [
         float(shares(bodies[index].mask, path, other.mask, seen_paths(worlds, i)).covered[0, 0])
         for i, other in enumerate(bodies)
-        if i != index and worlds.scene.supports[index] != i
+        if i != index and worlds.layout.supports[index] != i
     ]
     within = inside / max((x1 - x0) * (y1 - y0), 1e-9)
     return 0.0 if bool(path.passed[0, 0]) else within * max(0.0, 1 - max(hidden, default=0.0))
@@ -239,7 +239,7 @@ def _outline(mask: CroppedMask) -> Floats:
 
 def camera_record(fit: CameraFit, worlds: Worlds, ensemble: Worlds | None) -> CameraEstimate:
     """The camera of the first draw; how far its height varies is seen in an ensemble ensemble it."""
-    cameras, deviation = worlds.scene.cameras, np.sqrt(np.diag(fit.covariance))
+    cameras, deviation = worlds.layout.cameras, np.sqrt(np.diag(fit.covariance))
     right, up, _ = cameras.axes[0]
     focal = float(cameras.focal[0])
     return CameraEstimate(
@@ -252,20 +252,20 @@ def camera_record(fit: CameraFit, worlds: Worlds, ensemble: Worlds | None) -> Ca
             focal=focal * float(deviation[1]),
             pitch=math.degrees(float(deviation[0])),
             roll=math.degrees(fit.roll_sigma),
-            height=0.0 if ensemble is None else float(np.std(ensemble.scene.cameras.height)),
+            height=0.0 if ensemble is None else float(np.std(ensemble.layout.cameras.height)),
         ),
     )
 
 
 def body_records(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[Body, ...]:
     """Where the first draw has each body."""
-    cameras, records = worlds.scene.cameras, []
+    cameras, records = worlds.layout.cameras, []
     for index, (seen, shape, placed, on) in enumerate(
-        zip(bodies, worlds.shapes[0], worlds.scene.bodies, worlds.scene.supports, strict=True)
+        zip(bodies, worlds.shapes[0], worlds.layout.bodies, worlds.layout.supports, strict=True)
     ):
         centre = np.array(shape.position) - np.array([0.0, cameras.height[0], 0.0])
         x, y, z = (float(v) for v in centre @ cameras.axes[0])
-        stands = placed.stands and index not in worlds.scene.unsupported
+        stands = placed.stands and index not in worlds.layout.unsupported
         support = bodies[on].name if on is not None else "floor" if stands else "air"
         records.append(
             Body(

@@ -13,10 +13,10 @@ from cow_service.narration import place_words
 from cow_service.physics.ballistic import FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import Camera, CameraFit, fit_shadow, prior
+from cow_service.physics.layout import flies
 from cow_service.physics.outcome import Query
-from cow_service.physics.placement import Put
-from cow_service.physics.placing import flies
-from cow_service.physics.world import Led, WorldInput
+from cow_service.physics.placement import PlacementGoal
+from cow_service.physics.world import PrescribedMotion, WorldInput
 from cow_service.readers.options import plain
 from cow_service.records import BBox, Grounding, Intervention, LocatedObject, Motion, Shape
 from cow_service.requests import CameraRequest, SimulateRequest
@@ -98,12 +98,12 @@ def reconstruct(situation: Situation, path: FreePath | None) -> tuple[WorldInput
         fps=request.fps,
         # People aim at what they ask about; where that is put elsewhere, not at its place in the image.
         asked=None if target in [each.body for each in goals] else target,
-        led=None if path is None else _prescribed(path, bodies[0], situation.grounding),
+        prescribed=None if path is None else _prescribed(path, bodies[0], situation.grounding),
         others={} if path is not None else _motions_of_others(bodies, motion),
-        taken=bodies[len(present) :],
+        removed=bodies[len(present) :],
         turns_wanted=query is not None and query.asked.relation == "tips",
-        put=goal,
-        put_before=goals,
+        placement=goal,
+        placed_before=goals,
     )
     return world, query
 
@@ -119,8 +119,8 @@ def free_path(situation: Situation) -> FreePath | None:
     return ballistic_path(camera, situation.grounding, motion, times) if is_free else None
 
 
-def _prescribed(path: FreePath, mover: SeenBody, grounding: Grounding) -> Led:
-    return Led(path.states[:, :3], path.points + np.array(mover.foot) - np.array(grounding.point))
+def _prescribed(path: FreePath, mover: SeenBody, grounding: Grounding) -> PrescribedMotion:
+    return PrescribedMotion(path.states[:, :3], path.points + np.array(mover.foot) - np.array(grounding.point))
 
 
 def _motions_of_others(bodies: Sequence[SeenBody], motion: Motion) -> dict[int, Motion]:
@@ -237,7 +237,7 @@ def placed_before(grounding: Grounding, motion: Motion) -> tuple[Intervention, .
     return tuple(each for each in grounding.interventions if each.kind == "place" and each is not carried)
 
 
-def placement_goal(situation: Situation, bodies: Sequence[SeenBody]) -> Put | None:
+def placement_goal(situation: Situation, bodies: Sequence[SeenBody]) -> PlacementGoal | None:
     """Where the mover is seen going; None where it is put nowhere, or before it moves.
 
     Raises `CannotGround` where nothing says where to, a target was not found or is the mover, or has no opening.
@@ -250,14 +250,16 @@ def placement_goal(situation: Situation, bodies: Sequence[SeenBody]) -> Put | No
     return _goal(situation.scene, placed, 0, bodies)
 
 
-def placement_goals(situation: Situation, bodies: Sequence[SeenBody], *, follows_path: bool) -> tuple[Put, ...]:
+def placement_goals(
+    situation: Situation, bodies: Sequence[SeenBody], *, follows_path: bool
+) -> tuple[PlacementGoal, ...]:
     """What is put somewhere before anything moves, in its order.
 
     Raises `CannotGround` as `placement_goal`, for what is put to the mover while that is put somewhere itself, and for
     a mover that is put elsewhere and `follows_path`.
     """
     grounding, motion = situation.grounding, situation.motion
-    found: list[Put] = []
+    found: list[PlacementGoal] = []
     for each in placed_before(grounding, motion):
         name = each.object.object
         body = 0 if is_same(each.object.bbox, grounding.bbox) else _body(each.object, bodies)
@@ -277,7 +279,7 @@ def placement_goals(situation: Situation, bodies: Sequence[SeenBody], *, follows
     return tuple(found)
 
 
-def _with_openings(bodies: Sequence[SeenBody], goals: Sequence[Put]) -> tuple[SeenBody, ...]:
+def _with_openings(bodies: Sequence[SeenBody], goals: Sequence[PlacementGoal]) -> tuple[SeenBody, ...]:
     """The bodies; of those that something is put into, as wide at their lower end as their opening was measured."""
     bottoms = {
         goal.targets[0]: goal.opening.bottom
@@ -287,7 +289,7 @@ def _with_openings(bodies: Sequence[SeenBody], goals: Sequence[Put]) -> tuple[Se
     return tuple(replace(body, taper=bottoms.get(index, body.taper)) for index, body in enumerate(bodies))
 
 
-def _goal(scene: Scene, placed: Intervention, body: int, bodies: Sequence[SeenBody]) -> Put:
+def _goal(scene: Scene, placed: Intervention, body: int, bodies: Sequence[SeenBody]) -> PlacementGoal:
     if placed.relation is None or not placed.targets:
         raise _says_no_place(placed.object.object)
     targets = tuple(_body(target, bodies) for target in placed.targets)
@@ -298,7 +300,7 @@ def _goal(scene: Scene, placed: Intervention, body: int, bodies: Sequence[SeenBo
     opening = _opening(scene, bodies[targets[0]]) if placed.relation == "into" else None
     if opening is not None and _has_hidden_foot(bodies, targets[0], body):
         opening = replace(opening, foot_hidden=True)
-    return Put(placed.relation, targets, opening, _free_side(scene, bodies, targets[0], body), body)
+    return PlacementGoal(placed.relation, targets, opening, _free_side(scene, bodies, targets[0], body), body)
 
 
 def _says_no_place(name: str) -> CannotGround:

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from cow_service.narration import doubts_of, facts_of, facts_of_both
 from cow_service.physics.bodies import supports_of
 from cow_service.physics.ensemble import EnsembleResult, run_ensemble
+from cow_service.physics.layout import flies
 from cow_service.physics.outcome import KIND_OF, Query
-from cow_service.physics.placing import flies
 from cow_service.physics.world import WorldInput
 from cow_service.records import Asked, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
@@ -52,15 +52,15 @@ def _decidable(situation: Situation, world: WorldInput, query: Query | None) -> 
 
     Where the mover is put somewhere and nothing is asked, whether it gets there: shown is what it does in most worlds.
     """
-    if world.put is not None and situation.grounding.asked is None:
-        return Query(Asked(relation="inside"), world.put.targets[0])
+    if world.placement is not None and situation.grounding.asked is None:
+        return Query(Asked(relation="inside"), world.placement.targets[0])
     if query is None or not situation.is_separated or query.subject >= len(world.bodies):
         return None
     subject = world.bodies[query.subject]
     in_air = flies(subject, situation.motion) if query.subject == 0 else subject.is_flying
-    on_floor = not in_air and supports_of((*world.bodies, *world.taken))[query.subject] is None
+    on_floor = not in_air and supports_of((*world.bodies, *world.removed))[query.subject] is None
     relation = query.asked.relation
-    is_decided = relation in BY_ENCOUNTERS or (world.put is not None and relation == "inside")
+    is_decided = relation in BY_ENCOUNTERS or (world.placement is not None and relation == "inside")
     return query if is_decided and not (on_floor and relation == "lands") else None
 
 
@@ -69,7 +69,7 @@ def _decidable(situation: Situation, world: WorldInput, query: Query | None) -> 
 
 def judge(asked: Asked, query: Query | None, result: EnsembleResult) -> Outcome:
     """What the worlds say to what is asked; without a probability where they cannot tell."""
-    names = [body.name for body in (*result.world.bodies, *result.world.taken)]
+    names = [body.name for body in (*result.world.bodies, *result.world.removed)]
     outcome = Outcome(
         asked=asked if result.query is None else result.query.asked,
         subject=None if query is None or not query.subject else names[query.subject],

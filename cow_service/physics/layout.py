@@ -1,51 +1,24 @@
-"""Places all bodies of a scene on its floor, or in the air, and sets the mover going, for many draws at once."""
+"""Where the bodies of a scene stand or fly as the image shows them, and how they set out, for many draws at once."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import NormalDist
 from types import MappingProxyType
 
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import CameraFit
-from cow_service.physics.draws import COLUMN
-from cow_service.physics.lift import FARTHEST, NEAREST, Cameras, Placed, above, in_the_air
+from cow_service.physics.draws import COLUMN, quantiles
+from cow_service.physics.lift import FARTHEST, NEAREST, Cameras, LiftedBody, above, in_the_air
 from cow_service.records import FALLING_KINDS, BBox, Cue, Motion
 from cow_service.vision.masks import Floats
 
 HUNG = 4.0  # how much likelier it hangs over that than where the camera's priors have it
 HUNG_SIGMA = 0.3  # of the mover's half width: how far ahead of the other it is
 LEAST_OVERLAP = 0.1  # of the narrower box: with less of it above the other, it is seen beside that
-
-
-def is_above(mover: BBox, asked: BBox) -> bool:
-    """Whether the picture shows the mover above what is asked about."""
-    overlap = min(mover[2], asked[2]) - max(mover[0], asked[0])
-    narrower = min(mover[2] - mover[0], asked[2] - asked[0])
-    return overlap > LEAST_OVERLAP * narrower and mover[1] + mover[3] < asked[1] + asked[3]
-
-
-def hung_over(mover: Placed, heights: Floats, ahead_per_height: Floats, fit: CameraFit, draws: Floats) -> Floats:
-    """Heights [K] (m) of the camera, of which most draws have the mover over what is asked about.
-
-    `heights` [K] are those of the fit's draws. What is asked about stands `ahead_per_height` [K] times the height of
-    the camera ahead of it, over the floor. What a shadow tells of the height weighs against it.
-    """
-    aside = HUNG_SIGMA * mover.half_width * draws[:, COLUMN["turn"]]
-    aligned = (mover.centre[:, 2] + aside) / ahead_per_height
-    in_radii = 2 * (aligned[0] + mover.centre[0, 1]) / (mover.half_width[0] + mover.half_height[0])
-    if in_radii <= 0:
-        return heights
-    off = (np.log(in_radii) - fit.mean[2]) / np.sqrt(fit.covariance[2, 2])
-    weight = HUNG * np.exp(-0.5 * off**2)
-    shares = np.array([NormalDist().cdf(z) for z in draws[:, COLUMN["depth"]]])
-    return np.where(shares < weight / (1 + weight), aligned, heights)
-
-
 # Degrees, one standard deviation of a direction in the image, by where it was read.
 TURN_SIGMA: dict[Cue, float] = {
     "arrow": 1.5, "trail": 1.5, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
@@ -61,11 +34,11 @@ LEAST_SHRUNK = 0.5  # of its width: bodies that overlap more are left to the eng
 
 
 @dataclass(frozen=True)
-class PlacedScene:
+class Layout:
     """The bodies of a scene, the mover first, for draws [K]."""
 
     cameras: Cameras
-    bodies: tuple[Placed, ...]
+    bodies: tuple[LiftedBody, ...]
     supports: tuple[int | None, ...]  # index of the body that each stands on; None: the floor, or nothing
     velocity: Floats  # [K, 3] m/s, of the mover
     further: tuple[Floats, ...]  # [K, 3] m/s, of the mover in each further leg
@@ -74,7 +47,7 @@ class PlacedScene:
     unsupported: frozenset[int] = frozenset()  # bodies whose support was taken away, or put elsewhere
     put: frozenset[int] = frozenset()  # bodies that were put where they are
 
-    def first(self, count: int) -> PlacedScene:
+    def first(self, count: int) -> Layout:
         """Without the bodies behind the first ones, which are taken away: what stood on them has no support."""
         loose: set[int] = set()
         for _ in range(count):  # what stands on something that falls falls, too
@@ -86,7 +59,7 @@ class PlacedScene:
         """What was put into or onto a body: that it is there is no encounter of the body that carries it."""
         return frozenset(i for i in self.put if self.supports[i] == body)
 
-    def rearranged(self, on: Mapping[int, int | None]) -> PlacedScene:
+    def rearranged(self, on: Mapping[int, int | None]) -> Layout:
         """With some bodies put elsewhere, where they stand `on` others or the floor: what stood on them falls."""
         loose: set[int] = set()
         for _ in self.supports:
@@ -97,7 +70,7 @@ class PlacedScene:
         return replace(self, bodies=bodies, supports=supports, unsupported=unsupported, put=frozenset(on))
 
 
-def place(
+def lay_out(
     bodies: Sequence[SeenBody],
     motion: Motion,
     fit: CameraFit,
@@ -105,131 +78,126 @@ def place(
     draws: Floats,
     asked: int | None = None,
     others: Mapping[int, Motion] = MappingProxyType({}),
-) -> PlacedScene:
+) -> Layout:
     """Places bodies seen in an image of a size (width, height), px. `asked` is the body that the question is about.
 
     `others` are motions of other bodies, by their places among `bodies`.
     """
     cameras, parameters = Cameras.drawn(fit, size, draws)
-    supports = supports_of(bodies)
-    mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
-    if not flies(mover, motion):
-        share = _depth_share(bodies, supports, motion, cameras, draws)
-        unit = _stand(bodies, supports, 0, cameras, draws, share)
-        if unit is not None:
-            cameras = cameras.at_height(depth / np.maximum(cameras.depth(unit.centre), 1e-6))
-            placed = _with_others(bodies, supports, motion, cameras, draws, None, share)
-            return _going(placed, supports, motion, cameras, parameters, draws, asked, others)
-    ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
-    height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
-    if motion.kind == "fall" and asked is not None and is_above(mover.bbox, bodies[asked].bbox):
-        below = _stand(bodies, supports, asked, cameras.at_height(np.ones(len(draws))), draws)
-        if below is not None and not bodies[asked].is_flying:
-            height = hung_over(ball, height, below.centre[:, 2], fit, draws)
-    cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
-    placed = in_the_air(cameras, mover.bbox, mover.shape, depth)
-    all_placed = _with_others(bodies, supports, motion, cameras, draws, placed)
-    return _going(all_placed, supports, motion, cameras, parameters, draws, asked, others)
+    picture = _Picture(bodies, supports_of(bodies), motion, draws)
+    cameras, placed = picture.placed(cameras, parameters, fit, asked)
+    target = None if asked is None else placed[asked]
+    velocity = _velocity(placed[0], motion, cameras, draws, target)
+    legs = [motion.model_copy(update={"direction": step.direction, "depth": step.depth}) for step in motion.steps]
+    further = tuple(_velocity(placed[0], leg, cameras, draws, None) for leg in legs)
+    also = {i: _velocity(placed[i], each, cameras, draws, None, "other_speed") for i, each in others.items()}
+    placed = _apart(placed)
+    resting = tuple(on if body.stands else None for on, body in zip(picture.supports, placed, strict=True))
+    return Layout(cameras, tuple(placed), resting, velocity, further, also, parameters[:, 3:5])
 
 
 def flies(mover: SeenBody, motion: Motion) -> bool:
     """Whether the mover is in the air at the first frame, as far as is said."""
     if mover.prior is not None and mover.prior.stands_on is not None:
         return mover.prior.stands_on == "air"
-    return motion.kind in FALLING_KINDS or rises(motion)
+    # Words, not a drawn cue, that say that something moves up: not along the floor, then.
+    said = motion.kind == "linear" and motion.cue == "text" and motion.depth == 0
+    return motion.kind in FALLING_KINDS or (said and motion.direction is not None and motion.direction[1] < -0.5)
 
 
-def rises(motion: Motion) -> bool:
-    """Whether words, not a drawn cue, say that something moves up: not along the floor, then."""
-    return (
-        motion.kind == "linear"
-        and motion.cue == "text"
-        and motion.depth == 0
-        and motion.direction is not None
-        and motion.direction[1] < -0.5
-    )
+@dataclass(frozen=True)
+class _Picture:
+    """What the picture shows, as draws [K, P] have it."""
+
+    bodies: Sequence[SeenBody]
+    supports: list[int | None]
+    motion: Motion
+    draws: Floats
+
+    def placed(
+        self, cameras: Cameras, parameters: Floats, fit: CameraFit, asked: int | None
+    ) -> tuple[Cameras, list[LiftedBody]]:
+        """The cameras at the heights that the mover tells, and the bodies."""
+        bodies, motion, draws = self.bodies, self.motion, self.draws
+        mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
+        if not flies(mover, motion):
+            share = self._depth_share(cameras)
+            unit = self._standing(0, cameras, draws, share)
+            if unit is not None:
+                cameras = cameras.at_height(depth / np.maximum(cameras.depth(unit.centre), 1e-6))
+                return cameras, [self._body(i, cameras, depth, share if i == 0 else 1.0) for i in range(len(bodies))]
+        ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
+        height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
+        if motion.kind == "fall" and asked is not None and _is_above(mover.bbox, bodies[asked].bbox):
+            below = self._standing(asked, cameras.at_height(np.ones(len(draws))), draws)
+            if below is not None and not bodies[asked].is_flying:
+                height = _height_over(ball, height, below.centre[:, 2], fit, draws)
+        cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
+        flying = in_the_air(cameras, mover.bbox, mover.shape, depth)
+        return cameras, [flying, *(self._body(i, cameras, depth) for i in range(1, len(bodies)))]
+
+    def _body(self, index: int, cameras: Cameras, depth: Floats, depth_share: float = 1.0) -> LiftedBody:
+        """A body where it stands, or else in the air, about at the depth [K] (m) of the mover."""
+        body = self.bodies[index]
+        standing = None if body.is_flying else self._standing(index, cameras, self.draws, depth_share)
+        if standing is not None and NEAREST < cameras.depth(standing.centre)[0] / depth[0] < FARTHEST:
+            return standing
+        guess = depth if index == 0 else depth * np.exp(DEPTH_SIGMA * self.draws[:, COLUMN["foot"]])
+        return in_the_air(cameras, body.bbox, body.shape, guess)
+
+    def _standing(self, index: int, cameras: Cameras, draws: Floats, depth_share: float = 1.0) -> LiftedBody | None:
+        """A body on the floor, or on the body that carries it, which stands on the floor."""
+        body, on = self.bodies[index], self.supports[index]
+        plane = np.zeros(len(draws))
+        if on is not None:
+            support = above(cameras, self.bodies[on].core, self.bodies[on].shape, draws, plane)
+            if support is not None:
+                plane = np.minimum(support.top, 0.95 * cameras.height)
+        return above(cameras, body.core, body.shape, draws, plane, depth_share, body.taper)
+
+    def _depth_share(self, cameras: Cameras) -> float:
+        """How deep the mover is along the line of sight, of its width: a vehicle is longer along its heading."""
+        motion, first = self.motion, cameras.repeated(1)
+        unit = self._standing(0, first, self.draws[:1]) if self.bodies[0].elongated else None
+        if unit is None or motion.direction is None or motion.kind != "linear":
+            return 1.0
+        way = _along_floor(unit, motion, first, np.array([motion.direction]))[0]
+        sight = unit.centre[0, [0, 2]] / np.linalg.norm(unit.centre[0, [0, 2]])
+        along = abs(float(way[[0, 2]] @ sight))
+        across = math.sqrt(max(0.0, 1 - along**2))
+        return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
 
 
-def _with_others(
-    bodies: Sequence[SeenBody],
-    supports: list[int | None],
-    motion: Motion,
-    cameras: Cameras,
-    draws: Floats,
-    flying: Placed | None,
-    depth_share: float = 1.0,
-) -> list[Placed]:
-    """The mover, which stands, or flies as given, and the other bodies."""
-    depth = cameras.focal * motion.metres_per_pixel.value
-    placed: list[Placed] = []
-    for i, body in enumerate(bodies):
-        if i == 0 and flying is not None:
-            placed.append(flying)
-            continue
-        share = depth_share if i == 0 else 1.0
-        standing = None if body.is_flying else _stand(bodies, supports, i, cameras, draws, share)
-        if standing is None or not NEAREST < cameras.depth(standing.centre)[0] / depth[0] < FARTHEST:
-            guess = depth if i == 0 else depth * np.exp(DEPTH_SIGMA * draws[:, COLUMN["foot"]])
-            standing = in_the_air(cameras, body.bbox, body.shape, guess)
-        placed.append(standing)
-    return placed
+def _is_above(mover: BBox, asked: BBox) -> bool:
+    """Whether the picture shows the mover above what is asked about."""
+    overlap = min(mover[2], asked[2]) - max(mover[0], asked[0])
+    narrower = min(mover[2] - mover[0], asked[2] - asked[0])
+    return overlap > LEAST_OVERLAP * narrower and mover[1] + mover[3] < asked[1] + asked[3]
 
 
-def _going(
-    placed: list[Placed],
-    supports: list[int | None],
-    motion: Motion,
-    cameras: Cameras,
-    parameters: Floats,
-    draws: Floats,
-    asked: int | None,
-    others: Mapping[int, Motion],
-) -> PlacedScene:
-    """The bodies apart from each other, and the velocities of those that are set moving."""
-    velocity = _velocity(placed[0], motion, cameras, draws, None if asked is None else placed[asked])
-    legs = [motion.model_copy(update={"direction": step.direction, "depth": step.depth}) for step in motion.steps]
-    further = tuple(_velocity(placed[0], leg, cameras, draws, None) for leg in legs)
-    also = {i: _velocity(placed[i], each, cameras, draws, None, "other_speed") for i, each in others.items()}
-    placed = _apart(placed)
-    resting = tuple(on if body.stands else None for on, body in zip(supports, placed, strict=True))
-    return PlacedScene(cameras, tuple(placed), resting, velocity, further, also, parameters[:, 3:5])
+def _height_over(mover: LiftedBody, heights: Floats, ahead_per_height: Floats, fit: CameraFit, draws: Floats) -> Floats:
+    """Heights [K] (m) of the camera, of which most draws have the mover over what is asked about.
 
-
-def _stand(
-    bodies: Sequence[SeenBody],
-    supports: list[int | None],
-    index: int,
-    cameras: Cameras,
-    draws: Floats,
-    depth_share: float = 1.0,
-) -> Placed | None:
-    """A body on the floor, or on the body that carries it, which stands on the floor."""
-    body, on = bodies[index], supports[index]
-    plane = np.zeros(len(draws))
-    if on is not None:
-        support = above(cameras, bodies[on].core, bodies[on].shape, draws, plane)
-        if support is not None:
-            plane = np.minimum(support.top, 0.95 * cameras.height)
-    return above(cameras, body.core, body.shape, draws, plane, depth_share, body.taper)
-
-
-def _depth_share(
-    bodies: Sequence[SeenBody], supports: list[int | None], motion: Motion, cameras: Cameras, draws: Floats
-) -> float:
-    """How deep the mover is along the line of sight, of its width: a vehicle is longer along its heading."""
-    first = cameras.repeated(1)
-    unit = _stand(bodies, supports, 0, first, draws[:1]) if bodies[0].elongated else None
-    if unit is None or motion.direction is None or motion.kind != "linear":
-        return 1.0
-    way = _along_floor(unit, motion, first, np.array([motion.direction]))[0]
-    sight = unit.centre[0, [0, 2]] / np.linalg.norm(unit.centre[0, [0, 2]])
-    along = abs(float(way[[0, 2]] @ sight))
-    across = math.sqrt(max(0.0, 1 - along**2))
-    return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
+    `heights` [K] are those of the fit's draws. What is asked about stands `ahead_per_height` [K] times the height of
+    the camera ahead of it, over the floor. What a shadow tells of the height weighs against it.
+    """
+    aside = HUNG_SIGMA * mover.half_width * draws[:, COLUMN["turn"]]
+    aligned = (mover.centre[:, 2] + aside) / ahead_per_height
+    in_radii = 2 * (aligned[0] + mover.centre[0, 1]) / (mover.half_width[0] + mover.half_height[0])
+    if in_radii <= 0:
+        return heights
+    off = (np.log(in_radii) - fit.mean[2]) / np.sqrt(fit.covariance[2, 2])
+    weight = HUNG * np.exp(-0.5 * off**2)
+    return np.where(quantiles(draws[:, COLUMN["depth"]]) < weight / (1 + weight), aligned, heights)
 
 
 def _velocity(
-    mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, asked: Placed | None, speed_name: str = "speed"
+    mover: LiftedBody,
+    motion: Motion,
+    cameras: Cameras,
+    draws: Floats,
+    asked: LiftedBody | None,
+    speed_name: str = "speed",
 ) -> Floats:
     """[K, 3] m/s right, up and ahead."""
     if motion.direction is None or motion.speed == 0:
@@ -244,7 +212,7 @@ def _velocity(
     elif mover.stands:
         way = _along_floor(mover, motion, cameras, direction)
     else:
-        way = np.einsum("kij,kj->ki", cameras.axes, _with_depth(direction, motion.depth))
+        way = _out_of_image(motion, cameras, direction)
     return way * speed[:, None]
 
 
@@ -253,15 +221,17 @@ def speed_factors(motion: Motion, draws: Floats, name: str = "speed") -> Floats:
     return np.exp(motion.speed_deviation * draws[:, COLUMN[name]])
 
 
-def _with_depth(direction: Floats, depth: float) -> Floats:
-    """Unit vectors [K, 3] in the frame of the camera, of directions [K, 2] in the image and the sine of the depth."""
-    return np.concatenate([direction * math.sqrt(1 - depth**2), np.full((len(direction), 1), depth)], axis=1)
+def _out_of_image(motion: Motion, cameras: Cameras, direction: Floats) -> Floats:
+    """Unit vectors [K, 3] of directions [K, 2] in the image, turned out of its plane as the motion says."""
+    depth = np.full((len(direction), 1), motion.depth)
+    way = np.concatenate([direction * math.sqrt(1 - motion.depth**2), depth], axis=1)
+    return np.einsum("kij,kj->ki", cameras.axes, way)
 
 
-def _along_floor(mover: Placed, motion: Motion, cameras: Cameras, direction: Floats) -> Floats:
+def _along_floor(mover: LiftedBody, motion: Motion, cameras: Cameras, direction: Floats) -> Floats:
     """Unit vectors [K, 3] over the floor whose image at the mover has the directions [K, 2]."""
     if motion.depth and motion.source == "request":  # readers' depth is that of the direction, which the floor tells
-        way = np.einsum("kij,kj->ki", cameras.axes, _with_depth(direction, motion.depth))
+        way = _out_of_image(motion, cameras, direction)
     else:
         points, depth = cameras.project(mover.centre)
         step = cameras.focal / depth * mover.half_width * 0.05
@@ -276,7 +246,7 @@ def _along_floor(mover: Placed, motion: Motion, cameras: Cameras, direction: Flo
 
 
 def _thrown(
-    mover: Placed, motion: Motion, cameras: Cameras, draws: Floats, direction: Floats, asked: Placed | None
+    mover: LiftedBody, motion: Motion, cameras: Cameras, draws: Floats, direction: Floats, asked: LiftedBody | None
 ) -> Floats:
     """Unit vectors [K, 3] seen in directions [K, 2]: in a vertical plane, turned from that of the image by the depth.
 
@@ -297,30 +267,27 @@ def _thrown(
             bearing = math.atan2(float(away[2]), float(np.sign(direction[0, 0]) * away[0]))
             weight = weight * (1 + AIMED * np.exp(-0.5 * ((turns - bearing) / AIM_SIGMA) ** 2))
         below = (np.cumsum(weight) - weight / 2) / weight.sum()
-        shares = np.array([NormalDist().cdf(z) for z in draws[:, COLUMN["depth"]]])
-        turn = np.interp(shares, below, turns)
+        turn = np.interp(quantiles(draws[:, COLUMN["depth"]]), below, turns)
     return _in_plane(mover, cameras, direction, np.clip(turn, -1.5, 1.5))
 
 
-def _in_plane(mover: Placed, cameras: Cameras, direction: Floats, turn: Floats) -> Floats:
+def _in_plane(mover: LiftedBody, cameras: Cameras, direction: Floats, turn: Floats) -> Floats:
     """Unit vectors [K, 3], seen in directions [K, 2], in vertical planes turned from that of the image (radians)."""
     sense = np.where(direction[:, 0] < 0, -1.0, 1.0)
     level = np.stack([sense * np.cos(turn), np.zeros(len(turn)), np.sin(turn)], axis=1)
     up = np.tile(np.array([0.0, 1.0, 0.0]), (len(turn), 1))
-    seen = np.stack([_image_velocity(mover, cameras, way) for way in (level, up)], axis=2)
-    shares = np.linalg.solve(seen + 1e-9 * np.eye(2), direction[:, :, None])[:, :, 0]
+    step = 1e-4 * mover.half_width[:, None]
+    scale = (cameras.depth(mover.centre) / cameras.focal)[:, None]
+    seen: list[Floats] = []  # image velocities [K, 2], to a common factor, of the mover going either way
+    for way in (level, up):
+        before, after = (cameras.project(mover.centre + side * step * way)[0] for side in (-1.0, 1.0))
+        seen.append((after - before) / (2 * step) * scale)
+    shares = np.linalg.solve(np.stack(seen, axis=2) + 1e-9 * np.eye(2), direction[:, :, None])[:, :, 0]
     way = shares[:, :1] * level + shares[:, 1:] * up
     return way / np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
 
 
-def _image_velocity(mover: Placed, cameras: Cameras, way: Floats) -> Floats:
-    """Image velocities [K, 2], to a common factor, of the mover with velocities [K, 3]."""
-    step = 1e-4 * mover.half_width[:, None]
-    ends = [cameras.project(mover.centre + side * step * way)[0] for side in (-1.0, 1.0)]
-    return (ends[1] - ends[0]) / (2 * step) * (cameras.depth(mover.centre) / cameras.focal)[:, None]
-
-
-def _apart(placed: list[Placed]) -> list[Placed]:
+def _apart(placed: list[LiftedBody]) -> list[LiftedBody]:
     """Makes bodies slimmer that would overlap: boxes are wider than the things in them."""
     bodies = list(placed)
     centres = np.stack([body.centre for body in placed])
@@ -342,14 +309,14 @@ def _apart(placed: list[Placed]) -> list[Placed]:
     return bodies
 
 
-def _reach(body: Placed, way: Floats) -> Floats:
+def _reach(body: LiftedBody, way: Floats) -> Floats:
     """Half the extent [K] of a body over the floor in the directions [K, 2]."""
     sight = body.centre[:, [0, 2]] / np.maximum(np.linalg.norm(body.centre[:, [0, 2]], axis=1), 1e-9)[:, None]
     along = np.einsum("ki,ki->k", way, sight) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)
     return body.half_width * np.sqrt(1 + (body.depth_share**2 - 1) * along**2)
 
 
-def _slimmer(body: Placed, first: Placed, share: Floats) -> Placed:
+def _slimmer(body: LiftedBody, first: LiftedBody, share: Floats) -> LiftedBody:
     """A body of at most a share of its first width; a sphere that stands keeps its foot."""
     half = np.minimum(body.half_width, share * first.half_width)
     if first.shape != "sphere":
