@@ -86,7 +86,7 @@ class TestWorlds:
         bodies.append(_drawn("cup", "cylinder", camera.box(raised)))
         table = _drawn("table", "box", camera.box(outline("box", (0.6, 3.2), 0.4, 0.4)))
         still = _moving(camera, half).model_copy(update={"kind": "static", "direction": None, "speed": 0.0})
-        world = WorldInput(tuple(bodies), still, known(camera), camera.size, 33, 16.0, taken=(table,))
+        world = WorldInput(tuple(bodies), still, known(camera), camera.size, 33, 16.0, removed=(table,))
         assert run_world(world.as_it_is(), likeliest()).layout.supports[1] == 2
         fallen, kept = run_world(world, likeliest()), run_world(world.as_it_is(), likeliest())
         assert fallen.runs[0].positions[1, 0, 1] == pytest.approx(kept.runs[0].positions[1, 0, 1])
@@ -106,7 +106,7 @@ class TestWorlds:
         far = _drawn("far", "cylinder", camera.box(outline("cylinder", (0.0, 4.2), 0.12, 0.35)))
         for taken, other, changes in ((vase, far, likely), (far, vase, 1 - likely)):
             bodies = (mover, post, other)
-            world = WorldInput(bodies, _moving(camera, half), known(camera), camera.size, 65, 16.0, taken=(taken,))
+            world = WorldInput(bodies, _moving(camera, half), known(camera), camera.size, 65, 16.0, removed=(taken,))
             asked = Asked(form="changes", relation="touches", target="post", negated=negated)
             changed, factual = run_ensemble(world, Query(asked, target=1), 9)
             assert changed.decided is not None

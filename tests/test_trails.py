@@ -21,7 +21,7 @@ from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.vision.circles import Edges
 from cow_service.vision.scene import Scene
-from cow_service.vision.trail_removal import without_ghost_shadows
+from cow_service.vision.trail_removal import without_earlier_shadows
 from cow_service.vision.trails import Position, Trail, TrailEnd, find_trails, trail_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -113,7 +113,7 @@ def test_the_shadows_of_earlier_positions_are_taken_out() -> None:
         rows.append(np.clip((1.06 - away) / 0.12, 0, 1))
     shaded = (image * (1 - 0.16 * np.max(rows, axis=0))[..., None]).astype(np.uint8)
     shown = Trail(tuple(Position(x, y, 26.0, 1.0) for x, y in PLACES), evident=True, end_known=True)
-    clean = without_ghost_shadows(shaded, shown, np.zeros(shaded.shape[:2], bool))
+    clean = without_earlier_shadows(shaded, shown, np.zeros(shaded.shape[:2], bool))
     own, others = rows[-1] > 0.9, (np.max(rows[:-1], axis=0) > 0.5) & (rows[-1] == 0)
     left = np.abs(clean[others].astype(float) - image[others]).mean()
     assert left < 0.4 * np.abs(shaded[others].astype(float) - image[others]).mean()

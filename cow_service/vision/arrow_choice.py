@@ -26,7 +26,13 @@ def gap(arrow: Arrow, bbox: BBox) -> float:
 
 def arrows_near(scene: Scene, bbox: BBox) -> list[Arrow]:
     """Arrows that start or end close to a box and at no other object, nearest first."""
-    near = [arrow for arrow in scene.arrows if gap(arrow, bbox) <= REACH and not _starts_elsewhere(scene, arrow, bbox)]
+    others = [region.bbox for region in scene.regions if iou(region.bbox, bbox) < SAME_OBJECT_IOU]
+    near: list[Arrow] = []
+    for arrow in scene.arrows:
+        x, y = arrow.tail
+        elsewhere = any(x0 <= x < x1 and y0 <= y < y1 for x0, y0, x1, y1 in others) and gap(arrow, bbox) > REACH / 4
+        if gap(arrow, bbox) <= REACH and not elsewhere:
+            near.append(arrow)
     return sorted(near, key=lambda arrow: gap(arrow, bbox))
 
 
@@ -68,16 +74,6 @@ def at_arrow(scene: Scene, regions: Sequence[Region]) -> list[Region]:
     nearest = gap(arrow, ranked[0].bbox)
     alone = len(ranked) == 1 or nearest < RIVAL * gap(arrow, ranked[1].bbox)
     return [ranked[0]] if ranked[0] in regions and nearest <= REACH and alone else []
-
-
-def _starts_elsewhere(scene: Scene, arrow: Arrow, bbox: BBox) -> bool:
-    """Whether an arrow's tail lies at another object and far from this one."""
-    x, y = arrow.tail
-    for region in scene.regions:
-        x0, y0, x1, y1 = region.bbox
-        if iou(region.bbox, bbox) < SAME_OBJECT_IOU and x0 <= x < x1 and y0 <= y < y1 and gap(arrow, bbox) > REACH / 4:
-            return True
-    return False
 
 
 def _ends_of(arrows: Sequence[Arrow]) -> str:

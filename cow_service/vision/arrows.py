@@ -70,7 +70,9 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int,
     """Drawn arrows among the strokes of an image whose full size is [height, width]; overlapping findings are one."""
     found: list[tuple[_Shape, Stroke]] = []
     for stroke in strokes:
-        if any(shape.fit > CERTAIN_FIT and _same_place(stroke, other) for shape, other in found):
+        corners = np.array([stroke.x, stroke.y, *stroke.patch.shape])  # drawings can be found twice
+        known = [other for shape, other in found if shape.fit > CERTAIN_FIT]
+        if any((np.abs(corners - [other.x, other.y, *other.patch.shape]) <= 3).all() for other in known):
             continue
         shape = fit_arrow(stroke.patch, stroke.hollow)
         if shape is not None:
@@ -97,12 +99,6 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int,
             )
         )
     return tuple(arrows)
-
-
-def _same_place(a: Stroke, b: Stroke) -> bool:
-    """Whether two strokes fill the same box, to a few pixels: then they are one drawing, found twice."""
-    corners = zip((a.x, a.y, *a.patch.shape), (b.x, b.y, *b.patch.shape), strict=True)
-    return all(abs(p - q) <= 3 for p, q in corners)
 
 
 def fit_arrow(patch: Mask, hollow: bool = False) -> _Shape | None:
@@ -275,7 +271,11 @@ def _line_width(patch: Mask) -> int | None:
     if min(h, w) < MIN_SIDE:
         return None
     sides = (patch[:, w // 2], patch[:, w // 2][::-1], patch[h // 2], patch[h // 2][::-1])
-    widths = [_first_run(side) for side in sides]
+    starts = [int(np.argmax(side)) for side in sides]  # the line begins within a fringe of 2 px
+    widths = [
+        start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0
+        for start, side in zip(starts, sides, strict=True)
+    ]
     line = int(np.median(widths))
     if not 1 <= line <= 0.2 * min(h, w):
         return None
@@ -287,9 +287,3 @@ def _line_width(patch: Mask) -> int | None:
     if patch[frame].sum() < ON_OUTLINE * patch.sum() or rim.mean() < COVERED:
         return None
     return line
-
-
-def _first_run(side: NDArray[np.bool_]) -> int:
-    """How many pixels inwards the line ends, where it begins within a fringe of 2 px; else 0."""
-    start = int(np.argmax(side))
-    return start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0

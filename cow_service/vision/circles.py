@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
-from cow_service.vision.masks import Floats, Floats32, Image, Mask, scaled
+from cow_service.vision.contrast import lab_gradients
+from cow_service.vision.masks import Floats, Floats32, Image, Mask, lab_of, scaled
 
 WORKING_SIDE = 512  # px: images are searched at this size
 EDGE = 1.0, 2.2  # Lab units per px, and times the median gradient; the larger counts
@@ -80,8 +81,7 @@ class Edges:
         """The circles that stand out, those with most edges on them first."""
         found: list[Circle] = []
         for x, y, radius in _voted(self.points, self.normals, self.shape):
-            fitted = self._fitted(x, y, radius)
-            circle = None if fitted is None else self._enlarged(*fitted)
+            circle = self._fitted(x, y, radius)
             if circle is not None and not any(circle.is_same(other) for other in found):
                 found.append(circle)
         return tuple(sorted(found, key=lambda circle: -circle.support))
@@ -95,15 +95,15 @@ class Edges:
     def fit(self, x: float, y: float, radius: float) -> Circle | None:
         """The circle near one of the image (px), if edges lie on it."""
         fx, fy = self.stretch
-        fitted = self._fitted(x / fx - 0.5, y / fy - 0.5, 2 * radius / (fx + fy))
-        return None if fitted is None else self._enlarged(*fitted)
+        return self._fitted(x / fx - 0.5, y / fy - 0.5, 2 * radius / (fx + fy))
 
     def may_fit(self, places: Floats, radius: float) -> Mask:
         """Which of circles of the image around `places` [K, 2] (px) have enough edges near them for `fit`."""
         fx, fy = self.stretch
         x, y, radius = places[:, :1] / fx - 0.5, places[:, 1:] / fy - 0.5, 2 * radius / (fx + fy)
         near = self._near(x.min(), y.min(), x.max(), y.max(), radius)
-        on, _, _ = _on_circle(self.points[near], self.normals[near], x, y, radius, _reach(radius, FIRST_REACH))
+        reach = max(2.0, FIRST_REACH * radius)
+        on, _, _ = _on_circle(self.points[near], self.normals[near], x, y, radius, reach)
         return np.count_nonzero(on, axis=1) >= LEAST_ON
 
     def notch(self, a: Circle, b: Circle) -> float | None:
@@ -132,9 +132,25 @@ class Edges:
         step = float((aside - radius)[beside].mean() - (aside - radius)[between].mean())
         return step / max(float(depth[between].mean() - depth[beside].mean()), 1e-6)
 
-    def _fitted(self, x: float, y: float, radius: float) -> tuple[float, float, float, frozenset[int]] | None:
+    def _fitted(self, x: float, y: float, radius: float) -> Circle | None:
+        """The circle by least squares over the edges near one of the working size, twice; None where few lie on it."""
         near = self._near(x, y, x, y, radius)
-        return _fitted(self.points[near], self.normals[near], x, y, radius)
+        points, normals = self.points[near], self.normals[near]
+        for share in (FIRST_REACH, SECOND_REACH):
+            on, across, down = _on_circle(points, normals, x, y, radius, max(2.0, share * radius))
+            if np.count_nonzero(on) < LEAST_ON:
+                return None
+            a, b, fitted = _least_squares(across[on], down[on])
+            if not 0.7 * radius < fitted < 1.4 * radius or math.hypot(a, b) > 0.4 * radius:
+                return None
+            x, y, radius = x + a, y + b, fitted
+        on, across, down = _on_circle(points, normals, x, y, radius, max(NEAR[1], NEAR[0] * radius))
+        turns = np.arctan2(down[on], across[on]) / (2 * np.pi)
+        bins = frozenset((np.floor(turns * BINS).astype(int) % BINS).tolist())
+        if len(bins) < LEAST_ARC * BINS:
+            return None
+        fx, fy = self.stretch
+        return Circle(float((x + 0.5) * fx), float((y + 0.5) * fy), radius * (fx + fy) / 2, bins)
 
     def _near(self, left: float, top: float, right: float, bottom: float, radius: float) -> NDArray[np.intp]:
         """Indices of the edges that circles around the places of a box may lie on."""
@@ -143,17 +159,10 @@ class Edges:
         columns = self.points[first:last, 0]
         return first + np.nonzero((columns > left - reach) & (columns < right + reach))[0]
 
-    def _enlarged(self, x: float, y: float, radius: float, on: frozenset[int]) -> Circle:
-        fx, fy = self.stretch
-        return Circle(float((x + 0.5) * fx), float((y + 0.5) * fy), radius * (fx + fy) / 2, on)
-
 
 def _edges(small: Image) -> tuple[Floats, Floats]:
     """Points [N, 2] (px) where the gradient is strongest across the edge, and its unit vectors [N, 2]."""
-    lab = np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
-    blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
-    dx, dy = (cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
-    total = np.asarray(cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3), np.float32))), np.float32)
+    dx, dy, total = lab_gradients(lab_of(small))
     strong = total > max(EDGE[0], EDGE[1] * float(np.median(total[::2, ::2])))
     strong[:2] = strong[-2:] = False
     strong[:, :2] = strong[:, -2:] = False
@@ -215,28 +224,6 @@ def _voted(points: Floats, normals: Floats, shape: tuple[int, int]) -> list[tupl
         scores[max(0, i - 3) : i + 4, *near] = 0
         best[near] = scores[:, *near].max(axis=0)
     return found
-
-
-def _reach(radius: float, share: float) -> float:
-    return max(2.0, share * radius)
-
-
-def _fitted(
-    points: Floats, normals: Floats, x: float, y: float, radius: float
-) -> tuple[float, float, float, frozenset[int]] | None:
-    """The circle by least squares over the edges near one, twice; None where too few lie on it."""
-    for share in (FIRST_REACH, SECOND_REACH):
-        on, across, down = _on_circle(points, normals, x, y, radius, _reach(radius, share))
-        if np.count_nonzero(on) < LEAST_ON:
-            return None
-        a, b, fitted = _least_squares(across[on], down[on])
-        if not 0.7 * radius < fitted < 1.4 * radius or math.hypot(a, b) > 0.4 * radius:
-            return None
-        x, y, radius = x + a, y + b, fitted
-    on, across, down = _on_circle(points, normals, x, y, radius, max(NEAR[1], NEAR[0] * radius))
-    turns = np.arctan2(down[on], across[on]) / (2 * np.pi)
-    bins = frozenset((np.floor(turns * BINS).astype(int) % BINS).tolist())
-    return (x, y, radius, bins) if len(bins) >= LEAST_ARC * BINS else None
 
 
 def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ By colour alone, a ball's region lacks its highlight and includes its contact sh
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import cv2
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, EDGE_THRESHOLDS, View
-from cow_service.vision.masks import Floats, Floats32, Mask, outline_of, window_of
+from cow_service.vision.masks import Floats, Floats32, Mask, hull, outline_of, window_of
 
 TRIES = 120  # circles through three points of the outline
 NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
@@ -44,7 +45,9 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
     if circle is None:
         return None
     x, y, radius, on_circle = circle
-    radius = _radius_on_edges(edges, x, y, radius, grow)
+    # The radius with the strongest median edge.
+    radii = radius + np.arange(-BLED, max(0.5, grow) + 0.01, 0.5)
+    radius = float(radii[int(np.median(_along_rays(edges, x, y, radii), axis=0).argmax())])
     height, width = part.shape
     angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)
     columns, rows = np.round(x + radius * np.cos(angles)).astype(int), np.round(y + radius * np.sin(angles)).astype(int)
@@ -52,9 +55,16 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
     strong = cv2.dilate((edges > edge_threshold).astype(np.uint8), np.ones((3, 3), np.uint8))
     if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < ON_EDGES:
         return None
-    rays = _strongest_on(edges, x, y, radius)
+    # On a ball's rays nothing is stronger than its outline; a circle around a cube or mug meets edges elsewhere.
+    offsets = np.arange(RAY[0] * radius, RAY[1] * radius + 0.01, 0.5)
+    strongest = np.abs(offsets[_along_rays(edges, x, y, radius + offsets).argmax(axis=1)])
+    rays = strongest < max(RAY_ERROR[0], RAY_ERROR[1] * radius)
     sharpest = rays[seen].mean()
-    if on_circle < WHOLE and _longest_arc(rays) < LEAST_ARC:
+    # A polygon has many short runs of such rays; gaps of one ray are closed.
+    twice = np.concatenate([rays, rays])
+    closed = twice | (np.roll(twice, 1) & np.roll(twice, -1))
+    longest = max((len(list(run)) for on, run in itertools.groupby(closed.tolist()) if on), default=0)
+    if on_circle < WHOLE and min(1.0, longest / len(rays)) < LEAST_ARC:
         return None
     if on_circle + sharpest < ON_BOTH or (not seen.all() and sharpest < BEYOND_IMAGE):
         return None
@@ -65,37 +75,12 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
     return disc if both > filled * disc.sum() and both > (1 - SPILLED) * part.sum() else None
 
 
-def _radius_on_edges(edges: Floats32, x: float, y: float, radius: float, grow: float) -> float:
-    """The radius (px) of the circle with the strongest median edge: `BLED` smaller at most, or `grow` larger."""
+def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
+    """Values [SAMPLES, R] on rays from a place, at distances [R]."""
     angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)[:, None]
-    radii = radius + np.arange(-BLED, max(0.5, grow) + 0.01, 0.5)[None]
-    columns, rows = x + np.cos(angles) * radii, y + np.sin(angles) * radii
-    values = np.asarray(cv2.remap(edges, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR))
-    return float(radii[0, int(np.median(values, axis=0).argmax())])
-
-
-def _strongest_on(edges: Floats32, x: float, y: float, radius: float) -> Mask:
-    """For each of the `SAMPLES` rays from the middle of a circle, whether the strongest edge near it lies on it.
-
-    On a ball's rays nothing is stronger than its outline; a circle around a cube or mug meets edges elsewhere.
-    """
-    angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)[:, None]
-    offsets = np.arange(RAY[0] * radius, RAY[1] * radius + 0.01, 0.5)[None]
-    columns, rows = x + np.cos(angles) * (radius + offsets), y + np.sin(angles) * (radius + offsets)
+    columns, rows = x + np.cos(angles) * radii[None], y + np.sin(angles) * radii[None]
     values = cv2.remap(edges, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)
-    strongest = np.abs(offsets[0][np.asarray(values).argmax(axis=1)])
-    return strongest < max(RAY_ERROR[0], RAY_ERROR[1] * radius)
-
-
-def _longest_arc(rays: Mask) -> float:
-    """Share of the circle that the longest run of rays takes, gaps of one ray closed: a polygon has many short runs."""
-    twice = np.concatenate([rays, rays])
-    closed = twice | (np.roll(twice, 1) & np.roll(twice, -1))
-    longest = length = 0
-    for on in closed:
-        length = length + 1 if on else 0
-        longest = max(longest, length)
-    return min(1.0, longest / len(rays))
+    return np.asarray(values, np.float32)
 
 
 def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
@@ -142,10 +127,10 @@ def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
 
     `lab` [h, w, 3] is the image in CIE Lab.
     """
-    upper, lower = window_of(mouth), window_of(body)
-    if upper is None or lower is None:
+    mouth_window, body_window = window_of(mouth), window_of(body)
+    if mouth_window is None or body_window is None:
         return None
-    (rows, columns), (below, across) = upper, lower
+    (rows, columns), (below, across) = mouth_window, body_window
     width, gap = columns.stop - columns.start, below.start - rows.stop
     shared = min(columns.stop, across.stop) - max(columns.start, across.start)
     aside = abs(columns.start + columns.stop - across.start - across.stop) / 2
@@ -154,7 +139,9 @@ def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
     if shared < OVERLAP * min(width, across.stop - across.start) or aside > NECK_OFF_MIDDLE * width:
         return None
     shoulder = below.start + max(1, round(SHOULDER * (below.stop - below.start)))
-    neck = _hull(mouth, body[:shoulder]) & ~mouth & ~body
+    upper = body.copy()
+    upper[shoulder:] = False
+    neck = hull(mouth | upper) & ~mouth & ~body
     ends = np.nonzero(neck.any(axis=0))[0]
     beside = np.zeros(neck.shape, bool)
     beside[rows.stop : below.start, max(0, int(ends[0]) - width // 2) : int(ends[-1]) + width // 2] = True
@@ -163,14 +150,6 @@ def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
     if not beside.any() or not inner.any():
         return None
     return neck if np.linalg.norm(lab[inner].mean(axis=0) - lab[beside].mean(axis=0)) > NECK_STEP else None
-
-
-def _hull(mouth: Mask, shoulder: Mask) -> Mask:
-    """The convex hull [h, w] of a mouth [h, w] and of the upper rows of a body."""
-    points = [np.argwhere(mask)[:, ::-1] for mask in (mouth, shoulder)]
-    hull = np.zeros(mouth.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(points).astype(np.int32)), 1)
-    return hull > 0
 
 
 WEIGHTS = np.array([1.0, 0.5, 0.5], np.float32)  # of L, a and b in a step: compression spreads colour, not lightness
@@ -210,7 +189,10 @@ def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | N
         differs &= steps > BLUR * np.percentile(steps[differs], 90)
     if not differs[above - LEAST_HEIGHT : above].any():
         return None
-    found = _joined(differs, part[strip])
+    body = cv2.dilate(part[strip].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    _, labels = cv2.connectedComponents((differs | body).astype(np.uint8), connectivity=8)
+    joined = np.unique(labels[part[strip]])
+    found = differs & np.isin(labels, joined[joined > 0])
     seen = _above_rim(found[:above])
     if seen is None or abs(float(np.nonzero(seen)[1].mean()) + left - middle) > OFF_MIDDLE * width:
         return None
@@ -223,14 +205,6 @@ def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | N
     whole = np.zeros(part.shape, bool)
     whole[strip] = found
     return whole
-
-
-def _joined(differs: Mask, part: Mask) -> Mask:
-    """What of the pixels that differ [n, m] is joined to the part [n, m]."""
-    body = cv2.dilate(part.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    _, labels = cv2.connectedComponents((differs | body).astype(np.uint8), connectivity=8)
-    joined = np.unique(labels[part])
-    return differs & np.isin(labels, joined[joined > 0])
 
 
 def _above_rim(found: Mask) -> Mask | None:
@@ -305,13 +279,21 @@ class _Tops:
 
     def surely_white(self) -> frozenset[int]:
         """Those that have no colour of their own and a sharp outline."""
-        tops = [top for top, area in enumerate(self.areas) if top and area >= LEAST_WHITE]
-        return frozenset(top for top in tops if self._is_neutral(top) and self.is_sharp(top))
+        found: list[int] = []
+        for top, ((x, y, w, h), area) in enumerate(zip(self.boxes, self.areas, strict=True)):
+            window = slice(y, y + h), slice(x, x + w)
+            if top and area >= LEAST_WHITE:
+                chroma = float(np.median(self._chroma[window][self.labels[window] == top]))
+                found += [top] if chroma < CHROMA_STEP and self.is_sharp(top) else []
+        return frozenset(found)
 
-    def _is_neutral(self, top: int) -> bool:
-        x, y, w, h = self.boxes[top]
-        window = slice(y, y + h), slice(x, x + w)
-        return float(np.median(self._chroma[window][self.labels[window] == top])) < CHROMA_STEP
+    def has_side(self, top: int, side: _Box, area: int, lit: bool) -> bool:
+        """Whether a side is that of a top: small beside it, and lit or right below it."""
+        x, y, w, _ = side
+        tx, ty, tw, _ = self.boxes[top]
+        overlap = min(x + w, tx + tw + 3) - max(x, tx - 3)
+        hangs = overlap > HANGS * w and y >= ty
+        return self.areas[top] >= LEAST_TOP and area < MAX_RATIO * self.areas[top] and (lit or hangs)
 
 
 def white_sides(view: View, core: Mask) -> Mask:
@@ -330,7 +312,7 @@ def white_sides(view: View, core: Mask) -> Mask:
                 continue
             touched = set(np.unique(tops.labels[near][cv2.dilate(patch, _KERNEL, iterations=4) > 0]).tolist()) - {0}
             lit = len(touched) > 0 and float(np.median(view.bright[near][patch > 0])) > BRIGHT_REACH
-            if any(_belongs(tops, top, box, int(patch.sum()), lit) for top in (touched & white if weak else touched)):
+            if any(tops.has_side(top, box, int(patch.sum()), lit) for top in (touched & white if weak else touched)):
                 sides[near] |= cv2.dilate(patch, _KERNEL, iterations=2) > 0
     return sides
 
@@ -349,15 +331,6 @@ def _enclosed(view: View, floor: float, factor: float) -> Iterator[tuple[tuple[s
             continue
         near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
         yield near, (labels[near] == i).astype(np.uint8), (x, y, w, h)
-
-
-def _belongs(tops: _Tops, top: int, side: _Box, area: int, lit: bool) -> bool:
-    """Whether a side is a top's: small beside it, and lit or right below it."""
-    x, y, w, _ = side
-    tx, ty, tw, _ = tops.boxes[top]
-    overlap = min(x + w, tx + tw + 3) - max(x, tx - 3)
-    hangs = overlap > HANGS * w and y >= ty
-    return tops.areas[top] >= LEAST_TOP and area < MAX_RATIO * tops.areas[top] and (lit or hangs)
 
 
 def _lit_fronts(view: View, tops: _Tops) -> Mask:

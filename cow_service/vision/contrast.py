@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import Floats32, Image, scaled
+from cow_service.vision.masks import Floats32, Image, lab_of, scaled
 
 CHROMA_STEP = 9.0  # Lab units from the surroundings: an object
 BRIGHT_STEP = 5.0  # Lab lightness above the surroundings: an object
@@ -31,30 +31,21 @@ class View:
 
     def crop(self, window: tuple[slice, slice]) -> View:
         """The same measurements for a part of the image."""
-        return replace(
-            self,
-            lab=self.lab[window],
-            chroma=self.chroma[window],
-            chroma_gap=self.chroma_gap[window],
-            bright=self.bright[window],
-            around=self.around[window],
-            edges=self.edges[window],
-        )
+        names = ("lab", "chroma", "chroma_gap", "bright", "around", "edges")
+        return replace(self, **{name: getattr(self, name)[window] for name in names})
 
 
 def view_of(small: Image) -> View:
     """Measures every pixel against a median over half the image around it."""
     smooth = cv2.bilateralFilter(small, 5, 25, 5)
-    lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
+    lab = lab_of(np.asarray(smooth, np.uint8))
     coarse = scaled(np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.uint8), 0.25)
     size = small.shape[1], small.shape[0]
     around = cv2.resize(_surroundings(coarse), size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
     (lightness, a, b), (around_l, around_a, around_b) = cv2.split(lab), cv2.split(around)
     around_l = around_l / np.float32(2.55)
     gap = cv2.magnitude(a - (around_a - 128), b - (around_b - 128))
-    blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
-    dx, dy = (cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
-    edges = cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3), np.float32)))
+    edges = lab_gradients(lab)[2]
     median_edge = float(np.median(edges))
     return View(
         lab=lab,
@@ -62,10 +53,17 @@ def view_of(small: Image) -> View:
         chroma_gap=np.asarray(gap, np.float32),
         bright=np.asarray(lightness - around_l, np.float32),
         around=np.asarray(around_l, np.float32),
-        edges=np.asarray(edges, np.float32),
+        edges=edges,
         median_edge=median_edge,
         edge_threshold=max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * median_edge),
     )
+
+
+def lab_gradients(lab: Floats32) -> tuple[Floats32, Floats32, Floats32]:
+    """Of an image in CIE Lab, per px: to the right and down [h, w, 3], and the length of all of them [h, w]."""
+    blurred = cv2.GaussianBlur(lab, (0, 0), 1.0)
+    dx, dy = (np.asarray(cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8), np.float32) for order in ((1, 0), (0, 1)))
+    return dx, dy, np.asarray(cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3), np.float32))), np.float32)
 
 
 def _surroundings(coarse: Image) -> Image:

@@ -53,11 +53,12 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
         reach = np.inf
     if around is None:
         return image
-    beside = _beside(around, reach)
     varied = _is_varied(around.source, around.inside, around.trusted)
     if varied and np.isfinite(reach):
         around = _surroundings(image, hole, avoid, max(24, int(WIDE * size))) or around
-        beside = _beside(around, reach)
+    beside = around.trusted & (around.away < reach)
+    if not beside.any():
+        beside = around.trusted
     shading = push_pull(around.source, beside)
     if varied:
         filled = exemplar_inpaint(around.source, around.inside | (around.away <= around.rim), ~around.trusted, shading)
@@ -66,7 +67,16 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
         detail = np.abs(shading - cv2.blur(shading, (width, width)))[beside]
         most = MOST_UNREST * float(np.percentile(detail, 99))
         filled = shading + _texture(image, hole, avoid, around.crop, width, most)
-    return _faded_in(image, filled, around, size)
+    # It fades out next to the hole, and over a longer way in the object's shadow.
+    fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
+    wide = cv2.dilate(around.shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    reaches = np.where(wide, np.float32(max(fade, around.rim)), np.float32(around.rim))
+    share = np.asarray(np.clip(1 - around.away / reaches, 0, 1) * around.known, np.float32)
+    share[around.inside] = 1
+    result = image.copy()
+    mixed = around.source + (filled - around.source) * three_channels(share)
+    result[around.crop] = cv2.convertScaleAbs(np.maximum(mixed, 0))
+    return result
 
 
 @dataclass(frozen=True)
@@ -97,28 +107,15 @@ def _surroundings(image: Image, hole: Mask, avoid: Mask | None, margin: int) -> 
     source = image[crop].astype(np.float32)
     away = np.asarray(cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
     rim = max(RIM_LEAST, RIM * float(np.sqrt(np.count_nonzero(inside))))
-    shadow = _contact_shadow(source, inside, known)
+    # What is much darker than most at the hole's rim is the object's own shadow, no shading to draw in.
+    width = 2 * max(3, int(0.15 * np.sqrt(np.count_nonzero(inside)))) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+    shadow = (cv2.dilate(inside.astype(np.uint8), kernel) > 0) & known
+    if shadow.any():
+        grey = source @ np.full(3, 1 / 3, np.float32)
+        shadow &= grey < np.percentile(grey[shadow], 65) - SHADOW_STEP
     trusted = known & ~shadow & (away > rim)
     return _Surroundings(crop, source, inside, known, trusted if trusted.any() else known, shadow, away, rim)
-
-
-def _beside(around: _Surroundings, reach: float) -> Mask:
-    """[h, w]: what shading is taken from: what lies within a reach (px) of the hole, or else all that is trusted."""
-    near = around.trusted & (around.away < reach)
-    return near if near.any() else around.trusted
-
-
-def _faded_in(image: Image, filled: Floats32, around: _Surroundings, size: float) -> Image:
-    """The image with a filled crop in the hole, fading out next to it, and over a longer way in the object's shadow."""
-    fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
-    wide = cv2.dilate(around.shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    reach = np.where(wide, np.float32(max(fade, around.rim)), np.float32(around.rim))
-    share = np.asarray(np.clip(1 - around.away / reach, 0, 1) * around.known, np.float32)
-    share[around.inside] = 1
-    share = three_channels(share)
-    result = image.copy()
-    result[around.crop] = cv2.convertScaleAbs(np.maximum(around.source + (filled - around.source) * share, 0))
-    return result
 
 
 def _is_varied(source: Floats32, inside: Mask, known: Mask) -> bool:
@@ -127,30 +124,15 @@ def _is_varied(source: Floats32, inside: Mask, known: Mask) -> bool:
     ring = (cv2.dilate(inside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & known
     if not ring.any():
         return False
-    return float(source[ring].std(axis=0).max()) > VARIED or _roughness(source, ring) > STRUCTURED
-
-
-def _roughness(source: Floats32, ring: Mask) -> float:
-    """Standard deviation (grey levels) of what is coarser than texture in a ring from a quadratic surface."""
+    if float(source[ring].std(axis=0).max()) > VARIED:
+        return True
     ys, xs = np.nonzero(ring)
     every = max(1, len(ys) // MOST_SAMPLES)
     ys, xs = ys[::every], xs[::every]
     values = np.asarray(cv2.blur(source, (7, 7)), np.float64)[ys, xs]
-    u, v = (xs - xs.mean()) / max(1.0, float(xs.std())), (ys - ys.mean()) / max(1.0, float(ys.std()))
-    terms = quadratic_terms(u, v)
+    terms = quadratic_terms((xs - xs.mean()) / max(1.0, float(xs.std())), (ys - ys.mean()) / max(1.0, float(ys.std())))
     rest = values - terms @ np.linalg.lstsq(terms, values, rcond=None)[0]
-    return float(rest.std(axis=0).max())
-
-
-def _contact_shadow(source: Floats32, inside: Mask, known: Mask) -> Mask:
-    """Known pixels at the hole's rim that are much darker than most: the object's own shadow, no shading to draw in."""
-    reach = 2 * max(3, int(0.15 * np.sqrt(np.count_nonzero(inside)))) + 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    rim = (cv2.dilate(inside.astype(np.uint8), kernel) > 0) & known
-    if not rim.any():
-        return rim
-    grey = source @ np.full(3, 1 / 3, np.float32)
-    return rim & (grey < np.percentile(grey[rim], 65) - SHADOW_STEP)
+    return float(rest.std(axis=0).max()) > STRUCTURED  # coarser than texture, from a quadratic surface
 
 
 def quadratic_terms(u: Floats, v: Floats) -> Floats:

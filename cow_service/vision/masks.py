@@ -40,6 +40,11 @@ def resized_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     return cv2.resize(mask.astype(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) >= 128
 
 
+def lab_of(image: Image) -> Floats32:
+    """An RGB image [h, w, 3] in CIE Lab."""
+    return np.asarray(cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
+
+
 def three_channels(values: Floats32) -> Floats32:
     """Values [h, w] for each of three colours: broadcasting over the last axis is several times slower."""
     return np.asarray(cv2.merge((values, values, values)), np.float32)

@@ -26,6 +26,7 @@ from cow_service.vision.masks import (
     bbox_of,
     enlarged,
     iou,
+    lab_of,
     outline_of,
     scaled,
     window_of,
@@ -63,7 +64,7 @@ class Region:
     mask: CroppedMask
     colour: str
     colours: frozenset[str]  # all names that people may use for its colour
-    roundness: float  # 0..1: how much of the smallest circle around it the region fills
+    roundness: float  # 0..1, of the smallest circle around it: a disc has 1, a square 0.8, a bottle less than 0.5
     confidence: float  # 0..1: how sure it is that this is one separable thing with this outline; see `_confidence`
     is_disc: bool  # its outline was fitted by a circle: the mask is exact, segmenting it again would not improve it
 
@@ -93,7 +94,10 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
     view = view_of(scaled(image, scale))
-    core = _core(view)
+    # What is surely of an object: of another hue, clearly brighter, or nearly black.
+    black = (view.lab[..., 0] < BLACK_SHARE * view.around).astype(np.uint8)
+    solid_black = cv2.morphologyEx(black, cv2.MORPH_OPEN, _DISC) > 0  # a contact shadow is a thin strip
+    core = (view.chroma_gap > CHROMA_STEP) | (view.bright > BRIGHT_STEP) | solid_black
     if core.mean() > CLUTTER:
         return ()
     solid = (core | white_sides(view, core)).astype(np.uint8)
@@ -107,13 +111,17 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     for i in range(1, count):
         if not MIN_AREA * solid.size <= stats[i][4] <= MAX_AREA * solid.size or _is_background(stats[i], solid.shape):
             continue
-        window = _window(stats[i], solid.shape)
+        x, y, w, h = (int(v) for v in stats[i][:4])
+        pad = 6 + max(w, h) // 3  # a ball may have lost as much to a highlight
+        window = slice(max(0, y - pad), y + h + pad), slice(max(0, x - pad), x + w + pad)
         near = view.crop(window)
         for part in _parts(near, labels[window] == i):
             if _is_wall(near, part, walls[window]):
                 continue
             disc = as_disc(part, near.edges, view.edge_threshold)
-            if disc is not None or _is_sharp(near, part, view.edge_threshold):
+            # An object's outline lies on edges; that of a patch of light does not.
+            strong = cv2.dilate(near.edges, np.ones((5, 5), np.uint8))[outline_of(part)] > view.edge_threshold
+            if disc is not None or float(np.mean(strong)) > SHARP_SHARE:
                 whole = np.zeros(solid.shape, bool)
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
@@ -131,29 +139,8 @@ def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
 
 def disc_region(image: Image, disc: Mask) -> Region:
     """A ball of an RGB image [H, W, 3] whose mask [H, W] is known."""
-    pixels = image[disc][None].astype(np.float32) / 255
-    lab = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB), np.float32)[0]
-    return Region(CroppedMask.of(disc), *_names(lab), roundness=1.0, confidence=1.0, is_disc=True)
-
-
-def _window(stats: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of a component with a little around it."""
-    x, y, w, h = (int(v) for v in stats[:4])
-    pad = 6 + max(w, h) // 3  # a ball may have lost as much to a highlight
-    return slice(max(0, y - pad), min(shape[0], y + h + pad)), slice(max(0, x - pad), min(shape[1], x + w + pad))
-
-
-def _core(view: View) -> Mask:
-    """Pixels that are surely of an object: another hue, clearly brighter, or nearly black."""
-    black = (view.lab[..., 0] < BLACK_SHARE * view.around).astype(np.uint8)
-    solid_black = cv2.morphologyEx(black, cv2.MORPH_OPEN, _DISC) > 0  # a contact shadow is a thin strip
-    return (view.chroma_gap > CHROMA_STEP) | (view.bright > BRIGHT_STEP) | solid_black
-
-
-def _is_sharp(view: View, part: Mask, edge_threshold: float) -> bool:
-    """Whether the outline of a part lies on edges, as an object's does and a patch of light does not."""
-    nearby = cv2.dilate(view.edges, np.ones((5, 5), np.uint8))
-    return float(np.mean(nearby[outline_of(part)] > edge_threshold)) > SHARP_SHARE
+    names = _names(lab_of(image[disc][None])[0])
+    return Region(CroppedMask.of(disc), *names, roundness=1.0, confidence=1.0, is_disc=True)
 
 
 def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
@@ -300,7 +287,11 @@ def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
 
 def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
     """Joins dark lower ends, such as a car's wheels with the shade between them, with what they carry."""
-    dark = [one for one in found if not one.is_disc and _is_black(one)]
+    dark: list[_Found] = []
+    for one in found:
+        lightness, a, b = (float(value) for value in np.median(one.lab, axis=0))
+        if not one.is_disc and lightness < DARK and colour_name(lightness, a, b) in {"black", "brown"}:
+            dark.append(one)
     whole = {i: one for i, one in enumerate(found) if all(one is not other for other in dark)}
     for part in dark:
         box, near = bbox_of(part.mask), cv2.dilate(part.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -313,11 +304,6 @@ def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
     return list(whole.values())
 
 
-def _is_black(one: _Found) -> bool:
-    lightness, a, b = (float(value) for value in np.median(one.lab, axis=0))
-    return colour_name(lightness, a, b) in {"black", "brown"} and lightness < DARK
-
-
 def _region(found: _Found, size: tuple[int, int]) -> Region:
     """A part that was found, as a region of the image (height and width)."""
     soft = found.mask.astype(np.float32)
@@ -325,7 +311,11 @@ def _region(found: _Found, size: tuple[int, int]) -> Region:
     if near is not None:
         soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
     mask = enlarged(soft, size)
-    return Region(mask, *_names(found.lab), _roundness(mask.patch), found.confidence, found.is_disc)
+    contours, _ = cv2.findContours(mask.patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = max(contours, key=cv2.contourArea)
+    _, radius = cv2.minEnclosingCircle(outline)
+    roundness = float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))
+    return Region(mask, *_names(found.lab), roundness, found.confidence, found.is_disc)
 
 
 def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
@@ -334,11 +324,3 @@ def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
     sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
     seen = [float(v) for v in np.median(sample, axis=0)]
     return colour_name(*seen), colour_names(*seen)
-
-
-def _roundness(mask: Mask) -> float:
-    """1 for a disc. A square has about 0.8, a bottle less than 0.5."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = max(contours, key=cv2.contourArea)
-    _, radius = cv2.minEnclosingCircle(outline)
-    return float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))

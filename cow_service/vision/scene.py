@@ -19,7 +19,7 @@ from cow_service.vision.masks import CroppedMask, Image, Mask, bbox_of, iou, wit
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region, disc_region, find_regions, region_of
 from cow_service.vision.segmentation import CutQuality, cut_quality, mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
-from cow_service.vision.trail_removal import without_ghost_shadows, without_ghosts
+from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
 
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
@@ -186,11 +186,11 @@ class Scene:
         """The image [H, W, 3] without its cues: neither drawings nor earlier positions of a trail and their shadows."""
         image = self._undrawn
         for trail in self.trails:
-            image = without_ghosts(image, trail)
+            image = without_earlier_positions(image, trail)
             objects = np.zeros((self.height, self.width), bool)
             for region in find_regions(image):
                 region.mask.add_to(objects)
-            image = without_ghost_shadows(image, trail, objects)
+            image = without_earlier_shadows(image, trail, objects)
         return image
 
     @cached_property
@@ -239,14 +239,15 @@ class Scene:
     def silhouette(self, bbox: BBox) -> Mask:
         """Mask [H, W] of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
         if bbox not in self._masks:
-            self._masks[bbox] = self._preset[bbox]() if bbox in self._preset else self._segmented(bbox)
+            region = None if bbox in self._preset else self.region_of(bbox)
+            if bbox in self._preset:
+                mask = self._preset[bbox]()
+            elif region is not None and region.is_disc:
+                mask = region.mask.full()
+            else:
+                mask = mask_from_bbox(self.clean, bbox, None if region is None else region.mask.full())
+            self._masks[bbox] = mask
         return self._masks[bbox]
-
-    def _segmented(self, bbox: BBox) -> Mask:
-        region = self.region_of(bbox)
-        if region is not None and region.is_disc:
-            return region.mask.full()
-        return mask_from_bbox(self.clean, bbox, None if region is None else region.mask.full())
 
     def preset_mask(self, bbox: BBox, mask: Callable[[], Mask]) -> None:
         """Gives the mask that an earlier run segmented for a box; it may have been segmented from a point instead."""

@@ -39,10 +39,7 @@ class CutQuality:
 def cut_quality(image: Image, mask: Mask) -> CutQuality:
     """The quality of a mask [H, W], not empty, that was cut from an image [H, W, 3]."""
     height, width = mask.shape
-    x0, y0, x1, y1 = bbox_of(mask)
-    pad = MARGIN * max(x1 - x0, y1 - y0) + 6
-    rows = slice(max(0, int(y0 - pad)), min(height, int(np.ceil(y1 + pad))))
-    columns = slice(max(0, int(x0 - pad)), min(width, int(np.ceil(x1 + pad))))
+    rows, columns = _crop_around(bbox_of(mask), width, height)
     scale = min(1.0, WORKING_SIDE / max(rows.stop - rows.start, columns.stop - columns.start))
     lab = cv2.cvtColor(scaled(image[rows, columns], scale), cv2.COLOR_RGB2LAB).astype(np.float32)
     inside = scaled(mask[rows, columns].astype(np.uint8) * np.uint8(255), scale) >= 128
@@ -67,6 +64,14 @@ def _local_mean(values: Floats32, where: Mask, reach: float) -> Floats32:
     return np.asarray(summed / (total[..., None] + 1e-4), np.float32)
 
 
+def _crop_around(bbox: BBox, width: int, height: int) -> tuple[slice, slice]:
+    """Rows and columns of an image around a box."""
+    x0, y0, x1, y1 = bbox
+    pad = MARGIN * max(x1 - x0, y1 - y0) + 6
+    rows = slice(max(0, int(y0 - pad)), min(height, int(np.ceil(y1 + pad))))
+    return rows, slice(max(0, int(x0 - pad)), min(width, int(np.ceil(x1 + pad))))
+
+
 def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
     """Mask [H, W] of the object in a box, by GrabCut; a guess [H, W] of it makes the cut surer and faster.
 
@@ -74,9 +79,7 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
     """
     height, width = image.shape[:2]
     x0, y0, x1, y1 = _inside(bbox, width, height)
-    pad = MARGIN * max(x1 - x0, y1 - y0) + 6
-    rows = slice(max(0, int(y0 - pad)), min(height, int(np.ceil(y1 + pad))))
-    columns = slice(max(0, int(x0 - pad)), min(width, int(np.ceil(x1 + pad))))
+    rows, columns = _crop_around((x0, y0, x1, y1), width, height)
     crop = image[rows, columns]
     scale = min(1.0, WORKING_SIDE / max(crop.shape[:2]))
     small = scaled(crop, scale)
@@ -84,12 +87,25 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
     box = np.array([x0 - columns.start, y0 - rows.start, x1 - columns.start, y1 - rows.start]) * scale
     if guess is None:
         cut = _grabcut(small, _labels_from_box(h, w, box, CORE))
-        if not _spans(_tidy(cut, box), box):  # a part of the object, such as a face
-            cut = _grabcut(small, _labels_from_box(h, w, box, LARGE_CORE))
+        inside = _tidy(cut, box)
+        left, top, right, bottom = bbox_of(inside) if inside.any() else (0.0, 0.0, 0.0, 0.0)
+        if right - left < SPAN * (box[2] - box[0]) or bottom - top < SPAN * (box[3] - box[1]):
+            cut = _grabcut(small, _labels_from_box(h, w, box, LARGE_CORE))  # it was a part, such as a face
     else:
-        near = cv2.resize(guess[rows, columns].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA)
-        cut = _grabcut(small, _labels_from_guess(np.asarray(near, np.uint8)))
-    if guess is not None:  # a guess may have missed a highlight: its box is not the object's
+        near = np.asarray(
+            cv2.resize(guess[rows, columns].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA), np.uint8
+        )
+        size = float(np.sqrt(near.sum()))
+        outer, inner = (
+            cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+            for reach in (max(2, int(GROW * size)), max(1, int(SHRINK * size)))
+        )
+        labels = np.full(near.shape, cv2.GC_BGD, np.uint8)
+        labels[cv2.dilate(near, outer) > 0] = cv2.GC_PR_BGD
+        labels[near > 0] = cv2.GC_PR_FGD
+        labels[cv2.erode(near, inner, borderValue=1) > 0] = cv2.GC_FGD
+        cut = _grabcut(small, labels)
+        # A guess may have missed a highlight: its box is not the object's.
         grow = GROW * float(np.sqrt((box[2] - box[0]) * (box[3] - box[1])))
         box = box + grow * np.array([-1, -1, 1, 1])
     soft = cv2.GaussianBlur(_tidy(cut, box).astype(np.float32), (0, 0), 0.7)
@@ -149,8 +165,10 @@ def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[
     cv2.rectangle(labels, (int(box[0]), int(box[1])), (int(box[2]), int(box[3])), int(cv2.GC_PR_BGD), -1)
     cv2.circle(labels, (round(x), round(y)), max(3, int(0.6 * r)), int(cv2.GC_PR_FGD), -1)
     cv2.circle(labels, (round(x), round(y)), max(2, int(0.15 * r)), int(cv2.GC_FGD), -1)
-    cut = _component_at(_grabcut(small, labels), x, y)
-    if cut.sum() < 30:
+    _, parts = cv2.connectedComponents(_grabcut(small, labels).astype(np.uint8), connectivity=4)
+    part = parts[min(h - 1, max(0, round(y))), min(w - 1, max(0, round(x)))]
+    cut = parts == part
+    if not part or cut.sum() < 30:
         return 0.0, None
     lab = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32), (0, 0), 1.2)
     dx, dy = cv2.Sobel(lab, cv2.CV_32F, 1, 0), cv2.Sobel(lab, cv2.CV_32F, 0, 1)
@@ -171,14 +189,6 @@ def _inside(bbox: BBox, width: int, height: int) -> BBox:
     return x0, y0, min(max(bbox[2], x0 + 2), float(width)), min(max(bbox[3], y0 + 2), float(height))
 
 
-def _spans(cut: Mask, box: Floats) -> bool:
-    """Whether a cut reaches across most of its box both ways."""
-    if not cut.any():
-        return False
-    left, top, right, bottom = bbox_of(cut)
-    return right - left >= SPAN * (box[2] - box[0]) and bottom - top >= SPAN * (box[3] - box[1])
-
-
 def _labels_from_box(height: int, width: int, box: Floats, core: float) -> NDArray[np.uint8]:
     """GrabCut's labels: background outside the box, probable foreground in its ellipse, sure in the `core` of that."""
     labels = np.full((height, width), cv2.GC_BGD, np.uint8)
@@ -192,19 +202,6 @@ def _labels_from_box(height: int, width: int, box: Floats, core: float) -> NDArr
         rise, run = max(2, (y1 - y0) // 7), max(2, (x1 - x0) // 7)
         for corner in (labels[: y0 + rise, : x0 + run], labels[: y0 + rise, x1 - run :]):
             corner[:] = cv2.GC_BGD
-    return labels
-
-
-def _labels_from_guess(guess: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    size = float(np.sqrt(guess.sum()))
-    outer, inner = (
-        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-        for reach in (max(2, int(GROW * size)), max(1, int(SHRINK * size)))
-    )
-    labels = np.full(guess.shape, cv2.GC_BGD, np.uint8)
-    labels[cv2.dilate(guess, outer) > 0] = cv2.GC_PR_BGD
-    labels[guess > 0] = cv2.GC_PR_FGD
-    labels[cv2.erode(guess, inner, borderValue=1) > 0] = cv2.GC_FGD
     return labels
 
 
@@ -241,15 +238,9 @@ def _tidy(cut: Mask, box: Floats) -> Mask:
     return whole.astype(bool)
 
 
-def _component_at(mask: Mask, x: float, y: float) -> Mask:
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    label = labels[min(mask.shape[0] - 1, max(0, round(y))), min(mask.shape[1] - 1, max(0, round(x)))]
-    return labels == label if label else np.zeros_like(mask)
-
-
 def _ellipse(height: int, width: int, box: BBox) -> Mask:
     mask = np.zeros((height, width), np.uint8)
-    centre = (round((box[0] + box[2]) / 2), round((box[1] + box[3]) / 2))
-    axes = (max(1, round((box[2] - box[0]) / 2)), max(1, round((box[3] - box[1]) / 2)))
+    centre = round((box[0] + box[2]) / 2), round((box[1] + box[3]) / 2)
+    axes = max(1, round((box[2] - box[0]) / 2)), max(1, round((box[3] - box[1]) / 2))
     cv2.ellipse(mask, centre, axes, 0, 0, 360, 1, -1)
     return mask.astype(bool)

@@ -6,14 +6,15 @@ or one of several alike is not taken for the shadow: None is returned instead of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from cow_service.records import BBox
-from cow_service.vision.masks import Floats, Floats32, Mask, resized_mask, scaled
+from cow_service.vision.inpainting import quadratic_terms
+from cow_service.vision.masks import Floats, Floats32, Mask, lab_of, resized_mask, scaled
 from cow_service.vision.scene import Scene
 
 WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
@@ -57,6 +58,22 @@ class _Floor:
     top: int  # px: the row of the image at which it begins
     stretch: tuple[float, float]  # back to the image's size
 
+    @staticmethod
+    def below(bbox: BBox, scene: Scene) -> _Floor:
+        """The floor of a scene below an object in the air."""
+        scale = min(1.0, WORKING_WIDTH / (bbox[2] - bbox[0]))
+        small = scaled(scene.clean, scale)
+        height, width = small.shape[:2]
+        taken = np.zeros((scene.height, scene.width), bool)
+        for region in scene.regions:
+            region.mask.add_to(taken)
+        taken[max(0, int(bbox[1])) : int(np.ceil(bbox[3])), max(0, int(bbox[0])) : int(np.ceil(bbox[2]))] = True
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+        grown = cv2.dilate(resized_mask(taken, (width, height)).astype(np.uint8), kernel) > 0
+        top = min(height - 1, max(0, int(bbox[3] * scale)))
+        box = (bbox[0] * scale, bbox[1] * scale - top, bbox[2] * scale, bbox[3] * scale - top)
+        return _Floor(lab_of(small)[top:], ~grown[top:], box, top, (scene.width / width, scene.height / height))
+
 
 def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None where it has none or several patches could be it."""
@@ -68,8 +85,7 @@ def _find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     width = bbox[2] - bbox[0]
     if region is None or width < LEAST_WIDTH:
         return None
-    scale = min(1.0, WORKING_WIDTH / width)
-    floor = _floor(scene, bbox, scale)
+    floor = _Floor.below(bbox, scene)
     fits = [shadow for shadow in (_fit_ellipse(floor, ellipse) for ellipse in _candidates(floor)) if shadow is not None]
     fits.sort(key=lambda fit: -fit.shade)
     if not fits or (len(fits) > 1 and fits[1].shade > RIVAL_SHADE * fits[0].shade):
@@ -79,21 +95,6 @@ def _find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     (x0, y0, x1, y1), (x, y), (xx, yy, xy) = shadow.bbox, shadow.centre, shadow.spread
     box = (x0 * fx, (y0 + floor.top) * fy, x1 * fx, (y1 + floor.top) * fy)
     return Shadow(box, (x * fx, (y + floor.top) * fy), (xx * fx * fx, yy * fy * fy, xy * fx * fy), shadow.shade)
-
-
-def _floor(scene: Scene, bbox: BBox, scale: float) -> _Floor:
-    small = scaled(scene.clean, scale)
-    height, width = small.shape[:2]
-    lab = np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
-    taken = np.zeros((scene.height, scene.width), bool)
-    for region in scene.regions:
-        region.mask.add_to(taken)
-    taken[max(0, int(bbox[1])) : int(np.ceil(bbox[3])), max(0, int(bbox[0])) : int(np.ceil(bbox[2]))] = True
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
-    grown = cv2.dilate(resized_mask(taken, (width, height)).astype(np.uint8), kernel) > 0
-    top = min(height - 1, max(0, int(bbox[3] * scale)))
-    box = (bbox[0] * scale, bbox[1] * scale - top, bbox[2] * scale, bbox[3] * scale - top)
-    return _Floor(lab[top:], ~grown[top:], box, top, (scene.width / width, scene.height / height))
 
 
 def _candidates(floor: _Floor) -> Iterator[Ellipse]:
@@ -173,7 +174,7 @@ def _fit_ellipse(floor: _Floor, seen: Ellipse) -> Shadow | None:
     points = np.stack([xs + columns.start + 0.5, ys + rows.start + 0.5], axis=1).astype(np.float64)
     lab = floor.lab[rows, columns][free][::every].astype(np.float64)
     u, v = (points[:, 0] - x) / a, (points[:, 1] - y) / a
-    smooth = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    smooth = quadratic_terms(u, v)
     start = np.array([x + 0.5, y + 0.5, np.log(a), np.log(b), 0.0, np.log(0.15)])
     parameters, dark = _least_squares(points, lab[:, 0], smooth, start)
     inside = _soft_ellipse(points, parameters)
@@ -220,7 +221,6 @@ def _soft_ellipse(points: Floats, parameters: Floats) -> Floats:
 
 def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats) -> tuple[Floats, float]:
     """Damped Gauss-Newton over the ellipse; floor and darkness follow from it linearly."""
-
     basis = np.linalg.qr(smooth)[0]
     plain = light - basis @ (basis.T @ light)
 
@@ -234,7 +234,10 @@ def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats)
     rest, dark = residual(parameters)
     step = np.array([0.1, 0.1, 0.02, 0.02, 0.02, 0.05])
     for _ in range(MAX_ITERATIONS):
-        slopes = np.stack(list(_slopes(lambda p: residual(p)[0], parameters, rest, step)), axis=1)
+        slopes = np.stack(
+            [(residual(parameters + each)[0] - rest) / size for each, size in zip(np.diag(step), step, strict=True)],
+            axis=1,
+        )
         normal = slopes.T @ slopes
         move = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), slopes.T @ rest)
         tried = parameters + np.clip(move, -5 * step, 5 * step)
@@ -247,10 +250,3 @@ def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats)
         else:
             damping *= 5
     return parameters, dark
-
-
-def _slopes(function: Callable[[Floats], Floats], at: Floats, value: Floats, step: Floats) -> Iterator[Floats]:
-    for i, size in enumerate(step):
-        moved = at.copy()
-        moved[i] += size
-        yield (function(moved) - value) / size

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import Floats32, Image, Mask, scaled
+from cow_service.vision.masks import Image, Mask, scaled
 
 WORKING_SIDE = 896  # px: longer images are searched at this size
 THIN = 41  # px: side of the median window; narrower structures stand out from it
@@ -74,7 +74,11 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
             for tolerance in TOLERANCES:
                 same = np.asarray(cv2.bitwise_and(_alike(window, colour, tolerance), allowed), np.uint8)
                 for patch in _patches(same, most=0.30, flat=partial(_alike, window, colour, FLAT)):
-                    if _is_known(known, patch.box, patch.area) or 2 * patch.flat < patch.area:
+                    before = known.get(patch.box)
+                    if before is not None and abs(patch.area - before) <= ALIKE * before:
+                        continue
+                    known[patch.box] = patch.area
+                    if 2 * patch.flat < patch.area:
                         continue
                     stroke = Stroke(bx + patch.box[0], by + patch.box[1], patch.mask, colour)
                     if _is_drawn(image, stroke):
@@ -86,15 +90,6 @@ def _alike(image: Image, colour: Colour, tolerance: int) -> NDArray[np.uint8]:
     """255 where an image [h, w, 3] has a colour, within so many grey levels."""
     low, high = tuple(max(0, v - tolerance) for v in colour), tuple(min(255, v + tolerance) for v in colour)
     return np.asarray(cv2.inRange(image, low, high), np.uint8)
-
-
-def _is_known(known: dict[Box, int], box: Box, area: int) -> bool:
-    """Whether a patch of this box and nearly this area was seen before; records it if not."""
-    before = known.get(box)
-    if before is not None and abs(area - before) <= ALIKE * before:
-        return True
-    known[box] = area
-    return False
 
 
 def drawing_mask(image: Image, stroke: Stroke) -> Mask:
@@ -111,18 +106,15 @@ def drawing_mask(image: Image, stroke: Stroke) -> Mask:
     for width in range(1, OUTLINE_MOST + 1):
         wider = cv2.dilate(grown, kernel)
         ring = near[(wider > 0) & (grown == 0)].astype(np.float32)
-        if len(ring) and np.median(np.abs(ring - np.median(ring, axis=0)).max(axis=1)) < FLAT and _is_ink(ring):
-            reach = width + FRINGE + 1
+        if len(ring):
+            colour = np.median(ring, axis=0)
+            is_ink = colour.min() > 225 or colour.max() < 30  # outlines are white or black
+            if is_ink and np.median(np.abs(ring - colour).max(axis=1)) < FLAT:
+                reach = width + FRINGE + 1
         grown = wider
     mask = np.zeros(image.shape[:2], bool)
     mask[window] = cv2.dilate(patch, kernel, iterations=reach) > 0
     return mask
-
-
-def _is_ink(ring: Floats32) -> bool:
-    """Whether a ring of pixels [N, 3] has the white or black of an outline."""
-    colour = np.median(ring, axis=0)
-    return bool(colour.min() > 225 or colour.max() < 30)
 
 
 def full_size(mask: Mask, size: tuple[int, int]) -> Mask:
@@ -154,16 +146,12 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
     ring = cv2.dilate(near, _SQUARE) > near
     beyond = image[y0:y1, x0:x1][ring].astype(np.int16)
     sharp = (np.abs(beyond - np.array(stroke.colour, np.int16)) > SHARP).any(axis=1)
-    return bool(np.count_nonzero(sharp) > SHARP_SHARE * len(beyond)) and not _is_gap(image, stroke)
-
-
-def _is_gap(image: Image, stroke: Stroke) -> bool:
-    """Whether the patch has the colour of what surrounds it: floor seen between two objects."""
-    x, y, (h, w) = stroke.x, stroke.y, stroke.patch.shape
-    reach = max(h, w)
-    near = image[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
-    alike = np.count_nonzero(_alike(near, stroke.colour, FLAT)) - np.count_nonzero(stroke.patch)
-    return alike > GAP_SHARE * near.shape[0] * near.shape[1]
+    if np.count_nonzero(sharp) <= SHARP_SHARE * len(beyond):
+        return False
+    reach = max(h, w)  # what has the colour of its surroundings is floor that is seen between two objects
+    around = image[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
+    alike = np.count_nonzero(_alike(around, stroke.colour, FLAT)) - np.count_nonzero(stroke.patch)
+    return alike <= GAP_SHARE * around.shape[0] * around.shape[1]
 
 
 def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:

@@ -9,34 +9,31 @@ import cv2
 import numpy as np
 
 from cow_service.vision.inpainting import fill_hole
-from cow_service.vision.masks import Floats, Floats32, Image, Mask, scaled, window_of
+from cow_service.vision.masks import Floats, Floats32, Image, Mask, lab_of, scaled, window_of
 from cow_service.vision.trails import FADED, Position, Trail
 
 RIM, LEAST_RIM = 0.06, 2.0  # of the radius, px: around a position, mixed with the background
 APART = 0.03  # of the radius by which a place must lie outside all earlier positions to be surely the present one's
 
 
-def ghosts_of(trail: Trail, shape: tuple[int, int]) -> Mask:
-    """Mask [H, W] of the earlier positions of a trail and their rims, without the present one."""
-    return _grown(trail.older, shape) & ~trail.present.disc(shape)
-
-
-def without_ghosts(image: Image, trail: Trail, kept: Mask | None = None) -> Image:
+def without_earlier_positions(image: Image, trail: Trail, kept: Mask | None = None) -> Image:
     """The image [H, W, 3] with the present position of a trail alone. `kept` are other objects that stay."""
     shape = image.shape[0], image.shape[1]
-    ghosts = _grown(trail.older, shape)
+    earlier = np.zeros(shape, bool)
+    for position in trail.older:
+        earlier |= position.disc(shape, max(LEAST_RIM, RIM * position.radius))
     if kept is not None:
-        ghosts &= ~kept
+        earlier &= ~kept
     present = trail.present
-    reached = present.disc(shape, _rim(present))
-    hole = ghosts | reached if (ghosts & reached).any() else ghosts
+    reached = present.disc(shape, max(LEAST_RIM, RIM * present.radius))
+    hole = earlier | reached if (earlier & reached).any() else earlier
     filled = fill_hole(image, hole, kept)
-    window = window_of(ghosts & reached)
+    window = window_of(earlier & reached)
     result = image.copy()
-    result[ghosts] = filled[ghosts]
+    result[earlier] = filled[earlier]
     if window is not None:
         share, colours = _completed(image, trail, window)
-        over = (ghosts & reached)[window]
+        over = (earlier & reached)[window]
         mixed = share[..., None] * colours + (1 - share[..., None]) * filled[window]
         result[window] = np.where(over[..., None], np.round(mixed), result[window]).astype(np.uint8)
     return result
@@ -86,18 +83,6 @@ def _sampled(image: Image, of: Position, u: Floats32, v: Floats32) -> Floats32:
     return image[rows, columns].astype(np.float32)
 
 
-def _grown(positions: tuple[Position, ...], shape: tuple[int, int]) -> Mask:
-    mask = np.zeros(shape, bool)
-    for position in positions:
-        mask |= position.disc(shape, _rim(position))
-    return mask
-
-
-def _rim(position: Position) -> float:
-    """px."""
-    return max(LEAST_RIM, RIM * position.radius)
-
-
 WORKING_WIDTH = 16.0  # px: the image is searched at the size at which the ball is so wide
 LEAST_WIDTH = 16.0  # px of the ball in the image
 WIDTHS = (0.7, 0.85, 1.0, 1.15, 1.3)  # of the ball's
@@ -130,27 +115,21 @@ class _Row:
         return mask
 
 
-def without_ghost_shadows(image: Image, trail: Trail, objects: Mask) -> Image:
-    """The image [H, W, 3], its ghosts taken out, with the shadow of the present position alone.
+def without_earlier_shadows(image: Image, trail: Trail, objects: Mask) -> Image:
+    """The image [H, W, 3], its earlier positions taken out, with the shadow of the present position alone.
 
     `objects` [H, W] hide the floor, and stay. The image as it is where no shadows of a trail can be told.
     """
-    row = _find_row(image, trail, objects)
-    if row is None:
+    if 2 * trail.present.radius < LEAST_WIDTH:
         return image
+    found = _Floor.of(image, trail, objects, WORKING_WIDTH).darkest()
+    if found is None:
+        return image
+    row = _Floor.of(image, trail, objects, 2 * WORKING_WIDTH).fitted(found)
     shape = image.shape[0], image.shape[1]
     rim = cv2.dilate(objects.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     hole = row.mask(shape, slice(0, -1), GROWN) & ~row.mask(shape, slice(-1, None), OWN) & ~rim
     return fill_hole(image, hole, (row.mask(shape, slice(-1, None), GROWN) | rim) & ~hole)
-
-
-def _find_row(image: Image, trail: Trail, objects: Mask) -> _Row | None:
-    """The shadows, found at a coarse size and fitted at twice that; None where there are none."""
-    if 2 * trail.present.radius < LEAST_WIDTH:
-        return None
-    coarse = _Floor.of(image, trail, objects, WORKING_WIDTH)
-    found = coarse.darkest()
-    return None if found is None else _Floor.of(image, trail, objects, 2 * WORKING_WIDTH).fitted(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +165,9 @@ class _Floor:
 
     def darkest(self) -> Floats | None:
         """The row that is darkest against the floor about it; None where none is."""
-        allowed = _below(self.places[-1], self.width, self.shade.shape)
+        (x, y), (ys, xs) = self.places[-1].tolist(), np.mgrid[: self.shade.shape[0], : self.shade.shape[1]]
+        # Where the middle of the present position's shadow may lie.
+        allowed = (ys > y + (0.5 + NEAREST) * self.width) & (np.abs(xs - x) < SLANT * (ys - y) + 0.5 * self.width)
         best: tuple[float, Floats] | None = None
         for wide, flat, drift in product(WIDTHS, FLATNESS, DRIFTS):
             centres, half = self.ellipses(np.array([0.0, 0.0, wide, flat, drift]))
@@ -202,9 +183,8 @@ class _Floor:
         centres, half = self.ellipses(start)
         height, width = self.shade.shape
         ys, xs = np.mgrid[:height, :width]
-        near = np.hypot((xs[..., None] - centres[:, 0]) / half[0], (ys[..., None] - centres[:, 1]) / half[1]).min(
-            axis=2
-        )
+        across, down = (xs[..., None] - centres[:, 0]) / half[0], (ys[..., None] - centres[:, 1]) / half[1]
+        near = np.hypot(across, down).min(axis=2)
         kept = (near < FIT_REACH) & (self.weight > 0)
         points, shade = np.stack([xs[kept], ys[kept]], axis=1), self.shade[kept].astype(np.float64)
 
@@ -232,7 +212,7 @@ class _Floor:
 
 def _shade(small: Image, width: float) -> tuple[Floats32, Floats32]:
     """By what share each pixel [h, w] is darker than the floor about it, and 1 where it may be floor, else 0."""
-    lab = np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
+    lab = lab_of(small)
     side = int(1.3 * width) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     light = cv2.GaussianBlur(lab[..., 0], (0, 0), 0.7)
@@ -245,13 +225,6 @@ def _shade(small: Image, width: float) -> tuple[Floats32, Floats32]:
     off = np.hypot(lab[..., 1] - hue[0] * dimmed, lab[..., 2] - hue[1] * dimmed)
     plain = (off < SAME_HUE) & (shade < MOST_SHADE)
     return shade.astype(np.float32), plain.astype(np.float32)
-
-
-def _below(present: Floats, width: float, shape: tuple[int, ...]) -> Mask:
-    """Where the middle of the present position's shadow may lie [h, w]."""
-    ys, xs = np.mgrid[: shape[0], : shape[1]]
-    x, y = float(present[0]), float(present[1])
-    return (ys > y + (0.5 + NEAREST) * width) & (np.abs(xs - x) < SLANT * (ys - y) + 0.5 * width)
 
 
 def _darkest(

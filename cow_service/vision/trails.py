@@ -18,16 +18,18 @@ from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
 from cow_service.vision.masks import Floats, Image, Mask, iou
 
-LOOKS, LEAST_CONTRAST = 0.3, 12.0  # difference of the looks over the contrast, at most; grey levels of that contrast
+UNLIKE, LEAST_CONTRAST = 0.3, 12.0  # difference of appearance over the contrast, at most; grey levels of that contrast
 LEAST_OPACITY = 0.08
 MOST_UNREST = 12.0  # grey levels of a background's variation that are allowed for
-# Radii: offsets from the centre at which looks are compared.
+# Radii: offsets from the centre at which appearances are compared.
 OFFSETS = np.array([(r * math.cos(t), r * math.sin(t)) for r in (0.25, 0.5, 0.7, 0.85)
                     for t in np.linspace(0, 2 * math.pi, 24, endpoint=False)])  # fmt: skip
+_TURNS = np.linspace(0, 2 * math.pi, 48, endpoint=False)
+AROUND_RIM = np.concatenate([f * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1) for f in (1.15, 1.3)])  # the same
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class Appearance:
     """How circles of an RGB image [H, W, 3] look inside and about them, in grey levels."""
 
     image: Image
@@ -48,11 +50,14 @@ class Looks:
 
         Without `compared` they are known to.
         """
-        rings = [self._ring(i, chain) for i in range(len(chain))]
+        rings: list[Floats] = []  # colours around each, others left out
+        for i, circle in enumerate(chain):
+            outside = self._free(i, chain, AROUND_RIM, 1.1)
+            rings.append(self._at(circle, AROUND_RIM[outside] if outside.sum() > 8 else AROUND_RIM))
         about = [np.median(ring, axis=0) for ring in rings]
         unrest = [float(np.median(np.linalg.norm(r - a, axis=1))) for r, a in zip(rings, about, strict=True)]
         inner = [self._at(circle, OFFSETS) for circle in chain]
-        free = [self._free(i, chain) for i in range(len(chain))]
+        free = [self._free(i, chain, OFFSETS, 1.05) for i in range(len(chain))]
         strength = [float(np.abs(v[f] - b).mean()) if f.any() else 0.0
                     for v, b, f in zip(inner, about, free, strict=True)]  # fmt: skip
         model = max((0, len(chain) - 1), key=lambda i: strength[i])
@@ -74,20 +79,10 @@ class Looks:
         ys = np.clip(circle.y + circle.radius * offsets[:, 1], 0, self.image.shape[0] - 1).astype(int)
         return self.image[ys, xs].astype(np.float64)
 
-    def _free(self, i: int, chain: Sequence[Circle]) -> Mask:
-        """Which of `OFFSETS` of a circle lie in no other."""
-        circle = chain[i]
-        points = np.array([circle.x, circle.y]) + circle.radius * OFFSETS
-        return ~inside_any(points, [other for j, other in enumerate(chain) if j != i], 1.05)
-
-    def _ring(self, i: int, chain: Sequence[Circle]) -> Floats:
-        """Colours [N, 3] around a circle, others left out."""
-        circle = chain[i]
-        turns = np.linspace(0, 2 * math.pi, 48, endpoint=False)
-        ring = np.concatenate([f * np.stack([np.cos(turns), np.sin(turns)], axis=1) for f in (1.15, 1.3)])
-        points = np.array([circle.x, circle.y]) + circle.radius * ring
-        free = ~inside_any(points, [other for j, other in enumerate(chain) if j != i], 1.1)
-        return self._at(circle, ring[free] if free.sum() > 8 else ring)
+    def _free(self, i: int, chain: Sequence[Circle], offsets: Floats, factor: float) -> Mask:
+        """Which offsets [N, 2] (radii) of a circle lie in no other, their radii multiplied."""
+        points = np.array([chain[i].x, chain[i].y]) + chain[i].radius * offsets
+        return ~inside_any(points, [other for j, other in enumerate(chain) if j != i], factor)
 
 
 def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float | None:
@@ -99,14 +94,14 @@ def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float
     contrast = float(np.median(np.linalg.norm(model, axis=1)))
     if contrast < LEAST_CONTRAST:
         return None
-    if float(np.median(np.linalg.norm(plain, axis=1))) < LOOKS * contrast / 2:
+    if float(np.median(np.linalg.norm(plain, axis=1))) < UNLIKE * contrast / 2:
         return 1.0
     share = float((seen * model).sum() / (model**2).sum())
     rest = float(np.median(np.linalg.norm(seen - share * model, axis=1)))
     if math.isinf(unrest):
         return min(max(share, LEAST_OPACITY), 1.0)
     allowed = min(unrest, MOST_UNREST)
-    if not LEAST_OPACITY < share < 1.15 or rest > LOOKS * contrast * share + allowed:
+    if not LEAST_OPACITY < share < 1.15 or rest > UNLIKE * contrast * share + allowed:
         return None
     return min(share, 1.0)
 
@@ -189,7 +184,8 @@ class Trail:
         """The same positions with the present one at an end."""
         ends = self.positions[0], self.positions[-1]
         if end.near is not None:
-            gaps = [_gap(position, end.near) for position in ends]
+            x0, y0, x1, y1 = end.near
+            gaps = [math.dist(position.centre, ((x0 + x1) / 2, (y0 + y1) / 2)) for position in ends]
         elif end.side is not None:
             gaps = [-position.x * end.side[0] - position.y * end.side[1] for position in ends]
         else:
@@ -229,55 +225,64 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     edges = Edges.of(image)
     if edges is None:
         return ()
-    looks = Looks(image)
+    appearance = Appearance(image)
     ends = [circle for circle in edges.circles() if circle.support >= END_SUPPORT]
-    ends = [circle for circle in ends if looks.contrast(circle) >= LEAST_CONTRAST]
+    ends = [circle for circle in ends if appearance.contrast(circle) >= LEAST_CONTRAST]
     trails: list[Trail] = []
     tried = 0
     for a, b in itertools.combinations(ends, 2):
-        known = any(_is_part(circle, trail) for circle in (a, b) for trail in trails)
-        if tried < MAX_PAIRS and not known and _may_be_one(a, b) and looks.alike((a, b)):
+        known = any(
+            math.dist((circle.x, circle.y), position.centre) < 0.6 * position.radius
+            for circle in (a, b)
+            for trail in trails
+            for position in trail.positions
+        )
+        # Whether they may be positions of one ball with others between or beyond them.
+        apart, mean = math.dist((a.x, a.y), (b.x, b.y)), (a.radius + b.radius) / 2
+        small, large = sorted((a.radius, b.radius))
+        may_be_one = 0.25 * mean < apart < MOST_GAP * 3 * mean and large < SIZES**3 * small
+        if tried < MAX_PAIRS and not known and may_be_one and appearance.alike((a, b)):
             tried += 1
-            chain = _chain(edges, looks, a, b)
-            trail = None if chain is None else _trail(looks, chain)
+            chain = _chain(edges, appearance, a, b)
+            trail = None if chain is None else _trail(appearance, chain)
             if trail is not None:
                 trails.append(trail)
     whole: list[Trail] = []
     for trail in sorted(trails, key=lambda trail: -len(trail.positions)):
-        if not any(_share_positions(trail, other) for other in whole):
+        if not any(
+            math.dist(p.centre, q.centre) < 0.6 * max(p.radius, q.radius)
+            for other in whole
+            for p in trail.positions
+            for q in other.positions
+        ):
             whole.append(trail)
     return tuple(whole)
 
 
-def _share_positions(a: Trail, b: Trail) -> bool:
-    return any(math.dist(p.centre, q.centre) < 0.6 * max(p.radius, q.radius) for p in a.positions for q in b.positions)
-
-
-def _may_be_one(a: Circle, b: Circle) -> bool:
-    """Whether two circles may be positions of one ball with others between or beyond them."""
-    apart, mean = math.dist((a.x, a.y), (b.x, b.y)), (a.radius + b.radius) / 2
-    return 0.25 * mean < apart < MOST_GAP * 3 * mean and max(a.radius, b.radius) < SIZES**3 * min(a.radius, b.radius)
-
-
-def _chain(edges: Edges, looks: Looks, a: Circle, b: Circle) -> tuple[Circle, ...] | None:
+def _chain(edges: Edges, appearance: Appearance, a: Circle, b: Circle) -> tuple[Circle, ...] | None:
     """The circles along the path through two of them, in order; None where they are fewer than three, or no path."""
     best: tuple[Circle, ...] = ()
     reach = 0.5 * math.dist((a.x, a.y), (b.x, b.y)) + 1.6 * max(a.radius, b.radius)
     low, high = (min(a.x, b.x) - reach, min(a.y, b.y) - reach), (max(a.x, b.x) + reach, max(a.y, b.y) + reach)
     near = edges.within((*low, *high))
     for inner in range(3 * MAX_POSITIONS // 4):
-        chain = _between(near, looks, a, b, inner)
+        chain = _between(near, appearance, a, b, inner)
         if chain is None:
             continue
-        chain = _beyond(edges, looks, _beyond(edges, looks, chain)[::-1])
-        if len(chain) > max(2, len(best)) and _is_path(chain) and looks.alike(chain) and _is_outlined(edges, chain):
+        chain = _beyond(edges, appearance, _beyond(edges, appearance, chain)[::-1])
+        if (
+            len(chain) > max(2, len(best))
+            and _is_path(chain)
+            and appearance.alike(chain)
+            and _is_outlined(edges, chain)
+        ):
             best = chain
     for _ in range(2):  # both ends
-        best = _prolonged(edges, looks, best)[::-1] if best else best
+        best = _prolonged(edges, appearance, best)[::-1] if best else best
     return best or None
 
 
-def _prolonged(edges: Edges, looks: Looks, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
+def _prolonged(edges: Edges, appearance: Appearance, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
     """A chain with circles that its path leads on to, though too pale, or too much overlaid, to be compared."""
     while len(chain) < MAX_POSITIONS:
         x, y = (3 * getattr(chain[-1], at) - 3 * getattr(chain[-2], at) + getattr(chain[-3], at) for at in "xy")
@@ -285,13 +290,13 @@ def _prolonged(edges: Edges, looks: Looks, chain: tuple[Circle, ...]) -> tuple[C
         if found is None or found.support < PALE_SUPPORT or any(found.is_same(other) for other in chain):
             return chain
         near = math.dist((found.x, found.y), (x, y)) < PREDICTED * found.radius
-        if not near or not _is_path((*chain, found)) or looks.contrast(found) < LEAST_CONTRAST / 2:
+        if not near or not _is_path((*chain, found)) or appearance.contrast(found) < LEAST_CONTRAST / 2:
             return chain
         chain = (*chain, found)
     return chain
 
 
-def _between(edges: Edges, looks: Looks, a: Circle, b: Circle, inner: int) -> tuple[Circle, ...] | None:
+def _between(edges: Edges, appearance: Appearance, a: Circle, b: Circle, inner: int) -> tuple[Circle, ...] | None:
     """Two circles with so many others between them, evenly along an arc that bulges to one side or the other."""
     apart = math.dist((a.x, a.y), (b.x, b.y))
     gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
@@ -310,12 +315,12 @@ def _between(edges: Edges, looks: Looks, a: Circle, b: Circle, inner: int) -> tu
             if found is None or any(found.is_same(other) for other in (*chain, b)):
                 break
             chain.append(found)
-        if len(chain) == inner + 1 and _is_path((*chain, b)) and looks.alike((*chain, b)):
+        if len(chain) == inner + 1 and _is_path((*chain, b)) and appearance.alike((*chain, b)):
             return (*chain, b)
     return None
 
 
-def _beyond(edges: Edges, looks: Looks, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
+def _beyond(edges: Edges, appearance: Appearance, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
     """A chain with what goes on after its last circle."""
     while len(chain) < MAX_POSITIONS:
         last, before = chain[-1], chain[-2]
@@ -323,14 +328,15 @@ def _beyond(edges: Edges, looks: Looks, chain: tuple[Circle, ...]) -> tuple[Circ
         if len(chain) > 2:
             seeds.insert(0, (3 * last.x - 3 * before.x + chain[-3].x, 3 * last.y - 3 * before.y + chain[-3].y))
         else:
-            turned = [_turned(before, last, angle) for angle in (-0.35, 0.35, -0.7, 0.7)]
-            seeds += turned
+            dx, dy = last.x - before.x, last.y - before.y
+            for cosine, sine in ((math.cos(angle), math.sin(angle)) for angle in (-0.35, 0.35, -0.7, 0.7)):
+                seeds.append((last.x + dx * cosine - dy * sine, last.y + dx * sine + dy * cosine))
         longer = None
         for x, y in seeds:
             found = _fit_near(edges, x, y, last.radius**2 / before.radius)
             if found is not None and not any(found.is_same(other) for other in chain):
                 longer = (*chain, found)
-                if _is_path(longer) and looks.alike(longer):
+                if _is_path(longer) and appearance.alike(longer):
                     break
                 longer = None
         if longer is None:
@@ -351,11 +357,6 @@ def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
             if circle.support > SURE_SUPPORT:
                 break
     return max(near, key=lambda circle: circle.support, default=None)
-
-
-def _turned(before: Circle, last: Circle, angle: float) -> tuple[float, float]:
-    dx, dy = last.x - before.x, last.y - before.y
-    return (last.x + dx * math.cos(angle) - dy * math.sin(angle), last.y + dx * math.sin(angle) + dy * math.cos(angle))
 
 
 def _is_path(chain: Sequence[Circle]) -> bool:
@@ -398,9 +399,9 @@ def _is_outlined(edges: Edges, chain: Sequence[Circle]) -> bool:
     return True
 
 
-def _trail(looks: Looks, chain: tuple[Circle, ...]) -> Trail | None:
+def _trail(appearance: Appearance, chain: tuple[Circle, ...]) -> Trail | None:
     """The trail of a chain, its more opaque end last; where they are alike, that of which more is seen."""
-    shares = looks.opacities(chain, compared=False)
+    shares = appearance.opacities(chain, compared=False)
     if shares is None:
         return None
     opacity = np.clip(shares / shares.max(), 0, 1)
@@ -412,12 +413,3 @@ def _trail(looks: Looks, chain: tuple[Circle, ...]) -> Trail | None:
     rank = (opacity[0], opacity[-1]) if known else (chain[0].support, chain[-1].support)
     ordered = positions if rank[1] >= rank[0] else positions[::-1]
     return Trail(ordered, overlap or faded or (known and len(chain) > 3), known)
-
-
-def _is_part(circle: Circle, trail: Trail) -> bool:
-    return any(math.dist((circle.x, circle.y), p.centre) < 0.6 * p.radius for p in trail.positions)
-
-
-def _gap(position: Position, bbox: BBox) -> float:
-    """px from the centre of a position to that of a box."""
-    return math.dist(position.centre, ((bbox[0] + bbox[2]) / 2, (bbox[1] + bbox[3]) / 2))
