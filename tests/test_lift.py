@@ -166,7 +166,7 @@ class TestStanding:
         assert not found.stands
 
 
-class TestPlacedScene:
+class TestLayout:
     def test_a_camera_that_looks_up_sees_bodies_in_the_air(self) -> None:
         bodies = body((300, 150, 340, 190), "sphere"), body((100, 100, 200, 260), "cylinder")
         for draws in (likeliest(), ensemble(50)):
