@@ -18,6 +18,7 @@ BESIDE = 3.0  # px beside a body's box where the support's upper edge is looked 
 ENDS = 0.2  # of the height, at the upper and at the lower end, where a vessel has no handle
 HANDLE, BARE = 0.12, 0.05  # of the width: so far a handle reaches at least, and the other side at most
 WIDER = 1.15  # a support is so much wider than what stands on it
+LEAST_OVERLAP = 0.1  # of the narrower box: with less of it above the other, it is seen beside that
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,12 @@ class SeenBody:
         """Volume of the body that its outline would turn to about its axis, of that of the cylinder around it."""
         widths = self.mask.patch.sum(axis=1)
         return float(np.mean((widths / max(1, int(widths.max()))) ** 2)) if len(widths) else 1.0
+
+    def is_above(self, other: SeenBody) -> bool:
+        """Whether the picture shows it above another one."""
+        (x0, y0, x1, y1), (left, top, right, bottom) = self.bbox, other.bbox
+        overlap = min(x1, right) - max(x0, left)
+        return overlap > LEAST_OVERLAP * min(x1 - x0, right - left) and y0 + y1 < top + bottom
 
     @property
     def is_flying(self) -> bool:

@@ -60,42 +60,6 @@ def hollow_of(seen: SeenOpening, half_width: float, half_height: float, row: Flo
     return Hollow(opening, bottom, 2 * half_height * (1 - FLOOR_SHARE), sides)
 
 
-def wall_segments(hollow: Hollow, half_width: float, half_height: float) -> list[Floats]:
-    """The corners [8, 3] of each convex segment of the wall, which stands on the floor of the container."""
-    turn = math.pi / hollow.sides
-    angles = turn + 2 * turn * np.arange(hollow.sides + 1)
-    circle = np.stack([np.cos(angles), np.zeros_like(angles), np.sin(angles)], axis=1)
-    around = np.asarray(circle / math.cos(turn), np.float64)
-    levels = ((half_width, hollow.opening, half_height), (floor_radius(hollow, half_width), hollow.bottom, 0.0))
-    corners: list[Floats] = []
-    for outer, inner, height in levels:
-        level = np.array([0.0, height if height else half_height - hollow.depth, 0.0])
-        corners += [around * outer + level, around * inner + level]
-    return [np.concatenate([ring[i : i + 2] for ring in corners]) for i in range(hollow.sides)]
-
-
-def floor_radius(hollow: Hollow, half_width: float) -> float:
-    """Outer radius (m) of the floor of a container, or half its side."""
-    return hollow.bottom + half_width - hollow.opening
-
-
-def floor_thickness(hollow: Hollow, half_height: float) -> float:
-    """Metres."""
-    return 2 * half_height - hollow.depth
-
-
-def relative_density(hollow: Hollow, half_width: float, half_height: float) -> float:
-    """The density with which a container is as heavy as a solid body of its outline would be with a density of 1.
-
-    Things that hold others are made of heavier stuff than balls and blocks of their size; the thickness of their walls
-    is not seen, and must not decide what tips them.
-    """
-    low, high = floor_radius(hollow, half_width), half_width
-    outline = 2 * half_height * (low**2 + low * high + high**2) / 3
-    space = hollow.depth * (hollow.bottom**2 + hollow.bottom * hollow.opening + hollow.opening**2) / 3
-    return outline / max(outline - space, 0.02 * outline)
-
-
 RESTS = 0.3  # of the lower body's half height: how far apart the ends of two bodies may be that stand on each other
 
 
@@ -122,10 +86,25 @@ class RigidShape:
     hollow: Hollow | None = None  # it is an open container
     follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
 
+    @property
+    def is_active(self) -> bool:
+        """Whether it moves by itself."""
+        return self.starts or self.follows is not None
+
+    @property
+    def is_ghostly(self) -> bool:
+        """Whether it passes through everything."""
+        return self.ghost or self.follows is not None
+
     def stands_on(self, other: RigidShape) -> bool:
         """Whether its lower end is, at the start, about where the upper end of another body is."""
         low, top = self.position[1] - self.half_height, other.position[1] + other.half_height
         return abs(low - top) < RESTS * min(self.half_height, other.half_height)
+
+    def holds_middle_of(self, other: RigidShape) -> bool:
+        """Whether the middle of another body lies inside it, if it stands upright."""
+        right, up, ahead = (there - here for there, here in zip(other.position, self.position, strict=True))
+        return abs(up) < self.half_height and math.hypot(right, ahead) < self.half_width
 
 
 ENGINE_SIZE = 0.15  # m inside the engine: half the width of the first body of the first world
@@ -202,7 +181,11 @@ class _Engine:
         self.frames = range(0, num_frames, every)
         self.substeps = max(1, math.ceil((LEAST_STEPS if self.is_alone else LEAST_STEPS_OF_MANY) / fps))
         self.scale = ENGINE_SIZE / worlds[0][0].half_width
-        self.world = _empty_world(1 / (fps * self.substeps), min(GRAVITY * self.scale, MOST_GRAVITY))
+        self.world = PhysicsWorld(gravity=(0.0, -min(GRAVITY * self.scale, MOST_GRAVITY), 0.0))
+        self.world.set_num_threads(1)
+        parameters = self.world.integration_parameters
+        parameters.dt = 1 / (fps * self.substeps)
+        parameters.normalized_max_corrective_velocity = 1.0  # m/s: bodies that overlap part slowly
         self.collector = ChannelEventCollector()
         self.world.event_handler = self.collector  # pyright: ignore[reportAttributeAccessIssue]
         floor = Collider.halfspace((0.0, 1.0, 0.0)).friction(FLOOR_FRICTION).restitution(FLOOR_RESTITUTION)
@@ -215,51 +198,42 @@ class _Engine:
         self.middle = np.array([bodies[0].position for bodies in worlds]) * [self.scale, 0.0, self.scale]
         self.origin -= self.middle
         self.groups = [Group(1 << (k % side % COLOURS * COLOURS + k // side % COLOURS)) for k in range(len(worlds))]
-        self.led = {
-            (k, i): body.follows
-            for k, bodies in enumerate(worlds)
-            for i, body in enumerate(bodies)
-            if body.follows is not None
-        }
-        self.courses = {
-            (k, i): body.course
-            for k, bodies in enumerate(worlds)
-            for i, body in enumerate(bodies)
-            if body.course is not None
-        }
-        self.handles = [[self._add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
+        everything = [((k, i), body) for k, bodies in enumerate(worlds) for i, body in enumerate(bodies)]
+        self.followers = {which: body.follows for which, body in everything if body.follows is not None}
+        self.courses = {which: body.course for which, body in everything if body.course is not None}
+        self.handles = [[self.add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
         shape = len(worlds), len(worlds[0]), len(self.frames)
         self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
         self.meetings: list[list[Meeting]] = [[] for _ in worlds]
-        self.awake = [{i for i, body in enumerate(bodies) if _acts(body)} for bodies in worlds]
+        self.awake = [{i for i, body in enumerate(bodies) if body.is_active} for bodies in worlds]
         self.drift = np.zeros(shape[:2], bool)  # taken out: they go on in a straight line
         self.touching: list[dict[int, set[int]]] = [{} for _ in worlds]
         self.joined: dict[frozenset[tuple[int, int]], int] = {}  # pairs of colliders that touch, per pair of bodies
 
     def run(self) -> list[WorldRun]:
-        self._record([(k, i) for k, bodies in enumerate(self.worlds) for i in range(len(bodies))], 0)
+        self.record([(k, i) for k, bodies in enumerate(self.worlds) for i in range(len(bodies))], 0)
         for row in range(1, len(self.frames)):
-            self._advance(self.frames[row - 1])
+            self.advance(self.frames[row - 1])
             for moving in (self.positions, self.velocities, self.turns):
                 moving[:, :, row] = moving[:, :, row - 1]
             self.positions[:, :, row] += self.drift[..., None] * self.velocities[:, :, row] * (self.every / self.fps)
-            self._record([(k, i) for k, awake in enumerate(self.awake) for i in awake if not self.drift[k, i]], row)
+            self.record([(k, i) for k, awake in enumerate(self.awake) for i in awake if not self.drift[k, i]], row)
             if self.finished is not None:
                 for k in np.nonzero(self.finished(self.positions[:, 0, row], self.velocities[:, 0, row]))[0].tolist():
-                    self._take_out(k, 0, row)
+                    self.take_out(k, 0, row)
         return [
             WorldRun(self.positions[k], self.velocities[k], self.turns[k], self.meetings[k], set(self.awake[k]))
             for k in range(len(self.worlds))
         ]
 
-    def _add(self, k: int, i: int, body: RigidShape) -> RigidBodyHandle:
+    def add(self, k: int, i: int, body: RigidShape) -> RigidBodyHandle:
         """Adds a body; what neither moves nor is touched costs nothing."""
         x, y, z = (np.array(body.position) * self.scale + self.origin[k]).tolist()
         builder = RigidBody.kinematic_position_based() if body.follows is not None else RigidBody.dynamic()
         lift = GAP if body.falls and not body.ghost else 0.0
         builder = builder.translation((x, y + lift, z)).rotation(_rotation(body))
         builder = builder.gravity_scale(1.0 if body.falls else 0.0)
-        if _acts(body):
+        if body.is_active:
             x, y, z = (v * self.scale for v in body.velocity)
             builder = builder.linvel((x, y, z)).ccd_enabled(not body.ghost).soft_ccd_prediction(FORESEEN)
             if body.glides and body.shape == "sphere":  # it rolls
@@ -271,78 +245,62 @@ class _Engine:
         colliders: list[Collider | ColliderBuilder] = [
             _combined(part.friction(0.0 if body.glides else body.friction))
             .restitution(body.restitution)
-            .sensor(_passes(body))
+            .sensor(body.is_ghostly)
             .collision_groups(group)
             .active_events(ActiveEvents.COLLISION_EVENTS)
             for part in _colliders(body, self.scale)
         ]
         handle = self.world.add_body(builder, colliders=colliders)
-        for collider in self._body(handle).colliders:
+        for collider in self.body_of(handle).colliders:
             self.owner[collider.index] = k, i
         return handle
 
-    def _body(self, handle: RigidBodyHandle) -> RigidBody:
+    def body_of(self, handle: RigidBodyHandle) -> RigidBody:
         return self.world.rigid_bodies[handle]
 
-    def _advance(self, frame: int) -> None:
+    def advance(self, frame: int) -> None:
         """From one recorded frame to the next."""
         for step in range(self.every * self.substeps):
             time = frame / self.fps + step / (self.fps * self.substeps)
-            self._lead(time + 1 / (self.fps * self.substeps))
-            self._steer(time, 1 / (self.fps * self.substeps))
-            before = self._velocities() if self.is_alone else {}
+            self.steer(time, 1 / (self.fps * self.substeps))
+            before: dict[tuple[int, int], Floats] = {}  # velocities
+            if self.is_alone:
+                before = {(0, i): np.array(self.body_of(self.handles[0][i]).linvel.to_tuple()) for i in self.awake[0]}
             self.world.step()
             for event in self.collector.drain_collision_events():
                 first, second = event.collider1.index, event.collider2.index
-                if self._begins(first, second, event.started):
-                    self._meet(time, first, second, before)
+                # Containers have many colliders: bodies begin to touch with the first pair of them.
+                pair = frozenset((self.owner.get(first, FLOOR), self.owner.get(second, FLOOR)))
+                touching = self.joined.get(pair, 0)
+                self.joined[pair] = touching + 1 if event.started else max(0, touching - 1)
+                if event.started and touching == 0:
+                    self.meet(time, first, second, before)
 
-    def _begins(self, first: int, second: int, started: bool) -> bool:
-        """Whether two bodies begin to touch, by an event of two of their colliders: containers have many."""
-        pair = frozenset((self.owner.get(first, FLOOR), self.owner.get(second, FLOOR)))
-        before = self.joined.get(pair, 0)
-        self.joined[pair] = before + 1 if started else max(0, before - 1)
-        return started and before == 0
-
-    def _lead(self, time: float) -> None:
-        """Sets where bodies that follow a path are to be at a time."""
-        for (k, i), path in self.led.items():
-            at = min(time * self.fps, len(path) - 1.0)
+    def steer(self, time: float, step: float) -> None:
+        """Has bodies follow their paths and courses from a time on for one step (s)."""
+        for (k, i), path in self.followers.items():
+            at = min((time + step) * self.fps, len(path) - 1.0)
             low = min(int(at), len(path) - 2)
             there = (path[low] + (at - low) * (path[low + 1] - path[low])) * self.scale + self.origin[k]
-            self._body(self.handles[k][i]).set_next_kinematic_translation(tuple(there.tolist()))
-
-    def _steer(self, time: float, step: float) -> None:
-        """Gives bodies on a course the velocity that they have from a time on for one step (s)."""
+            self.body_of(self.handles[k][i]).set_next_kinematic_translation(tuple(there.tolist()))
         for (k, i), course in list(self.courses.items()):
             if course.changes(time - 1.5 * step, time + step):
-                self._set_velocity(k, i, course.mean_velocity(time, time + step))
+                body, shape = self.body_of(self.handles[k][i]), self.worlds[k][i]
+                x, y, z = (course.mean_velocity(time, time + step) * self.scale).tolist()
+                body.linvel = Vec3(x, body.linvel.y if shape.falls else y, z)
+                if shape.shape == "sphere" and shape.falls:  # on the floor it rolls
+                    radius = shape.half_width * self.scale
+                    body.angvel = Vec3(z / radius, 0.0, -x / radius)
             if course.end <= time:
-                self._let_go(k, i)
+                self.release(k, i)
 
-    def _set_velocity(self, k: int, i: int, velocity: Floats) -> None:
-        """Of a body [3] (m/s); what falls keeps its vertical velocity, and a sphere on the floor rolls."""
-        body, shape = self._body(self.handles[k][i]), self.worlds[k][i]
-        x, y, z = (velocity * self.scale).tolist()
-        body.linvel = Vec3(x, body.linvel.y if shape.falls else y, z)
-        if shape.shape == "sphere" and shape.falls:
-            radius = shape.half_width * self.scale
-            body.angvel = Vec3(z / radius, 0.0, -x / radius)
-
-    def _let_go(self, k: int, i: int) -> None:
+    def release(self, k: int, i: int) -> None:
         """A body glides no more: from now on it is subject to friction."""
         self.courses.pop((k, i), None)
-        for collider in self._body(self.handles[k][i]).colliders:
+        for collider in self.body_of(self.handles[k][i]).colliders:
             self.world.colliders[collider].friction = self.worlds[k][i].friction
 
-    def _velocities(self) -> dict[tuple[int, int], Floats]:
-        return {
-            (k, i): np.array(self._body(self.handles[k][i]).linvel.to_tuple())
-            for k, awake in enumerate(self.awake)
-            for i in awake
-        }
-
-    def _meet(self, time: float, first: int, second: int, before: dict[tuple[int, int], Floats]) -> None:
+    def meet(self, time: float, first: int, second: int, before: dict[tuple[int, int], Floats]) -> None:
         """Notes that two colliders begin to touch. The lower body comes first, the floor last."""
         met = sorted(self.owner[index] for index in (first, second) if index in self.owner)
         if not met:
@@ -350,29 +308,28 @@ class _Engine:
         (k, a), b = met[0], met[1][1] if len(met) > 1 else None
         impulse = 0.0
         if (k, a) in before:
-            after = np.array(self._body(self.handles[k][a]).linvel.to_tuple())
+            after = np.array(self.body_of(self.handles[k][a]).linvel.to_tuple())
             impulse = float(np.linalg.norm(after - before[k, a])) / self.scale
         self.meetings[k].append(Meeting(time, a, b, impulse))
-        if b is None or _passes(self.worlds[k][a]) or _passes(self.worlds[k][b]):
+        if b is None or self.worlds[k][a].is_ghostly or self.worlds[k][b].is_ghostly:
             return
         self.touching[k].setdefault(a, set()).add(b)
         self.touching[k].setdefault(b, set()).add(a)
         if not {a, b} & self.awake[k]:  # bodies that stand close together touch when nothing moves
             return
-        self._wake(k, {a, b})
+        self.wake(k, {a, b})
         one, other = self.worlds[k][a], self.worlds[k][b]
         if time < AT_START and (one.stands_on(other) or other.stands_on(one)):
             return
         for i in (a, b):
             if self.worlds[k][i].glides:
                 course = self.courses.get((k, i))
-                self._let_go(k, i)
+                self.release(k, i)
                 if course is not None and course.halts:
-                    for stopped in (a, b):
-                        self._body(self.handles[k][stopped]).linvel = Vec3(0.0, 0.0, 0.0)
-                        self._body(self.handles[k][stopped]).angvel = Vec3(0.0, 0.0, 0.0)
+                    for stopped in (self.body_of(self.handles[k][each]) for each in (a, b)):
+                        stopped.linvel = stopped.angvel = Vec3(0.0, 0.0, 0.0)
 
-    def _wake(self, k: int, bodies: set[int]) -> None:
+    def wake(self, k: int, bodies: set[int]) -> None:
         """Has bodies recorded from now on, and what they have touched: it stands on them or leans against them."""
         waiting = list(bodies)
         while waiting:
@@ -380,11 +337,11 @@ class _Engine:
             self.awake[k].add(i)
             waiting += self.touching[k].get(i, set()) - self.awake[k]
 
-    def _record(self, which: Sequence[tuple[int, int]], row: int) -> None:
+    def record(self, which: Sequence[tuple[int, int]], row: int) -> None:
         """Writes down where some bodies of worlds are."""
         if not which:
             return
-        bodies = [self._body(self.handles[k][i]) for k, i in which]
+        bodies = [self.body_of(self.handles[k][i]) for k, i in which]
         k, i = (np.array(column) for column in zip(*which, strict=True))
         positions = np.array([body.translation.to_tuple() for body in bodies]) - self.origin[k]
         self.positions[k, i, row] = positions / self.scale
@@ -393,27 +350,14 @@ class _Engine:
             turns = [body.rotation for body in bodies]
             self.turns[k, i, row] = np.array([(turn.i, turn.j, turn.k, turn.w) for turn in turns])
         for far in np.nonzero(np.abs((positions - self.middle[k])[:, [0, 2]]).max(axis=1) > REACH)[0].tolist():
-            self._take_out(*which[far], row)
+            self.take_out(*which[far], row)
 
-    def _take_out(self, k: int, i: int, row: int) -> None:
+    def take_out(self, k: int, i: int, row: int) -> None:
         """Leaves a body out of what is computed from now on: it keeps its last velocity over the floor."""
         if not self.drift[k, i]:
-            self._body(self.handles[k][i]).is_enabled = False
+            self.body_of(self.handles[k][i]).is_enabled = False
             self.drift[k, i] = True
             self.velocities[k, i, row, 1] = 0.0
-
-
-def _empty_world(dt: float, gravity: float) -> PhysicsWorld:
-    world = PhysicsWorld(gravity=(0.0, -gravity, 0.0))
-    world.set_num_threads(1)
-    parameters = world.integration_parameters
-    parameters.dt = dt
-    parameters.normalized_max_corrective_velocity = 1.0  # m/s: bodies that overlap part slowly
-    return world
-
-
-def _acts(body: RigidShape) -> bool:
-    return body.starts or body.follows is not None
 
 
 def _rotation(body: RigidShape) -> tuple[float, float, float]:
@@ -426,11 +370,6 @@ def _rotation(body: RigidShape) -> tuple[float, float, float]:
     return x * angle, y * angle, z * angle
 
 
-def _passes(body: RigidShape) -> bool:
-    """Whether it passes through everything."""
-    return body.ghost or body.follows is not None
-
-
 def _combined(collider: ColliderBuilder) -> ColliderBuilder:
     rule = CoefficientCombineRule.MULTIPLY
     return collider.friction_combine_rule(rule).restitution_combine_rule(rule)
@@ -438,21 +377,40 @@ def _combined(collider: ColliderBuilder) -> ColliderBuilder:
 
 def _colliders(body: RigidShape, scale: float) -> list[ColliderBuilder]:
     """Of one solid piece, or a container's floor and wall segments."""
-    if body.hollow is None:
-        return [_collider(body, scale).density(body.density)]
-    sizes = body.hollow, body.half_width, body.half_height
-    half, radius = floor_thickness(body.hollow, body.half_height) / 2 * scale, floor_radius(*sizes[:2]) * scale
-    # A flat cylinder stands on the floor as a hull of its corners does not: that sinks into it.
-    floor = Collider.cylinder(half, radius) if body.hollow.sides > BOX_SIDES else Collider.cuboid(radius, half, radius)
-    parts = [floor.translation((0.0, half - body.half_height * scale, 0.0))]
-    parts += [Collider.convex_hull(corners * scale) for corners in wall_segments(*sizes)]
-    return [part.density(body.density * relative_density(*sizes)) for part in parts]
-
-
-def _collider(body: RigidShape, scale: float) -> ColliderBuilder:
     width, height = body.half_width * scale, body.half_height * scale
+    if body.hollow is not None:
+        return _container_colliders(body, body.hollow, scale)
     if body.shape == "sphere":
-        return Collider.ball(width)
-    if body.shape == "box":
-        return Collider.cuboid(width, height, body.half_depth * scale)
-    return Collider.cylinder(height, width) if body.shape == "cylinder" else Collider.cone(height, width)
+        solid = Collider.ball(width)
+    elif body.shape == "box":
+        solid = Collider.cuboid(width, height, body.half_depth * scale)
+    else:
+        solid = Collider.cylinder(height, width) if body.shape == "cylinder" else Collider.cone(height, width)
+    return [solid.density(body.density)]
+
+
+def _container_colliders(body: RigidShape, hollow: Hollow, scale: float) -> list[ColliderBuilder]:
+    """A floor, and convex segments of the wall that stands on it."""
+    half_width, half_height = body.half_width, body.half_height
+    foot = hollow.bottom + half_width - hollow.opening  # m: outer radius of the floor, or half its side
+    turn = math.pi / hollow.sides
+    angles = turn + 2 * turn * np.arange(hollow.sides + 1)
+    circle = np.stack([np.cos(angles), np.zeros_like(angles), np.sin(angles)], axis=1)
+    circle = np.asarray(circle / math.cos(turn), np.float64)
+    rings: list[Floats] = []
+    levels = ((half_width, hollow.opening, half_height), (foot, hollow.bottom, half_height - hollow.depth))
+    for outer, inner, height in levels:
+        level = np.array([0.0, height, 0.0])
+        rings += [circle * outer + level, circle * inner + level]
+    half, radius = (2 * half_height - hollow.depth) / 2 * scale, foot * scale
+    # A flat cylinder stands on the floor as a hull of its corners does not: that sinks into it.
+    floor = Collider.cylinder(half, radius) if hollow.sides > BOX_SIDES else Collider.cuboid(radius, half, radius)
+    parts = [floor.translation((0.0, half - half_height * scale, 0.0))]
+    for i in range(hollow.sides):
+        parts.append(Collider.convex_hull(np.concatenate([ring[i : i + 2] for ring in rings]) * scale))
+    # As heavy as a solid body of its outline: things that hold others are made of heavier stuff than balls and blocks
+    # of their size, and the thickness of their walls is not seen and must not decide what tips them.
+    outline = 2 * half_height * (foot**2 + foot * half_width + half_width**2) / 3
+    space = hollow.depth * (hollow.bottom**2 + hollow.bottom * hollow.opening + hollow.opening**2) / 3
+    density = body.density * (outline / max(outline - space, 0.02 * outline))
+    return [part.density(density) for part in parts]

@@ -145,17 +145,24 @@ def _events_of(
 ) -> Events:
     enough = COVERED * np.exp(COVERED_SIGMA * draws[:, COLUMN["outline"]])[:, None]
     eligible, count = np.ones(len(bodies), bool), len(bodies)
-    on = worlds.layout.supports[subject]
+    on, loads = worlds.layout.supports[subject], worlds.layout.loads_of(subject)
     eligible[[0, subject, *([] if on is None else [on])]] = False
     times: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
     partly: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
     most: PerKind = {kind: np.zeros((len(draws), count)) for kind in KINDS}
-    times["touches"] = _touches(subject, worlds, count, on)
+    # When it first touches each other one, once it moves itself.
+    for k, (shapes, run) in enumerate(zip(worlds.shapes, worlds.runs, strict=True)):
+        since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
+        for meeting in run.meetings:
+            if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
+                other = meeting.b if meeting.a == subject else meeting.a
+                if other != on and other not in loads:
+                    times["touches"][k, other] = min(times["touches"][k, other], meeting.time)
     partly["touches"] = times["touches"]
     path, step = paths[subject], worlds.every / fps
     clock = np.arange(path.depth.shape[1]) * step
     for other in range(count):
-        if other in (subject, on) or other in worlds.layout.loads_of(subject):
+        if other in (subject, on) or other in loads:
             continue
         found = shares(bodies[subject].mask, path, bodies[other].mask, paths[other])
         before = clock[None] <= times["touches"][:, other : other + 1] + step
@@ -165,19 +172,6 @@ def _events_of(
             times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)
             partly[kind][:, other] = np.where(seen >= ANY_PART, clock[None], NEVER).min(axis=1)
     return Events(times, most, eligible, partly, subject)
-
-
-def _touches(subject: int, worlds: Worlds, count: int, on: int | None) -> Floats:
-    """[K, B]: when a body first touches each other one, once it moves itself."""
-    times = np.full((len(worlds.runs), count), NEVER)
-    for k, (shapes, run) in enumerate(zip(worlds.shapes, worlds.runs, strict=True)):
-        since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
-        for meeting in run.meetings:
-            if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
-                other = meeting.b if meeting.a == subject else meeting.a
-                if other != on and other not in worlds.layout.loads_of(subject):
-                    times[k, other] = min(times[k, other], meeting.time)
-    return times
 
 
 def encounters(

@@ -13,12 +13,11 @@ from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN, quantiles
 from cow_service.physics.lift import FARTHEST, NEAREST, Cameras, LiftedBody, above, in_the_air
-from cow_service.records import FALLING_KINDS, BBox, Cue, Motion
+from cow_service.records import FALLING_KINDS, Cue, Motion
 from cow_service.vision.masks import Floats
 
 HUNG = 4.0  # how much likelier it hangs over that than where the camera's priors have it
 HUNG_SIGMA = 0.3  # of the mover's half width: how far ahead of the other it is
-LEAST_OVERLAP = 0.1  # of the narrower box: with less of it above the other, it is seen beside that
 # Degrees, one standard deviation of a direction in the image, by where it was read.
 TURN_SIGMA: dict[Cue, float] = {
     "arrow": 1.5, "trail": 1.5, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
@@ -121,31 +120,31 @@ class _Picture:
         bodies, motion, draws = self.bodies, self.motion, self.draws
         mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
         if not flies(mover, motion):
-            share = self._depth_share(cameras)
-            unit = self._standing(0, cameras, draws, share)
+            share = self.depth_share(cameras)
+            unit = self.standing(0, cameras, draws, share)
             if unit is not None:
                 cameras = cameras.at_height(depth / np.maximum(cameras.depth(unit.centre), 1e-6))
-                return cameras, [self._body(i, cameras, depth, share if i == 0 else 1.0) for i in range(len(bodies))]
+                return cameras, [self.body_at(i, cameras, depth, share if i == 0 else 1.0) for i in range(len(bodies))]
         ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
         height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
-        if motion.kind == "fall" and asked is not None and _is_above(mover.bbox, bodies[asked].bbox):
-            below = self._standing(asked, cameras.at_height(np.ones(len(draws))), draws)
+        if motion.kind == "fall" and asked is not None and mover.is_above(bodies[asked]):
+            below = self.standing(asked, cameras.at_height(np.ones(len(draws))), draws)
             if below is not None and not bodies[asked].is_flying:
                 height = _height_over(ball, height, below.centre[:, 2], fit, draws)
         cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
         flying = in_the_air(cameras, mover.bbox, mover.shape, depth)
-        return cameras, [flying, *(self._body(i, cameras, depth) for i in range(1, len(bodies)))]
+        return cameras, [flying, *(self.body_at(i, cameras, depth) for i in range(1, len(bodies)))]
 
-    def _body(self, index: int, cameras: Cameras, depth: Floats, depth_share: float = 1.0) -> LiftedBody:
+    def body_at(self, index: int, cameras: Cameras, depth: Floats, depth_share: float = 1.0) -> LiftedBody:
         """A body where it stands, or else in the air, about at the depth [K] (m) of the mover."""
         body = self.bodies[index]
-        standing = None if body.is_flying else self._standing(index, cameras, self.draws, depth_share)
+        standing = None if body.is_flying else self.standing(index, cameras, self.draws, depth_share)
         if standing is not None and NEAREST < cameras.depth(standing.centre)[0] / depth[0] < FARTHEST:
             return standing
         guess = depth if index == 0 else depth * np.exp(DEPTH_SIGMA * self.draws[:, COLUMN["foot"]])
         return in_the_air(cameras, body.bbox, body.shape, guess)
 
-    def _standing(self, index: int, cameras: Cameras, draws: Floats, depth_share: float = 1.0) -> LiftedBody | None:
+    def standing(self, index: int, cameras: Cameras, draws: Floats, depth_share: float = 1.0) -> LiftedBody | None:
         """A body on the floor, or on the body that carries it, which stands on the floor."""
         body, on = self.bodies[index], self.supports[index]
         plane = np.zeros(len(draws))
@@ -155,10 +154,10 @@ class _Picture:
                 plane = np.minimum(support.top, 0.95 * cameras.height)
         return above(cameras, body.core, body.shape, draws, plane, depth_share, body.taper)
 
-    def _depth_share(self, cameras: Cameras) -> float:
+    def depth_share(self, cameras: Cameras) -> float:
         """How deep the mover is along the line of sight, of its width: a vehicle is longer along its heading."""
         motion, first = self.motion, cameras.repeated(1)
-        unit = self._standing(0, first, self.draws[:1]) if self.bodies[0].elongated else None
+        unit = self.standing(0, first, self.draws[:1]) if self.bodies[0].elongated else None
         if unit is None or motion.direction is None or motion.kind != "linear":
             return 1.0
         way = _along_floor(unit, motion, first, np.array([motion.direction]))[0]
@@ -166,13 +165,6 @@ class _Picture:
         along = abs(float(way[[0, 2]] @ sight))
         across = math.sqrt(max(0.0, 1 - along**2))
         return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
-
-
-def _is_above(mover: BBox, asked: BBox) -> bool:
-    """Whether the picture shows the mover above what is asked about."""
-    overlap = min(mover[2], asked[2]) - max(mover[0], asked[0])
-    narrower = min(mover[2] - mover[0], asked[2] - asked[0])
-    return overlap > LEAST_OVERLAP * narrower and mover[1] + mover[3] < asked[1] + asked[3]
 
 
 def _height_over(mover: LiftedBody, heights: Floats, ahead_per_height: Floats, fit: CameraFit, draws: Floats) -> Floats:

@@ -142,7 +142,7 @@ def settle(
         current = [_at_rest(bodies, run) for bodies, run in zip(released, runs, strict=True)]
         ends, clearance, above = zip(*found, strict=True)
         results: tuple[PlacementResult, ...] = tuple(
-            "overlaps" if any(_holds_middle(bodies[goal.body], bodies[i]) for i in flying) else end
+            "overlaps" if any(bodies[goal.body].holds_middle_of(bodies[i]) for i in flying) else end
             for bodies, end in zip(current, ends, strict=True)
         )
         current = [_made_room(bodies, goal.body, free) for bodies in current]
@@ -190,7 +190,7 @@ def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
         whole = replace(target, half_height=half, position=(x, y + half - target.half_height, z), hollow=hollow)
         bodies[goal.targets[0]] = whole
     body = bodies[goal.body]
-    x, y, z = _end(goal, bodies)
+    x, y, z = _place_of_release(goal, bodies)
     aim = body.half_width * AIM_SIGMA
     tip = goal.relation == "onto" and bodies[goal.targets[0]].shape in ("sphere", "cone")
     x += body.half_width * (OFF_TOP if tip else AIM_OFF) + aim * float(row[COLUMN["let_go_right"]])
@@ -200,7 +200,7 @@ def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
     return tuple(bodies)
 
 
-def _end(goal: PlacementGoal, bodies: Sequence[RigidShape]) -> tuple[float, float, float]:
+def _place_of_release(goal: PlacementGoal, bodies: Sequence[RigidShape]) -> tuple[float, float, float]:
     """Where the middle of a body is released (m)."""
     body, target = bodies[goal.body], bodies[goal.targets[0]]
     up = body.half_height + DROP * body.half_width
@@ -211,25 +211,17 @@ def _end(goal: PlacementGoal, bodies: Sequence[RigidShape]) -> tuple[float, floa
     if goal.relation == "between":
         other = bodies[goal.targets[1]].position
         return (x + other[0]) / 2, bottom + up, (z + other[2]) / 2
-    right, ahead = _side(goal, target)
+    # The side of the target, as a unit vector right and ahead: as the camera sees it, or as the target goes.
+    speed, distance = math.hypot(target.velocity[0], target.velocity[2]), max(math.hypot(x, z), 1e-9)
+    sign = {"in-front-of": -1.0, "behind": 1.0, "left-of": -1.0, "right-of": 1.0}.get(goal.relation, float(goal.side))
+    if goal.by_heading and speed > 0:
+        right, ahead = -sign * target.velocity[0] / speed, -sign * target.velocity[2] / speed
+    elif goal.relation in ("in-front-of", "behind"):
+        right, ahead = sign * (x / distance), sign * (z / distance)
+    else:
+        right, ahead = sign * (z / distance), sign * (-x / distance)
     away = _reach(target, right, ahead) + _reach(body, right, ahead) + BESIDE_GAP * body.half_width
     return x + away * right, bottom + up, z + away * ahead
-
-
-def _side(goal: PlacementGoal, target: RigidShape) -> tuple[float, float]:
-    """The unit vector right and ahead on which side of a target a body is put: as the camera sees it, or as it goes."""
-    x, _, z = target.position
-    speed = math.hypot(target.velocity[0], target.velocity[2])
-    if goal.by_heading and speed > 0:
-        sign = 1.0 if goal.relation == "in-front-of" else -1.0
-        return sign * target.velocity[0] / speed, sign * target.velocity[2] / speed
-    distance = max(math.hypot(x, z), 1e-9)
-    sight, across = (x / distance, z / distance), (z / distance, -x / distance)
-    if goal.relation in ("in-front-of", "behind"):
-        sign = -1.0 if goal.relation == "in-front-of" else 1.0
-        return sign * sight[0], sign * sight[1]
-    sign = {"left-of": -1.0, "right-of": 1.0}.get(goal.relation, float(goal.side))
-    return sign * across[0], sign * across[1]
 
 
 def _reach(body: RigidShape, right: float, ahead: float) -> float:
@@ -292,7 +284,12 @@ def classify(
         way, half = np.array(second.position) - np.array(first.position), released[body].half_width
         free = math.hypot(way[0], way[2]) - first.half_width - second.half_width
         clearance = (free - 2 * half) / max(free, 1e-3 * half)
-    if clearance < 0 or any(_overlap(released[body], other) for i, other in enumerate(lying) if i != body):
+    here, overlaps = released[body], clearance < 0
+    for other in (*lying[:body], *lying[body + 1 :]):
+        away = math.hypot(*(here.position[i] - other.position[i] for i in (0, 2)))
+        level = abs(here.position[1] - other.position[1]) < here.half_height + other.half_height
+        overlaps |= level and away < here.half_width + other.half_width - OVERLAPPING * here.half_width
+    if overlaps:
         return "overlaps", clearance, math.nan
     tips = released[body].shape != "sphere" and _upright(run.turns[body, -1]) < TIPPED
     return ("tips" if tips else "beside"), clearance, math.nan
@@ -351,19 +348,6 @@ def _upright(turn: Floats) -> float:
     """Upright component of a body's axis."""
     x, _, z, _ = (float(v) for v in turn)
     return 1 - 2 * (x * x + z * z)
-
-
-def _overlap(body: RigidShape, other: RigidShape) -> bool:
-    """Whether a body is put where another one is."""
-    away = math.hypot(*(body.position[i] - other.position[i] for i in (0, 2)))
-    level = abs(body.position[1] - other.position[1]) < body.half_height + other.half_height
-    return level and away < body.half_width + other.half_width - OVERLAPPING * body.half_width
-
-
-def _holds_middle(body: RigidShape, other: RigidShape) -> bool:
-    """Whether the middle of another body lies inside a body that stands upright."""
-    right, up, ahead = (there - here for there, here in zip(other.position, body.position, strict=True))
-    return abs(up) < body.half_height and math.hypot(right, ahead) < body.half_width
 
 
 def _at_rest(bodies: Shapes, run: WorldRun) -> Shapes:

@@ -146,22 +146,22 @@ class _Draw:
                 )
             )
         velocities = [legs[k] for legs in (layout.velocity, *layout.further)]
-        bodies[0] = self._set_going(0, bodies[0], given.motion, velocities, "speed")
+        bodies[0] = self.set_going(0, bodies[0], given.motion, velocities, "speed")
         for loose in layout.unsupported:
             bodies[loose] = replace(bodies[loose], starts=True)
         for i, motion in given.others.items():
             if i < len(bodies):  # else it is taken away
-                bodies[i] = self._set_going(i, bodies[i], motion, [layout.others[i][k]], "other_speed")
+                bodies[i] = self.set_going(i, bodies[i], motion, [layout.others[i][k]], "other_speed")
         return tuple(bodies)
 
-    def _set_going(
+    def set_going(
         self, index: int, body: RigidShape, motion: Motion, velocities: Sequence[Floats], speed: str
     ) -> RigidShape:
         """A body that is thrown, released, moves by itself, or follows a path; velocities [3] are those of its legs."""
         given, seen, velocity = self.given, self.given.bodies[index], velocities[0]
         changes: dict[str, Any] = {"velocity": tuple(velocity.tolist()), "starts": motion.kind != "static"}
         if index == 0 and given.prescribed is not None:
-            changes |= {"follows": self._along(given.prescribed), "falls": False}
+            changes |= {"follows": self.along_path(given.prescribed), "falls": False}
         else:
             changes["falls"] = motion.kind in FALLING_KINDS or not flies(seen, motion)
             changes["glides"] = motion.kind == "linear"
@@ -179,7 +179,7 @@ class _Draw:
             changes |= {"shape": "box", "half_width": length, "half_depth": VEHICLE_WIDTH * length, "yaw": yaw}
         return replace(body, **changes)
 
-    def _along(self, path: PrescribedMotion) -> Floats:
+    def along_path(self, path: PrescribedMotion) -> Floats:
         """Positions [F, 3] along a path: on the floor for what stands there, if its foot is below the horizon."""
         mover, cameras, k = self.layout.bodies[0], self.layout.cameras, self.k
         height = float(cameras.height[k])
