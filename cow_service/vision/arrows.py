@@ -65,6 +65,25 @@ class _Profile:
     axis: Floats  # unit vector along the shaft
     centre: Floats  # a point on it
 
+    def is_arrow_like(self) -> bool:
+        """Whether the shaft keeps its width, and the head is symmetric, of plausible length and tapers to a tip."""
+        extent, thickness, head_width, peak = self.extent, self.thickness, self.head_width, self.peak
+        n = len(extent)
+        head = extent[peak:]
+        shaft_extent = extent[max(1, n // 20) : max(self.neck - 1, n // 3)]
+        steady = float(np.nanmean(np.abs(shaft_extent - thickness) <= max(1.6, 0.3 * thickness)))
+        head_length = n - 1 - peak
+        return not (
+            steady < 0.75
+            or len(shaft_extent) < 0.25 * n
+            or head_length < 0.35 * (head_width - thickness) / 2
+            or head_length > 0.7 * n
+            or head_length > 2.5 * head_width
+            or abs(self.middle) > 0.22 * head_width + 1
+            or float(np.nanmean(np.diff(head) <= 1.5)) < 0.9
+            or head[-1] > 0.45 * head_width + thickness
+        )
+
 
 def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[Arrow, ...]:
     """Drawn arrows among the strokes of an image whose full size is [height, width]; overlapping findings are one."""
@@ -131,7 +150,7 @@ def _measure(points: Floats, centre: Floats, axis: Floats, patch: Mask, least_he
     for _ in range(2):
         if profile is not None:
             profile = _profile(points, profile.centre, profile.axis, least_head)
-    if profile is None or not _is_arrow_like(profile):
+    if profile is None or not profile.is_arrow_like():
         return None
     tail, tip = profile.centre + profile.axis * profile.start, profile.centre + profile.axis * profile.end
     thickness, head_width = profile.thickness, profile.head_width
@@ -179,26 +198,6 @@ def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) ->
     along = (points - origin) @ line
     start, end = float(along.min()), float(along.max())
     return _Profile(extent, start, end, thickness, head_width, peak, neck, middle, line, origin)
-
-
-def _is_arrow_like(profile: _Profile) -> bool:
-    """Whether the shaft keeps its width, and the head is symmetric, of plausible length and tapers to a tip."""
-    extent, thickness, head_width, peak = profile.extent, profile.thickness, profile.head_width, profile.peak
-    n = len(extent)
-    head = extent[peak:]
-    shaft_extent = extent[max(1, n // 20) : max(profile.neck - 1, n // 3)]
-    steady = float(np.nanmean(np.abs(shaft_extent - thickness) <= max(1.6, 0.3 * thickness)))
-    head_length = n - 1 - peak
-    return not (
-        steady < 0.75
-        or len(shaft_extent) < 0.25 * n
-        or head_length < 0.35 * (head_width - thickness) / 2
-        or head_length > 0.7 * n
-        or head_length > 2.5 * head_width
-        or abs(profile.middle) > 0.22 * head_width + 1
-        or float(np.nanmean(np.diff(head) <= 1.5)) < 0.9
-        or head[-1] > 0.45 * head_width + thickness
-    )
 
 
 def _overlap(

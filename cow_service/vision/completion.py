@@ -295,6 +295,19 @@ class _Tops:
         hangs = overlap > HANGS * w and y >= ty
         return self.areas[top] >= LEAST_TOP and area < MAX_RATIO * self.areas[top] and (lit or hangs)
 
+    def lit_fronts(self, view: View) -> Mask:
+        """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide."""
+        lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | self.white
+        fronts = np.zeros(lit.shape, bool)
+        for top, (x, y, w, h) in enumerate(self.boxes):
+            if top == 0 or self.areas[top] < LEAST_TOP or not 0.2 * w < h < 0.8 * w or not self.is_sharp(top):
+                continue
+            window = slice(y, y + h + w), slice(x, x + w)
+            _, blobs = cv2.connectedComponents(lit[window].astype(np.uint8), connectivity=4)
+            joined = np.unique(blobs[self.labels[window] == top])
+            fronts[window] |= np.isin(blobs, joined[joined > 0])
+        return fronts
+
 
 def white_sides(view: View, core: Mask) -> Mask:
     """Patches enclosed by edges at a bright neutral top: the other faces of something white, lit or in shade.
@@ -303,7 +316,7 @@ def white_sides(view: View, core: Mask) -> Mask:
     """
     neutral = (view.chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
     tops = _Tops(view, core & (view.bright > BRIGHT_STEP) & neutral)
-    sides = _lit_fronts(view, tops)
+    sides = tops.lit_fronts(view)
     white = tops.surely_white()
     for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if white else [])):
         weak = thresholds == WEAK_EDGES
@@ -331,17 +344,3 @@ def _enclosed(view: View, floor: float, factor: float) -> Iterator[tuple[tuple[s
             continue
         near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
         yield near, (labels[near] == i).astype(np.uint8), (x, y, w, h)
-
-
-def _lit_fronts(view: View, tops: _Tops) -> Mask:
-    """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide."""
-    lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | tops.white
-    fronts = np.zeros(lit.shape, bool)
-    for top, (x, y, w, h) in enumerate(tops.boxes):
-        if top == 0 or tops.areas[top] < LEAST_TOP or not 0.2 * w < h < 0.8 * w or not tops.is_sharp(top):
-            continue
-        window = slice(y, y + h + w), slice(x, x + w)
-        _, blobs = cv2.connectedComponents(lit[window].astype(np.uint8), connectivity=4)
-        joined = np.unique(blobs[tops.labels[window] == top])
-        fronts[window] |= np.isin(blobs, joined[joined > 0])
-    return fronts

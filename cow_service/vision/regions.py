@@ -88,6 +88,19 @@ class _Found:
     confidence: float
     is_disc: bool
 
+    def region(self, size: tuple[int, int]) -> Region:
+        """A part that was self, as a region of the image (height and width)."""
+        soft = self.mask.astype(np.float32)
+        near = window_of(self.mask, round(6 * MASK_SIGMA))
+        if near is not None:
+            soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
+        mask = enlarged(soft, size)
+        contours, _ = cv2.findContours(mask.patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        outline = max(contours, key=cv2.contourArea)
+        _, radius = cv2.minEnclosingCircle(outline)
+        roundness = float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))
+        return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc)
+
 
 def find_regions(image: Image) -> tuple[Region, ...]:
     """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
@@ -127,7 +140,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
                 found.append(_Found(whole, near.lab[part], confidence, disc is not None))
     whole_ones = _with_undersides(_with_tops(view, _with_mouths(view, found)))
-    regions = [_region(one, (height, width)) for one in whole_ones]
+    regions = [one.region((height, width)) for one in whole_ones]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
@@ -302,20 +315,6 @@ def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
         else:
             whole[len(found) + len(whole)] = part
     return list(whole.values())
-
-
-def _region(found: _Found, size: tuple[int, int]) -> Region:
-    """A part that was found, as a region of the image (height and width)."""
-    soft = found.mask.astype(np.float32)
-    near = window_of(found.mask, round(6 * MASK_SIGMA))
-    if near is not None:
-        soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
-    mask = enlarged(soft, size)
-    contours, _ = cv2.findContours(mask.patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = max(contours, key=cv2.contourArea)
-    _, radius = cv2.minEnclosingCircle(outline)
-    roundness = float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))
-    return Region(mask, *_names(found.lab), roundness, found.confidence, found.is_disc)
 
 
 def _names(lab: Floats32) -> tuple[str, frozenset[str]]:

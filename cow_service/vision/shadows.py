@@ -74,6 +74,115 @@ class _Floor:
         box = (bbox[0] * scale, bbox[1] * scale - top, bbox[2] * scale, bbox[3] * scale - top)
         return _Floor(lab_of(small)[top:], ~grown[top:], box, top, (scene.width / width, scene.height / height))
 
+    def candidates(self) -> Iterator[Ellipse]:
+        """Upright ellipses below the object that stand out from the ring about them, the clearest first."""
+        left, top, right, bottom = self.box
+        width = right - left
+        ys, xs = np.mgrid[: self.free.shape[0], : self.free.shape[1]]
+        below = (ys > bottom + NEAREST * width) & (
+            np.abs(xs - (left + right) / 2) < SLANT * (ys - (top + bottom) / 2) + 0.5 * width
+        )
+        best = np.zeros(self.free.shape, np.float32)
+        which = np.zeros(self.free.shape, np.int64)
+        sizes = [(LIKELY_WIDTH * width / 2, flat * LIKELY_WIDTH * width / 2) for flat in FLATNESS]
+        for i, (a, b) in enumerate(sizes):
+            contrast = self.contrast(a, b)
+            better = contrast > best
+            best[better], which[better] = contrast[better], i
+        best[~below] = 0
+        least, alone = 0.6 * LEAST_SHADE, 0
+        for _ in range(MAX_TRIES):
+            y, x = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
+            if best[y, x] < least or alone == MAX_CANDIDATES:
+                return
+            a, b = sizes[int(which[y, x])]
+            if self.stands_alone((float(x), float(y), a, b)):
+                least, alone, cleared = max(least, 0.4 * float(best[y, x])), alone + 1, 1.2
+                yield float(x), float(y), a, b
+            else:
+                cleared = 0.6
+            best[((xs - x) / (cleared * a)) ** 2 + ((ys - y) / (cleared * b)) ** 2 <= 1] = 0
+
+    def stands_alone(self, seen: Ellipse) -> bool:
+        """Whether the self is lighter than the ellipse on each of its four sides, unlike beside an edge of light."""
+        x, y, a, b = seen
+        rows = slice(max(0, int(y - RING[1] * b)), int(y + RING[1] * b) + 2)
+        columns = slice(max(0, int(x - RING[1] * a)), int(x + RING[1] * a) + 2)
+        light, free = self.lab[rows, columns, 0], self.free[rows, columns]
+        v, u = np.mgrid[: light.shape[0], : light.shape[1]].astype(np.float64)
+        u, v = (u + columns.start - x) / a, (v + rows.start - y) / b
+        radius, angle = np.hypot(u, v), np.arctan2(v, u)
+        middle = float(light[free & (radius < 0.8)].mean())
+        ring = free & (radius > RING[0]) & (radius < RING[1])
+        sides = [ring & (np.abs((angle - turn + np.pi) % (2 * np.pi) - np.pi) < np.pi / 4) for turn in QUARTERS]
+        steps = [float(light[side].mean()) - middle for side in sides if side.any()]
+        return min(steps) > MIN_EVENNESS * float(np.mean(steps))
+
+    def contrast(self, a: float, b: float) -> Floats32:
+        """Per pixel [h, w] how much darker an ellipse there is than the ring about it, as a share; 0 beside objects."""
+        ry, rx = int(np.ceil(RING[1] * b)), int(np.ceil(RING[1] * a))
+        ys, xs = np.mgrid[-ry : ry + 1, -rx : rx + 1]
+        radius = np.sqrt((xs / a) ** 2 + (ys / b) ** 2)
+        inner, ring = (radius <= 0.9).astype(np.float32), ((radius >= RING[0]) & (radius <= RING[1])).astype(np.float32)
+        weight = self.free.astype(np.float32)
+        light = self.lab[..., 0] * weight
+        inside, about = (
+            [cv2.filter2D(values, cv2.CV_32F, kernel / kernel.sum(), borderType=cv2.BORDER_CONSTANT)
+             for values in (light, weight)]
+            for kernel in (inner, ring)
+        )  # fmt: skip
+        whole = (inside[1] > 0.97) & (about[1] > 0.7)
+        dark = 1 - (inside[0] / np.maximum(inside[1], 1e-3)) / np.maximum(about[0] / np.maximum(about[1], 1e-3), 1.0)
+        return np.where(whole, dark, 0).astype(np.float32)
+
+    def fit_ellipse(self, seen: Ellipse) -> Shadow | None:
+        """A soft tilted ellipse on a smooth self, fitted to the lightness around what was seen."""
+        x, y, a, b = seen
+        rows = slice(max(0, round(y - 2.2 * b - 2)), round(y + 2.2 * b + 3))
+        columns = slice(max(0, round(x - 1.8 * a)), round(x + 1.8 * a + 1))
+        free = self.free[rows, columns]
+        if free.sum() < LEAST_PIXELS:
+            return None
+        every = max(1, int(free.sum()) // MOST_PIXELS)
+        ys, xs = (axis[::every] for axis in np.nonzero(free))
+        points = np.stack([xs + columns.start + 0.5, ys + rows.start + 0.5], axis=1).astype(np.float64)
+        lab = self.lab[rows, columns][free][::every].astype(np.float64)
+        u, v = (points[:, 0] - x) / a, (points[:, 1] - y) / a
+        smooth = quadratic_terms(u, v)
+        start = np.array([x + 0.5, y + 0.5, np.log(a), np.log(b), 0.0, np.log(0.15)])
+        parameters, dark = _least_squares(points, lab[:, 0], smooth, start)
+        inside = _soft_ellipse(points, parameters)
+        plain = lab - smooth @ np.linalg.lstsq(smooth, lab, rcond=None)[0]
+        terms = np.column_stack([smooth, inside])
+        weights = np.linalg.lstsq(terms, lab, rcond=None)[0]
+        left_over = lab[:, 0] - terms @ weights[:, 0]
+        core = inside > 0.5
+        if not core.any():
+            return None
+        level, *hue = np.median((smooth @ weights[:-1])[core], axis=0)
+        # What takes a share of the light away takes the same share of a* and b* as of L* + 16.
+        tint = weights[-1, 1:] - np.array(hue) * weights[-1, 0] / (float(level) + 16)
+        explained = 1 - float((left_over**2).sum()) / max(1e-9, float((plain[:, 0] ** 2).sum()))
+        px, py, log_a, log_b, tilt, log_soft = (float(p) for p in parameters)
+        wide, high, soft = float(np.exp(log_a)), float(np.exp(log_b)), float(np.exp(log_soft))
+        shade = -dark / max(float(level), 1.0)
+        width = self.box[2] - self.box[0]
+        fits = (
+            LEAST_SHADE < shade < MOST_SHADE
+            and explained > EXPLAINED
+            and SOFTNESS[0] < soft < SOFTNESS[1]
+            and float(np.hypot(*tint)) < SAME_HUE
+            and 0.7 * width < 2 * wide < 1.6 * width
+            and 0.15 < high / wide < 0.95
+            and float(np.hypot((px - x) / a, (py - y) / b)) < 0.6
+            and abs(tilt) < 0.7
+        )
+        if not fits:
+            return None
+        spread = wide**2 / 4, high**2 / 4 * (1 + tilt**2), tilt * wide * high / 4
+        half = 2 * float(np.sqrt(spread[1]))
+        return Shadow((px - wide, py - half, px + wide, py + half), (px, py), spread, shade)
+
 
 def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None where it has none or several patches could be it."""
@@ -86,7 +195,7 @@ def _find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     if region is None or width < LEAST_WIDTH:
         return None
     floor = _Floor.below(bbox, scene)
-    fits = [shadow for shadow in (_fit_ellipse(floor, ellipse) for ellipse in _candidates(floor)) if shadow is not None]
+    fits = [shadow for shadow in (floor.fit_ellipse(ellipse) for ellipse in floor.candidates()) if shadow is not None]
     fits.sort(key=lambda fit: -fit.shade)
     if not fits or (len(fits) > 1 and fits[1].shade > RIVAL_SHADE * fits[0].shade):
         return None
@@ -95,119 +204,6 @@ def _find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     (x0, y0, x1, y1), (x, y), (xx, yy, xy) = shadow.bbox, shadow.centre, shadow.spread
     box = (x0 * fx, (y0 + floor.top) * fy, x1 * fx, (y1 + floor.top) * fy)
     return Shadow(box, (x * fx, (y + floor.top) * fy), (xx * fx * fx, yy * fy * fy, xy * fx * fy), shadow.shade)
-
-
-def _candidates(floor: _Floor) -> Iterator[Ellipse]:
-    """Upright ellipses below the object that stand out from the ring about them, the clearest first."""
-    left, top, right, bottom = floor.box
-    width = right - left
-    ys, xs = np.mgrid[: floor.free.shape[0], : floor.free.shape[1]]
-    below = (ys > bottom + NEAREST * width) & (
-        np.abs(xs - (left + right) / 2) < SLANT * (ys - (top + bottom) / 2) + 0.5 * width
-    )
-    best = np.zeros(floor.free.shape, np.float32)
-    which = np.zeros(floor.free.shape, np.int64)
-    sizes = [(LIKELY_WIDTH * width / 2, flat * LIKELY_WIDTH * width / 2) for flat in FLATNESS]
-    for i, (a, b) in enumerate(sizes):
-        contrast = _contrast(floor, a, b)
-        better = contrast > best
-        best[better], which[better] = contrast[better], i
-    best[~below] = 0
-    least, alone = 0.6 * LEAST_SHADE, 0
-    for _ in range(MAX_TRIES):
-        y, x = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
-        if best[y, x] < least or alone == MAX_CANDIDATES:
-            return
-        a, b = sizes[int(which[y, x])]
-        if _stands_alone(floor, (float(x), float(y), a, b)):
-            least, alone, cleared = max(least, 0.4 * float(best[y, x])), alone + 1, 1.2
-            yield float(x), float(y), a, b
-        else:
-            cleared = 0.6
-        best[((xs - x) / (cleared * a)) ** 2 + ((ys - y) / (cleared * b)) ** 2 <= 1] = 0
-
-
-def _stands_alone(floor: _Floor, seen: Ellipse) -> bool:
-    """Whether the floor is lighter than the ellipse on each of its four sides, unlike beside an edge of light."""
-    x, y, a, b = seen
-    rows = slice(max(0, int(y - RING[1] * b)), int(y + RING[1] * b) + 2)
-    columns = slice(max(0, int(x - RING[1] * a)), int(x + RING[1] * a) + 2)
-    light, free = floor.lab[rows, columns, 0], floor.free[rows, columns]
-    v, u = np.mgrid[: light.shape[0], : light.shape[1]].astype(np.float64)
-    u, v = (u + columns.start - x) / a, (v + rows.start - y) / b
-    radius, angle = np.hypot(u, v), np.arctan2(v, u)
-    middle = float(light[free & (radius < 0.8)].mean())
-    ring = free & (radius > RING[0]) & (radius < RING[1])
-    sides = [ring & (np.abs((angle - turn + np.pi) % (2 * np.pi) - np.pi) < np.pi / 4) for turn in QUARTERS]
-    steps = [float(light[side].mean()) - middle for side in sides if side.any()]
-    return min(steps) > MIN_EVENNESS * float(np.mean(steps))
-
-
-def _contrast(floor: _Floor, a: float, b: float) -> Floats32:
-    """Per pixel [h, w] how much darker an ellipse there is than the ring about it, as a share; 0 beside objects."""
-    ry, rx = int(np.ceil(RING[1] * b)), int(np.ceil(RING[1] * a))
-    ys, xs = np.mgrid[-ry : ry + 1, -rx : rx + 1]
-    radius = np.sqrt((xs / a) ** 2 + (ys / b) ** 2)
-    inner, ring = (radius <= 0.9).astype(np.float32), ((radius >= RING[0]) & (radius <= RING[1])).astype(np.float32)
-    weight = floor.free.astype(np.float32)
-    light = floor.lab[..., 0] * weight
-    inside, about = (
-        [cv2.filter2D(values, cv2.CV_32F, kernel / kernel.sum(), borderType=cv2.BORDER_CONSTANT)
-         for values in (light, weight)]
-        for kernel in (inner, ring)
-    )  # fmt: skip
-    whole = (inside[1] > 0.97) & (about[1] > 0.7)
-    dark = 1 - (inside[0] / np.maximum(inside[1], 1e-3)) / np.maximum(about[0] / np.maximum(about[1], 1e-3), 1.0)
-    return np.where(whole, dark, 0).astype(np.float32)
-
-
-def _fit_ellipse(floor: _Floor, seen: Ellipse) -> Shadow | None:
-    """A soft tilted ellipse on a smooth floor, fitted to the lightness around what was seen."""
-    x, y, a, b = seen
-    rows = slice(max(0, round(y - 2.2 * b - 2)), round(y + 2.2 * b + 3))
-    columns = slice(max(0, round(x - 1.8 * a)), round(x + 1.8 * a + 1))
-    free = floor.free[rows, columns]
-    if free.sum() < LEAST_PIXELS:
-        return None
-    every = max(1, int(free.sum()) // MOST_PIXELS)
-    ys, xs = (axis[::every] for axis in np.nonzero(free))
-    points = np.stack([xs + columns.start + 0.5, ys + rows.start + 0.5], axis=1).astype(np.float64)
-    lab = floor.lab[rows, columns][free][::every].astype(np.float64)
-    u, v = (points[:, 0] - x) / a, (points[:, 1] - y) / a
-    smooth = quadratic_terms(u, v)
-    start = np.array([x + 0.5, y + 0.5, np.log(a), np.log(b), 0.0, np.log(0.15)])
-    parameters, dark = _least_squares(points, lab[:, 0], smooth, start)
-    inside = _soft_ellipse(points, parameters)
-    plain = lab - smooth @ np.linalg.lstsq(smooth, lab, rcond=None)[0]
-    terms = np.column_stack([smooth, inside])
-    weights = np.linalg.lstsq(terms, lab, rcond=None)[0]
-    left_over = lab[:, 0] - terms @ weights[:, 0]
-    core = inside > 0.5
-    if not core.any():
-        return None
-    level, *hue = np.median((smooth @ weights[:-1])[core], axis=0)
-    # What takes a share of the light away takes the same share of a* and b* as of L* + 16.
-    tint = weights[-1, 1:] - np.array(hue) * weights[-1, 0] / (float(level) + 16)
-    explained = 1 - float((left_over**2).sum()) / max(1e-9, float((plain[:, 0] ** 2).sum()))
-    px, py, log_a, log_b, tilt, log_soft = (float(p) for p in parameters)
-    wide, high, soft = float(np.exp(log_a)), float(np.exp(log_b)), float(np.exp(log_soft))
-    shade = -dark / max(float(level), 1.0)
-    width = floor.box[2] - floor.box[0]
-    fits = (
-        LEAST_SHADE < shade < MOST_SHADE
-        and explained > EXPLAINED
-        and SOFTNESS[0] < soft < SOFTNESS[1]
-        and float(np.hypot(*tint)) < SAME_HUE
-        and 0.7 * width < 2 * wide < 1.6 * width
-        and 0.15 < high / wide < 0.95
-        and float(np.hypot((px - x) / a, (py - y) / b)) < 0.6
-        and abs(tilt) < 0.7
-    )
-    if not fits:
-        return None
-    spread = wide**2 / 4, high**2 / 4 * (1 + tilt**2), tilt * wide * high / 4
-    half = 2 * float(np.sqrt(spread[1]))
-    return Shadow((px - wide, py - half, px + wide, py + half), (px, py), spread, shade)
 
 
 def _soft_ellipse(points: Floats, parameters: Floats) -> Floats:
