@@ -234,14 +234,6 @@ SECRET_SETTINGS = {
 }
 
 
-def _message(item: Any) -> str:
-    """One bad setting."""
-    name = str(item["loc"][0])
-    if name in SECRET_SETTINGS:
-        return f"COW_{name.upper()} {SECRET_SETTINGS[name]}"
-    return f"COW_{name.upper()}={item['input']!r}: {item['msg'].removeprefix('Value error, ')}"
-
-
 def load_settings(**overrides: Any) -> Settings:
     """Settings from the environment, with overrides that are not None. Raises `SettingsError` for a bad value."""
     try:
@@ -250,5 +242,12 @@ def load_settings(**overrides: Any) -> Settings:
         field = str(error).split('"')[1:2]
         raise SettingsError(f"Bad settings: COW_{''.join(field).upper()} is not JSON.") from error
     except ValidationError as error:
-        messages = "; ".join(_message(item) for item in error.errors() if item["type"] != "default_factory_not_called")
-        raise SettingsError(f"Bad settings: {messages}.") from error
+        messages: list[str] = []
+        for item in error.errors():
+            name = str(item["loc"][0])
+            if name in SECRET_SETTINGS:
+                messages.append(f"COW_{name.upper()} {SECRET_SETTINGS[name]}")
+            elif item["type"] != "default_factory_not_called":
+                reason = item["msg"].removeprefix("Value error, ")
+                messages.append(f"COW_{name.upper()}={item['input']!r}: {reason}")
+        raise SettingsError(f"Bad settings: {'; '.join(messages)}.") from error

@@ -40,8 +40,10 @@ def chat_fields(body: dict[str, Any]) -> dict[str, Any]:
     system = [] if body.get("instructions") is None else [{"role": "system", "content": body["instructions"]}]
     chat["messages"] = [*system, *_messages(body.get("input"))]
     text, reasoning = _object(body, "text"), _object(body, "reasoning")
-    if text.get("format") is not None:
-        chat["response_format"] = _response_format(text["format"])
+    if isinstance(form := text.get("format"), dict) and form.get("type") == "json_schema":
+        form = {"type": "json_schema", "json_schema": _without_type(form)}
+    if form is not None:
+        chat["response_format"] = form
     if text.get("verbosity") is not None:
         chat["verbosity"] = text["verbosity"]
     if reasoning.get("effort") is not None:
@@ -124,12 +126,6 @@ def _part(part: Any, pointer: str) -> dict[str, Any]:
     if kind in ("input_image", "input_file") and given.get("file_id") is not None:
         raise wrong(f"{pointer}/file_id", f"{STATELESS}, and so no files: send the image itself as `image_url`")
     raise wrong(f"{pointer}/type", f"parts of the type {str(kind)[:40]!r} cannot be sent on as a chat")
-
-
-def _response_format(given: Any) -> Any:
-    if isinstance(given, dict) and given.get("type") == "json_schema":
-        return {"type": "json_schema", "json_schema": _without_type(given)}
-    return given
 
 
 def _tool(place: int, tool: Any) -> dict[str, Any]:
