@@ -32,36 +32,10 @@ from cow_service.records import Usage, Verdict
 from cow_service.stages.answering import gate_of
 from cow_service.stages.keys import FirstAnswers
 
-OVERLAY = "Not sent to the model: the overlay of the simulation that the frames are of."
-
-
-def message(digests: Iterable[str], text: str, pictures: Pictures) -> ChatMessageUser:
-    """Pictures, then a text."""
-    content: list[Content] = [*(_picture(digest, pictures) for digest in digests), ContentText(text=text)]
-    return ChatMessageUser(content=content)
-
-
-def conversation(case: Case, asked: CaseReplies, overlay: str | None, pictures: Pictures) -> list[ChatMessage]:
-    """What a viewer shows: what was asked last, every reply, and in the first repeat the overlay.
-
-    What `/answer` sends by itself is not known here: in its place stand the image, the frames and the question.
-    """
-    frames = [digest for found in asked.evidence for digest in found.frames]
-    sent: tuple[ChatMessage, ...] = asked.messages or (message((case.item.image, *frames), case.question, pictures),)
-    shown: list[ChatMessage] = [*sent, *(ChatMessageAssistant(content=reply.text) for reply in asked.replies)]
-    if overlay is not None and case.repeat == 1:
-        shown.append(message((overlay,), OVERLAY, pictures))
-    return shown
-
-
-def _picture(digest: str, pictures: Pictures) -> ContentImage:
-    data = pictures.read(digest)
-    return ContentImage(image=f"data:{media_type_of(data)};base64,{base64.b64encode(data).decode()}")
-
-
 GATE_VOTES = 3
 GATE_THRESHOLD = 1.0
 PROMPT = "eval-question"
+OVERLAY = "Not sent to the model: the overlay of the simulation that the frames are of."
 
 
 @dataclass(frozen=True)
@@ -173,3 +147,27 @@ def _text(answer: AsyncAnswer) -> str:
     said = answer.answer or ("Not sure" if answer.not_sure else "")
     reasons = answer.reasoning.replace("'", "\u2019")
     return f"{{'Reasoning': '{reasons}', 'Answer': '{said}'}}"
+
+
+def message(digests: Iterable[str], text: str, pictures: Pictures) -> ChatMessageUser:
+    """Pictures, then a text."""
+    content: list[Content] = [*(_picture(digest, pictures) for digest in digests), ContentText(text=text)]
+    return ChatMessageUser(content=content)
+
+
+def conversation(case: Case, asked: CaseReplies, overlay: str | None, pictures: Pictures) -> list[ChatMessage]:
+    """What a viewer shows: what was asked last, every reply, and in the first repeat the overlay.
+
+    What `/answer` sends by itself is not known here: in its place stand the image, the frames and the question.
+    """
+    frames = [digest for found in asked.evidence for digest in found.frames]
+    sent: tuple[ChatMessage, ...] = asked.messages or (message((case.item.image, *frames), case.question, pictures),)
+    shown: list[ChatMessage] = [*sent, *(ChatMessageAssistant(content=reply.text) for reply in asked.replies)]
+    if overlay is not None and case.repeat == 1:
+        shown.append(message((overlay,), OVERLAY, pictures))
+    return shown
+
+
+def _picture(digest: str, pictures: Pictures) -> ContentImage:
+    data = pictures.read(digest)
+    return ContentImage(image=f"data:{media_type_of(data)};base64,{base64.b64encode(data).decode()}")

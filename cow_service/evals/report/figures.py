@@ -400,7 +400,7 @@ def _draw_cost_panel(
     lowest = min(100 * (tpr.mean - (tpr.sd or 0)) for tpr in spreads)
     highest = max(100 * (tpr.mean + (tpr.sd or 0)) for tpr in spreads)
     _percent_axis(axes, max(-3, lowest - 12), min(103, highest + 12))
-    axes.grid()
+    axes.grid(visible=True)
 
 
 DRAWINGS = {"gains": draw_gains, "rates": draw_rates, "calibration": draw_calibration, "cost": draw_cost}
