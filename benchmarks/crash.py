@@ -21,6 +21,7 @@ import sys
 import tempfile
 import threading
 import time
+import zlib
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
@@ -109,8 +110,11 @@ class Ground:
         engine = sa.create_engine(self.url.replace("postgresql://", "postgresql+psycopg://"))
         try:
             with engine.connect() as connection:
-                query = sa.text("SELECT result FROM cow_stage_results WHERE stage = 'generation'")
-                made = [json.loads(text)["value"]["generator"] for text in connection.execute(query).scalars()]
+                query = sa.text("SELECT result FROM cow_results WHERE stage = 'generation'")
+                made = [
+                    json.loads(zlib.decompress(result))["value"]["generator"]
+                    for result in connection.execute(query).scalars()
+                ]
         finally:
             engine.dispose()
         return {one["seed"] for one in made if one["name"] == "slow"}

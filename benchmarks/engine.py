@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from cow_service.jobs.engine import JobEngine, new_job_id
-from cow_service.jobs.spec import JobSpec
+from cow_service.jobs.job_table import JobSpec
 from cow_service.media.images import DecodedImage, encode_png
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service

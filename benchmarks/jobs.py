@@ -24,17 +24,21 @@ import numpy as np
 import sqlalchemy as sa
 
 from cow_service.jobs.engine import JobEngine, new_job_id
-from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.state import JobFilters
-from cow_service.jobs.workflow_table import SCHEMA
+from cow_service.jobs.job_table import JobFilters, JobSpec
 from cow_service.media.images import DecodedImage, encode_png
 from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.stages.run import now
 
 FAILED_EVERY = 100
-DBOS_TABLES = ("workflow_status", "workflow_input", "workflow_output")
-OUR_TABLES = {"cow_stage_results": "key", "cow_trajectories": None, "cow_holds": None, "cow_job_stages": None}
+# Their keys; the last one is that of the job.
+TABLES = {
+    "cow_jobs": ("id",),
+    "cow_results": ("key", "job_id"),
+    "cow_trajectories_of_jobs": ("job_id",),
+    "cow_references": ("job_id",),
+    "cow_stages_of_jobs": ("job_id",),
+}
 GIVEN: dict[str, Any] = {"grounding": {"bbox": [10, 20, 30, 40]}, "num_frames": 9, "video": False}
 
 
@@ -60,30 +64,36 @@ def run_job(engine: JobEngine, image: DecodedImage, motion: dict[str, Any]) -> s
 
 def copies(engine: sa.Engine, job: str, first: int, count: int, step_ms: int) -> None:
     """Copies all rows of a job, each a little older than the one before."""
-    schema = f"{SCHEMA}." if engine.dialect.name == "postgresql" else ""
+    is_postgres = engine.dialect.name == "postgresql"
     series = (
         f"SELECT generate_series({first}, {first + count - 1}) AS n"
-        if schema
+        if is_postgres
         else f"SELECT {first} AS n UNION ALL SELECT n + 1 FROM numbers WHERE n < {first + count - 1}"
+    )
+    older = (
+        f"to_char(CAST(t.created_at AS timestamptz) AT TIME ZONE 'UTC' - numbers.n * interval '{step_ms} ms', "
+        """'YYYY-MM-DD"T"HH24:MI:SS.MS"Z"')"""
+        if is_postgres
+        else f"strftime('%Y-%m-%dT%H:%M:%fZ', t.created_at, '-' || (numbers.n * {step_ms / 1000}) || ' seconds')"
     )
     inspector = sa.inspect(engine)
     with engine.begin() as connection:
-        for table in (*(schema + name for name in DBOS_TABLES), *OUR_TABLES):
-            name, key = table.rpartition(".")[2], OUR_TABLES.get(table)
-            columns = [c["name"] for c in inspector.get_columns(name, schema=SCHEMA if "." in table else None)]
+        for table, keys in TABLES.items():
+            columns = [column["name"] for column in inspector.get_columns(table)]
             told: list[str] = []
             for column in columns:
-                if column in ("workflow_uuid", "job_id", key):
+                if column in keys:
                     told.append(f"t.{column} || '-' || numbers.n")
-                elif name == "workflow_status" and column in ("created_at", "updated_at", "completed_at"):
-                    told.append(f"t.{column} - {step_ms} * numbers.n")
+                elif (table, column) == ("cow_jobs", "created_at"):
+                    told.append(older)
+                elif column == "ended":
+                    told.append(f"t.ended - {step_ms / 1000} * numbers.n")
                 else:
                     told.append(f"t.{column}")
-            whose = "workflow_uuid" if name in DBOS_TABLES else "job_id"
             connection.execute(
                 sa.text(
                     f"WITH RECURSIVE numbers AS ({series}) INSERT INTO {table} ({', '.join(columns)}) "
-                    f"SELECT {', '.join(told)} FROM {table} t, numbers WHERE t.{whose} = :job"
+                    f"SELECT {', '.join(told)} FROM {table} t, numbers WHERE t.{keys[-1]} = :job"
                 ),
                 {"job": job},
             )
@@ -127,7 +137,7 @@ def measure(engine: JobEngine, counts: list[int]) -> list[dict[str, Any]]:
                 "one_ms": timed(lambda: engine.find(good, None)),
             }
         )
-        tidy = engine._maintenance.collect_garbage  # pyright: ignore[reportPrivateUsage]
+        tidy = engine._maintenance.clean_up  # pyright: ignore[reportPrivateUsage]
         tidy()  # the first round after such a change of the tables is not typical
         started = time.process_time()
         tidy()

@@ -1,13 +1,20 @@
-"""A semaphore that serves the lowest priority value first and whose waits can be canceled."""
+"""Threads and processes: a semaphore with priorities, and processes that end with the one that started them."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
 
 CANCEL_POLL_SECONDS = 0.1  # how often a waiting thread checks whether it was canceled
 
@@ -78,3 +85,41 @@ class PrioritySemaphore:
         while self._permits and self._waiting:
             self._permits -= 1
             heapq.heappop(self._waiting).granted.set()
+
+
+OOM_SCORE = "500"  # the system ends such a process before the one that holds the jobs
+
+
+@dataclass(frozen=True)
+class Spawned:
+    """A process that waits for its first message, and the pipe to it."""
+
+    process: subprocess.Popen[bytes]
+    pipe: Connection[Any, Any]
+
+
+_ahead: dict[str, Spawned] = {}
+
+
+def spawn(module: str) -> Spawned:
+    """Starts `python -m MODULE FD`, where FD is its end of the pipe; or returns what `spawn_ahead` started."""
+    if module in _ahead:
+        return _ahead.pop(module)
+    ours, theirs = Pipe()
+    with theirs:
+        command = [sys.executable, "-m", module, str(theirs.fileno())]
+        return Spawned(subprocess.Popen(command, pass_fds=[theirs.fileno()]), ours)
+
+
+def spawn_ahead(module: str) -> None:
+    """Starts a process for the first caller of `spawn`: it imports what it needs while this one does."""
+    _ahead[module] = spawn(module)
+
+
+def leave_decisions_to_the_parent() -> None:
+    """Called by such a process at its start."""
+    # A terminal's Ctrl-C and a service manager's stop reach every process: the one that holds the jobs decides.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    with suppress(OSError):  # elsewhere than on Linux
+        Path("/proc/self/oom_score_adj").write_text(OOM_SCORE)

@@ -21,10 +21,9 @@ from cow_service.api.app import create_app
 from cow_service.errors import CowError, StorageUnavailable
 from cow_service.jobs.computing import Elsewhere
 from cow_service.jobs.engine import JobEngine
-from cow_service.jobs.readiness import Readiness
+from cow_service.jobs.readiness import Readiness, warm_up
 from cow_service.service import Service
 from cow_service.settings import SettingsError
-from cow_service.warm_up import warm_up
 from cow_service.workers.pool import WorkerPool
 
 EVERYWHERE = ("0.0.0.0", "::")  # addresses at which a server listens, and nobody asks

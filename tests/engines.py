@@ -10,9 +10,9 @@ from pathlib import Path
 
 from conftest import SLOWNESS
 from fastapi import FastAPI
+from job_rows import open_jobs
 
 from cow_service.api.app import create_app
-from cow_service.jobs import state
 from cow_service.jobs.engine import JobEngine
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -51,7 +51,7 @@ def end_jobs(engine: JobEngine, seconds: float = 30.0 * SLOWNESS) -> None:
     Else they would go on with the next test's service, and ask its multimodal LLM about another image.
     """
     until = time.monotonic() + seconds
-    while (left := set(state.open_jobs())) or engine.active.ids():
+    while (left := open_jobs(engine.database)) or engine.active.runs():
         for job_id in left:
             engine.cancel(job_id, None)
         assert time.monotonic() < until, "the work on an earlier test's job does not end"

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import object_store
 import pytest
+from job_rows import add_job
 
 from cow_service.errors import ArtifactNotFound, StorageUnavailable
-from cow_service.jobs import state
 from cow_service.jobs.database import Database
-from cow_service.jobs.garbage import collect_artifacts
-from cow_service.jobs.state import OpenJob
+from cow_service.jobs.job_table import JobTable
+from cow_service.jobs.maintenance import collect_artifacts
 from cow_service.media import object_artifacts
 from cow_service.media.artifact_stores import open_artifact_store
 from cow_service.media.artifacts import ArtifactStore
@@ -227,13 +227,15 @@ def test_beyond_the_budget_the_oldest_go_first(settings, monkeypatch):
         store = service.artifacts
         kept = {name: store.put(name.encode() * 500, "image/png").sha256 for name in ("ab", "cd", "ef", "gh")}
         for name, sha256 in kept.items():
+            add_job(database, f"job-{name}")
             database.add_references(f"job-{name}", [sha256])
+            if name != "ab":
+                JobTable(database).cancel(f"job-{name}")
         # An object store tells the times of its own clock, in whole seconds: here they are told.
         ages = dict(zip(kept.values(), (4000, 3000, 2000, 1000), strict=True))
         listed, now = [*store.listed()], time.time()
         aged = [type(one)(one.sha256, one.size, now - ages[one.sha256]) for one in listed]
         monkeypatch.setattr(store, "listed", lambda: iter(aged))
-        monkeypatch.setattr(state, "open_jobs", lambda: {"job-ab": OpenJob("cutout", None, 0)})
         collect_artifacts(service, database, lambda: False, now=now)
         assert {one.sha256 for one in listed if _is_there(store, one.sha256)} == set(kept.values())  # used just now
         collect_artifacts(service, database, lambda: False, now=now + LONG)
@@ -254,12 +256,13 @@ def test_the_file_of_the_database_gives_room_back(tmp_path: Path):
     jobs, noise = [f"job-{number}" for number in range(40)], np.random.default_rng(0)
     for job in jobs:
         digits = noise.integers(0, 10**9, 60_000).tobytes().hex()  # what is stored deflated stays large
+        add_job(database, job)
         database.store_result(hashlib.sha256(job.encode()).hexdigest(), job, "motion", digits, [])
     database.give_room_back(lambda: False)
     file = tmp_path / "jobs.sqlite3"
     full = file.stat().st_size
     assert full > 15_000_000
-    database.remove_jobs(jobs)
+    JobTable(database).delete(jobs)
     database.give_room_back(lambda: False)
     assert file.stat().st_size < full / 4
     database.close()

@@ -24,7 +24,7 @@ def database(request: pytest.FixtureRequest) -> Iterator[str | None]:
         yield None
         return
     if SCALE == 1:
-        pytest.skip("kills on PostgreSQL are tested in `make soak`; recovery on it is in test_recovery.py")
+        pytest.skip("kills on PostgreSQL are tested in `make soak`; recovery on it is in test_job_table.py")
     with postgres_server() as url:
         yield url
 

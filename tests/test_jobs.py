@@ -991,7 +991,7 @@ def events_until(served: Served, job_id: str, stage: str) -> list[dict[str, Any]
 def stage_results(served: Served, job_id: str) -> dict[str, float]:
     """When each stage that a job came to was kept."""
     with closing(sqlite3.connect(served.data / "jobs.sqlite3")) as database:
-        found = database.execute("SELECT stage, created_at FROM cow_stage_results WHERE job_id = ?", (job_id,))
+        found = database.execute("SELECT stage, created_at FROM cow_results WHERE job_id = ?", (job_id,))
         return dict(found.fetchall())
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from servers import BODY, data_url
 
 from cow_service.api.submission import MAX_CONCURRENT_BODIES
-from cow_service.jobs.open_jobs import OpenJobs
+from cow_service.jobs.active import ActiveJobs
 from cow_service.media.images import encode_png
 from cow_service.net import ImageUrls
 from cow_service.service import Service
@@ -143,12 +143,12 @@ def test_a_late_message_about_a_deleted_job_is_not_taken_for_the_next_one(
     """A key that is used again after a deletion has the same job id: what is said of the first job may come late."""
     service, witness = served
     transport = httpx.ASGITransport(app_for(service))
-    announce, held = OpenJobs.ended, threading.Event()
+    announce, held = ActiveJobs.notify_ended, threading.Event()
 
-    def late(registry: OpenJobs, job_id: str, outcome: Any, created_at: str | None = None) -> None:
+    def late(active: ActiveJobs, job_id: str, outcome: Any, created_at: str | None = None) -> None:
         if isinstance(outcome, str) and json.loads(outcome)["answer"] == "1":
             held.wait(20)
-        announce(registry, job_id, outcome, created_at)
+        announce(active, job_id, outcome, created_at)
 
     async def calls() -> str:
         async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
@@ -163,5 +163,5 @@ def test_a_late_message_about_a_deleted_job_is_not_taken_for_the_next_one(
             held.set()
             return (await second).json()["answer"]
 
-    monkeypatch.setattr(OpenJobs, "ended", late)
+    monkeypatch.setattr(ActiveJobs, "notify_ended", late)
     assert asyncio.run(calls()) == "2"

@@ -385,7 +385,7 @@ def test_unknown_tools_and_resources_are_errors_of_the_protocol(here: tuple[Sess
 def statuses(folder: Path) -> list[str]:
     """Of the jobs in a data folder, oldest first."""
     with sqlite3.connect(folder / "data" / "jobs.sqlite3") as database:
-        found = database.execute("SELECT status FROM workflow_status ORDER BY created_at, rowid").fetchall()
+        found = database.execute("SELECT status FROM cow_jobs ORDER BY created_at, rowid").fetchall()
     database.close()
     return [status for (status,) in found]
 
@@ -395,7 +395,7 @@ def test_a_call_that_is_canceled_cancels_its_job(here: tuple[Session, Path]) -> 
     call = session.start("simulate", **SLOWLY)
     eventually(lambda: [told for told in session.told if told[2] == "generation"])
     call.cancel()  # else it would take a minute
-    eventually(lambda: statuses(folder)[-1] == "CANCELLED")
+    eventually(lambda: statuses(folder)[-1] == "canceled")
     assert session.tools()
 
 
@@ -547,7 +547,7 @@ def test_it_ends_when_standard_input_does(tmp_path: Path) -> None:
         code, log = raw.ended()
     assert code == 0, log
     assert "Traceback" not in log
-    assert statuses(tmp_path) == ["CANCELLED"]
+    assert statuses(tmp_path) == ["canceled"]
 
 
 def test_a_signal_ends_it_and_the_job_goes_on_at_the_next_start(tmp_path: Path) -> None:
@@ -558,7 +558,7 @@ def test_a_signal_ends_it_and_the_job_goes_on_at_the_next_start(tmp_path: Path) 
         code, log = raw.ended()
     assert code == 128 + signal.SIGTERM, log
     assert "Traceback" not in log
-    assert statuses(tmp_path) == ["PENDING"]
+    assert statuses(tmp_path) == ["queued"]
 
 
 @pytest.mark.parametrize(

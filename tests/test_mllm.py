@@ -353,7 +353,7 @@ def test_a_caller_who_leaves_is_not_waited_for(mllm: MllmServer, make) -> None:
     service = make(mllm_timeout=30)
     app = app_for(service)
     body = json.dumps(QUICK | {"image": blank(64, 64), "question": OPTIONS, "imagine": "never"}).encode()
-    jobs = running_engine().active.ids
+    jobs = running_engine().active.runs
 
     async def leave() -> None:
         """Closes the connection as soon as the model is asked, as a server tells its application."""

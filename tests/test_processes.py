@@ -24,8 +24,8 @@ from postgres import postgres_server
 from servers import Served, Worker, eventually, problem, slow
 
 from cow_service.api.middleware.access import hash_of
-from cow_service.jobs.overview import Overview
-from cow_service.jobs.process_table import ProcessTable
+from cow_service.jobs.job_table import VERSION
+from cow_service.jobs.processes import Overview, ProcessTable
 from cow_service.records import ProcessInfo, WorkerInfo, WorkerJob
 from cow_service.settings import Settings
 
@@ -113,7 +113,7 @@ def test_jobs_of_another_version_are_told_of(served: Served) -> None:
     def set_version(version: str) -> None:
         with sqlite3.connect(served.data / "jobs.sqlite3") as database:
             changed = database.execute(
-                "UPDATE workflow_status SET application_version = ? WHERE workflow_uuid = ? AND status = 'ENQUEUED'",
+                "UPDATE cow_jobs SET version = ? WHERE id = ? AND executor IS NULL",
                 (version, waits),
             )
         assert changed.rowcount == 1
@@ -131,7 +131,7 @@ def test_jobs_of_another_version_are_told_of(served: Served) -> None:
     report = cow(served, "doctor")
     assert report.returncode == 1
     assert "Start a server or worker of a COW with workflow version 0" in report.stdout
-    set_version("1")
+    set_version(VERSION)
     assert served.ended(waits)["status"] == "succeeded"
     eventually(lambda: served.http.get("/readyz").status_code == 200)
 
@@ -143,21 +143,21 @@ def test_a_worker_that_crashes_is_counted(served: Served) -> None:
 
 
 def test_processes_are_shown_while_they_tell_of_themselves() -> None:
-    engine = running_engine().database.engine
-    table, keys = ProcessTable(engine), {"alice": hash_of("cow_alice")}
+    database = running_engine().database
+    table, keys = ProcessTable(database), {"alice": hash_of("cow_alice")}
     job = WorkerJob(id="secret", kind="answer", progress=0, seconds=1)
     worker = WorkerInfo(name="light-1", queue="light", pid=2, memory_mb=1, jobs_done=0, jobs=(job,))
     info = {"role": "worker", "host": "box", "pid": 1, "version": "9", "workflow_version": "9", "seen_at": "now"}
-    table.write(ProcessInfo(executor_id="other", workers=(worker,), queues={"light": 3}, **info), [])
+    table.write(ProcessInfo(executor_id="other", workers=(worker,), queues={"light": 3}, **info))
 
     def shown(settings: Settings) -> list[str | None]:
-        found = Overview(engine, settings).workers().processes
+        found = Overview(database, settings).workers().processes
         return [job.id for one in found if one.host == "box" for worker in one.workers for job in worker.jobs]
 
     assert shown(Settings()) == ["secret"]
     assert shown(Settings(api_keys=keys)) == [None], "an id is for the owner of the job"
-    with engine.begin() as connection:
-        connection.execute(sa.text("UPDATE cow_processes SET seen = seen - 11 WHERE executor_id = 'other'"))
+    with database.transaction() as connection:
+        connection.execute(sa.text("UPDATE cow_executors SET seen = seen - 11 WHERE executor = 'other'"))
     assert shown(Settings()) == []
     table.remove("other")
 

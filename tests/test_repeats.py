@@ -19,6 +19,7 @@ import pytest
 from conftest import SCALE, example
 from drawn import ball, floor, png_bytes
 from engines import app_for
+from job_rows import add_job
 from mllm_server import MllmServer
 from rich.console import Console
 from servers import data_url
@@ -29,9 +30,8 @@ from cow_service.cli.console import _answer_table
 from cow_service.cli.main import app as cli
 from cow_service.client.display import answer_html
 from cow_service.errors import MllmUnavailable
+from cow_service.jobs.computing import KeyLocks, Outages, StoredStep
 from cow_service.jobs.database import Database
-from cow_service.jobs.outages import Outages
-from cow_service.jobs.stage_cache import KeyLocks, StoredStep
 from cow_service.mcp.results import answer_text
 from cow_service.pipeline import answer
 from cow_service.records import Answer, Usage
@@ -324,6 +324,7 @@ def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
     answers(mllm, list("ABA"), looking="B")
     database = Database(Settings(data_dir=tmp_path))
     database.create_tables()
+    add_job(database, "one")
     step = StoredStep(
         "one",
         None,

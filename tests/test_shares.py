@@ -9,13 +9,13 @@ from typing import Any
 
 import httpx
 import pytest
+from job_rows import add_job
 from postgres import postgres_server
 from servers import ASYNC, TERMINAL, TIME_LIMIT, Served, eventually, problem, slow
 
 from cow_service.api.middleware.access import hash_of, new_key
-from cow_service.jobs.open_jobs import OpenJobs
-from cow_service.jobs.state import OpenJob
-from cow_service.service import Service
+from cow_service.jobs.database import Database
+from cow_service.jobs.queues import step_of
 from cow_service.settings import Settings
 
 LIMIT = 1
@@ -121,13 +121,15 @@ def test_priority_is_no_part_of_what_an_idempotency_key_stands_for(alice: Caller
 def test_a_key_of_more_weight_has_more_turns(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("COW_API_KEYS", json.dumps(HASHES))
     monkeypatch.setenv("COW_KEY_WEIGHTS", json.dumps({"alice": 4}))
-    jobs = OpenJobs(Service(Settings(data_dir=tmp_path)))
+    settings = Settings(data_dir=tmp_path)
+    database = Database(settings)
+    database.create_tables()
 
     def last_turn(owner: str) -> int:
-        for number in range(9):
-            turn = jobs.take_turn(owner, "light", "normal").number
-            jobs.record(f"{owner}{number}", OpenJob("cutout", owner, turn))
-        return turn
+        step = step_of(settings.key_weights.get(owner, 1.0))
+        jobs = [add_job(database, f"{owner}{number}", owner, step=step) for number in range(9)]
+        assert jobs[-1] is not None
+        return jobs[-1].spec.turn
 
     assert last_turn("bob") == 4 * last_turn("alice") > 0
-    jobs.database.close()
+    database.close()

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from job_rows import add_job
 from pydantic import SecretStr
 
 from cow_service.errors import Canceled, StorageUnavailable
+from cow_service.jobs.computing import KeyLocks, Outages, StoredStep
 from cow_service.jobs.database import Database
-from cow_service.jobs.outages import Outages
-from cow_service.jobs.stage_cache import KeyLocks, StoredStep
+from cow_service.jobs.job_table import JobTable
 from cow_service.media.disk_artifacts import DiskArtifacts
 from cow_service.observability.metrics import Metrics
 from cow_service.records import MetresPerPixel, Motion
@@ -41,6 +42,7 @@ def step(
     owner: str | None = None,
     budget: float = 0,
 ) -> StoredStep:
+    add_job(database, job_id, owner)
     return StoredStep(
         job_id,
         owner,
@@ -110,6 +112,16 @@ def test_nothing_is_stored_for_a_job_that_was_canceled_meanwhile(database: Datab
         step(database, tmp_path, "one", check=canceled)("motion", SHARED, lambda: result(1))
     assert database.find_result(SHARED.digest) is None
     assert database.finished_stages("one") == set()
+
+
+def test_nothing_is_stored_for_a_job_that_was_deleted_meanwhile(database: Database, tmp_path: Path) -> None:
+    store = step(database, tmp_path, "one")
+    JobTable(database).delete(["one"])
+    with pytest.raises(Canceled, match="was deleted"):
+        store("motion", SHARED, lambda: result(1))
+    assert database.find_result(SHARED.digest) is None
+    with pytest.raises(Canceled, match="was deleted"):
+        database.add_references("one", ["0" * 64])
 
 
 def test_servers_of_one_database_have_one_place_for_artifacts(tmp_path: Path) -> None:

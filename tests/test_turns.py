@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.jobs.turns import LAST, STEP, moves, next_turn, step_of
+from cow_service.jobs.queues import LAST, STEP, moves, next_turn, step_of
 from cow_service.requests import PRIORITIES, Priority
 
 OWNERS = st.sampled_from(("alice", "bob", "carol", None))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cow_service import warm_up as warming
+from cow_service.jobs import readiness as warming
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -19,7 +19,7 @@ LOADED = """
 import sys
 from pathlib import Path
 from cow_service.settings import Settings
-from cow_service.warm_up import warm_up
+from cow_service.jobs.readiness import warm_up
 warm_up(Settings(data_dir=Path(sys.argv[1])))
 from cow_service.readers.embedded.english import grammar as parsing
 print(parsing._grammar.cache_info().currsize, *(f"cow_service.{name}" in sys.modules for name in (

@@ -14,7 +14,7 @@ from conftest import SCALE
 from postgres import postgres_server
 from servers import ASYNC, BODY, Served, Worker, eventually, problem, slow
 
-from cow_service.jobs.queues import _Queue, check_queues  # pyright: ignore[reportPrivateUsage]
+from cow_service.jobs.queues import check_queues
 from cow_service.settings import Settings, SettingsError
 
 pytestmark = pytest.mark.slow
@@ -189,13 +189,3 @@ def test_a_queue_whose_backend_is_not_installed_is_told_with_how_to_install_it(m
     monkeypatch.setattr("cow_service.weights.manifests.find_spec", lambda name: None)
     with pytest.raises(SettingsError, match=r"ati lacks .*torch.*: pip install \"cow-service\[wan\]\""):
         check_queues(Settings(queues=("ati",)))
-
-
-def test_jobs_that_did_not_wait_take_places_of_those_that_do() -> None:
-    taken = 0
-    queue = _Queue("cow-light", 3, lambda: taken)
-    assert queue._worker_concurrency == 3  # pyright: ignore[reportPrivateUsage]
-    taken = 2
-    assert queue._worker_concurrency == 1  # pyright: ignore[reportPrivateUsage]
-    taken = 4
-    assert queue._worker_concurrency == 0  # pyright: ignore[reportPrivateUsage]

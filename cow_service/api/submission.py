@@ -21,8 +21,7 @@ from cow_service.api.middleware.body_limit import release_body
 from cow_service.errors import Canceled, CowError, FieldError, InvalidRequest, JobNotFound, StorageUnavailable
 from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
-from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.state import JobState
+from cow_service.jobs.job_table import JobSpec, JobState
 from cow_service.media.images import DecodedImage
 from cow_service.observability import logging as context
 from cow_service.records import TERMINAL, JobKind

@@ -28,8 +28,7 @@ from cow_service.client.display import (
     readiness_words,
 )
 from cow_service.errors import CowError, InvalidRequest
-from cow_service.jobs.inspection import unserved_jobs
-from cow_service.jobs.overview import remedy, told
+from cow_service.jobs.processes import describe_unserved, remedy, unserved_jobs
 from cow_service.media.images import DecodedImage
 from cow_service.records import (
     DIRECTED_KINDS,
@@ -354,4 +353,5 @@ def print_report(report: Report, *, as_json: bool) -> None:
     if report.jobs_problem:
         console.print(f"[red]{escape(report.jobs_problem)}[/]", highlight=False, soft_wrap=True)
     for one in report.unserved:
-        console.print(f"[yellow]{escape(f'{told(one)} {remedy(one)}')}[/]", highlight=False, soft_wrap=True)
+        text = escape(f"{describe_unserved(one)} {remedy(one)}")
+        console.print(f"[yellow]{text}[/]", highlight=False, soft_wrap=True)

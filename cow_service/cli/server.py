@@ -78,7 +78,7 @@ def migrate() -> None:
 
     Servers and workers do so themselves when they start, unless COW_MIGRATE is false.
     """
-    from cow_service.jobs.migration import migrate as run  # noqa: PLC0415
+    from cow_service.jobs.workflows import migrate as run  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 
     run(load_settings())
@@ -185,9 +185,9 @@ def open_service(*, ahead: bool = False, **overrides: Any) -> Service:
         os.environ.setdefault(name, level)
     settings = load_settings(**overrides)
     if ahead and settings.workers and settings.role == "all":
-        from cow_service.workers.spawning import spawn_ahead  # noqa: PLC0415
+        from cow_service.concurrency import spawn_ahead  # noqa: PLC0415
 
-        spawn_ahead()
+        spawn_ahead("cow_service.workers")
     from cow_service.service import Service  # noqa: PLC0415
 
     return Service(settings)

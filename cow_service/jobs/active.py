@@ -10,12 +10,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from cow_service.errors import Canceled, CowError
-from cow_service.media.images import DecodedImage
 from cow_service.records import JobKind
 from cow_service.requests import Stage
 
 STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")
-BEGIN_SECONDS = 10.0  # within which a job that was taken from its queue begins
 STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation the last is left out
 
 
@@ -23,15 +21,15 @@ At = tuple[Stage | None, float]
 """A stage, and the share of it that is done."""
 
 
-@dataclass
+@dataclass(eq=False)
 class ActiveJob:
     """One job that this process works on."""
 
     kind: JobKind
+    run: str = ""  # the attempt
     at: At = (None, 0.0)  # one value, read at once
     cancel_requested: threading.Event = field(default_factory=threading.Event)
     begun: float | None = None  # when its first stage began (`time.monotonic`)
-    finished: bool = False  # the work is over, though the database may not have its outcome yet
 
     def check(self) -> None:
         """Raises `Canceled` where its end was requested."""
@@ -68,49 +66,27 @@ class ActiveJobs:
     """The jobs that this process runs or waits for. Safe to use from every thread.
 
     An idempotency key that is used again after its job was deleted comes to the same id: a message about an id may be
-    about the earlier job. Images are therefore checked by digest, and outcomes carry the time of their job.
+    about the earlier job. Outcomes therefore carry the time of their job.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._running: dict[str, ActiveJob] = {}
-        self._canceled: dict[str, float] = {}  # when the end of jobs was requested that did not run
         self._elsewhere: dict[str, At] = {}  # how far jobs are that other processes run
         self._waiters: dict[str, list[Waiter]] = {}
-        self._images: dict[str, DecodedImage] = {}
-
-    def put_image(self, job: str, image: DecodedImage) -> None:
-        """Keeps the pixels of a job that starts at once, so that they are not decoded again."""
-        with self._lock:
-            self._images[job] = image
-
-    def take_image(self, job: str, sha256: str) -> DecodedImage | None:
-        """The pixels that were kept, once, if they are those of the image with that digest."""
-        with self._lock:
-            image = self._images.get(job)
-            if image is None or image.info.sha256 != sha256:
-                return None
-            return self._images.pop(job)
-
-    def drop_image(self, job: str) -> None:
-        """Forgets the pixels of a job that was not started."""
-        with self._lock:
-            self._images.pop(job, None)
 
     @contextmanager
-    def running(self, job: str, kind: JobKind) -> Generator[ActiveJob]:
-        """Around the work on a job."""
-        active = ActiveJob(kind)
+    def running(self, job: str, kind: JobKind, run: str = "") -> Generator[ActiveJob]:
+        """Around an attempt to compute a job."""
+        active = ActiveJob(kind, run)
         with self._lock:
             self._running[job] = active
-            if time.monotonic() - self._canceled.pop(job, -BEGIN_SECONDS) < BEGIN_SECONDS:
-                active.cancel_requested.set()
         try:
             yield active
         finally:
             with self._lock:
-                self._images.pop(job, None)
-                active.finished = True
+                if self._running.get(job) is active:  # else another job of the same id runs by now
+                    del self._running[job]
 
     def progress(self, job: str, active: ActiveJob, stage: Stage | None, done: float) -> None:
         """Records how far the work on a job is, and wakes its waiters. Raises `Canceled` on request."""
@@ -120,8 +96,7 @@ class ActiveJobs:
         if stage != active.at[0] or done > active.at[1]:
             active.begun = active.begun or time.monotonic()
             active.at = stage, done
-            for waiter in self._waiters_of(job):
-                waiter.loop.call_soon_threadsafe(waiter.changed.set)
+            self._wake(job)
 
     def get(self, job: str) -> ActiveJob | None:
         """The state of a job that this process runs."""
@@ -141,48 +116,26 @@ class ActiveJobs:
         with self._lock:
             return self._elsewhere | {job: active.at for job, active in self._running.items()}
 
-    def heard(self, job: str, stage: Stage | None, done: float) -> None:
-        """Another process told how far a job is; wakes its waiters."""
+    def set_progress_elsewhere(self, job: str, stage: Stage | None, done: float) -> None:
+        """Notes how far a job is that another process computes, and wakes its waiters."""
         if self.get(job) is None:
             self._elsewhere[job] = stage, done
-            for waiter in self._waiters_of(job):
-                waiter.loop.call_soon_threadsafe(waiter.changed.set)
+            self._wake(job)
 
     def awaited_elsewhere(self) -> list[str]:
         """The jobs that somebody waits for in this process, and that it does not run."""
         with self._lock:
             return [job for job in self._waiters if job not in self._running]
 
-    def ids(self) -> list[str]:
-        """The jobs that this process works on."""
+    def runs(self) -> dict[str, str]:
+        """The jobs that this process works on, and its attempts."""
         with self._lock:
-            return [job for job, active in self._running.items() if not active.finished]
-
-    def ids_of_waiting(self) -> list[str]:
-        """Those of them that are not begun: they wait for a place."""
-        with self._lock:
-            return [job for job, active in self._running.items() if active.begun is None and not active.finished]
-
-    def forget(self, job: str) -> None:
-        """Drops the state of a job whose work is over."""
-        with self._lock:
-            active = self._running.get(job)
-            if active is not None and active.finished:
-                del self._running[job]
+            return {job: active.run for job, active in self._running.items()}
 
     def request_cancel(self, job: str) -> None:
-        """Has the work on a job end at its next step, also where it was taken from its queue and is about to begin."""
-        active, now = self.get(job), time.monotonic()
-        if active is not None:
+        """Has the work on a job end at its next step, where this process does it."""
+        if (active := self.get(job)) is not None:
             active.cancel_requested.set()
-            return
-        with self._lock:
-            self._canceled = {one: at for one, at in self._canceled.items() if now - at < BEGIN_SECONDS} | {job: now}
-
-    def expect(self, job: str) -> None:
-        """A new job has this id: what was asked of an earlier one is over."""
-        with self._lock:
-            self._canceled.pop(job, None)
 
     @contextmanager
     def waiting(self, job: str) -> Generator[Waiter]:
@@ -205,10 +158,13 @@ class ActiveJobs:
 
     def notify_ended(self, job: str, outcome: str | CowError | None, created_at: str | None = None) -> None:
         """Tells waiters that a job has ended. `outcome` where it is at hand, and of which job of that id it is."""
-        self.forget(job)
         self._elsewhere.pop(job, None)
         for waiter in self._waiters_of(job):
             waiter.loop.call_soon_threadsafe(waiter.notify, outcome, created_at)
+
+    def _wake(self, job: str) -> None:
+        for waiter in self._waiters_of(job):
+            waiter.loop.call_soon_threadsafe(waiter.changed.set)
 
     def _waiters_of(self, job: str) -> list[Waiter]:
         with self._lock:

@@ -1,25 +1,174 @@
 """The computation of one job: its stages, each result stored as soon as it is there. In any process that has a service.
 
-A job engine gives its jobs to a `Computer`: its own process (`in_process.py`), or others (`cow_service.workers`).
+A job engine gives its jobs to a `Computer`: its own process, or others (`cow_service.workers`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeVar
 
+import psutil
+from pydantic import ValidationError
+from pydantic_core import to_json
+
+from cow_service.errors import ArtifactNotFound, StorageUnavailable
+from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.database import Database
-from cow_service.jobs.kept_apart import without
-from cow_service.jobs.outages import Outages
-from cow_service.jobs.spec import JobSpec
-from cow_service.jobs.stage_cache import HoldKey, StoredStep
+from cow_service.jobs.job_table import JobSpec, JobTable
+from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import DecodedImage
+from cow_service.observability.metrics import gpu_memory
 from cow_service.pipeline import answer, simulate
-from cow_service.records import GpuMemory
+from cow_service.records import Answer, GpuMemory
 from cow_service.requests import AnswerRequest, ImageArtifact, Stage
 from cow_service.service import Service
+from cow_service.stages.keys import RESULT_TYPES, StageKey, StageResult, digest_of
 from cow_service.stages.run import Progress
+
+CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for another one's result checks whether it was canceled
+FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # seconds between two tries
+
+Value = TypeVar("Value")
+HoldKey = Callable[[str, Callable[[], None]], AbstractContextManager[None]]
+"""Holds the lock of a key; what the second argument raises ends the wait for it."""
+
+log = logging.getLogger("cow_service")
+
+
+@dataclass(frozen=True)
+class Outages:
+    """How long a job waits for storage, and who tells that nobody wants its result any more."""
+
+    budget: float  # seconds, of each outage
+    check_canceled: Callable[[], None]
+
+    def wait_through(self, work: Callable[[], Value]) -> Value:
+        """What `work` returns, tried again while storage is away.
+
+        Raises `StorageUnavailable` where it is away for longer than the budget, and what `check_canceled` raises.
+        """
+        began, wait = time.monotonic(), FIRST_WAIT
+        while True:
+            try:
+                return work()
+            except StorageUnavailable as error:
+                left = began + self.budget - time.monotonic()
+                if left <= 0:
+                    raise
+                log.warning("a job waits: %s", error.detail)
+                until = time.monotonic() + min(wait, left)
+                while (rest := until - time.monotonic()) > 0:
+                    self.check_canceled()
+                    time.sleep(min(FIRST_WAIT, rest))
+                wait = min(2 * wait, LONGEST_WAIT)
+
+
+@dataclass
+class KeyLocks:
+    """A lock for each key in use: what one job computes, another one waits for."""
+
+    _guard: threading.Lock = field(default_factory=threading.Lock)
+    _locks: dict[str, tuple[threading.Lock, int]] = field(default_factory=dict[str, tuple[threading.Lock, int]])
+
+    @contextmanager
+    def held(self, key: str, check_canceled: Callable[[], None]) -> Generator[None]:
+        """Holds the lock of a key. What `check_canceled` raises ends the wait for it."""
+        with self._guard:
+            lock, users = self._locks.get(key, (threading.Lock(), 0))
+            self._locks[key] = (lock, users + 1)
+        try:
+            while not lock.acquire(timeout=CANCEL_POLL_SECONDS):
+                check_canceled()
+            try:
+                yield
+            finally:
+                lock.release()
+        finally:
+            with self._guard:
+                lock, users = self._locks.pop(key)
+                if users > 1:
+                    self._locks[key] = (lock, users - 1)
+
+
+@dataclass
+class StoredStep:
+    """The `Step` of one job: a result is stored as soon as it is there, and not computed again."""
+
+    job_id: str
+    owner: str | None  # whose results of other jobs may be taken: nobody learns what another key asked
+    fresh: bool  # results of other jobs are not taken
+    database: Database
+    artifacts: ArtifactStore
+    looked_for: Callable[[Stage, bool], None]  # hears whether a stage was found
+    hold_key: HoldKey
+    outages: Outages
+    trajectory_key: str | None = None  # of this job's trajectory, where it computed one
+
+    def __call__(
+        self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
+    ) -> tuple[StageResult[Any], bool]:
+        """The stage's result, and whether another job had computed it.
+
+        A job that computes one of `key.also` at this moment is not waited for: it reads more than is wanted here.
+        """
+        digest, *also = (self._stored_as(each, key.shareable) for each in (key.digest, *key.also))
+        with self.hold_key(digest, self.outages.check_canceled):
+            found = self.outages.wait_through(
+                lambda: next((each for key in (digest, *also) if (each := self._find(stage, key)) is not None), None)
+            )
+            if found is not None:
+                result, reused = found
+                self.looked_for(stage, reused)
+                if reused:
+                    self.outages.wait_through(lambda: self.database.reuse_result(self.job_id, stage, result.artifacts))
+                return result, reused
+            self.looked_for(stage, False)
+            result = self.outages.wait_through(compute)
+            self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
+            text, trajectory = result.model_dump_json(exclude={"value"} if stage == "trajectory" else None), None
+            if stage == "trajectory":
+                trajectory, self.trajectory_key = result.value.model_dump_json(), digest
+            stored = digest, self.job_id, stage, text, result.artifacts, trajectory
+            self.outages.wait_through(lambda: self.database.store_result(*stored))
+            return result, False
+
+    def _stored_as(self, digest: str, shareable: bool) -> str:
+        """What a result is stored under, where not all jobs may find it."""
+        if self.fresh or not shareable:
+            return digest_of({"job": self.job_id, "key": digest})
+        return digest if self.owner is None else digest_of({"owner": self.owner, "key": digest})
+
+    def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:
+        """A stored result all of whose artifacts are there, and whether it is another job's."""
+        row = self.database.find_result(digest)
+        if row is None:
+            return None
+        job_id, values = row
+        try:
+            result = RESULT_TYPES[stage].model_validate_json(to_json(values))
+            if result.artifacts and job_id != self.job_id:  # before they are looked for: nobody removes them meanwhile
+                self.database.add_references(self.job_id, result.artifacts)
+            self.artifacts.touch(*result.artifacts)
+        except (ArtifactNotFound, ValidationError):  # lost, or of another version
+            return None
+        return result, job_id != self.job_id
+
+
+@dataclass
+class EngineParts:
+    """What all parts of a job engine share."""
+
+    service: Service  # only tests exchange it
+    database: Database
+    jobs: JobTable
+    active: ActiveJobs
 
 
 @dataclass(frozen=True)
@@ -37,12 +186,14 @@ class Work:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a job came to: the result as JSON, and the time of each stage that was computed for it, s.
+    """The result of a job, and the time of each stage that was computed for it, s.
 
-    A trajectory that was kept apart (`kept_apart.py`) is not in it.
+    `kept` is what is stored of it: without the trajectory where that is stored under `trajectory_key`.
     """
 
-    result: str
+    result: str  # JSON
+    kept: str  # JSON
+    trajectory_key: str | None
     timings: dict[str, float]
 
 
@@ -83,8 +234,11 @@ class Computer(Protocol):
         ...
 
 
-class Elsewhere:
-    """Computes no jobs: worker processes that share the job database take them from its queues."""
+class InProcess:
+    """Computes jobs in the threads that ask for it."""
+
+    def __init__(self, parts: EngineParts) -> None:
+        self._parts, self._locks, self._jobs_done = parts, KeyLocks(), 0
 
     def start(self) -> None:
         """Does nothing."""
@@ -93,12 +247,32 @@ class Elsewhere:
         """Does nothing."""
 
     def capacity(self, queue: str) -> int:
-        """None."""
-        return 0
+        """Those that compute, and those that wait for an MLLM."""
+        settings = self._parts.service.settings
+        return settings.concurrency + settings.mllm_concurrency
 
     def compute(self, work: Work) -> Outcome:
-        """Is never called, as no job is taken."""
-        raise NotImplementedError
+        """As the protocol says."""
+        try:
+            return compute(work, self._parts.service, self._parts.database, self._locks.held)
+        finally:
+            self._jobs_done += 1
+
+    def workers(self) -> tuple[WorkerState, ...]:
+        """The process itself."""
+        memory, jobs = psutil.Process().memory_info().rss, tuple(self._parts.active.runs())
+        return (WorkerState("server", None, os.getpid(), memory, self._jobs_done, jobs, gpu_memory()),)
+
+
+class Elsewhere(InProcess):
+    """Computes no jobs: worker processes that share the job database take them from its queues."""
+
+    def __init__(self) -> None:
+        """It needs nothing."""
+
+    def capacity(self, queue: str) -> int:
+        """None."""
+        return 0
 
     def workers(self) -> tuple[WorkerState, ...]:
         """None."""
@@ -131,4 +305,9 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
             result = simulate(run)
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
     text = result.model_dump_json()
-    return Outcome(text if step.trajectory is None else without(text, "trajectory", *step.trajectory), computed)
+    simulation = result.simulation if isinstance(result, Answer) else result
+    if step.trajectory_key is None or simulation is None:
+        return Outcome(text, text, None, computed)
+    bare = simulation.model_copy(update={"trajectory": None})
+    bare = result.model_copy(update={"simulation": bare}) if isinstance(result, Answer) else bare
+    return Outcome(text, bare.model_dump_json(warnings=False), step.trajectory_key, computed)

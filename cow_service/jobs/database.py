@@ -1,8 +1,6 @@
 """The job database: SQLite in the data folder, or PostgreSQL by COW_DATABASE_URL. DBOS keeps its tables beside ours.
 
-`cow_stage_results` keeps the results of stages under their cache keys, `cow_trajectories` the trajectories, which are
-most of them (`kept_apart.py`). `cow_holds` has the artifact references: which job needs which artifact. An artifact
-without a reference may be removed.
+Results, references and finished stages belong to a job, and are deleted with its row.
 """
 
 from __future__ import annotations
@@ -11,20 +9,23 @@ import os
 import sqlite3
 import sys
 import time
-from collections.abc import Callable, Generator, Iterable
+import zlib
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import sqlalchemy as sa
+from pydantic_core import from_json
 from sqlalchemy import event
 from sqlalchemy.exc import SQLAlchemyError
 
-from cow_service.errors import StorageUnavailable
-from cow_service.jobs.kept_apart import key_in, whole
-from cow_service.jobs.packing import deflated, inflated, packed, unpacked
-from cow_service.jobs.tables import METADATA, REFERENCES, RESULTS, STAGES, TRAJECTORIES
+from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.settings import Settings, SettingsError
+
+if TYPE_CHECKING:
+    import psycopg
 
 BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
 MAX_IDS = 500  # in one statement
@@ -33,22 +34,118 @@ MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log, beyond which it is cu
 TABLES_LOCK = 0x434F5701  # of PostgreSQL, held while tables are created
 INCREMENTAL = 2  # SQLite's number of that mode
 VACUUM_PAGES, KEPT_FREE_PAGES = 500, 500  # of 4 kB: given back at a time, and kept for what is written next
+DEFLATE_LEVEL = 3  # of zlib: higher ones take several times as long and save a twentieth
+OPEN = ("queued", "running")  # the statuses of jobs that have not ended
 
 # These run several times in every job: as plain text they take a fifth of the time that expressions do.
-_FIND = "SELECT job_id, result FROM cow_stage_results WHERE key = ?"
+_FIND = (
+    "SELECT r.job_id, r.result, t.trajectory FROM cow_results r "
+    "LEFT JOIN cow_trajectories_of_jobs t ON t.job_id = r.job_id AND t.key = r.key WHERE r.key = ?"
+)
 # A result that lost its artifacts is computed again, and replaces the one that was there.
 _SAVE = (
-    "INSERT INTO cow_stage_results (key, job_id, stage, result, created_at) VALUES (?, ?, ?, ?, ?) "
+    "INSERT INTO cow_results (key, job_id, stage, result, created_at) VALUES (?, ?, ?, ?, ?) "
     "ON CONFLICT (key) DO UPDATE SET job_id = excluded.job_id, result = excluded.result, "
     "created_at = excluded.created_at"
 )
 _SAVE_TRAJECTORY = (
-    "INSERT INTO cow_trajectories (job_id, key, trajectory) VALUES (?, ?, ?) "
+    "INSERT INTO cow_trajectories_of_jobs (job_id, key, trajectory) VALUES (?, ?, ?) "
     "ON CONFLICT (job_id, key) DO UPDATE SET trajectory = excluded.trajectory"
 )
-_FIND_TRAJECTORY = "SELECT trajectory FROM cow_trajectories WHERE job_id = ? AND key = ?"
-_DONE = "INSERT INTO cow_job_stages (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
-_ADD_REFERENCES = "INSERT INTO cow_holds (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
+_DONE = "INSERT INTO cow_stages_of_jobs (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
+_ADD_REFERENCES = "INSERT INTO cow_references (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
+
+METADATA = sa.MetaData()
+JOBS = sa.Table(
+    "cow_jobs",
+    METADATA,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("owner", sa.Text),  # the name of a key; null where the server has none
+    sa.Column("status", sa.String(16), nullable=False),  # a `JobStatus`: queued until work on it begins
+    sa.Column("created_at", sa.String(32), nullable=False),  # RFC 3339 in UTC, to the millisecond: sorts as text
+    sa.Column("ended", sa.Float),  # Unix time, s
+    sa.Column("version", sa.String(16), nullable=False),  # of the workflow that computes it
+    sa.Column("queue", sa.String(64), nullable=False),
+    sa.Column("priority", sa.String(16), nullable=False),
+    sa.Column("turn", sa.Integer, nullable=False),  # among the jobs of its queue: the lowest is taken first
+    sa.Column("executor", sa.String(64)),  # the process that has taken it; null while it waits in its queue
+    sa.Column("run", sa.String(64)),  # names this attempt: an earlier one can change nothing any more
+    sa.Column("starts", sa.Integer, nullable=False),  # how often it was taken
+    sa.Column("generator", sa.Text, nullable=False),
+    sa.Column("question", sa.Text, nullable=False),
+    sa.Column("image", sa.String(64), nullable=False),
+    sa.Column("webhook", sa.Text),
+    sa.Column("spec", sa.LargeBinary, nullable=False),  # a `JobSpec` as JSON, deflated
+    sa.Column("format", sa.Integer),  # of the result: `FORMAT` when it was stored
+    sa.Column("result", sa.LargeBinary),  # JSON, deflated, without the trajectory where `trajectory_key` names one
+    sa.Column("trajectory_key", sa.String(64)),
+    sa.Column("error", sa.Text),  # JSON
+    sa.Index("cow_jobs_of_time", "created_at"),
+    sa.Index("cow_jobs_of_status", "status", "created_at"),
+    sa.Index("cow_jobs_of_owner", "owner", "created_at"),
+    sa.Index("cow_jobs_ended", "ended"),
+)
+
+
+def _of_job(**options: Any) -> sa.Column[str]:
+    return sa.Column("job_id", sa.String(64), sa.ForeignKey(JOBS.c.id, ondelete="CASCADE"), **options)
+
+
+# Results of stages by their cache keys.
+RESULTS = sa.Table(
+    "cow_results",
+    METADATA,
+    sa.Column("key", sa.String(64), primary_key=True),
+    _of_job(nullable=False, index=True),
+    sa.Column("stage", sa.String(32), nullable=False),
+    sa.Column("result", sa.LargeBinary, nullable=False),  # JSON, deflated; without its value where that is a trajectory
+    sa.Column("created_at", sa.Float, nullable=False),
+)
+# A trajectory is most of a result: it is stored once for its stage and its job, under the key of the stage.
+TRAJECTORIES = sa.Table(
+    "cow_trajectories_of_jobs",
+    METADATA,
+    _of_job(primary_key=True),
+    sa.Column("key", sa.String(64), primary_key=True),
+    sa.Column("trajectory", sa.LargeBinary, nullable=False),  # JSON, deflated
+)
+# Which job needs which artifact: one without a reference may be removed.
+REFERENCES = sa.Table(
+    "cow_references",
+    METADATA,
+    sa.Column("sha256", sa.String(64), primary_key=True),
+    _of_job(primary_key=True, index=True),
+)
+# The stages of each job that are done, whoever computed their results.
+STAGES = sa.Table(
+    "cow_stages_of_jobs",
+    METADATA,
+    _of_job(primary_key=True),
+    sa.Column("stage", sa.String(32), primary_key=True),
+)
+# Where the artifacts of all jobs are: one row, once a server has started.
+STORES = sa.Table(
+    "cow_artifact_store",
+    METADATA,
+    sa.Column("id", sa.Integer, primary_key=True),  # always 1
+    sa.Column("address", sa.Text, nullable=False),
+)
+# When a process last began a kind of maintenance, of which each is one process's work at a time.
+MAINTENANCE = sa.Table(
+    "cow_maintenance",
+    METADATA,
+    sa.Column("task", sa.String(16), primary_key=True),
+    sa.Column("begun", sa.Float, nullable=False),  # Unix time, s
+)
+# One row for each process that runs an engine.
+PROCESSES = sa.Table(
+    "cow_executors",
+    METADATA,
+    sa.Column("executor", sa.String(64), primary_key=True),
+    sa.Column("seen", sa.Float, nullable=False),  # Unix time of the database, s
+    sa.Column("info", sa.Text, nullable=False),  # a `ProcessInfo` as JSON
+)
 
 
 class Database:
@@ -56,17 +153,30 @@ class Database:
 
     def __init__(self, settings: Settings) -> None:
         self.url, self.file = _address(settings)
-        self.engine = _engine(self.url, self.file is not None)
-        self._reading = self.engine.execution_options(isolation_level="AUTOCOMMIT")  # single statements
+        self._use(_engine(self.url, self.file is not None))
+
+    def _use(self, engine: sa.Engine) -> None:
+        self.engine = engine
+        self._reading = engine.execution_options(isolation_level="AUTOCOMMIT")  # single statements
 
     def create_tables(self) -> None:
         """Makes our tables where they are missing, and the folder of a file."""
         if self.file is not None:
             self.file.parent.mkdir(parents=True, exist_ok=True)
-        with database_errors(), self.engine.begin() as connection:
+        with self.transaction() as connection:
             if self.file is None:  # two processes that create the same table at the same time would fail one another
                 connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": TABLES_LOCK})
             METADATA.create_all(connection)
+
+    def open_read_only(self) -> None:
+        """Uses the file, which exists, without changing it."""
+        assert self.file is not None
+        self._use(sa.create_engine(f"sqlite:///file:{quote(str(self.file.resolve()))}?mode=ro&uri=true"))
+
+    def has_tables(self) -> bool:
+        """Whether a server of this version has used the database."""
+        with database_errors():
+            return METADATA.tables.keys() <= set(sa.inspect(self.engine).get_table_names())
 
     def check_tables(self) -> None:
         """Raises `StorageUnavailable` where a table of ours is missing."""
@@ -80,13 +190,10 @@ class Database:
 
         A server with a store of its own would take jobs whose images it does not have, and fail them.
         """
-        with self._cursor() as cursor:
-            cursor.execute(
-                self._plain("INSERT INTO cow_artifact_store (id, address) VALUES (1, ?) ON CONFLICT DO NOTHING"),
-                (address,),
-            )
-            cursor.execute("SELECT address FROM cow_artifact_store WHERE id = 1")
-            known = cursor.fetchone()[0]
+        with self.transaction() as connection:
+            first = "INSERT INTO cow_artifact_store (id, address) VALUES (1, :address) ON CONFLICT DO NOTHING"
+            connection.execute(sa.text(first), {"address": address})
+            known = connection.execute(sa.select(STORES.c.address)).scalar_one()
         if known != address:
             raise StorageUnavailable(
                 f"The jobs of this database have their images in {known}, and this server in {address}. Give all "
@@ -97,13 +204,18 @@ class Database:
 
     def check(self) -> None:
         """Runs a query that always succeeds where the database can be used."""
-        with database_errors(), self._reading.connect() as connection:
-            connection.execute(sa.text("SELECT 1"))
+        self.read(sa.text("SELECT 1"))
 
-    def check_server(self) -> None:
-        """As `check`, but only of a database server: DBOS would wait for one that is down, and so would the caller."""
-        if self.file is None:
-            self.check()
+    def read(self, query: sa.Executable) -> Sequence[Any]:
+        """The rows of a single query."""
+        with database_errors(), self._reading.connect() as connection:
+            return connection.execute(query).all()
+
+    @contextmanager
+    def transaction(self) -> Generator[sa.Connection]:
+        """A connection whose statements are committed together at the end of the block."""
+        with database_errors(), self.engine.begin() as connection:
+            yield connection
 
     def give_room_back(self, stop: Callable[[], bool]) -> None:
         """Returns the room of removed rows to the disk, in steps between which others write.
@@ -135,15 +247,19 @@ class Database:
 
     def notify(self, channel: str, payload: str) -> None:
         """Tells all who listen to a channel of PostgreSQL."""
-        with database_errors(), self._reading.connect() as connection:
-            connection.execute(
-                sa.text("SELECT pg_notify(:channel, :payload)"), {"channel": channel, "payload": payload}
-            )
+        self.read(sa.select(sa.func.pg_notify(channel, payload)))
+
+    def session(self) -> psycopg.Connection[Any]:
+        """A connection to PostgreSQL of the caller's own. Raises `psycopg.Error`."""
+        import psycopg  # noqa: PLC0415 # costly to import where it is not needed
+
+        address = sa.make_url(self.url).set(drivername="postgresql").render_as_string(hide_password=False)
+        return psycopg.connect(address, autocommit=True, connect_timeout=CONNECT_SECONDS)
 
     def flush(self) -> None:
         """Returns once everything that was committed is on the disk, and so outlives a loss of power."""
         if self.file is None:
-            with database_errors(), self.engine.begin() as connection:
+            with self.transaction() as connection:
                 connection.execute(sa.text("SET LOCAL synchronous_commit = on"))
                 connection.execute(sa.text("SELECT txid_current()"))  # a commit that waits for all before it
             return
@@ -157,42 +273,34 @@ class Database:
         finally:
             os.close(descriptor)
 
-    def find_result(self, key: str) -> tuple[str, str] | None:
-        """The job that computed a stage's result, and the result as JSON."""
+    def find_result(self, key: str) -> tuple[str, Any] | None:
+        """The job that computed a stage's result, and the result as JSON values."""
         with self._cursor() as cursor:
             cursor.execute(self._plain(_FIND), (key,))
             row = cursor.fetchone()
         if row is None:
             return None
-        job, text = row[0], self.whole(row[0], unpacked(row[1]), "value")
-        return None if text is None else (job, text)
-
-    def whole(self, job: str, text: str, name: str = "trajectory") -> str | None:
-        """The result of a job as JSON, or of a stage, with the trajectory that the job keeps apart from it.
-
-        None where there is none any more: the job was deleted.
-        """
-        key = key_in(text, name)
-        if key is None:
-            return text
-        with self._cursor() as cursor:
-            cursor.execute(self._plain(_FIND_TRAJECTORY), (job, key))
-            row = cursor.fetchone()
-        return None if row is None else whole(text, name, inflated(row[0]), key)
+        job, result, trajectory = row[0], unpacked(row[1]), row[2]
+        if trajectory is not None:
+            result["value"] = unpacked(trajectory)
+        return job, result
 
     def store_result(
         self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str], trajectory: str | None = None
     ) -> None:
-        """Adds references to a stage's artifacts, and saves its result, and the trajectory that is apart from it."""
+        """Adds references to a stage's artifacts, and saves its result; its value apart from it as `trajectory`.
+
+        Raises `Canceled` where the job was deleted.
+        """
         with self._cursor(writes=True) as cursor:
             self._add_references(cursor, job, artifacts)
             if trajectory is not None:
-                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, key, deflated(trajectory)))
+                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, key, packed(trajectory)))
             cursor.execute(self._plain(_SAVE), (key, job, stage, packed(result), time.time()))
             cursor.execute(self._plain(_DONE), (job, stage))
 
     def reuse_result(self, job: str, stage: str, artifacts: Iterable[str]) -> None:
-        """Adds references to the artifacts of a result that another job had computed."""
+        """Adds references to the artifacts of a result that another job had computed. Raises as `store_result` does."""
         with self._cursor(writes=True) as cursor:
             self._add_references(cursor, job, artifacts)
             cursor.execute(self._plain(_DONE), (job, stage))
@@ -202,43 +310,38 @@ class Database:
         return self._column(sa.select(STAGES.c.stage).where(STAGES.c.job_id == job))
 
     def add_references(self, job: str, artifacts: Iterable[str]) -> None:
-        """Notes that a job needs some artifacts."""
+        """Notes that a job needs some artifacts. Raises as `store_result` does."""
         with self._cursor() as cursor:
             self._add_references(cursor, job, artifacts)
 
-    def remove_jobs(self, jobs: list[str]) -> list[str]:
-        """Removes the results and references of some jobs; returns the artifacts that no job needs any more."""
-        artifacts: set[str] = set()
-        with database_errors(), self.engine.begin() as connection:
-            for chunk in _chunks(jobs):
-                theirs = sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(chunk)).distinct()
-                artifacts |= set(connection.execute(theirs).scalars())
-                connection.execute(sa.delete(REFERENCES).where(REFERENCES.c.job_id.in_(chunk)))
-                for ours in (RESULTS, TRAJECTORIES, STAGES):
-                    connection.execute(sa.delete(ours).where(ours.c.job_id.in_(chunk)))
-        return list(artifacts - self.referenced(artifacts))
-
     def referenced(self, artifacts: Iterable[str]) -> set[str]:
         """Those of some artifacts that a job needs."""
-        found: set[str] = set()
-        for chunk in _chunks(list(artifacts)):
-            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.sha256.in_(chunk)))
+        found, all_of_them = set[str](), list(artifacts)
+        for start in range(0, len(all_of_them), MAX_IDS):
+            some = all_of_them[start : start + MAX_IDS]
+            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.sha256.in_(some)))
         return found
 
-    def artifacts_of(self, jobs: Iterable[str]) -> set[str]:
-        """The artifacts that some jobs need."""
-        found: set[str] = set()
-        for chunk in _chunks(list(jobs)):
-            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(chunk)))
-        return found
+    def referenced_by_open_jobs(self) -> set[str]:
+        """The artifacts that jobs need which have not ended."""
+        return self._column(sa.select(REFERENCES.c.sha256).join(JOBS).where(JOBS.c.status.in_(OPEN)))
 
-    def jobs_with(self, sha256: str) -> list[str]:
-        """The jobs that need an artifact."""
-        return list(self._column(sa.select(REFERENCES.c.job_id).where(REFERENCES.c.sha256 == sha256)))
+    def take_turn(self, task: str, seconds: float) -> bool:
+        """Whether no process has begun a task of maintenance for so long: it is then the caller's alone."""
+        now = time.time()
+        first = sa.text("INSERT INTO cow_maintenance (task, begun) VALUES (:task, 0) ON CONFLICT DO NOTHING")
+        due = MAINTENANCE.c.task == task, MAINTENANCE.c.begun <= now - seconds
+        with self.transaction() as connection:
+            connection.execute(first, {"task": task})
+            return connection.execute(sa.update(MAINTENANCE).where(*due).values(begun=now)).rowcount > 0
 
-    def _column(self, query: Any) -> set[str]:
-        with database_errors(), self._reading.connect() as connection:
-            return set(connection.execute(query).scalars())
+    def give_turn_back(self, task: str) -> None:
+        """The task was not done: whoever asks next may take it."""
+        with self.transaction() as connection:
+            connection.execute(sa.update(MAINTENANCE).where(MAINTENANCE.c.task == task).values(begun=0))
+
+    def _column(self, query: sa.Executable) -> set[str]:
+        return {row[0] for row in self.read(query)}
 
     @contextmanager
     def _cursor(self, *, writes: bool = False) -> Generator[Any]:
@@ -271,12 +374,27 @@ class Database:
             cursor.execute(self._plain(_ADD_REFERENCES.format(", ".join(["(?, ?)"] * (len(rows) // 2)))), rows)
 
 
+def packed(json: str) -> bytes:
+    """A JSON text as the database keeps it: a trajectory is tens of kilobytes of digits."""
+    return zlib.compress(json.encode(), DEFLATE_LEVEL)
+
+
+def unpacked(kept: bytes) -> Any:
+    """The values of a JSON text that was packed."""
+    return from_json(zlib.decompress(kept))
+
+
 @contextmanager
 def database_errors() -> Generator[None]:
-    """Translates the database's errors to `StorageUnavailable`. Their own text may hold addresses, and is left out."""
+    """Translates the database's errors to `StorageUnavailable`. Their own text may hold addresses, and is left out.
+
+    What belongs to a job that was deleted meanwhile cannot be stored: this raises `Canceled`.
+    """
     try:
         yield
     except (SQLAlchemyError, sqlite3.Error, *_driver_errors()) as error:
+        if "IntegrityError" in (kind.__name__ for kind in type(error).__mro__):
+            raise Canceled("The job was deleted before it was done.") from error
         raise StorageUnavailable(
             f"The job database cannot be used ({type(error).__name__}): see COW_DATABASE_URL, and the disk it is on."
         ) from error
@@ -286,10 +404,6 @@ def _driver_errors() -> tuple[type[Exception], ...]:
     """Those of PostgreSQL's driver, which takes long to import where it is not needed."""
     driver = sys.modules.get("psycopg")
     return () if driver is None else (driver.Error,)
-
-
-def _chunks(values: list[str]) -> Iterable[list[str]]:
-    return (values[i : i + MAX_IDS] for i in range(0, len(values), MAX_IDS))
 
 
 def _address(settings: Settings) -> tuple[str, Path | None]:

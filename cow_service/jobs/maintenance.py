@@ -1,187 +1,347 @@
-"""Background work of a job engine: announces ends, polls for cancellations, recovers jobs, collects garbage."""
+"""Background work of a job engine: recovers jobs, notices cancellations, and cleans up what nobody needs any more."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import threading
 import time
-from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from collections.abc import Callable, Generator, Iterable
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
 
-from dbos import DBOS
+import psycopg
 from dbos import error as dbos_error
+from filelock import FileLock, Timeout
 from sqlalchemy.exc import SQLAlchemyError
 
-from cow_service.errors import CowError
-from cow_service.jobs import state
-from cow_service.jobs.garbage import collect_artifacts
-from cow_service.jobs.leases import Lease
-from cow_service.jobs.news import JobNews, News
-from cow_service.jobs.open_jobs import OpenJobs
-from cow_service.jobs.queues import PREFIX
-from cow_service.jobs.recovery import recover
-from cow_service.jobs.tidying import give_turn_back, takes_turn, without_job
+from cow_service.errors import CowError, StorageUnavailable
+from cow_service.jobs import webhooks, workflows
+from cow_service.jobs.computing import EngineParts
+from cow_service.jobs.database import Database, database_errors
+from cow_service.jobs.webhooks import Webhooks
+from cow_service.media.artifacts import ArtifactStore, ListedArtifact
+from cow_service.service import Service
 
-OUTCOME_POLL_SECONDS = 0.005  # while the database has not got the outcome of finished work
-OUTCOME_TIMEOUT_SECONDS = 30.0  # after which waiters are left to their own polling
-CANCEL_POLL_SECONDS = 1.0  # for jobs that run here and were canceled by another process, and for processes that ended
+POLL_SECONDS = 1.0  # for processes that ended, and for jobs that run here and were canceled by another process
 STALLED_SECONDS = 10.0  # between checks for stalled jobs
-GARBAGE_SECONDS = 600.0  # between garbage collections
-TURN_SECONDS = 0.9 * GARBAGE_SECONDS  # since the last one of any process, which may have begun late
+CLEAN_UP_SECONDS = 600.0  # between two rounds
+TURN_SECONDS = 0.9 * CLEAN_UP_SECONDS  # since the last one of any process, which may have begun late
 # The same where artifacts are listed, which costs seconds for hundreds of thousands. It must be done sooner only where
 # they have a budget: without a reference they are kept for an hour anyway.
 LISTING_SECONDS = 0.9 * 3600.0
-SUBMIT_SECONDS = 5.0  # within which a job is in the database after the reference to its image
 MAX_REMOVED_JOBS = 200  # at a time
 JOIN_TIMEOUT_SECONDS = 5.0
+# Both are longer than an object store's times of use may be wrong.
+UNREFERENCED_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
+BUDGET_GRACE_SECONDS = 900.0  # that it is kept after its last use, whatever the budget: a stage may be about to refer
+LEFTOVER_SECONDS = 24 * 3600.0  # that a temporary file is kept after it was last written to
+BEAT_SECONDS = 1.5  # between two signs of life
+SILENCE_SECONDS = 8.0  # after which PostgreSQL ends the session of a lease
+CONFIRM_SECONDS = 2.5  # that a lease must be free: after a restart of the server everybody's is for a moment
 
 log = logging.getLogger("cow_service")
 
 
-class Maintenance:
-    """Two threads beside an engine's own."""
+class FolderLease:
+    """The lease of a process on SQLite: a lock file, which the operating system releases however the process ends."""
 
-    def __init__(self, open_jobs: OpenJobs, lease: Lease, news: News) -> None:
-        self._open_jobs = open_jobs
-        self._news = news
-        self._lease = lease
-        self._finished: dict[str, float] = {}  # jobs whose outcome is awaited, and until when
-        self._has_finished = threading.Event()
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._lock: FileLock | None = None
+        self._executor = ""
+
+    def acquire(self) -> str:
+        """Takes a lease on a new executor id, and returns the id. Raises `StorageUnavailable`."""
+        self._executor = uuid4().hex
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._lock = FileLock(self._folder / f"{self._executor}.lock")
+            self._lock.acquire(timeout=0)
+        except OSError as error:
+            raise StorageUnavailable("The data folder cannot be written: no place for this process.") from error
+        return self._executor
+
+    @contextmanager
+    def ended(self, executors: Iterable[str]) -> Generator[list[str]]:
+        """Those of some executors whose processes have ended. Nobody else finds them inside the block."""
+        locks: dict[str, FileLock] = {}
+        try:
+            for executor in set(executors) - {self._executor}:
+                lock = FileLock(self._folder / f"{executor}.lock")
+                with suppress(Timeout):
+                    lock.acquire(timeout=0)
+                    locks[executor] = lock
+            yield list(locks)
+        finally:
+            for lock in locks.values():
+                lock.release()
+                Path(lock.lock_file).unlink(missing_ok=True)
+
+    def release(self) -> None:
+        """Gives the lease back."""
+        if self._lock is not None:
+            self._lock.release()
+            Path(self._lock.lock_file).unlink(missing_ok=True)
+            self._lock = None
+
+
+class SessionLease:
+    """The lease of a process on PostgreSQL: an advisory lock of a session, which ends after a silence.
+
+    So also a process that is frozen, or whose machine is gone, loses it.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._executor = ""
+        self._session: psycopg.Connection[Any] | None = None
+        self._guard = threading.Lock()
         self._stop = threading.Event()
-        self._threads: list[threading.Thread] = []
+        self._thread: threading.Thread | None = None
+        self._free_since: dict[str, float] = {}
+
+    def acquire(self) -> str:
+        """As that of a folder."""
+        self._executor = uuid4().hex
+        self._stop.clear()
+        with database_errors():
+            self._open()
+        self._thread = threading.Thread(target=self._beat, name="cow-lease", daemon=True)
+        self._thread.start()
+        return self._executor
+
+    @contextmanager
+    def ended(self, executors: Iterable[str]) -> Generator[list[str]]:
+        """As that of a folder. One counts as ended when its lease was free before, too."""
+        with self._guard:
+            session = self._session
+            if session is None:  # an outage: nobody can be told from those that have ended
+                yield []
+                return
+            free = set[str]()
+            try:
+                with database_errors():
+                    for one in set(executors) - {self._executor}:
+                        row = session.execute("SELECT pg_try_advisory_lock(%s)", (_key(one),)).fetchone()
+                        free |= {one} if row is not None and row[0] else set()
+                now = time.monotonic()
+                self._free_since = {one: self._free_since.get(one, now) for one in free}
+                yield [one for one, since in self._free_since.items() if now - since >= CONFIRM_SECONDS]
+            finally:
+                with suppress(psycopg.Error):  # with the session its locks end, too
+                    for one in free:
+                        session.execute("SELECT pg_advisory_unlock(%s)", (_key(one),))
+
+    def release(self) -> None:
+        """As that of a folder."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._session is not None:
+            with suppress(psycopg.Error):
+                self._session.close()
+            self._session = None
+
+    def _beat(self) -> None:
+        """Keeps the session alive, and takes the lease again after an outage."""
+        while not self._stop.wait(BEAT_SECONDS):
+            with self._guard:
+                try:
+                    if self._session is None:
+                        self._open()
+                    else:
+                        self._session.execute("SELECT 1")
+                except psycopg.Error:
+                    log.warning("the lease of this process was lost: it is taken again when the database is back")
+                    if self._session is not None:
+                        with suppress(psycopg.Error):
+                            self._session.close()
+                    self._session = None
+                    self._free_since = {}
+
+    def _open(self) -> None:
+        session = self._database.session()
+        session.execute("SELECT set_config('idle_session_timeout', %s, false)", (f"{SILENCE_SECONDS:g}s",))
+        session.execute("SELECT pg_advisory_lock(%s)", (_key(self._executor),))  # held by who looks at it, for a moment
+        self._session = session
+
+
+def _key(executor: str) -> int:
+    return int.from_bytes(hashlib.sha256(executor.encode()).digest()[:8], signed=True)
+
+
+Lease = FolderLease | SessionLease
+
+
+def lease_of(database: Database, folder: Path) -> Lease:
+    """The lease of a process on a database; `folder` is that of the lock files."""
+    return SessionLease(database) if database.file is None else FolderLease(folder)
+
+
+class Maintenance:
+    """A thread beside an engine's own. `remove` removes jobs, and those of their artifacts not used since a time."""
+
+    def __init__(
+        self, parts: EngineParts, hooks: Webhooks, lease: Lease, remove: Callable[[list[str], float], None]
+    ) -> None:
+        self._parts, self._hooks, self._lease, self._remove = parts, hooks, lease, remove
+        self._executor = ""
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
         self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
 
-    def start(self) -> None:
-        """Starts the threads."""
+    def start(self, executor: str) -> None:
+        """Starts the thread, for a process."""
+        self._executor = executor
         self._stop.clear()
-        for target, name in ((self._announce_ends, "cow-outcomes"), (self._maintain, "cow-maintenance")):
-            thread = threading.Thread(target=target, name=name, daemon=True)
-            thread.start()
-            self._threads.append(thread)
+        self._thread = threading.Thread(target=self._maintain, name="cow-maintenance", daemon=True)
+        self._thread.start()
 
     def stop(self) -> None:
-        """Ends the threads; one that waits for a database that is down does not keep the process."""
+        """Ends the thread; one that waits for a database that is down does not keep the process."""
         self._stop.set()
-        self._has_finished.set()
-        for thread in self._threads:
-            thread.join(JOIN_TIMEOUT_SECONDS)
-        self._threads.clear()
+        if self._thread is not None:
+            self._thread.join(JOIN_TIMEOUT_SECONDS)
+            self._thread = None
 
-    def announce(self, job_id: str) -> None:
-        """Has the end of a job announced as soon as the database has its outcome."""
-        self._finished[job_id] = time.monotonic() + OUTCOME_TIMEOUT_SECONDS
-        self._has_finished.set()
-
-    def collect_garbage(self) -> None:
+    def clean_up(self) -> None:
         """Removes jobs past their retention, and artifacts without references."""
-        self._collect_jobs()
-        self._collect_artifacts()
-
-    def _collect_jobs(self) -> None:
-        open_jobs = self._open_jobs
-        before = datetime.now(UTC) - timedelta(hours=open_jobs.service.settings.job_retention_hours)
-        while not self._stop.is_set() and (jobs := state.ended_before(before, MAX_REMOVED_JOBS)):
-            open_jobs.remove(jobs, before.timestamp())
-        # What jobs left that were deleted while they ran. One that is being submitted refers to its image a moment
-        # before it is in the database: it is looked for twice.
-        missing = without_job(open_jobs.database)
-        if missing and not self._stop.wait(SUBMIT_SECONDS):
-            open_jobs.database.remove_jobs(sorted(set(missing) & set(without_job(open_jobs.database))))
+        self._clean_up_jobs()
         if not self._stop.is_set():
-            open_jobs.database.give_room_back(self._stop.is_set)
-
-    def _collect_artifacts(self) -> None:
-        if not self._stop.is_set():
-            collect_artifacts(self._open_jobs.service, self._open_jobs.database, self._stop.is_set)
-
-    def _announce_ends(self) -> None:
-        while self._has_finished.wait() and not self._stop.is_set():
-            self._has_finished.clear()
-            while self._finished and not self._stop.wait(OUTCOME_POLL_SECONDS):
-                if not self._logged(self._check_finished):
-                    self._stop.wait(CANCEL_POLL_SECONDS)
-
-    def _check_finished(self) -> None:
-        now = time.monotonic()
-        for job_id, until in list(self._finished.items()):
-            if now > until:
-                del self._finished[job_id]
-                self._open_jobs.active.forget(job_id)
-                continue
-            found = state.find(job_id, self._open_jobs.active, full=False)
-            if found is None or found.ended is not None:
-                self._open_jobs.ended(job_id, None)
-                self._news.tell(JobNews("ended", job_id))
-                del self._finished[job_id]
+            collect_artifacts(self._parts.service, self._parts.database, self._stop.is_set)
 
     def _maintain(self) -> None:
-        looked = collected = time.monotonic()  # recovered jobs refer to their artifacts before anything is removed
+        looked = cleaned = time.monotonic()  # recovered jobs refer to their artifacts before anything is removed
         while not self._stop.is_set():
             self._logged(self._recover)
-            self._logged(self._poll_cancellations)
+            self._logged(self._notice_cancellations)
             now = time.monotonic()
             if now - looked > STALLED_SECONDS:
                 looked = now
-                self._logged(self._resume_stalled)
-                self._logged(self._open_jobs.recount)
-            if now - collected > GARBAGE_SECONDS:
-                collected = now
-                self._logged(self._tidy)
-            self._stop.wait(CANCEL_POLL_SECONDS)
-
-    def _tidy(self) -> None:
-        database, settings = self._open_jobs.database, self._open_jobs.service.settings
-        if takes_turn(database, "jobs", TURN_SECONDS):
-            self._collect_jobs()
-        seconds = LISTING_SECONDS if settings.artifacts_max_gb is None else TURN_SECONDS
-        if self._stop.is_set() or not takes_turn(database, "artifacts", seconds):
-            return
-        try:
-            self._collect_artifacts()
-        except BaseException:
-            give_turn_back(database, "artifacts")  # an hour is long
-            raise
-
-    def _poll_cancellations(self) -> None:
-        """Another process may have canceled or deleted a job that runs here, or taken it while this one was frozen."""
-        running = self._open_jobs.active.ids()
-        if not running:
-            return
-        ours = {
-            one.workflow_id
-            for one in state.workflows_of_jobs(workflow_ids=running)
-            if one.status != "CANCELLED" and one.executor_id == DBOS.executor_id
-        }
-        for job_id in set(running) - ours:
-            self._open_jobs.active.request_cancel(job_id)
+                self._logged(self._release_stalled)
+            if now - cleaned > CLEAN_UP_SECONDS:
+                cleaned = now
+                self._logged(self._clean_up_in_turn)
+            self._stop.wait(POLL_SECONDS)
 
     def _recover(self) -> None:
-        """Returns the jobs of processes that have ended to their queues, from which any live process takes them."""
-        executors = state.executors_at_work() - {DBOS.executor_id}
-        if not executors:
+        """Has the jobs of processes that have ended done by others."""
+        executors = self._parts.jobs.executors() | workflows.busy_executors(self._hooks.client)
+        if executors == {self._executor} or not executors:
             return
-        with self._lease.ended(executors) as ended:
-            for job_id in recover(ended):
+        with self._lease.ended(executors - {self._executor}) as ended:
+            for job_id in workflows.recover(self._hooks.client, self._parts.jobs, ended) if ended else ():
                 log.info("recovering %s", job_id)
 
-    def _resume_stalled(self) -> None:
-        """Resumes jobs of this process that no thread works on: their outcome could not be written, for example."""
-        pending = state.workflows_of_jobs(status="PENDING", executor_id=DBOS.executor_id)
-        idle = {one.workflow_id for one in pending} - set(self._open_jobs.active.ids())
-        for one in pending:
-            if one.workflow_id in idle & self._idle:  # idle at the last check, too: it is not just being started
-                log.warning("job %s was stalled, and is resumed", one.workflow_id)
-                DBOS.resume_workflow(one.workflow_id, queue_name=PREFIX + state.queue_of(one))
+    def _notice_cancellations(self) -> None:
+        """Another process may have canceled or deleted a job that runs here, or taken it while this one was frozen."""
+        active = self._parts.active
+        if running := active.runs():
+            ours = self._parts.jobs.taken_by(self._executor)
+            for job_id, run in running.items():
+                if ours.get(job_id) != run:
+                    active.request_cancel(job_id)
+
+    def _release_stalled(self) -> None:
+        """Gives back jobs of this process that no thread works on: they could not be started, for example."""
+        taken = self._parts.jobs.taken_by(self._executor)
+        idle = taken.keys() - self._parts.active.runs().keys()
+        for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
+            log.warning("job %s was stalled, and goes back to its queue", job_id)
+            self._parts.jobs.release(job_id, taken[job_id])
         self._idle = idle
 
-    def _logged(self, work: Callable[[], None]) -> bool:
-        """Whether work succeeded. Errors are logged only: maintenance continues whatever happens."""
+    def _clean_up_in_turn(self) -> None:
+        """Does what no other process has done lately."""
+        database, settings = self._parts.database, self._parts.service.settings
+        if database.take_turn("jobs", TURN_SECONDS):
+            self._clean_up_jobs()
+        seconds = LISTING_SECONDS if settings.artifacts_max_gb is None else TURN_SECONDS
+        if self._stop.is_set() or not database.take_turn("artifacts", seconds):
+            return
+        try:
+            collect_artifacts(self._parts.service, database, self._stop.is_set)
+        except BaseException:
+            database.give_turn_back("artifacts")  # an hour is long
+            raise
+
+    def _clean_up_jobs(self) -> None:
+        before = time.time() - 3600.0 * self._parts.service.settings.job_retention_hours
+        while not self._stop.is_set() and (jobs := self._parts.jobs.ended_before(before, MAX_REMOVED_JOBS)):
+            self._remove(jobs, before)
+        # The records that DBOS keeps of attempts: those of jobs are of no use once they are over.
+        client = self._hooks.client
+        for name, until in ((workflows.WORKFLOW, time.time()), (webhooks.WORKFLOW, before)):
+            found = partial(workflows.ended_workflows, client, name, until, MAX_REMOVED_JOBS)
+            while not self._stop.is_set() and (records := found()):
+                client.delete_workflows(records)
+        if not self._stop.is_set():
+            self._parts.database.give_room_back(self._stop.is_set)
+
+    def _logged(self, work: Callable[[], None]) -> None:
+        """Errors are logged only: maintenance continues whatever happens."""
         try:
             work()
         except (CowError, dbos_error.DBOSException, SQLAlchemyError) as error:
             log.warning("maintenance: %s", getattr(error, "detail", type(error).__name__))
-            return False
         except Exception:
             log.exception("maintenance failed")
-            return False
-        return True
+
+
+def collect_artifacts(service: Service, database: Database, stop: Callable[[], bool], now: float | None = None) -> None:
+    """Removes what is not needed any more, as of `now` (Unix time, s; by default the clock's), until `stop` says so."""
+    now = time.time() if now is None else now
+    store, max_gb = service.artifacts, service.settings.artifacts_max_gb
+    store.remove_leftovers(now - LEFTOVER_SECONDS)
+    left = _remove_unreferenced(store, database, list(store.listed()), now - UNREFERENCED_GRACE_SECONDS, stop)
+    if max_gb is not None:
+        _keep_within(max_gb * 1e9, store, database, left, now - BUDGET_GRACE_SECONDS, stop)
+
+
+def _remove_unreferenced(
+    store: ArtifactStore, database: Database, listed: list[ListedArtifact], moment: float, stop: Callable[[], bool]
+) -> list[ListedArtifact]:
+    """Returns the artifacts that are left."""
+    needed = database.referenced(one.sha256 for one in listed if one.used_at <= moment)
+    left: list[ListedArtifact] = []
+    for one in listed:
+        kept = one.used_at > moment or one.sha256 in needed or stop()
+        if kept or not store.delete(one.sha256, moment):
+            left.append(one)
+    if removed := len(listed) - len(left):
+        log.info("removed %d artifacts that no job refers to", removed)
+    return left
+
+
+def _keep_within(
+    max_bytes: float,
+    store: ArtifactStore,
+    database: Database,
+    listed: list[ListedArtifact],
+    moment: float,
+    stop: Callable[[], bool],
+) -> None:
+    """Removes the longest unused artifacts until all fit, none of an open job and none that was used since `moment`."""
+    total = sum(one.size for one in listed)
+    if total <= max_bytes:
+        return
+    needed = database.referenced_by_open_jobs()
+    removed = 0
+    for one in sorted(listed, key=lambda each: each.used_at):
+        if total <= max_bytes or one.used_at > moment or stop():
+            break
+        if one.sha256 not in needed and store.delete(one.sha256, moment):
+            total -= one.size
+            removed += 1
+    log.info("removed %d artifacts for COW_ARTIFACTS_MAX_GB", removed)
+    if total > max_bytes:
+        log.warning(
+            "artifacts have %.1f GB, more than COW_ARTIFACTS_MAX_GB=%g: what is left is in use",
+            total / 1e9,
+            max_bytes / 1e9,
+        )

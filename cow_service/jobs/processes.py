@@ -1,4 +1,4 @@
-"""Tells the job database what this process does, every two seconds, and has it shown in its metrics."""
+"""The processes on a job database: what each tells of itself, and what they and the queues are doing together."""
 
 from __future__ import annotations
 
@@ -7,51 +7,103 @@ import os
 import platform
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Sequence
+from functools import partial
+from typing import Literal, TypeVar
 
-from dbos import DBOS
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
 
 from cow_service import __version__
-from cow_service.errors import CowError
-from cow_service.jobs import workflows
+from cow_service.errors import CowError, NotReady
 from cow_service.jobs.active import share_done
-from cow_service.jobs.computing import Computer, WorkerState
-from cow_service.jobs.open_jobs import OpenJobs
-from cow_service.jobs.overview import Overview
-from cow_service.jobs.process_table import ProcessTable
-from cow_service.jobs.queues import known_queues
+from cow_service.jobs.computing import Computer, EngineParts
+from cow_service.jobs.database import PROCESSES, Database
+from cow_service.jobs.job_table import RATE_SECONDS, VERSION, JobTable, OpenCount
+from cow_service.jobs.queues import LIGHT, known_queues, queue_of
 from cow_service.observability.logging import rfc3339
-from cow_service.records import ProcessInfo, ProcessRole, WorkerInfo, WorkerJob
+from cow_service.records import ProcessInfo, ProcessRole, QueueInfo, Unserved, WorkerInfo, WorkerJob, Workers
+from cow_service.settings import Settings
 
 TELL_SECONDS = 2.0  # between two rows
+ALIVE_SECONDS = 10.0  # since its last row, that a process is shown
+FORGOTTEN_SECONDS = 3600.0  # after which a row is deleted
 JOIN_TIMEOUT_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
+MAX_AGE_SECONDS = 1.0  # of an overview that is given out again
+
+Key = TypeVar("Key")
 
 log = logging.getLogger("cow_service")
+
+
+class ProcessTable:
+    """One row for each process that runs an engine. Times are the database's: the clocks of machines differ.
+
+    Every method raises `StorageUnavailable` where the database cannot be used.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        if database.file is None:
+            self._now = sa.cast(sa.extract("epoch", sa.func.clock_timestamp()), sa.Float)
+        else:
+            self._now = (sa.func.julianday("now") - 2440587.5) * 86400.0
+
+    def write(self, info: ProcessInfo) -> None:
+        """Notes that a process is alive, and what it does; deletes rows of those long gone."""
+        dialect = postgresql if self._database.file is None else sqlite
+        row = dialect.insert(PROCESSES).values(executor=info.executor_id, seen=self._now, info=info.model_dump_json())
+        kept = {"seen": row.excluded.seen, "info": row.excluded.info}
+        with self._database.transaction() as connection:
+            connection.execute(row.on_conflict_do_update(index_elements=["executor"], set_=kept))
+            connection.execute(sa.delete(PROCESSES).where(PROCESSES.c.seen < self._now - FORGOTTEN_SECONDS))
+
+    def remove(self, executor: str) -> None:
+        """Deletes the row of a process that ends."""
+        with self._database.transaction() as connection:
+            connection.execute(sa.delete(PROCESSES).where(PROCESSES.c.executor == executor))
+
+    def alive(self) -> tuple[ProcessInfo, ...]:
+        """Those seen in the last `ALIVE_SECONDS`, by role, host and process id."""
+        query = sa.select(PROCESSES.c.executor, PROCESSES.c.info)
+        found: list[ProcessInfo] = []
+        for executor, info in self._database.read(query.where(PROCESSES.c.seen > self._now - ALIVE_SECONDS)):
+            try:
+                found.append(ProcessInfo.model_validate_json(info, extra="ignore"))  # a later version has more fields
+            except ValueError:
+                log.warning("the process %s is of a version that this one does not understand", executor)
+        return tuple(sorted(found, key=lambda one: (one.role, one.host, one.pid)))
 
 
 class Processes:
     """This process among those on the job database. A thread of its own: maintenance may take minutes."""
 
-    def __init__(self, open_jobs: OpenJobs, computer: Computer, role: ProcessRole | None) -> None:
+    def __init__(self, parts: EngineParts, computer: Computer, role: ProcessRole | None) -> None:
         """`role`: by default that of the settings."""
-        self._open_jobs, self._computer = open_jobs, computer
-        self._role: ProcessRole = role or open_jobs.service.settings.role
-        self._table = ProcessTable(open_jobs.database.engine)
-        self.overview = Overview(open_jobs.database.engine, open_jobs.service.settings)
+        self._parts, self._computer = parts, computer
+        self._role: ProcessRole = role or parts.service.settings.role
+        self._table = ProcessTable(parts.database)
+        self.overview = Overview(parts.database, parts.service.settings)
         self._executor = ""
-        self._queues: dict[str, int] = {}
         self._draining = False
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def start(self) -> None:
-        """Begins to tell. DBOS runs already."""
-        self._executor = DBOS.executor_id
+    def start(self, executor: str) -> None:
+        """Begins to tell, under the id of this process."""
+        self._executor = executor
         self._draining = False
         self._stop.clear()
-        metrics = self._open_jobs.service.metrics
-        metrics.queue_depth, metrics.queue_oldest = self._depth, self._oldest
-        metrics.queue_unserved, metrics.workers = self._unserved, self.workers
+        metrics, overview = self._parts.service.metrics, self.overview
+        metrics.workers = self.workers
+        metrics.queue_depth = lambda: _sums(
+            ((one.queue, one.generator, one.state), one.jobs) for one in overview.counts()
+        )
+        metrics.queue_oldest = lambda: {one.name: one.oldest_seconds or 0.0 for one in overview.workers().queues}
+        metrics.queue_unserved = lambda: _sums(
+            ((one.queue, one.reason), one.jobs) for one in overview.workers().unserved
+        )
         self._thread = threading.Thread(target=self._tell_on, name="cow-processes", daemon=True)
         self._thread.start()
 
@@ -69,30 +121,45 @@ class Processes:
 
     def workers(self) -> tuple[WorkerInfo, ...]:
         """What computes jobs in this process and its worker processes."""
-        return tuple(map(self._info, self._computer.workers()))
+        return tuple(
+            WorkerInfo(
+                name=state.name,
+                queue=state.queue,
+                pid=state.pid,
+                memory_mb=round(state.memory_bytes / 1e6, 1),
+                jobs_done=state.jobs_done,
+                jobs=tuple(self._jobs(state.jobs)),
+                gpus=state.gpus,
+            )
+            for state in self._computer.workers()
+        )
+
+    def _jobs(self, jobs: Iterable[str]) -> Generator[WorkerJob]:
+        """Those of some jobs whose first stage has begun."""
+        for job_id in jobs:
+            active = self._parts.active.get(job_id)
+            if active is not None and active.begun is not None:
+                stage, done = active.at
+                progress, seconds = share_done(active.kind, stage, done), round(time.monotonic() - active.begun, 1)
+                yield WorkerJob(id=job_id, kind=active.kind, stage=stage, progress=progress, seconds=seconds)
 
     def _tell_on(self) -> None:
-        capacities = ((name, self._computer.capacity(name)) for name in known_queues(self._open_jobs.service.settings))
-        self._queues = {name: capacity for name, capacity in capacities if capacity > 0}
+        capacities = ((name, self._computer.capacity(name)) for name in known_queues(self._parts.service.settings))
+        queues = {name: capacity for name, capacity in capacities if capacity > 0}
         while not self._stop.is_set():
-            self._try(self._tell)
-            self._stop.wait(TELL_SECONDS)
-
-    def _tell(self) -> None:
-        self._table.write(
-            ProcessInfo(
+            info = ProcessInfo(
                 executor_id=self._executor,
                 seen_at=rfc3339(time.time()),
                 role=self._role,
                 host=platform.node(),
                 pid=os.getpid(),
                 version=__version__,
-                workflow_version=workflows.VERSION,
-                queues={} if self._draining else self._queues,
+                workflow_version=VERSION,
+                queues={} if self._draining else queues,
                 workers=self.workers(),
-            ),
-            self._open_jobs.active.ids_of_waiting(),
-        )
+            )
+            self._try(partial(self._table.write, info))
+            self._stop.wait(TELL_SECONDS)
 
     def _try(self, work: Callable[[], None]) -> None:
         """Does it, and goes on where it fails: what is told is for people, and no job depends on it."""
@@ -101,39 +168,141 @@ class Processes:
         except CowError as error:
             log.warning("what this process does could not be told: %s", error.detail)
 
-    def _info(self, state: WorkerState) -> WorkerInfo:
-        return WorkerInfo(
-            name=state.name,
-            queue=state.queue,
-            pid=state.pid,
-            memory_mb=round(state.memory_bytes / 1e6, 1),
-            jobs_done=state.jobs_done,
-            jobs=tuple(job for job_id in state.jobs if (job := self._job(job_id)) is not None),
-            gpus=state.gpus,
+
+class Overview:
+    """Reads the picture, at most once a second however many ask. Safe to use from every thread."""
+
+    def __init__(self, database: Database, settings: Settings) -> None:
+        self._settings = settings
+        self._table, self._jobs = ProcessTable(database), JobTable(database)
+        self._lock = threading.Lock()
+        self._counts: list[OpenCount] = []
+        self._workers = Workers(processes=(), queues=())
+        self._read_at = -MAX_AGE_SECONDS
+
+    def workers(self) -> Workers:
+        """What `GET /workers` returns. Raises `StorageUnavailable`."""
+        with self._lock:
+            self._read()
+            return self._workers
+
+    def counts(self) -> list[OpenCount]:
+        """The jobs that wait or run. Raises `StorageUnavailable`."""
+        with self._lock:
+            self._read()
+            return self._counts
+
+    def check_served(self) -> None:
+        """Raises `NotReady` where nobody takes the jobs of the default request, or those of another version."""
+        found, settings = self.workers(), self._settings
+        queue = queue_of(settings.reader, settings.generator, settings)
+        if settings.role == "api" and not _serving(found.processes, queue, VERSION):
+            raise NotReady(remedy(Unserved(queue=queue, workflow_version=VERSION, jobs=1, reason="queue")))
+        for one in found.unserved:
+            if one.reason == "version":
+                raise NotReady(f"{describe_unserved(one)} {remedy(one)}")
+
+    def _read(self) -> None:
+        if time.monotonic() - self._read_at < MAX_AGE_SECONDS:
+            return
+        processes, counts = self._table.alive(), self._jobs.open_counts()
+        if self._settings.api_keys:
+            processes = tuple(map(_without_ids, processes))
+        self._counts = counts
+        self._workers = Workers(
+            processes=processes,
+            queues=_queues(processes, counts, self._jobs.ended_lately()),
+            unserved=unserved(processes, counts),
         )
+        self._read_at = time.monotonic()
 
-    def _job(self, job_id: str) -> WorkerJob | None:
-        active = self._open_jobs.active.get(job_id)
-        if active is None or active.begun is None:
-            return None
-        stage, done = active.at
-        seconds = round(time.monotonic() - active.begun, 1)
-        return WorkerJob(
-            id=job_id, kind=active.kind, stage=stage, progress=share_done(active.kind, stage, done), seconds=seconds
+
+def unserved(processes: Sequence[ProcessInfo], counts: Iterable[OpenCount]) -> tuple[Unserved, ...]:
+    """Queued jobs that none of these processes takes."""
+    waiting = _sums(((one.workflow_version, one.queue), one.jobs) for one in counts if one.state == "queued")
+    versions = {process.workflow_version for process in processes if process.queues}
+    found: list[Unserved] = []
+    for (version, queue), jobs in sorted(waiting.items()):
+        if not _serving(processes, queue, version):
+            reason: Literal["version", "queue"] = "queue" if version in versions else "version"
+            found.append(Unserved(queue=queue, workflow_version=version, jobs=jobs, reason=reason))
+    return tuple(found)
+
+
+def unserved_jobs(settings: Settings) -> tuple[Unserved, ...]:
+    """Queued jobs that no live process takes, of a database that is not changed. Raises `StorageUnavailable`."""
+    database = Database(settings)
+    if database.file is not None:
+        if not database.file.exists():
+            return ()
+        database.open_read_only()
+    try:
+        if not database.has_tables():
+            return ()
+        return unserved(ProcessTable(database).alive(), JobTable(database).open_counts())
+    finally:
+        database.close()
+
+
+def describe_unserved(one: Unserved) -> str:
+    """Says that jobs wait in vain."""
+    jobs, wait = ("1 job", "waits") if one.jobs == 1 else (f"{one.jobs} jobs", "wait")
+    of = f"workflow version {one.workflow_version}" if one.reason == "version" else f"the queue {one.queue!r}"
+    return f"{jobs} of {of} {wait}, and no process takes them."
+
+
+def remedy(one: Unserved) -> str:
+    """Says what to do about it."""
+    if one.reason == "version":
+        return (
+            f"Start a server or worker of a COW with workflow version {one.workflow_version} on this job database "
+            "until they are done, or cancel them."
         )
+    return (
+        f"No process takes jobs of the queue {one.queue!r}: start `cow worker --queues {one.queue}` or a server on "
+        "this job database, where the backend of that queue is installed."
+    )
 
-    def _depth(self) -> Mapping[tuple[str, str, str], int]:
-        depth: dict[tuple[str, str, str], int] = {}
-        for one in self.overview.counts():
-            key = one.queue, one.generator, one.state
-            depth[key] = depth.get(key, 0) + one.jobs
-        return depth
 
-    def _oldest(self) -> Mapping[str, float]:
-        return {one.name: one.oldest_seconds or 0.0 for one in self.overview.workers().queues}
+def _sums(numbers: Iterable[tuple[Key, int]]) -> Counter[Key]:
+    """The numbers of each key together."""
+    sums: Counter[Key] = Counter()
+    for key, number in numbers:
+        sums[key] += number
+    return sums
 
-    def _unserved(self) -> Mapping[tuple[str, str], int]:
-        unserved: dict[tuple[str, str], int] = {}
-        for one in self.overview.workers().unserved:
-            unserved[one.queue, one.reason] = unserved.get((one.queue, one.reason), 0) + one.jobs
-        return unserved
+
+def _serving(processes: Iterable[ProcessInfo], queue: str, version: str) -> bool:
+    return any(queue in one.queues and one.workflow_version == version for one in processes)
+
+
+def _queues(
+    processes: Sequence[ProcessInfo], counts: Sequence[OpenCount], ended: dict[str, int]
+) -> tuple[QueueInfo, ...]:
+    jobs = _sums(((one.queue, one.state), one.jobs) for one in counts)
+    oldest: dict[str, float] = {}
+    for one in counts:
+        if one.state == "queued":
+            oldest[one.queue] = max(one.oldest_seconds, oldest.get(one.queue, 0.0))
+    served = {name for process in processes for name in process.queues}
+    names = {LIGHT} | served | {queue for queue, _ in jobs} | ended.keys()
+    return tuple(
+        QueueInfo(
+            name=name,
+            queued=jobs[name, "queued"],
+            running=jobs[name, "running"],
+            capacity=sum(process.queues.get(name, 0) for process in processes),
+            oldest_seconds=oldest.get(name),
+            jobs_per_minute=ended.get(name, 0) * 60 / RATE_SECONDS,
+        )
+        for name in sorted(names, key=lambda name: (name != LIGHT, name))
+    )
+
+
+def _without_ids(process: ProcessInfo) -> ProcessInfo:
+    """Where there are keys, nobody is told the ids of others' jobs."""
+    workers = tuple(
+        worker.model_copy(update={"jobs": tuple(job.model_copy(update={"id": None}) for job in worker.jobs)})
+        for worker in process.workers
+    )
+    return process.model_copy(update={"workers": workers})

@@ -16,12 +16,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from dbos import DBOS, SetEnqueueOptions, SetWorkflowID
+import sqlalchemy as sa
+from dbos import DBOSClient, DBOSPortableJSONSerializer, EnqueueOptions
+from dbos import error as dbos_error
 
-from cow_service.errors import WebhookNotAllowed
-from cow_service.jobs import workflows
-from cow_service.jobs.database import database_errors
-from cow_service.jobs.queues import WEBHOOKS
+from cow_service.errors import StorageUnavailable, WebhookNotAllowed
+from cow_service.jobs.database import Database, database_errors
+from cow_service.jobs.job_table import VERSION
 from cow_service.observability.metrics import Metrics
 from cow_service.records import Job
 from cow_service.settings import Settings
@@ -29,6 +30,9 @@ from cow_service.settings import Settings
 if TYPE_CHECKING:
     from cow_service.net import Egress
 
+APPLICATION = "cow"  # as DBOS knows it
+QUEUE = "cow-webhook-receivers"  # in which every receiver has a share of its own
+WORKFLOW = "webhook"  # the name of an attempt's workflow
 MAX_CONCURRENT_DELIVERIES = 100
 MAX_CONCURRENT_DELIVERIES_TO_ONE = 2  # receiver: one that is silent holds up its own calls alone
 POLL_SECONDS = 1.0
@@ -41,18 +45,24 @@ log = logging.getLogger("cow_service")
 
 
 class Webhooks:
-    """Signs and sends. Tests give an `egress` of their own."""
+    """Signs and sends; DBOS keeps the attempts that are to be made."""
 
-    def __init__(self, settings: Settings, metrics: Metrics, egress: Egress | None = None) -> None:
+    def __init__(self, settings: Settings, metrics: Metrics, database: Database) -> None:
         self._secret, self._metrics = settings.webhook_secret, metrics
-        self._given = egress
-        self._registered = False
+        # Unlike DBOS itself, its client can be told to raise where the database is away.
+        self.client = DBOSClient(
+            system_database_engine=database.engine,
+            serializer=DBOSPortableJSONSerializer(),
+            application_name=APPLICATION,
+            retry_connection_errors=False,
+            lazy=True,
+        )
 
     @cached_property
     def _egress(self) -> Egress:
         from cow_service.net import Egress  # noqa: PLC0415 # an HTTP client is costly to import
 
-        return Egress(None) if self._given is None else self._given
+        return Egress(None)
 
     def use(self, settings: Settings, metrics: Metrics) -> None:
         """Takes the secret from other settings, and counts elsewhere. Only tests do this."""
@@ -69,10 +79,35 @@ class Webhooks:
         except NotAllowed as error:
             raise WebhookNotAllowed(f"`webhook`: {error}") from error
 
-    def job_ended(self, job_id: str, url: str | None) -> None:
-        """Enqueues the first attempt, which waits until the database has the end of the job."""
-        if url is not None and self._secret is not None:
-            self.enqueue(job_id, url, 1, delay=None)
+    def register_queue(self) -> None:
+        """Makes the queue in which attempts wait. The tables of DBOS are there already."""
+        with database_errors():
+            self.client.register_queue(
+                QUEUE,
+                worker_concurrency=MAX_CONCURRENT_DELIVERIES,
+                partition_worker_concurrency=MAX_CONCURRENT_DELIVERIES_TO_ONE,
+                polling_interval_sec=POLL_SECONDS,
+            )
+
+    def enqueue(
+        self, connection: sa.Connection, job_id: str, url: str, attempt: int = 1, delay: float | None = None
+    ) -> None:
+        """Adds an attempt, to be made `delay` seconds after the transaction of the connection."""
+        if self._secret is None:
+            return
+        options: EnqueueOptions = {
+            "workflow_name": WORKFLOW,
+            "queue_name": QUEUE,
+            "workflow_id": attempt_ids(job_id)[attempt - 1],
+            "app_version": VERSION,
+            "queue_partition_key": _receiver(url),
+        }
+        if delay is not None:
+            options["delay_seconds"] = delay
+        try:
+            self.client.enqueue_in_transaction(connection, options, job_id, url, attempt)
+        except dbos_error.DBOSException as error:
+            raise StorageUnavailable(f"A webhook was not taken ({type(error).__name__}).") from error
 
     def send(self, job: Job, url: str, attempt: int) -> float | None:
         """Makes one attempt; returns the seconds until the next one, or None where none follows."""
@@ -94,30 +129,13 @@ class Webhooks:
             self._metrics.webhook("delivered" if status in SUCCESS else "gone")
             return None
         self._metrics.webhook("unreachable" if status is None else "refused")
-        return self.wait_after(job.id, attempt, f"the last answer was {status}")
-
-    def wait_after(self, job_id: str, attempt: int, reason: str) -> float | None:
-        """Seconds until the attempt after this one; None after the last."""
         if attempt > len(RETRY_SECONDS):
-            log.warning("webhook of job %s: given up after %d attempts, %s", job_id, attempt, reason)
+            log.warning(
+                "webhook of job %s: given up after %d attempts, the last answer was %s", job.id, attempt, status
+            )
             self._metrics.webhook_given_up()
             return None
         return RETRY_SECONDS[attempt - 1] * random.uniform(1 - JITTER, 1 + JITTER)  # so that retries spread
-
-    def enqueue(self, job_id: str, url: str, attempt: int, delay: float | None) -> None:
-        """Enqueues an attempt, to be made after `delay` seconds."""
-        with database_errors():
-            if not self._registered:
-                DBOS.register_queue(
-                    WEBHOOKS,
-                    worker_concurrency=MAX_CONCURRENT_DELIVERIES,
-                    partition_worker_concurrency=MAX_CONCURRENT_DELIVERIES_TO_ONE,
-                    polling_interval_sec=POLL_SECONDS,
-                )
-                self._registered = True
-            options = SetEnqueueOptions(delay_seconds=delay, queue_partition_key=_receiver(url))
-            with SetWorkflowID(attempt_ids(job_id)[attempt - 1]), options:
-                DBOS.enqueue_workflow(WEBHOOKS, workflows.webhook, job_id, url, attempt)
 
     def _headers(self, message: str, body: bytes) -> dict[str, str]:
         assert self._secret is not None

@@ -1,28 +1,177 @@
-"""The workflows that DBOS runs and recovers. Their names, arguments and order of steps are stored in databases.
+"""The workflows that DBOS runs: an attempt to compute a job, and an attempt to call a webhook.
 
-A change to the steps of a workflow needs a new name beside the old one, which stays until no database has jobs of it.
+The table of jobs (`job_table.py`) says who computes which job: each attempt is a workflow of its own, and where its
+process ends, another process makes the next one. A call of a webhook is kept by DBOS alone, which delays it, and runs
+it again.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import logging
+import math
+import threading
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from queue import Empty, SimpleQueue
+from uuid import uuid4
 
-from dbos import DBOS
+from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, SetWorkflowID
+from dbos import error as dbos_error
+from sqlalchemy.exc import SQLAlchemyError
 
-VERSION = "1"  # of all workflows; jobs of another version wait for a server that has it
-MAX_STARTS = 20  # of a job that ends its process each time
+from cow_service.errors import Canceled, CowError, StorageUnavailable, unforeseen
+from cow_service.jobs import webhooks
+from cow_service.jobs.active import ActiveJob
+from cow_service.jobs.computing import Computer, EngineParts, Outages, Work
+from cow_service.jobs.database import Database
+from cow_service.jobs.job_table import VERSION, JobTable, TakenJob
+from cow_service.jobs.notifications import Notification, Notifications
+from cow_service.jobs.webhooks import Webhooks
+from cow_service.media.images import DecodedImage
+from cow_service.observability import logging as context
+from cow_service.observability import tracing
+from cow_service.requests import Stage
+from cow_service.settings import Settings
+
+WORKFLOW = "job"  # the name of an attempt's workflow
+POLL_SECONDS = 0.25  # between two looks at the queues, besides whenever it is woken: other processes add jobs, too
+STOP_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
+
+Start = Callable[[TakenJob, DecodedImage | None], None]
+
+log = logging.getLogger("cow_service")
 
 
-class Runner(Protocol):
-    """Who does the work in this process."""
+class Interrupted(BaseException):
+    """The engine ends in the middle of a workflow. No `Exception`: DBOS must not record it as an outcome."""
 
-    def run(self, job_id: str, spec: dict[str, Any]) -> str:
-        """Does the work of a job; returns the result as JSON."""
-        ...
 
-    def deliver(self, job_id: str, url: str, attempt: int) -> None:
-        """Calls a webhook, and enqueues another attempt where that failed."""
-        ...
+class Runner:
+    """Does the work of this process's workflows. Safe to use from every thread."""
+
+    def __init__(
+        self,
+        parts: EngineParts,
+        computer: Computer,
+        hooks: Webhooks,
+        notifications: Notifications,
+        on_end: Callable[[TakenJob, str | CowError | None], None],
+    ) -> None:
+        """`on_end` is called when an attempt is over, with the outcome of the job where it has one."""
+        self._parts, self._jobs, self._active, self._computer = parts, parts.jobs, parts.active, computer
+        self._hooks, self._notifications, self._on_end = hooks, notifications, on_end
+        self._starting: dict[str, tuple[TakenJob, DecodedImage | None]] = {}  # by the ids of their workflows
+
+    def start(self, job: TakenJob, image: DecodedImage | None = None) -> None:
+        """Starts an attempt to compute a job in a thread; `image` has its pixels where they are at hand."""
+        workflow_id = f"{job.id}.{job.run}"
+        self._starting[workflow_id] = job, image
+        try:
+            with SetWorkflowID(workflow_id):
+                DBOS.start_workflow(compute_job, workflow_id)
+        except (SQLAlchemyError, dbos_error.DBOSException) as error:
+            log.warning("job %s could not be started: %s", job.id, type(error).__name__)
+            del self._starting[workflow_id]
+            self._on_end(job, None)  # maintenance will find that nobody works on it, and give it back
+
+    def compute(self, workflow_id: str) -> None:
+        """Computes a job, and stores its outcome."""
+        job, image = self._starting.pop(workflow_id)
+        outcome: str | CowError | None = None
+        try:
+            with (
+                context.bound(request=job.spec.request_id, job=job.id),
+                tracing.span(f"job {job.spec.kind}", parent=job.spec.traceparent, job_id=job.id),
+                self._active.running(job.id, job.spec.kind, job.run) as running,
+            ):
+                outcome = self._outcome(job, image, running)
+        finally:
+            self._on_end(job, outcome)
+
+    def call_webhook(self, job_id: str, url: str, attempt: int) -> None:
+        """Makes an attempt to call a webhook, and sees to another one where that failed."""
+
+        def check() -> None:
+            if _runner is not self:
+                raise Interrupted
+
+        def call() -> float | None:
+            found = patient.wait_through(lambda: self._jobs.find(job_id, None))
+            return None if found is None else self._hooks.send(found.job, url, attempt)
+
+        def enqueue() -> None:
+            with self._parts.database.transaction() as connection:
+                self._hooks.enqueue(connection, job_id, url, attempt + 1, wait)
+
+        patient = Outages(math.inf, check)
+        wait = DBOS.run_step(
+            {"name": "call"}, call
+        )  # a step, whose outcome is kept: a crash after it does not repeat it
+        if wait is not None:
+            patient.wait_through(enqueue)
+
+    def _outcome(self, job: TakenJob, image: DecodedImage | None, running: ActiveJob) -> str | CowError | None:
+        """The result or the error of a job, once it is stored; None where it has none, as it was canceled."""
+        metrics, kind = self._parts.service.metrics, job.spec.kind
+        patient = Outages(math.inf, running.check)  # the work is done: its outcome is not given up
+        try:
+            try:
+                computed = self._computer.compute(self._work(job, image, running))
+            except Canceled:
+                raise
+            except Exception as error:
+                if isinstance(error, CowError):
+                    log.info("job %s failed: %s", job.id, error.code)  # its detail may hold what was asked
+                    outcome = error
+                else:
+                    log.exception("job %s failed", job.id)
+                    outcome = unforeseen()
+                stored = patient.wait_through(lambda: self._jobs.fail(job, outcome))
+            else:
+                for stage, seconds in computed.timings.items():
+                    metrics.stage(stage, seconds)
+                outcome = computed.result
+                kept = job, computed.kept, computed.trajectory_key
+                stored = patient.wait_through(lambda: self._jobs.succeed(*kept))
+        except Canceled:
+            self._release(job)
+            return None
+        if not stored:
+            return None
+        metrics.job(kind, "succeeded" if isinstance(outcome, str) else "failed")
+        return outcome
+
+    def _work(self, job: TakenJob, image: DecodedImage | None, running: ActiveJob) -> Work:
+        images, begun = [image], False
+
+        def progress(stage: Stage | None, done: float) -> None:
+            nonlocal begun
+            self._active.progress(job.id, running, stage, done)
+            if stage is None:
+                return
+            if not begun:
+                with suppress(StorageUnavailable):  # it is tried again
+                    begun = self._jobs.begin(job)
+                    if not begun:
+                        raise Canceled("The job was canceled.")
+            self._notifications.send(Notification("progress", job.id, stage, done))
+
+        return Work(
+            job_id=job.id,
+            spec=job.spec.model_copy(update={"traceparent": context.traceparent()}),
+            owner=job.owner,
+            image=lambda: images.pop() if images else None,
+            progress=progress,
+            check=running.check,
+            looked_for=self._parts.service.metrics.stage_cache,
+        )
+
+    def _release(self, job: TakenJob) -> None:
+        """Gives a job that was interrupted back to its queue; one that was canceled stays so."""
+        with suppress(StorageUnavailable):  # else when this process has ended, or maintenance notices
+            self._jobs.release(job.id, job.run)
 
 
 _runner: Runner | None = None
@@ -34,27 +183,180 @@ def set_runner(runner: Runner | None) -> None:
     _runner = runner
 
 
-def _current() -> tuple[Runner, str]:
+@DBOS.workflow(name=WORKFLOW)
+def compute_job(workflow_id: str) -> None:
+    """An attempt to compute a job."""
     assert _runner is not None, "workflows run only while an engine does"
-    return _runner, DBOS.workflow_id or ""
+    _runner.compute(workflow_id)
 
 
-@DBOS.workflow(name="simulate", max_recovery_attempts=MAX_STARTS)
-def simulate(spec: dict[str, Any]) -> str:
-    """A job of `POST /simulate`."""
-    runner, job_id = _current()
-    return runner.run(job_id, spec)
+@DBOS.workflow(name=webhooks.WORKFLOW)
+def call_webhook(job_id: str, url: str, attempt: int) -> None:
+    """An attempt to notify a webhook that a job has ended."""
+    assert _runner is not None, "workflows run only while an engine does"
+    _runner.call_webhook(job_id, url, attempt)
 
 
-@DBOS.workflow(name="answer", max_recovery_attempts=MAX_STARTS)
-def answer(spec: dict[str, Any]) -> str:
-    """A job of `POST /answer`."""
-    runner, job_id = _current()
-    return runner.run(job_id, spec)
+def launch(database: Database, executor: str, *, migrate: bool, queues: tuple[str, ...] = (webhooks.QUEUE,)) -> None:
+    """Makes the tables, or looks whether they are there, and has DBOS run on them. Raises `StorageUnavailable`.
+
+    `queues`: those of DBOS from which this process takes work.
+    """
+    if migrate:
+        database.create_tables()
+    else:
+        database.check_tables()
+    config = DBOSConfig(
+        name=webhooks.APPLICATION,
+        system_database_url=database.url,
+        system_database_engine=database.engine,
+        application_version=VERSION,
+        executor_id=executor,
+        serializer=DBOSPortableJSONSerializer(),  # no pickles: reading the database runs no code
+        use_listen_notify=False,  # what processes tell each other is ours
+        run_migrations=migrate,
+        log_level="WARNING",
+    )
+    try:
+        DBOS(config=config)
+        DBOS.listen_queues(queues)
+        DBOS.launch()
+    except (SQLAlchemyError, dbos_error.DBOSException) as error:
+        DBOS.destroy()
+        remedy = "see COW_DATABASE_URL" if migrate else "run `cow migrate` first, and see COW_DATABASE_URL"
+        raise StorageUnavailable(f"The job database cannot be used ({type(error).__name__}): {remedy}.") from error
 
 
-@DBOS.workflow(name="webhook", max_recovery_attempts=MAX_STARTS)
-def webhook(job_id: str, url: str, attempt: int) -> None:
-    """One attempt to notify a webhook that a job has ended."""
-    runner, _ = _current()
-    runner.deliver(job_id, url, attempt)
+def busy_executors(client: DBOSClient) -> set[str]:
+    """The processes that have workflows in hand."""
+    pending = client.list_workflows(status="PENDING", load_input=False, load_output=False)
+    return {workflow.executor_id for workflow in pending if workflow.executor_id is not None}
+
+
+def recover(client: DBOSClient, jobs: JobTable, ended: list[str]) -> list[str]:
+    """Has the work of processes that have ended done by others; returns the ids of their jobs.
+
+    Calls of webhooks go back to their queue. Attempts to compute a job are over: their records are deleted.
+    """
+    recovered = jobs.recover(ended)
+    pending = client.list_workflows(executor_id=ended, status="PENDING", load_input=False, load_output=False)
+    for workflow in pending:
+        if workflow.name == webhooks.WORKFLOW:
+            client.resume_workflow(workflow.workflow_id, queue_name=webhooks.QUEUE)
+    client.delete_workflows([workflow.workflow_id for workflow in pending if workflow.name != webhooks.WORKFLOW])
+    return recovered
+
+
+def ended_workflows(client: DBOSClient, name: str, before: float, limit: int) -> list[str]:
+    """Some workflows of a name that ended before a time (Unix time, s)."""
+    moment = datetime.fromtimestamp(before, UTC).isoformat()
+    found = client.list_workflows(name=name, completed_before=moment, limit=limit, load_input=False, load_output=False)
+    return [workflow.workflow_id for workflow in found]
+
+
+def migrate(settings: Settings) -> None:
+    """Creates the tables of the job database that are missing, and updates those of an older DBOS.
+
+    Raises `StorageUnavailable`.
+    """
+    database = Database(settings)
+    try:
+        launch(database, f"migrate-{uuid4().hex}", migrate=True, queues=())
+        DBOS.destroy()
+    finally:
+        database.close()
+
+
+class Dispatcher:
+    """The places of this process, and the thread that fills them. Safe to use from every thread."""
+
+    def __init__(self, parts: EngineParts, capacity: Callable[[str], int], start: Start) -> None:
+        """`capacity`: of a queue by its name; `start` begins the work on a job that has a place."""
+        self._parts, self._capacity, self._start = parts, capacity, start
+        self._places = threading.Lock()
+        self._held: Counter[str] = Counter()  # the places of each queue that are held
+        self._handed: SimpleQueue[tuple[TakenJob, DecodedImage | None]] = SimpleQueue()
+        self._woken, self._stopping = threading.Event(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._executor = ""
+
+    def start(self, executor: str) -> None:
+        """Begins to take jobs for a process. DBOS runs already."""
+        self._executor = executor
+        self._stopping.clear()
+        self._thread = threading.Thread(target=self._dispatch, name="cow-dispatcher", daemon=True)
+        self._thread.start()
+
+    def drain(self) -> None:
+        """Takes no more jobs. Those that were handed over are started."""
+        self._stopping.set()
+        self._woken.set()
+
+    def stop(self) -> None:
+        """Ends the thread."""
+        self.drain()
+        if self._thread is not None:
+            self._thread.join(STOP_SECONDS)
+            self._thread = None
+
+    def wake(self) -> None:
+        """Has the queues looked at now: there is a new job, or a place."""
+        self._woken.set()
+
+    def hold_place(self, queue: str) -> bool:
+        """Holds a place for a job that is about to be handed over; False where none is free."""
+        capacity = self._capacity(queue)
+        with self._places:
+            if self._stopping.is_set() or self._held[queue] >= capacity:
+                return False
+            self._held[queue] += 1
+            return True
+
+    def free_place(self, queue: str) -> None:
+        """The holder of a place needs it no more."""
+        with self._places:
+            self._held[queue] -= 1
+        self.wake()
+
+    def hand_over(self, job: TakenJob, image: DecodedImage) -> None:
+        """Has a job started that holds a place already."""
+        self._handed.put((job, image))
+        self.wake()
+
+    def _dispatch(self) -> None:
+        while not self._stopping.is_set():
+            self._woken.clear()
+            try:
+                self._start_handed()
+                for queue in self._parts.jobs.waiting_queues():
+                    self._fill(queue)
+            except CowError as error:
+                log.warning("no jobs are taken: %s", error.detail)
+            except Exception:
+                log.exception("no jobs were taken")
+            self._woken.wait(POLL_SECONDS)
+        self._start_handed()
+
+    def _start_handed(self) -> None:
+        while True:
+            try:
+                job, image = self._handed.get_nowait()
+            except Empty:
+                return
+            self._start(job, image)
+
+    def _fill(self, queue: str) -> None:
+        places = 0
+        while self.hold_place(queue):
+            places += 1
+        taken: list[TakenJob] = []
+        try:
+            if places:
+                limit = self._parts.service.settings.running_limit_per_key
+                taken = self._parts.jobs.take(queue, self._executor, places, limit)
+        finally:
+            with self._places:
+                self._held[queue] -= places - len(taken)
+        for job in taken:
+            self._start_handed()  # these wait for nothing but this thread
+            self._start(job, None)

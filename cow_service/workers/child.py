@@ -18,23 +18,22 @@ from multiprocessing.connection import Connection
 
 import psutil
 
+from cow_service.concurrency import leave_decisions_to_the_parent
 from cow_service.errors import Canceled, CowError, unforeseen
+from cow_service.jobs.computing import HoldKey as HoldKeyOf
 from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
-from cow_service.jobs.stage_cache import HoldKey as HoldKeyOf
-from cow_service.jobs.stored_errors import error_as_json
+from cow_service.jobs.job_table import error_as_json
+from cow_service.jobs.readiness import warm_up
 from cow_service.observability import logging as context
 from cow_service.observability import logging as logs
 from cow_service.observability import tracing
 from cow_service.observability.metrics import gpu_memory
-from cow_service.processes import leave_decisions_to_the_parent
 from cow_service.requests import Stage
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.warm_up import warm_up
-from cow_service.workers.messages import (
+from cow_service.workers.process import (
     Cancel,
-    Configure,
     Failed,
     FromWorker,
     Heartbeat,
@@ -45,7 +44,6 @@ from cow_service.workers.messages import (
     Progressed,
     ReleaseKey,
     Start,
-    Stop,
     Succeeded,
     ToWorker,
 )
@@ -94,7 +92,7 @@ class WorkerProcess:
                     self._jobs[job_id].canceled.set()
                 case KeyHeld(job_id) if job_id in self._jobs:
                     self._jobs[job_id].key_held.set()
-                case Stop():
+                case None:
                     return
                 case _:
                     pass  # about a job that has just ended
@@ -181,10 +179,10 @@ def main(descriptor: int) -> None:
     pipe: Connection[FromWorker, ToWorker] = Connection(descriptor)
     try:
         first = pipe.recv()
-        assert isinstance(first, Configure)
-        logs.set_up(first.settings)
+        assert isinstance(first, Settings)
+        logs.set_up(first)
         tracing.start()
-        WorkerProcess(pipe, first.settings).run()
+        WorkerProcess(pipe, first).run()
     except (EOFError, OSError):
         pass
     tracing.stop()

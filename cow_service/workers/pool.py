@@ -17,9 +17,8 @@ import psutil
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import DeviceFailed, ShuttingDown, WorkerEnded
-from cow_service.jobs.computing import Outcome, Work, WorkerState
+from cow_service.jobs.computing import KeyLocks, Outcome, Work, WorkerState
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
-from cow_service.jobs.stage_cache import KeyLocks
 from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings
 from cow_service.stages.run import priority_of

@@ -9,33 +9,121 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import Literal
+from typing import Any, Literal
 
+from cow_service.concurrency import spawn
 from cow_service.errors import Canceled, CowError, JobTimeout, WorkerEnded
-from cow_service.jobs.computing import Outcome, Work
-from cow_service.jobs.stage_cache import KeyLocks
-from cow_service.jobs.stored_errors import error_from_json
+from cow_service.jobs.computing import KeyLocks, Outcome, Work
+from cow_service.jobs.job_table import JobSpec, error_from_json
+from cow_service.media.images import DecodedImage
 from cow_service.records import GpuMemory
+from cow_service.requests import Stage
 from cow_service.settings import Settings
-from cow_service.workers.messages import (
-    Cancel,
-    Configure,
-    Failed,
-    Heartbeat,
-    HoldKey,
-    KeyHeld,
-    Loaded,
-    LookedFor,
-    OfJob,
-    Progressed,
-    ReleaseKey,
-    Start,
-    Stop,
-    Succeeded,
-    ToWorker,
-)
-from cow_service.workers.spawning import spawn
+
+MODULE = "cow_service.workers"  # what a worker process runs
+
+# To the worker.
+
+
+@dataclass(frozen=True)
+class Start:
+    """Compute a job."""
+
+    job_id: str
+    spec: JobSpec
+    owner: str | None
+    image: DecodedImage | None  # else it is read from the artifacts
+
+
+@dataclass(frozen=True)
+class Cancel:
+    """Nobody wants the result any more."""
+
+    job_id: str
+
+
+@dataclass(frozen=True)
+class KeyHeld:
+    """The job holds the lock of the key that it asked for."""
+
+    job_id: str
+
+
+# From the worker.
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """The default backends are loaded, or the error, as JSON, for which they are not."""
+
+    error: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Heartbeat:
+    """The process is alive. `memory_bytes` is its resident set."""
+
+    memory_bytes: int
+    gpus: tuple[GpuMemory, ...]
+
+
+@dataclass(frozen=True)
+class Progressed:
+    """A job has come so far in a stage, 0 to 1."""
+
+    job_id: str
+    stage: Stage | None
+    done: float
+
+
+@dataclass(frozen=True)
+class LookedFor:
+    """A stage was looked for among stored results."""
+
+    job_id: str
+    stage: Stage
+    found: bool
+
+
+@dataclass(frozen=True)
+class HoldKey:
+    """A job wants the lock of a key: what one job computes, another one waits for, whatever worker it has."""
+
+    job_id: str
+    key: str
+
+
+@dataclass(frozen=True)
+class ReleaseKey:
+    """The job gives the lock of a key back."""
+
+    job_id: str
+    key: str
+
+
+@dataclass(frozen=True)
+class Succeeded:
+    """The job is done."""
+
+    job_id: str
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The job failed with an error, as JSON; `Canceled` where it was canceled."""
+
+    job_id: str
+    error: dict[str, Any]
+
+
+# The first message are the settings of the worker, of which those of concurrency are its own share; None ends it.
+ToWorker = Settings | Start | Cancel | KeyHeld | None
+OfJob = Progressed | LookedFor | HoldKey | ReleaseKey | Succeeded | Failed
+FromWorker = Loaded | Heartbeat | OfJob
+
 
 POLL_SECONDS = 0.1  # how often a job at work is checked: whether it was canceled, whether its time is over
 CANCEL_SECONDS = 5.0  # that a canceled job is given to end; then its process is ended
@@ -64,7 +152,7 @@ class Worker:
 
     def __init__(self, name: str, settings: Settings, on_end: Callable[[EndReason], None]) -> None:
         """`on_end` is called once, when the process has ended."""
-        spawned = spawn()
+        spawned = spawn(MODULE)
         self.name = name
         self.jobs_done = 0
         self.memory_bytes = 0
@@ -81,7 +169,7 @@ class Worker:
         self._end_reason: EndReason = "crashed"
         self._on_end = on_end
         threading.Thread(target=self._listen, name=f"cow-{name}", daemon=True).start()
-        self._send(Configure(settings))
+        self._send(settings)
 
     @property
     def pid(self) -> int:
@@ -126,7 +214,7 @@ class Worker:
         self._stopped = True
         if self.is_alive:
             self._end_reason = end_reason
-        self._send(Stop())
+        self._send(None)
         try:
             self._process.wait(END_SECONDS)
         except subprocess.TimeoutExpired:
@@ -138,7 +226,9 @@ class Worker:
     def check_alive(self) -> None:
         """Raises `WorkerGone`."""
         if self._ended.is_set():
-            raise WorkerGone(f"{self._reason} ({_how(self._process.wait())})", is_final=self._is_final)
+            code = self._process.wait()
+            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            raise WorkerGone(f"{self._reason} ({how})", is_final=self._is_final)
 
     def _follow(self, work: Work, inbox: SimpleQueue[OfJob | None], keys: _Keys) -> Outcome:
         until, canceled, begun = time.monotonic() + START_SECONDS + self._job_timeout, False, False
@@ -233,8 +323,3 @@ class _Keys:
         """Gives a key back, if the job holds it."""
         if key in self._held:
             self._held.pop(key).close()
-
-
-def _how(code: int) -> str:
-    """How a process ended, for the log."""
-    return f"signal {-code}" if code < 0 else f"exit code {code}"

@@ -21,7 +21,7 @@ from cow_service.api.routes.jobs import PING_SECONDS
 from cow_service.api.submission import Submission, Submitter
 from cow_service.errors import CowError
 from cow_service.jobs.engine import JobEngine
-from cow_service.jobs.events import QUEUED, follow
+from cow_service.jobs.subscriptions import QUEUED, follow
 from cow_service.records import TERMINAL, Job
 from cow_service.settings import Settings
 

@@ -14,8 +14,8 @@ from cow_service import errors
 from cow_service.api.problems import documented
 from cow_service.api.routes.simulate import RETURN
 from cow_service.api.submission import MINIMAL_APPLIED, Engine, Owner, json_response, minimize, preferences_of
-from cow_service.jobs.events import END, follow
-from cow_service.jobs.state import JobFilters
+from cow_service.jobs.job_table import JobFilters
+from cow_service.jobs.subscriptions import END, follow
 from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, JobStatus
 
 JobId = Annotated[str, Path(max_length=64, pattern=r"^[A-Za-z0-9-]+$", description="As the job says.")]

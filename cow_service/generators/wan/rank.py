@@ -17,6 +17,7 @@ from queue import SimpleQueue
 import torch
 from torch import Tensor, distributed
 
+from cow_service.concurrency import leave_decisions_to_the_parent
 from cow_service.errors import CowError, unforeseen
 from cow_service.generators.wan.denoising import Conditioning, denoise
 from cow_service.generators.wan.execution import within_memory
@@ -24,7 +25,6 @@ from cow_service.generators.wan.loading import load_rank
 from cow_service.generators.wan.rank_messages import Array, Failed, FromRank, Join, Load, Loaded, Share, ToRank
 from cow_service.generators.wan.sharing import HOST, Sharing
 from cow_service.observability import logging as logs
-from cow_service.processes import leave_decisions_to_the_parent
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import load_manifests
 

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor, distributed
 
+from cow_service.concurrency import spawn
 from cow_service.errors import CowError, DeviceFailed, GeneratorOutOfMemory, InternalError, WorkerEnded, kinds
 from cow_service.generators.wan.denoising import Conditioning, StepCallback, denoise
 from cow_service.generators.wan.profiles import Profile
 from cow_service.generators.wan.rank_messages import Array, Failed, FromRank, Join, Load, Share, ToRank
 from cow_service.generators.wan.sampling import Sampling
 from cow_service.generators.wan.sharing import HOST, Sharing
-from cow_service.processes import spawn
 from cow_service.settings import Settings
 from cow_service.weights.device import is_out_of_memory
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -12,33 +13,45 @@ from servers import BODY, events_of
 
 from cow_service.errors import StorageUnavailable
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.watches import Watches
+from cow_service.jobs.job_table import JobState
+from cow_service.jobs.subscriptions import JobEvent, JobView, subscribed
+from cow_service.records import Job
 from cow_service.service import Service
 
 LAST, FOLLOWERS = 5, 40
+FOUND = JobState(Job(id="job", kind="simulate", status="running", progress=0, created_at="", generator="cutout"), None)
 
 
-async def followed(watches: Watches[int], active: ActiveJobs, read) -> list[int]:
+@pytest.fixture(autouse=True)
+def polls_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cow_service.jobs.subscriptions.POLL_SECONDS", 0.01)
+
+
+def view(number: int) -> JobView:
+    return JobView(None if number >= LAST else FOUND, (JobEvent("stage", number, None),))
+
+
+async def followed(active: ActiveJobs, read: Callable[[], JobView]) -> list[int]:
     heard, number = [], 0
-    with watches.following(active, "job", read, lambda news: news >= LAST) as watch:
+    with subscribed(active, "job", read) as subscription:
         while not heard or heard[-1] < LAST:
-            news, number = await watch.after(number)
-            heard.append(news)
+            found, number = await subscription.after(number)
+            heard.append(found.events[0].number)
     return heard
 
 
 def test_all_followers_hear_what_is_read_once() -> None:
     reads = []
 
-    def read() -> int:
+    def read() -> JobView:
         reads.append(len(reads))
-        return min(reads[-1] // 2, LAST)  # the same twice is no news
+        return view(min(reads[-1] // 2, LAST))  # the same twice is no news
 
     async def all_of_them() -> list[list[int]]:
-        watches, active = Watches[int](0.01), ActiveJobs()
-        first = await asyncio.gather(*(followed(watches, active, read) for _ in range(FOLLOWERS)))
+        active = ActiveJobs()
+        first = await asyncio.gather(*(followed(active, read) for _ in range(FOLLOWERS)))
         assert active.awaited() == []
-        return [*first, await followed(watches, active, read)]
+        return [*first, await followed(active, read)]
 
     *heard, later = asyncio.run(all_of_them())
     assert all(each == sorted(set(each)) and each[-1] == LAST for each in heard)
@@ -47,14 +60,12 @@ def test_all_followers_hear_what_is_read_once() -> None:
 
 
 def test_what_reading_raises_reaches_all() -> None:
-    def read() -> int:
+    def read() -> JobView:
         raise StorageUnavailable("away")
 
     async def all_of_them() -> list[object]:
-        watches, active = Watches[int](0.01), ActiveJobs()
-        return await asyncio.gather(
-            *(followed(watches, active, read) for _ in range(FOLLOWERS)), return_exceptions=True
-        )
+        active = ActiveJobs()
+        return await asyncio.gather(*(followed(active, read) for _ in range(FOLLOWERS)), return_exceptions=True)
 
     assert {type(each) for each in asyncio.run(all_of_them())} == {StorageUnavailable}
 
@@ -62,8 +73,8 @@ def test_what_reading_raises_reaches_all() -> None:
 @pytest.mark.parametrize("leaving", [1, FOLLOWERS])
 def test_reading_ends_with_the_last_follower(leaving: int) -> None:
     async def leave() -> list[str]:
-        watches, active = Watches[int](0.01), ActiveJobs()
-        tasks = [asyncio.create_task(followed(watches, active, lambda: 0)) for _ in range(FOLLOWERS)]
+        active = ActiveJobs()
+        tasks = [asyncio.create_task(followed(active, lambda: view(0))) for _ in range(FOLLOWERS)]
         await asyncio.sleep(0.05)
         for task in tasks[:leaving]:
             task.cancel()

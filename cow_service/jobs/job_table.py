@@ -1,0 +1,500 @@
+"""The table of jobs: what callers see of a job, the queues in which jobs wait, and who has taken which job.
+
+Every change of a job is one transaction. Methods raise `StorageUnavailable` where the database cannot be used.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any, cast
+from uuid import uuid4
+
+import sqlalchemy as sa
+from pydantic import Field
+from pydantic_core import to_json
+from sqlalchemy.dialects import postgresql, sqlite
+
+from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds
+from cow_service.jobs.active import At, share_done
+from cow_service.jobs.database import JOBS, OPEN, REFERENCES, TRAJECTORIES, Database, packed, unpacked
+from cow_service.jobs.queues import moves, next_turn
+from cow_service.observability.logging import rfc3339
+from cow_service.records import AcceptedRequest, Answer, Job, JobKind, JobPage, JobStatus, Problem, Record, Simulation
+from cow_service.requests import AnswerRequest, Priority, SimulateRequest
+from cow_service.stages.keys import FORMAT, digest_of
+
+VERSION = "2"  # of the workflow that computes jobs; those of another version wait for a server that has it
+MAX_STARTS = 20  # of a job that ends its process each time
+RATE_SECONDS = 300.0  # over which ended jobs are counted
+MIN_ENDS = 2  # in that time, from which on a rate is known
+MAX_LISTED_QUESTION = 200  # characters of a question in lists
+EARLIEST, LATEST = datetime(1970, 1, 1, tzinfo=UTC), datetime(9000, 1, 1, tzinfo=UTC)  # that a filter distinguishes
+CLAIM_LOCK = 0x434F5702  # of PostgreSQL, held while jobs are taken that a limit across processes applies to
+
+OnEnd = Callable[[sa.Connection, str, str], None]
+"""Called in the transaction that ends a job: with the job, and the webhook that it has."""
+
+
+class JobSpec(Record):
+    """What a job has to do. Its image and masks are artifacts: a spec has no bytes. Databases store the field names."""
+
+    kind: JobKind
+    request: dict[str, Any]
+    reader: str = Field(description="As the server chose it, where the request names none.")
+    generator: str = Field(description="As the server chose it, where the request names none.")
+    created_at: str = Field(description="RFC 3339, UTC.")
+    fresh: bool = Field(default=False, description="Take no results of other jobs.")
+    webhook: str | None = Field(default=None, description="URL to call when the job has ended.")
+    priority: Priority = Field(default="normal", description="Among the waiting jobs of its key.")
+    turn: int = Field(default=0, ge=0, description="Its place among the jobs of all keys: the lower comes first.")
+    request_id: str | None = None
+    traceparent: str | None = None
+
+    @property
+    def digest(self) -> str:
+        """Equal for requests that ask for the same."""
+        return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
+
+    @property
+    def image(self) -> str:
+        """The digest of the image."""
+        digest: str = self.request["image"]["artifact"]
+        return digest
+
+    @property
+    def masks(self) -> list[str]:
+        """The digests of the masks that the request gives."""
+        places = [self.request.get("grounding") or {}, *self.request.get("objects", ())]
+        return [place["mask"]["artifact"] for place in places if place.get("mask")]
+
+    def accepted(self) -> AcceptedRequest:
+        """The request as its caller may send it again."""
+        priority = {} if self.priority == "normal" else {"priority": self.priority}
+        return AcceptedRequest(kind=self.kind, request=self.request | priority)
+
+    def parsed(self) -> SimulateRequest | AnswerRequest:
+        """The request, as it was validated when it came."""
+        model = AnswerRequest if self.kind == "answer" else SimulateRequest
+        return model.model_validate({**self.request, "reader": self.reader, "generator": self.generator})
+
+
+@dataclass(frozen=True)
+class TakenJob:
+    """A job that this process has taken. `run` names the attempt: only the latest one can change the job."""
+
+    id: str
+    spec: JobSpec
+    owner: str | None
+    queue: str
+    run: str
+
+
+@dataclass(frozen=True)
+class JobFilters:
+    """Which jobs a caller wants to see."""
+
+    status: tuple[JobStatus, ...] = ()
+    kind: JobKind | None = None
+    created_after: datetime | None = None
+    created_before: datetime | None = None
+    limit: int = 50
+    cursor: str | None = None
+
+
+@dataclass(frozen=True)
+class JobState:
+    """A job, the name of its owner's key, and its result as JSON values where it was asked for."""
+
+    job: Job
+    owner: str | None
+    content: dict[str, Any] | None = None
+    error: CowError | None = None
+    ended: float | None = None  # Unix time, s
+
+    @property
+    def result(self) -> str | None:
+        """The result as JSON."""
+        return None if self.content is None else to_json(self.content).decode()
+
+    def as_json(self) -> str:
+        """The job with its result."""
+        return to_json({**self.job.model_dump(mode="json"), "result": self.content}).decode()
+
+
+@dataclass(frozen=True)
+class OpenCount:
+    """Open jobs that have all of this in common."""
+
+    queue: str
+    generator: str
+    state: str  # "queued" or "running"
+    workflow_version: str
+    jobs: int
+    oldest: str  # when the first of them was created
+
+    @property
+    def oldest_seconds(self) -> float:
+        """Since the first of them was created."""
+        return max(0.0, time.time() - datetime.fromisoformat(self.oldest).timestamp())
+
+
+@dataclass(frozen=True)
+class Load:
+    """How many jobs are open: all, those of an owner, and those in a queue that no process has taken."""
+
+    jobs: int
+    own: int
+    waiting: int
+
+
+class JobTable:
+    """The jobs of a database."""
+
+    def __init__(self, database: Database, on_end: OnEnd = lambda connection, job_id, url: None) -> None:
+        self._database, self._on_end = database, on_end
+
+    def load(self, owner: str | None, queue: str = "") -> Load:
+        """What a new job of an owner adds to."""
+
+        def number_of(condition: sa.ColumnElement[bool]) -> sa.ColumnElement[int]:
+            return sa.func.coalesce(sa.func.sum(sa.case((condition, 1), else_=0)), 0)
+
+        waiting = sa.and_(JOBS.c.queue == queue, JOBS.c.executor.is_(None))
+        counts = sa.func.count(), number_of(JOBS.c.owner.is_not_distinct_from(owner)), number_of(waiting)
+        (row,) = self._database.read(sa.select(*counts).where(JOBS.c.status.in_(OPEN)))
+        return Load(*row)
+
+    def insert(
+        self, job_id: str, spec: JobSpec, owner: str | None, queue: str, step: int, executor: str | None
+    ) -> TakenJob | None:
+        """Adds a job and what it needs; None where there is one of that id.
+
+        Its turn comes `step` after that of its owner's last job. With an `executor` that process has taken it.
+        """
+        run = uuid4().hex
+        with self._database.transaction() as connection:
+            own = sa.select(JOBS.c.id, JOBS.c.owner, JOBS.c.turn, JOBS.c.priority)
+            own = own.where(JOBS.c.queue == queue, JOBS.c.status.in_(OPEN))
+            first: Sequence[Any] = connection.execute(own.order_by(JOBS.c.turn).limit(1)).all()
+            jobs: Sequence[Any] = connection.execute(own.where(JOBS.c.owner.is_not_distinct_from(owner))).all()
+            turn = next_turn([*first, *jobs], owner, spec.priority, step)
+            spec = spec.model_copy(update={"turn": turn})
+            row = {
+                **{name: getattr(spec, name) for name in ("kind", "created_at", "priority", "turn", "generator")},
+                **{"id": job_id, "owner": owner, "queue": queue, "status": "queued", "version": VERSION},
+                **{"question": spec.request["question"], "image": spec.image, "webhook": spec.webhook},
+                **{"executor": executor, "run": None if executor is None else run, "starts": int(executor is not None)},
+                "spec": packed(spec.model_dump_json()),
+            }
+            if connection.execute(self._insert(JOBS, [row]).returning(JOBS.c.id)).one_or_none() is None:
+                return None
+            needed = [{"sha256": sha256, "job_id": job_id} for sha256 in {spec.image, *spec.masks}]
+            connection.execute(self._insert(REFERENCES, needed))
+            if behind := [job.id for job in jobs if moves(job, owner, spec.priority, turn)]:
+                waits = JOBS.c.id.in_(behind), JOBS.c.executor.is_(None)
+                connection.execute(sa.update(JOBS).where(*waits).values(turn=JOBS.c.turn + step))
+        return TakenJob(job_id, spec, owner, queue, run)
+
+    def waiting_queues(self) -> list[str]:
+        """The queues in which jobs of this version wait."""
+        query = sa.select(JOBS.c.queue).distinct().where(*_WAITS)
+        return [row.queue for row in self._database.read(query)]
+
+    def take(self, queue: str, executor: str, number: int, limit_per_owner: int | None) -> list[TakenJob]:
+        """Gives some waiting jobs of a queue to a process, in their turns.
+
+        Jobs of one owner are taken only while fewer than `limit_per_owner` of theirs are taken, in any process.
+        """
+        order = JOBS.c.turn, JOBS.c.created_at, JOBS.c.id
+        wanted = sa.select(JOBS.c.id).where(JOBS.c.queue == queue, *_WAITS).order_by(*order).limit(number)
+        if limit_per_owner is not None:
+            wanted = wanted.where(JOBS.c.id.in_(_within_limit(queue, limit_per_owner)))
+        chosen = wanted.with_for_update(skip_locked=True).cte()  # as a subquery, PostgreSQL might run it several times
+        taken = (
+            sa.update(JOBS)
+            .where(JOBS.c.id.in_(sa.select(chosen.c.id)), JOBS.c.executor.is_(None))
+            .values(executor=executor, run=uuid4().hex, starts=JOBS.c.starts + 1)
+            .returning(JOBS.c.id, JOBS.c.owner, JOBS.c.turn, JOBS.c.created_at, JOBS.c.run, JOBS.c.spec)
+        )
+        with self._database.transaction() as connection:
+            if limit_per_owner is not None and self._database.file is None:
+                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(CLAIM_LOCK)))
+            rows = connection.execute(taken).all()
+        return [
+            TakenJob(row.id, _spec(row.spec).model_copy(update={"turn": row.turn}), row.owner, queue, row.run)
+            for row in sorted(rows, key=lambda row: (row.turn, row.created_at, row.id))
+        ]
+
+    def begin(self, job: TakenJob) -> bool:
+        """Work on a job begins. False where it is no longer this process's: it was canceled, for example."""
+        mine = JOBS.c.id == job.id, JOBS.c.run == job.run, JOBS.c.status.in_(OPEN)
+        with self._database.transaction() as connection:
+            return connection.execute(sa.update(JOBS).where(*mine).values(status="running")).rowcount > 0
+
+    def release(self, job_id: str, run: str) -> None:
+        """Puts a job back into its queue, if it has not ended."""
+        mine = JOBS.c.id == job_id, JOBS.c.run == run, JOBS.c.status.in_(OPEN)
+        with self._database.transaction() as connection:
+            connection.execute(sa.update(JOBS).where(*mine).values(_RELEASED))
+
+    def succeed(self, job: TakenJob, result: str, trajectory_key: str | None) -> bool:
+        """Stores the result of a job. False where the job is no longer this process's."""
+        values = {"result": packed(result), "format": FORMAT, "trajectory_key": trajectory_key}
+        return self._end(job.id, "succeeded", job.run, **values)
+
+    def fail(self, job: TakenJob, error: CowError) -> bool:
+        """Stores what a job failed with. False where the job is no longer this process's."""
+        return self._end(job.id, "failed", job.run, error=json.dumps(error_as_json(error)))
+
+    def cancel(self, job_id: str) -> bool:
+        """Ends a job; False where it had ended."""
+        return self._end(job_id, "canceled")
+
+    def executors(self) -> set[str]:
+        """The processes that have jobs."""
+        query = sa.select(JOBS.c.executor).distinct().where(JOBS.c.executor.is_not(None), JOBS.c.status.in_(OPEN))
+        return {row.executor for row in self._database.read(query)}
+
+    def taken_by(self, executor: str) -> dict[str, str]:
+        """The open jobs that a process has, and its attempts."""
+        query = sa.select(JOBS.c.id, JOBS.c.run).where(JOBS.c.executor == executor, JOBS.c.status.in_(OPEN))
+        return {row.id: row.run for row in self._database.read(query)}
+
+    def recover(self, executors: Iterable[str]) -> list[str]:
+        """Puts the jobs of processes that have ended back into their queues; returns their ids.
+
+        One that was started too often fails: it ends its process each time.
+        """
+        theirs = JOBS.c.executor.in_(list(executors)), JOBS.c.status.in_(OPEN)
+        worn_out = sa.select(JOBS.c.id, JOBS.c.run).where(*theirs, JOBS.c.starts >= MAX_STARTS)
+        detail = "The server ended while it worked on this job, again and again; it is not tried again."
+        error = json.dumps(error_as_json(InternalError(detail)))
+        for row in self._database.read(worn_out):
+            self._end(row.id, "failed", row.run, error=error)
+        with self._database.transaction() as connection:
+            recovered = sa.update(JOBS).where(*theirs).values(_RELEASED).returning(JOBS.c.id)
+            return [row.id for row in connection.execute(recovered)]
+
+    def find(self, job_id: str, at: At | None, *, full: bool = True) -> JobState | None:
+        """A job by its id: with its result unless `full` is false, and with its place while it waits.
+
+        `at`: how far it is, as it was known before this call.
+        """
+        query = sa.select(*_SHOWN, JOBS.c.queue, JOBS.c.turn)
+        if full:
+            stored = sa.and_(TRAJECTORIES.c.job_id == JOBS.c.id, TRAJECTORIES.c.key == JOBS.c.trajectory_key)
+            query = query.add_columns(JOBS.c.result, JOBS.c.format, TRAJECTORIES.c.trajectory)
+            query = query.select_from(JOBS.outerjoin(TRAJECTORIES, stored))
+        rows = self._database.read(query.where(JOBS.c.id == job_id))
+        if not rows:
+            return None
+        found = _state(rows[0], at)
+        if found.job.status == "queued":
+            return replace(found, job=found.job.model_copy(update=self._place_in_queue(rows[0])))
+        if full and found.job.status == "succeeded":
+            return replace(found, content=_content(rows[0]))
+        return found
+
+    def page(self, owner: str | None, filters: JobFilters, all_at: Mapping[str, At]) -> JobPage:
+        """Jobs of an owner, newest first; of everybody where there are no owners. Raises `InvalidRequest`."""
+        query = sa.select(*_SHOWN).order_by(JOBS.c.created_at.desc(), JOBS.c.id.desc()).limit(filters.limit + 1)
+        if owner is not None:
+            query = query.where(JOBS.c.owner == owner)
+        if filters.status:
+            query = query.where(JOBS.c.status.in_(filters.status))
+        if filters.kind is not None:
+            query = query.where(JOBS.c.kind == filters.kind)
+        if filters.created_after is not None:
+            query = query.where(JOBS.c.created_at >= _text(filters.created_after, round_up=True))
+        if filters.created_before is not None:
+            query = query.where(JOBS.c.created_at <= _text(filters.created_before))
+        if filters.cursor is not None:
+            last = sa.tuple_(*(sa.literal(part) for part in _read_cursor(filters.cursor)))
+            query = query.where(sa.tuple_(JOBS.c.created_at, JOBS.c.id) < last)
+        found = self._database.read(query)
+        rows = found[: filters.limit]
+        jobs: list[Job] = []
+        for row in rows:
+            job = _state(row, all_at.get(row.id)).job
+            if job.question is not None and len(job.question) > MAX_LISTED_QUESTION:
+                job = job.model_copy(update={"question": job.question[: MAX_LISTED_QUESTION - 1] + "…"})
+            jobs.append(job)
+        after = None
+        if len(found) > len(rows):
+            position = json.dumps([rows[-1].created_at, rows[-1].id]).encode()
+            after = base64.urlsafe_b64encode(position).decode().rstrip("=")
+        return JobPage(jobs=tuple(jobs), next=after)
+
+    def spec(self, job_id: str) -> JobSpec | None:
+        """What a job has to do."""
+        rows = self._database.read(sa.select(JOBS.c.spec).where(JOBS.c.id == job_id))
+        return _spec(rows[0].spec) if rows else None
+
+    def may_read(self, sha256: str, owner: str) -> bool:
+        """Whether a job of an owner needs an artifact."""
+        query = sa.select(JOBS.c.id).join(REFERENCES).where(REFERENCES.c.sha256 == sha256, JOBS.c.owner == owner)
+        return bool(self._database.read(query.limit(1)))
+
+    def ended_of(self, jobs: Sequence[str]) -> list[str]:
+        """Those of some jobs that have ended."""
+        query = sa.select(JOBS.c.id).where(JOBS.c.id.in_(jobs), JOBS.c.status.not_in(OPEN))
+        return [row.id for row in self._database.read(query)]
+
+    def ended_before(self, moment: float, limit: int) -> list[str]:
+        """Some jobs that ended before a time (Unix time, s)."""
+        return [row.id for row in self._database.read(sa.select(JOBS.c.id).where(JOBS.c.ended < moment).limit(limit))]
+
+    def open_counts(self) -> list[OpenCount]:
+        """How many jobs wait or run anywhere."""
+        groups = JOBS.c.queue, JOBS.c.generator, JOBS.c.status, JOBS.c.version
+        counts = sa.func.count(), sa.func.min(JOBS.c.created_at)
+        rows = self._database.read(sa.select(*groups, *counts).where(JOBS.c.status.in_(OPEN)).group_by(*groups))
+        return [OpenCount(*row) for row in rows]
+
+    def ended_lately(self) -> dict[str, int]:
+        """How many jobs of each queue ended, well or not, in the last `RATE_SECONDS`."""
+        lately = JOBS.c.ended > time.time() - RATE_SECONDS, JOBS.c.status.in_(("succeeded", "failed"))
+        rows = self._database.read(
+            sa.select(JOBS.c.queue, sa.func.count().label("jobs")).where(*lately).group_by(JOBS.c.queue)
+        )
+        return {row.queue: row.jobs for row in rows}
+
+    def delete(self, jobs: list[str]) -> set[str]:
+        """Deletes jobs with all that belongs to them; returns the artifacts that no other job needs."""
+        with self._database.transaction() as connection:
+            theirs = sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(jobs)).distinct()
+            artifacts = set(connection.execute(theirs).scalars())
+            connection.execute(sa.delete(JOBS).where(JOBS.c.id.in_(jobs)))
+        return artifacts - self._database.referenced(artifacts)
+
+    def _insert(self, table: sa.Table, rows: list[dict[str, Any]]) -> postgresql.Insert | sqlite.Insert:
+        """An insertion that skips rows that are there."""
+        dialect = postgresql if self._database.file is None else sqlite
+        return dialect.insert(table).values(rows).on_conflict_do_nothing()
+
+    def _end(self, job_id: str, status: JobStatus, run: str | None = None, **values: Any) -> bool:
+        """Ends an open job, and has its webhook called. Of an attempt: only if it is the latest."""
+        this = [JOBS.c.id == job_id] if run is None else [JOBS.c.id == job_id, JOBS.c.run == run]
+        ended = sa.update(JOBS).where(*this, JOBS.c.status.in_(OPEN)).values(status=status, ended=time.time(), **values)
+        with self._database.transaction() as connection:
+            row = connection.execute(ended.returning(JOBS.c.webhook)).one_or_none()
+            if row is not None and row.webhook is not None:
+                self._on_end(connection, job_id, row.webhook)
+            if row is None and run is not None:  # an earlier try whose commit was not heard of may have done it
+                row = connection.execute(sa.select(JOBS.c.id).where(*this, JOBS.c.status == status)).one_or_none()
+        return row is not None
+
+    def _place_in_queue(self, row: sa.Row[Any]) -> dict[str, float | None]:
+        """`position` and `expected_wait` of a queued job."""
+        now = time.time()
+        own = sa.tuple_(sa.literal(row.turn), sa.literal(row.created_at))
+        before = sa.select(sa.func.count()).where(
+            JOBS.c.queue == row.queue, JOBS.c.status == "queued", sa.tuple_(JOBS.c.turn, JOBS.c.created_at) < own
+        )
+        ended = JOBS.c.queue == row.queue, JOBS.c.ended > now - RATE_SECONDS
+        query = sa.select(before.scalar_subquery(), sa.func.count(), sa.func.min(JOBS.c.ended)).where(*ended)
+        ((position, ends, first),) = self._database.read(query)
+        wait = (position + 1) * (now - first) / ends if ends >= MIN_ENDS else None
+        return {"position": position, "expected_wait": None if wait is None else round(wait, 1)}
+
+
+_WAITS = JOBS.c.status == "queued", JOBS.c.executor.is_(None), JOBS.c.version == VERSION
+_RELEASED = {"status": "queued", "executor": None, "run": None}
+_SHOWN = tuple(
+    JOBS.c[name]
+    for name in ("id", "kind", "owner", "status", "created_at", "ended", "generator", "question", "image", "error")
+)
+
+
+def error_as_json(error: CowError) -> dict[str, Any]:
+    """Its code, detail, fields and usage, as JSON values."""
+    fields = [{"pointer": field.pointer, "detail": field.detail} for field in error.errors]
+    return {"code": error.code, "detail": error.detail, "errors": fields, "usage": error.usage}
+
+
+def error_from_json(kept: Mapping[str, Any]) -> CowError:
+    """The same error; an internal one where a later version made it, and it is not known here."""
+    kind = kinds().get(kept["code"], InternalError)
+    error = kind(kept["detail"], errors=tuple(FieldError(**field) for field in kept["errors"]))
+    error.usage = kept.get("usage")
+    return error
+
+
+def _within_limit(queue: str, limit: int) -> sa.Select[Any]:
+    """The waiting jobs of a queue that their owners may have beside those that are taken."""
+    taken = (
+        sa.select(JOBS.c.owner, sa.func.count().label("number"))
+        .where(JOBS.c.executor.is_not(None), JOBS.c.status.in_(OPEN))
+        .group_by(JOBS.c.owner)
+        .subquery()
+    )
+    order = JOBS.c.turn, JOBS.c.created_at, JOBS.c.id
+    place = sa.func.row_number().over(partition_by=JOBS.c.owner, order_by=order)
+    waiting = sa.select(JOBS.c.id, JOBS.c.owner, place.label("place")).where(JOBS.c.queue == queue, *_WAITS).subquery()
+    number = waiting.c.place + sa.func.coalesce(taken.c.number, 0)
+    return (
+        sa.select(waiting.c.id)
+        .outerjoin(taken, taken.c.owner == waiting.c.owner)
+        .where(sa.or_(waiting.c.owner.is_(None), number <= limit))
+    )
+
+
+def _spec(kept: bytes) -> JobSpec:
+    return JobSpec.model_validate(unpacked(kept))
+
+
+def _state(row: sa.Row[Any], at: At | None) -> JobState:
+    kind, status = cast(JobKind, row.kind), cast(JobStatus, row.status)
+    stage, progress = None, 1.0 if status == "succeeded" else 0.0
+    if at is not None and status == "running":
+        stage, done = at
+        progress = share_done(kind, stage, done)
+    error = None if row.error is None else error_from_json(json.loads(row.error))
+    job = Job(
+        id=row.id,
+        kind=kind,
+        status=status,
+        stage=stage,
+        progress=progress,
+        question=row.question,
+        image=row.image,
+        created_at=row.created_at,
+        finished_at=None if row.ended is None else max(rfc3339(row.ended), row.created_at),  # clocks may differ
+        generator=row.generator,
+        problem=None if error is None else Problem(**error.as_problem()),
+    )
+    return JobState(job, row.owner, error=error, ended=row.ended)
+
+
+def _content(row: sa.Row[Any]) -> dict[str, Any]:
+    """The result of a job, as it is written today."""
+    content: dict[str, Any] = unpacked(row.result)
+    if row.trajectory is not None:
+        (content.get("simulation") or content)["trajectory"] = unpacked(row.trajectory)  # null until now
+    if row.format != FORMAT:
+        model = Answer if row.kind == "answer" else Simulation
+        return model.model_validate(content).model_dump(mode="json")
+    return content
+
+
+def _text(moment: datetime, *, round_up: bool = False) -> str:
+    """A time as the table has it: to the millisecond."""
+    whole = min(max(moment, EARLIEST), LATEST)
+    rest = whole.microsecond % 1000
+    return rfc3339(whole.timestamp() + ((1000 - rest) / 1e6 if round_up and rest else 0.0))
+
+
+def _read_cursor(cursor: str) -> tuple[str, str]:
+    try:
+        created_at, job_id = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        datetime.fromisoformat(created_at)
+        return created_at, str(job_id)
+    except (ValueError, TypeError, binascii.Error, RecursionError) as error:
+        detail = "is none that this server gave out"
+        raise InvalidRequest(f"`cursor` {detail}.", errors=(FieldError("/cursor", detail),)) from error

@@ -1,0 +1,129 @@
+"""What the processes on one job database tell each other of jobs: queued, progress, ended, canceled.
+
+All of it only makes things quick: what counts is in the database.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import psycopg
+
+from cow_service.errors import CowError
+from cow_service.jobs.database import Database
+from cow_service.requests import Stage
+
+CHANNEL = "cow_jobs"
+RECONNECT_SECONDS = 1.0  # after a session was lost
+LISTEN_SECONDS = 1.0  # of one wait, after which it is looked whether to stop
+POLL_SECONDS = 0.05  # between two looks at SQLite, where somebody waits
+POLL_SHARE = 20  # and so many times as long as one took
+PROGRESS_SECONDS = 0.2  # between two messages on the progress of a job
+
+
+@dataclass(frozen=True)
+class Notification:
+    """What happened to a job. `stage` and `done` are those of its progress."""
+
+    what: Literal["queued", "progress", "ended", "canceled"]
+    job_id: str
+    stage: Stage | None = None
+    done: float = 0.0
+
+
+Receive = Callable[[Notification], None]
+
+
+class Notifications(ABC):
+    """Sends to the other processes, and receives from them in a thread of its own."""
+
+    def __init__(self) -> None:
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._executor = ""
+
+    def start(self, executor: str, receive: Receive) -> None:
+        """Begins to receive; `executor` names this process, whose own notifications are not received."""
+        self._executor = executor
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._listen, args=(receive,), name="cow-notifications", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends receiving."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    @abstractmethod
+    def send(self, notification: Notification) -> None:
+        """Tells all processes. What cannot be told is found in the database later."""
+
+    @abstractmethod
+    def _listen(self, receive: Receive) -> None: ...
+
+
+class PostgresNotifications(Notifications):
+    """By LISTEN and NOTIFY."""
+
+    def __init__(self, database: Database) -> None:
+        super().__init__()
+        self._database = database
+        self._sent: dict[str, float] = {}  # when the progress of a job was last sent
+
+    def send(self, notification: Notification) -> None:
+        """As the base class says."""
+        now = time.monotonic()
+        if notification.what != "progress":
+            self._sent.pop(notification.job_id, None)
+        elif now - self._sent.get(notification.job_id, 0.0) < PROGRESS_SECONDS:
+            return
+        else:
+            self._sent[notification.job_id] = now
+        with suppress(CowError):
+            self._database.notify(CHANNEL, json.dumps([self._executor, asdict(notification)]))
+
+    def _listen(self, receive: Receive) -> None:
+        while not self._stop.is_set():
+            try:
+                with self._database.session() as session:
+                    session.execute(f"LISTEN {CHANNEL}")
+                    while not self._stop.is_set():
+                        for message in session.notifies(timeout=LISTEN_SECONDS):
+                            with suppress(ValueError, TypeError):  # of another version
+                                sender, values = json.loads(message.payload)
+                                if sender != self._executor:
+                                    receive(Notification(**values))
+            except psycopg.Error:
+                self._stop.wait(RECONNECT_SECONDS)
+
+
+class PolledNotifications(Notifications):
+    """On SQLite, whose processes are on one machine: asks for the end of jobs that somebody waits for."""
+
+    def __init__(self, awaited: Callable[[], list[str]], ended: Callable[[list[str]], list[str]]) -> None:
+        """`awaited`: the jobs that are waited for here and computed elsewhere; `ended`: those of them that have
+        ended."""
+        super().__init__()
+        self._awaited, self._ended = awaited, ended
+
+    def send(self, notification: Notification) -> None:
+        """Does nothing."""
+
+    def _listen(self, receive: Receive) -> None:
+        took = 0.0
+        while not self._stop.wait(max(POLL_SECONDS, POLL_SHARE * took)):
+            began = time.monotonic()
+            if awaited := self._awaited():
+                with suppress(CowError):
+                    for job_id in self._ended(awaited):
+                        receive(Notification("ended", job_id))
+            took = time.monotonic() - began

@@ -1,0 +1,27 @@
+"""Jobs in a job database that no engine computes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import sqlalchemy as sa
+
+from cow_service.jobs.database import JOBS, OPEN, Database
+from cow_service.jobs.job_table import JobSpec, JobTable, TakenJob
+from cow_service.stages.run import now
+
+STEP = 100
+
+
+def add_job(database: Database, job_id: str, owner: str | None = None, **more: Any) -> TakenJob | None:
+    """Adds a job, which belongs to a process where an `executor` is named; None where there is one of that id."""
+    executor, step, queue = more.pop("executor", None), more.pop("step", STEP), more.pop("queue", "light")
+    request = {"image": {"artifact": "0" * 64}, "question": "?"}
+    asked = {"kind": "simulate", "request": request, "reader": "embedded", "generator": "cutout"}
+    spec = JobSpec(**({**asked, "created_at": now()} | more))
+    return JobTable(database).insert(job_id, spec, owner, queue, step, executor)
+
+
+def open_jobs(database: Database) -> list[str]:
+    """The jobs that wait or run."""
+    return [row.id for row in database.read(sa.select(JOBS.c.id).where(JOBS.c.status.in_(OPEN)))]

@@ -1,0 +1,196 @@
+"""Jobs in their queues: who takes which, what a process that ended leaves, and which attempt may end a job."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+from dbos import DBOS
+from engines import running_engine
+from job_rows import add_job
+from postgres import postgres_server
+from pydantic import SecretStr
+
+from cow_service.errors import InternalError, InvalidRequest
+from cow_service.jobs import webhooks, workflows
+from cow_service.jobs.database import JOBS, Database
+from cow_service.jobs.job_table import MAX_STARTS, JobFilters, JobTable
+from cow_service.jobs.workflows import Dispatcher
+from cow_service.settings import Settings
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[SecretStr]:
+    with postgres_server() as url:
+        yield SecretStr(url)
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
+def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
+    url = request.getfixturevalue("postgres") if request.param == "postgres" else None
+    database = Database(Settings(data_dir=tmp_path, database_url=url))
+    database.create_tables()
+    yield database
+    with database.transaction() as connection:
+        connection.execute(sa.delete(JOBS))
+    database.close()
+
+
+def ids(jobs: list[Any]) -> list[str]:
+    return [job.id for job in jobs]
+
+
+def test_jobs_are_taken_in_their_turns_and_once(database: Database) -> None:
+    table = JobTable(database)
+    for number in range(3):
+        for owner in ("alice", "bob"):
+            add_job(database, f"{owner}-{number}", owner)
+    add_job(database, "gpu", queue="ati")
+    assert sorted(table.waiting_queues()) == ["ati", "light"]
+    first = table.take("light", "me", 4, None)
+    assert Counter(job.owner for job in first) == {"alice": 2, "bob": 2}
+    assert sorted(ids(table.take("light", "other", 9, None))) == ["alice-2", "bob-2"]
+    assert table.take("light", "me", 9, None) == []
+    assert table.waiting_queues() == ["ati"]
+    assert table.executors() == {"me", "other"}
+    assert table.load("alice", "ati").own == 3
+    assert (table.load(None, "ati").jobs, table.load(None, "ati").waiting, table.load(None, "light").waiting) == (
+        7,
+        1,
+        0,
+    )
+
+
+def test_no_owner_has_more_taken_jobs_than_they_may_have(database: Database) -> None:
+    table = JobTable(database)
+    for owner in ("alice", "bob", None):
+        for number in range(3):
+            add_job(database, f"{owner}-{number}", owner)
+    taken = table.take("light", "me", 9, 1)
+    assert Counter(job.owner for job in taken) == {"alice": 1, "bob": 1, None: 3}
+    assert table.take("light", "other", 9, 1) == []
+    alice = next(job for job in taken if job.owner == "alice")
+    assert table.cancel(alice.id)
+    assert ids(table.take("light", "other", 9, 1)) == ["alice-1"]
+
+
+def test_many_who_take_at_the_same_time_take_each_job_once(database: Database) -> None:
+    table = JobTable(database)
+    for number in range(60):
+        add_job(database, str(number), "alice")
+
+    def take(executor: int) -> list[str]:
+        return [job.id for _ in range(10) for job in table.take("light", str(executor), 2, None)]
+
+    with ThreadPoolExecutor(8) as pool:
+        taken = [job for some in pool.map(take, range(8)) for job in some]
+    assert sorted(taken, key=int) == [str(number) for number in range(60)]
+
+
+def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: Database) -> None:
+    table = JobTable(database)
+    add_job(database, "job")
+    (old,) = table.take("light", "frozen", 1, None)
+    assert table.begin(old)
+    assert table.recover(["frozen"]) == ["job"]
+    found = table.find("job", None)
+    assert found is not None
+    assert (found.job.status, found.job.position) == ("queued", 0)
+    (new,) = table.take("light", "me", 1, None)
+    assert not table.begin(old)
+    assert not table.succeed(old, '{"by":"old"}', None)
+    table.release("job", old.run)
+    assert table.begin(new)
+    assert table.succeed(new, '{"by":"new"}', None)
+    assert table.succeed(new, '{"by":"new"}', None), "a repeated try whose first commit was not heard of"
+    assert not table.fail(new, InternalError("late"))
+    assert not table.cancel("job")
+    assert table.recover(["me", "frozen"]) == []
+    assert ids(table.page(None, JobFilters(status=("succeeded",)), {}).jobs) == ["job"]
+
+
+def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(database: Database) -> None:
+    table = JobTable(database)
+    old = add_job(database, "job", executor="me")
+    assert old is not None
+    assert add_job(database, "job") is None, "the id is taken"
+    table.delete(["job"])
+    new = add_job(database, "job", executor="me")
+    assert new is not None
+    assert not table.succeed(old, "{}", None)
+    assert table.taken_by("me") == {"job": new.run}
+
+
+def test_a_job_that_ends_its_process_each_time_fails(database: Database) -> None:
+    ended: list[str] = []
+    table = JobTable(database, lambda connection, job_id, url: ended.append(url))
+    add_job(database, "killer", webhook="https://call.test")
+    for _ in range(MAX_STARTS):
+        assert ended == []
+        assert ids(table.take("light", "me", 1, None)) == ["killer"]
+        table.recover(["me"])
+    found = table.find("killer", None)
+    assert found is not None
+    assert (found.job.status, ended) == ("failed", ["https://call.test"])
+    assert isinstance(found.error, InternalError)
+    assert "again and again" in found.error.detail
+
+
+def test_pages_show_each_job_once(database: Database) -> None:
+    table = JobTable(database)
+    for number in range(25):  # some at the same time
+        add_job(database, f"{number:02}", created_at=f"2026-01-01T00:00:00.{number // 3:03}Z")
+    shown: list[str] = []
+    cursor = None
+    while True:
+        page = table.page(None, JobFilters(limit=4, cursor=cursor), {})
+        shown += ids(list(page.jobs))
+        cursor = page.next
+        if cursor is None:
+            break
+    assert shown == [f"{number:02}" for number in range(24, -1, -1)]
+    for wrong in ("", "x", "W10", "WzEsMl0", "é"):
+        with pytest.raises(InvalidRequest, match="cursor"):
+            table.page(None, JobFilters(cursor=wrong), {})
+
+
+@pytest.mark.parametrize("capacity", [0, 3])
+def test_jobs_that_did_not_wait_take_places_of_those_that_do(capacity: int) -> None:
+    parts: Any = SimpleNamespace()
+    dispatcher = Dispatcher(parts, lambda queue: capacity, lambda job, image: None)
+    assert [dispatcher.hold_place("light") for _ in range(4)] == [place < capacity for place in range(4)]
+    if capacity:
+        dispatcher.free_place("light")
+        assert dispatcher.hold_place("light")
+    dispatcher.drain()
+    assert not dispatcher.hold_place("other")
+
+
+def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
+    """By the public interface of DBOS: what was left pending goes back to its queue, and nothing else is touched."""
+    engine = running_engine()
+    client, table = (
+        engine.webhooks.client,
+        sa.Table("workflow_status", sa.MetaData(), autoload_with=engine.database.engine),
+    )
+    left = {name: f"left-{name}" for name in (webhooks.WORKFLOW, workflows.WORKFLOW)}
+    with engine.database.transaction() as connection:
+        for name, workflow in left.items():
+            connection.execute(
+                sa.insert(table).values(
+                    workflow_uuid=workflow, status="PENDING", name=name, executor_id="ended", application_version="none"
+                )
+            )
+    assert "ended" in workflows.busy_executors(client)
+    workflows.recover(client, engine.jobs, ["ended"])
+    webhook = DBOS.get_workflow_status(left[webhooks.WORKFLOW])
+    assert webhook is not None
+    assert (webhook.status, webhook.queue_name) == ("ENQUEUED", webhooks.QUEUE)
+    assert DBOS.get_workflow_status(left[workflows.WORKFLOW]) is None
+    client.delete_workflows([left[webhooks.WORKFLOW]])
