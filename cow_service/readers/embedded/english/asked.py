@@ -7,11 +7,9 @@ read at all. A wrong yes is worse than "not sure".
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
-from importlib.resources import files
+from functools import lru_cache
 from itertools import pairwise
 
 from lark import Tree
@@ -30,7 +28,7 @@ from cow_service.readers.embedded.english.asking import (
 from cow_service.readers.embedded.english.clauses import is_during
 from cow_service.readers.embedded.english.grammar import parse_all, read_from
 from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.embedded.english.tokens import PUNCTUATION, Item, ObjectPhrase, Word, key_at, plain_words
+from cow_service.readers.embedded.english.tokens import PUNCTUATION, Item, ObjectPhrase, Word, key_at
 from cow_service.records import Asked
 
 # Words that hold a sentence together; what they join is read, or is named.
@@ -176,58 +174,6 @@ _OBJECTS = frozenset({"OBJ", "OBJS"})  # an object or objects of no name
 _SLOT = re.compile(r"<(\w+?)(\d?)>")
 
 
-@dataclass(frozen=True)
-class _Rule:
-    pattern: re.Pattern[str]
-    tokens: tuple[str, ...]  # what is said instead; "<thing>" is what stood there
-
-
-@cache
-def _rules() -> tuple[_Rule, ...]:
-    text = files("cow_service.readers.embedded.english").joinpath("paraphrases.toml").read_text(encoding="utf-8")
-    listed = tomllib.loads(text)
-    said = [(filler, "") for filler in listed["fillers"]] + list(listed["said_as"].items())
-    return tuple(_Rule(_pattern(pattern), tuple(instead.split())) for pattern, instead in said)
-
-
-def _pattern(pattern: str) -> re.Pattern[str]:
-    slotted = _SLOT.sub(lambda found: f"(?P<{found[1]}{found[2]}>{_SLOTS[found[1]]})", pattern)
-    return re.compile(rf"(?<=\s)(?:{slotted})(?=\s)")
-
-
-def rephrased(sentence: Sentence, question: Question) -> Sentence:
-    """The sentence in other words, without what tells of the motion; its words keep their places."""
-    items = question.items
-    words = [w for w in sentence.words if items[w.at].start not in question.read or w.text in lex.SETS["how_much"]]
-    places = {word.at for word in words}
-    for rule in _rules():
-        for _ in range(_MAX_CHANGES):
-            changed = _applied(rule, words)
-            if changed is None:
-                break
-            words = changed
-    return replace(sentence, words=words, dropped=frozenset(places - {word.at for word in words}))
-
-
-def _applied(rule: _Rule, words: Sequence[Word]) -> list[Word] | None:
-    text = " " + "".join(f"{word.text} " for word in words)
-    found = rule.pattern.search(text)
-    if found is None:
-        return None
-    first, end = (text[:place].count(" ") - 1 for place in (found.start(), found.end() + 1))
-    said: list[Word] = []
-    for token in rule.tokens:
-        slot = _SLOT.fullmatch(token)
-        if slot is None:
-            at = words[first].at
-            said += [Word(token, token, at)] if token in _OBJECTS else plain_words([token], at)
-        else:
-            start, stop = found.span(slot[1] + slot[2])
-            if start >= 0:  # of two ways to say it, the one that was said
-                said += words[text[:start].count(" ") - 1 : text[: stop + 1].count(" ") - 1]
-    return [*words[:first], *said, *words[end:]]
-
-
 _STARTS = lex.SETS["starts"]
 _OPENERS = lex.words(", and then so but now please")
 _CLAIM = ("true", "or", "false")
@@ -321,11 +267,7 @@ def _read(question: Question) -> _Reading | None:
     found, claim = _without_claim(sentences(question))
     if len(found) > MAX_SENTENCES or any(len(sentence.words) > MAX_TOKENS for sentence in found):
         return None
-    plain = _read_sentences(found, question, claim)
-    if plain is not None and not unread_words(question, plain.items).turning:
-        return plain
-    other = _read_sentences([rephrased(sentence, question) for sentence in found], question, claim)
-    return plain if other is None else other
+    return _read_sentences(found, question, claim)
 
 
 def _read_sentences(found: Sequence[Sentence], question: Question, claim: frozenset[int]) -> _Reading | None:
@@ -338,7 +280,7 @@ def _read_sentences(found: Sequence[Sentence], question: Question, claim: frozen
     listed = _listed(found[at], reading.covered, found[at + 1 :])
     if listed and reading.asking.form != "which-first":
         return None
-    named = {found[at].words[place].at for place in reading.covered} | claim | found[at].dropped
+    named = {found[at].words[place].at for place in reading.covered} | claim
     named |= {at for at, item in enumerate(question.items) if listed and (item.phrase in listed or item.key == "or")}
     named |= {at for at, item in enumerate(question.items) if item.key == "still" and question.interventions}
     named |= _premise(found[: at + 1], reading, question)
@@ -409,8 +351,12 @@ def _read_sentence(sentence: Sentence, question: Question, claim: Collection[int
 def _starts(sentence: Sentence, at: int, question: Question) -> bool:
     """Whether a question may begin at a token: with an auxiliary, or as in "ball rolls left - hits the mug?"."""
     tokens, word = sentence.tokens, sentence.words[at]
+    # "Thrown how the arrow shows": that "how" asks nothing.
+    before = [each.text for each in sentence.words[:at] if each.text != "how" or not question.has_read(each.at)]
+    if word.kind == "T" and tokens[at + 1 : at + 2] in (["or"], [","]):
+        return _opens(before)  # "the mug or the cone, which one does it hit?"
     if word.text in _STARTS and not (at and sentence.words[at - 1].at == word.at):
-        return _opens(tokens[:at])
+        return _opens(before)
     said = question.items[word.at].key
     if word.kind == "PRONOUN" and at and at + 1 < len(tokens):  # "let go of the ball, it lands on the mug?"
         said = question.items[sentence.words[at + 1].at].key

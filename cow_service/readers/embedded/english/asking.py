@@ -31,12 +31,12 @@ _BY_MOVER: dict[AskedRelation, AskedRelation] = {"covers": "covered", "covered":
 _INNER = frozenset({"untouched", "still"})  # acts inside `stays`
 _NEGATIONS = frozenset(
     {"no", "none", "misses", "missed", "avoids", "stays", "stays_up", "no_contact", "sticks_out", "stops_short"}
-    | {"spared", "stays_in"}
+    | {"spared", "safe", "stays_in", "stays_on", "seen"}
 )
 
 
 _SPARING = _NEGATIONS - {"no", "none", "no_contact"}
-_ANY_PART = frozenset({"any_part", "partly", "wholly", "in_full", "at_some_time"})  # hidden in part or once
+_ANY_PART = frozenset({"any_part", "all_seen", "partly", "wholly", "in_full", "at_some_time"})  # hidden in part or once
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,8 @@ def _read_tree(tree: Tree[Token], beside: str | None) -> Asking | None:
     subject = _tokens(next(tree.find_data("subject"), None))
     listed = [token for node in (*tree.find_data("list"), *tree.find_data("kind")) for token in _tokens(node)]
     things = list(dict.fromkeys(str(t) for t in _tokens(tree) if t.type == "T" and t not in (*subject, *listed)))
+    if form == "where":
+        things = []  # "what does it land on, the floor or the mug?"
     open_ = any(token.type == "PRONOUN" and token == "them" for token in _tokens(tree))  # which of them
     if open_ or negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
         return None
@@ -192,7 +194,6 @@ class Sentence:
     words: list[Word] = field(default_factory=list[Word])
     phrases: dict[str, ObjectPhrase] = field(default_factory=dict[str, ObjectPhrase])
     asks: bool = False  # it ends with a question mark, or with the text
-    dropped: frozenset[int] = frozenset()  # places of items that were left out of it because they change nothing
 
     @property
     def tokens(self) -> list[str]:

@@ -78,6 +78,10 @@ class Question:
     pronoun: str = ""  # that stands for the mover where it may stand for two things
     read: frozenset[int] = frozenset()
 
+    def has_read(self, at: int) -> bool:
+        """Whether the item at a place tells the motion and was understood."""
+        return self.items[at].start in self.read
+
 
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
