@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 
 from cow_service.media.images import encode_png
 from cow_service.readers.base import AnswerReading
-from cow_service.readers.embedded.answers import answer_from, choose_option
+from cow_service.readers.embedded.answers import answer_from, choose_option, count_of, says_it_happens, seconds_of
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
-from cow_service.readers.embedded.english.options_said import count_of, says_it_happens, seconds_of
 from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.options import (
     choices_source,
@@ -326,6 +325,8 @@ which object does it touch last?
 which object will it hit second?
 If the red ball rolls left, will the vase be hit? And will the cube be hit?
 If the red ball moves left and the blue ball moves right, will it hit the cube?
+If the red ball is rolled straight at the cup, will that then hit the cube?
+The red ball rolls left and the vase slides right, both slowly. Do they meet?
 If the red ball rolls left and hits the cube, will it hit the vase?
 Will the red ball hit something if it rolls left, the vase or the cube?
 """

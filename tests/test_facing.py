@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from cow_service.errors import CannotReadDirection
 from cow_service.physics.camera import FloorCamera
 from cow_service.readers.base import ReaderInput
-from cow_service.readers.embedded.facing import facing
+from cow_service.readers.embedded.facing import DARK, OTHER, PAINT, VehicleModel, facing
 from cow_service.readers.embedded.reader import EmbeddedReader, create
-from cow_service.readers.embedded.vehicle_model import DARK, OTHER, PAINT, VehicleModel
 from cow_service.records import Grounding
 from cow_service.settings import Settings
 from cow_service.vision.masks import Image, Mask, bbox_of, iou

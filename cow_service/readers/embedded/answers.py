@@ -5,24 +5,183 @@ One rule for every form: `Outcome.sure` decides whether an answer is given, and 
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 from cow_service.readers.base import AnswerReading
+from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.asked import Unread
-from cow_service.readers.embedded.english.options_said import (
-    count_of,
-    may_name,
-    names_none,
-    names_several,
-    says_it_happens,
-    seconds_of,
-    spans,
-)
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase
+from cow_service.readers.embedded.english.nouns import may_name
 from cow_service.readers.embedded.english.questions import parse_noun_phrase
-from cow_service.readers.embedded.english.tokens import ObjectPhrase
-from cow_service.readers.options import not_sure_option, says_not_sure
+from cow_service.readers.options import not_sure_option, plain, says_not_sure
 from cow_service.records import AnswerOption, Asked, Doubt, Outcome
+
+_YES = re.compile(r"(?:yes\b(?! (?:and|or) no).*|true)", re.DOTALL | re.IGNORECASE)
+# "No contact" says something of the event, "No, it stops" of what is asked.
+_NO = re.compile(
+    r"no\s*(?:[,.;:!()\u2013\u2014-].*)?|no (?:it|the|this|that|because|they)\b.*|false", re.DOTALL | re.IGNORECASE
+)
+_TOUCHING = lex.SETS["touching"]
+_COVERING = lex.words("hidden hide hides occluded occlude occludes occlusion covered obscured concealed obstructed")
+_MISSING = lex.words("miss misses missed missing avoid avoids avoided untouched")
+_SEEN = lex.words("visible unobstructed unoccluded uncovered")
+_NEGATIONS = lex.words("not no never n't without nothing neither")
+# They change nothing beside such a word.
+_FILLERS = lex.SETS["fillers"]
+_ANY_WORDS = lex.words("anything something any object objects nothing")
+_PASSIVE = lex.words("is are be get gets stays stay remains remain being")
+_BARE = {
+    "it will": True, "it does": True, "it would": True, "it will not": False, "it does not": False,
+    "it would not": False, "it can not": False,
+}  # fmt: skip
+_NONE = re.compile(
+    r"none|nothing|neither|never|not at all|no (?:object|objects|thing|collision|contact|one|time|hit)"
+    r"|none of (?:them|these|the above|the objects)|neither of (?:them|these|the two)"
+    r"|(?:it |the \w+(?: \w+)? )?(?:hits|touches|reaches) (?:nothing|none|none of them)"
+    r"|(?:it |the \w+(?: \w+)? )?misses (?:it|both|all|everything|both of them|all of them)"
+    r"|(?:it |the \w+(?: \w+)? )?never (?:hits|touches|reaches)(?: (?:it|anything|any of them))?"
+    r"|(?:it |the \w+(?: \w+)? )?(?:does|will) not(?: (?:hit|touch|reach|collide with))?"
+    r"(?: (?:it|anything|any object|any of them|happen))?"
+)
+_SEVERAL = re.compile(r"\b(?:both|all|several|more than one|at the same time|simultaneously|each)\b", re.IGNORECASE)
+
+
+def says_it_happens(text: str, asked: Asked) -> bool | None:
+    """Whether an option says that what is asked happens; None where it does not say so plainly."""
+    bare = text.strip().rstrip(".!")
+    if _YES.fullmatch(bare) or _NO.fullmatch(bare):
+        return _YES.fullmatch(bare) is not None
+    said = _unfolded(text)
+    if said in _BARE:
+        return _BARE[said]
+    event = _says_event(said.split(), asked)
+    return None if event is None else event != asked.negated
+
+
+def _says_event(words: list[str], asked: Asked) -> bool | None:
+    """Whether it says that the mover touches, hides or is hidden by the thing asked about, in words of that alone."""
+    yes, no = (_TOUCHING, _MISSING) if asked.relation == "touches" else (_COVERING, _SEEN)
+    about = [at for at, word in enumerate(words) if word in yes | no]
+    if len(about) != 1:
+        return None
+    known = yes | no | _NEGATIONS | _FILLERS
+    known |= _ANY_WORDS if asked.target is None else set(plain(asked.target).split())
+    if asked.target is not None:
+        known -= {"nothing"}
+    before, after = words[: about[0]], words[about[0] + 1 :]
+    acting = asked.relation != "covered" and _PASSIVE.isdisjoint(before)  # then the mover is spoken of, by any name
+    if not set(after if acting else words) <= known:
+        return None
+    turned = sum(word in _NEGATIONS for word in words)
+    return None if turned > 1 else (words[about[0]] in yes) != (turned == 1)
+
+
+def names_none(text: str) -> bool:
+    """Whether an option says that there is no such object, or that it never happens."""
+    return _NONE.fullmatch(_unfolded(text)) is not None
+
+
+def names_several(text: str) -> bool:
+    """Whether an option says that it is more than one object."""
+    return _SEVERAL.search(text) is not None and not names_none(text)
+
+
+def _unfolded(text: str) -> str:
+    """Lower-case words alone, "won't" as "will not"."""
+    return re.sub(r"\b(would|does|is|can|will)n? t\b", r"\1 not", plain(text).replace("won t", "will not"))
+
+
+Span = tuple[float, float]  # from, to; both the same where one value is named
+
+MOST = 1000  # of what is counted
+ALONE = 0.25  # share of a single value that it may be off
+_WORDS = {"zero": "0", "no": "0", **{word: str(value) for word, value in lex.NUMBER_WORDS.items()}}
+_UNITS = {"ms": 0.001, "milliseconds": 0.001, "millisecond": 0.001, "min": 60.0, "minute": 60.0, "minutes": 60.0}
+_N = r"(\d{1,6}(?:\.\d{1,6})?)"
+_UNIT = r"(?: ?(ms|milliseconds?|s|secs?|seconds?|min|minutes?))?"
+_ABOUT = r"(?:at|after|in|about|around|approximately|roughly|circa|ca|exactly|almost|nearly|it hits|it takes|~)"
+_BELOW = r"(?:less than|under|below|fewer than|within|before|in under|in less than|sooner than|<)"
+_ABOVE = r"(?:more than|over|above|longer than|later than|after more than|>)"
+_TIME_FORMS: tuple[tuple[re.Pattern[str], str], ...] = (
+    (re.compile(rf"(?:between|from)? ?{_N}{_UNIT} ?(?:and|to|-|–) ?{_N}{_UNIT}"), "range"),
+    (re.compile(rf"{_BELOW} ?{_N}{_UNIT}|(?:the )?first {_N}{_UNIT}"), "below"),
+    (re.compile(rf"{_ABOVE} ?{_N}{_UNIT}|{_N}{_UNIT} or (?:more|longer|later)"), "above"),
+    (re.compile(rf"(?:{_ABOUT} )*{_N}{_UNIT}(?: later)?"), "value"),
+)
+_THINGS = r"(?:(?: of (?:them|these|the objects))|(?: (?:other )?(?:objects?|things?|items?|obstacles?|bodies|body)))?"
+_COUNT_FORMS: tuple[tuple[re.Pattern[str], str], ...] = (
+    (re.compile(rf"(?:exactly |only |just )?(\d{{1,3}}){_THINGS}"), "value"),
+    (re.compile(rf"(?:between )?(\d{{1,3}}) ?(?:and|to|-|–|or) ?(\d{{1,3}}){_THINGS}"), "range"),
+    (re.compile(rf"(?:more than|over) (\d{{1,3}}){_THINGS}"), "above"),
+    (re.compile(rf"at least (\d{{1,3}}){_THINGS}|(\d{{1,3}})(?: ?\+| or more){_THINGS}"), "least"),
+    (re.compile(rf"(?:less than|fewer than) (\d{{1,3}}){_THINGS}"), "below"),
+    (re.compile(rf"(?:at most|up to) (\d{{1,3}}){_THINGS}|(\d{{1,3}}) or (?:less|fewer){_THINGS}"), "most"),
+)
+
+
+def seconds_of(text: str) -> Span | None:
+    """The time that a text names, s; None where it names none, or more than a time."""
+    said = _digits(text)
+    for pattern, form in _TIME_FORMS:
+        match = pattern.fullmatch(said)
+        if match is None:
+            continue
+        found = [group for group in match.groups() if group is not None]
+        numbers = [float(group) for group in found if group[0].isdigit()]
+        units = [_UNITS.get(group, 1.0) for group in found if not group[0].isdigit()] or [1.0]
+        values = [number * unit for number, unit in zip(numbers, (units * 2)[-len(numbers) :], strict=False)]
+        if form == "range":
+            return (values[0], values[1]) if values[0] < values[1] else None
+        return {"below": (0.0, values[0]), "above": (values[0], math.inf), "value": (values[0], values[0])}[form]
+    return None
+
+
+def spans(said: Sequence[Span]) -> list[Span]:
+    """The span that each time stands for: a value, for all that is nearer to it than to another value named."""
+    values = sorted({low for low, high in said if low == high})
+    gaps = [high - low for low, high in pairwise(values)]
+    return [_around(low, values, gaps) if low == high else (low, high) for low, high in said]
+
+
+def _around(value: float, values: Sequence[float], gaps: Sequence[float]) -> Span:
+    if not gaps:
+        return value * (1 - ALONE), value * (1 + ALONE)
+    at = values.index(value)
+    before, after = gaps[max(at - 1, 0)], gaps[min(at, len(gaps) - 1)]
+    return max(value - before / 2, 0.0), value + after / 2
+
+
+def count_of(text: str) -> range | None:
+    """The numbers that a text allows for what is counted; None where it names none."""
+    said = _digits(text)
+    if said in {"none", "nothing", "0 of them", "none of them"}:
+        return range(1)
+    for pattern, form in _COUNT_FORMS:
+        match = pattern.fullmatch(said)
+        if match is not None:
+            first, *rest = (int(group) for group in match.groups() if group is not None)
+            spans = {
+                "value": (first, first + 1), "range": (first, rest[0] + 1 if rest else 0), "above": (first + 1, MOST),
+                "least": (first, MOST), "below": (0, first), "most": (0, first + 1),
+            }  # fmt: skip
+            return range(*spans[form])
+    return None
+
+
+def _digits(text: str) -> str:
+    """Lower case, number words as digits, without a full stop at the end."""
+    said = re.sub(r"(?<=\d),(?=\d)", ".", text.lower().strip()).rstrip(".!")
+    said = re.sub(r"\bhalf a (?=second)", "0.5 ", said)
+    said = re.sub(r"\ba (?=second)", "1 ", said)
+    said = re.sub(r"\band a half\b", "and_a_half", said)
+    said = " ".join(_WORDS.get(word, word) for word in re.split(r"[\s]+", said))
+    said = re.sub(r"(\d+) and_a_half\b", r"\1.5", said)
+    return " ".join(said.split())
+
 
 HAPPENS = 0.5  # probability from which what is asked happens
 

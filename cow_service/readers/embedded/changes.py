@@ -8,8 +8,8 @@ from cow_service.errors import CannotGround
 from cow_service.narration import same_name
 from cow_service.readers.embedded.english.asked import read_asked
 from cow_service.readers.embedded.english.interventions import InterventionWords
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.embedded.english.tokens import ObjectPhrase
 from cow_service.readers.embedded.matching import describe, match_both, match_one
 from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import Asked, BBox, Intervention, LocatedObject

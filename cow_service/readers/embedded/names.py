@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cow_service.readers.embedded.english.nouns import container_form, is_cube, is_vehicle, kind_of, shape_of
-from cow_service.readers.embedded.english.options_said import may_name
+from cow_service.readers.embedded.english.nouns import container_form, is_cube, is_vehicle, kind_of, may_name, shape_of
 from cow_service.readers.options import plain
 from cow_service.records import ObjectPrior
 

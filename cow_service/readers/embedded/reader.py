@@ -22,19 +22,31 @@ from cow_service.readers.base import (
 )
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
-from cow_service.readers.embedded.doubts import noun_warnings
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked, unread
+from cow_service.readers.embedded.english.lexicon import ARROWS, ObjectPhrase
 from cow_service.readers.embedded.english.motion import MotionWords
 from cow_service.readers.embedded.english.nouns import is_vehicle
 from cow_service.readers.embedded.english.questions import Question, parse, parse_noun_phrase
-from cow_service.readers.embedded.english.tokens import ARROWS, ObjectPhrase
 from cow_service.readers.embedded.facing import facing
-from cow_service.readers.embedded.kinds import is_kind_asked, things_of_kinds
-from cow_service.readers.embedded.matching import best_matches, describe, inside_drawn_box, match_one
-from cow_service.readers.embedded.motions import length, other_readings, quantities, step_readings
+from cow_service.readers.embedded.matching import (
+    best_matches,
+    describe,
+    inside_drawn_box,
+    is_kind_asked,
+    is_known,
+    match_one,
+    noun_warnings,
+    things_of_kinds,
+)
+from cow_service.readers.embedded.motions import (
+    along_trail,
+    length,
+    other_readings,
+    quantities,
+    scene_of_mover,
+    step_readings,
+)
 from cow_service.readers.embedded.names import names_meant, read_name
-from cow_service.readers.embedded.naming import is_known
-from cow_service.readers.embedded.trails import along_trail, scene_of_mover
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,

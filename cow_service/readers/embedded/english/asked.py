@@ -25,10 +25,10 @@ from cow_service.readers.embedded.english.asking import (
     read_clause,
     sentences,
 )
-from cow_service.readers.embedded.english.clauses import is_during
 from cow_service.readers.embedded.english.grammar import parse_all, read_from
+from cow_service.readers.embedded.english.lexicon import PUNCTUATION, Item, ObjectPhrase, Word, key_at
+from cow_service.readers.embedded.english.motion import is_during
 from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.embedded.english.tokens import PUNCTUATION, Item, ObjectPhrase, Word, key_at
 from cow_service.records import Asked
 
 # Words that hold a sentence together; what they join is read, or is named.

@@ -11,8 +11,8 @@ from lark import Token, Tree
 
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.grammar import parse_all
+from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, Word, key_at, plain_words
 from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.embedded.english.tokens import Item, ObjectPhrase, Word, key_at, plain_words
 from cow_service.readers.options import plain
 from cow_service.records import AskedForm, AskedRelation
 

@@ -16,7 +16,7 @@ from itertools import islice
 from lark import Lark, Token, Tree
 from lark.grammar import Symbol, Terminal
 
-from cow_service.readers.embedded.english.tokens import Item, Word, words_at
+from cow_service.readers.embedded.english.lexicon import Item, Word, words_at
 
 STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial", "place", "opening", "premise"]
 MAX_WORDS = 48  # of one parse: its work may grow with the cube of their number

@@ -9,7 +9,7 @@ from lark import Token, Tree
 
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.grammar import read_from
-from cow_service.readers.embedded.english.tokens import Item, ObjectPhrase, key_at, words_of
+from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, key_at, words_of
 from cow_service.records import InterventionKind, PlaceRelation, Vector
 
 MAX_TRIES = 6  # of one question: each takes some ms; what comes after them is not looked for

@@ -16,7 +16,7 @@ from lark import Token, Tree
 from cow_service.readers.base import Quantity, SpeedWord, Unit
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.grammar import may_begin, parse_from, read_from, terminals
-from cow_service.readers.embedded.english.tokens import (
+from cow_service.readers.embedded.english.lexicon import (
     PUNCTUATION,
     QUANTITY,
     Item,

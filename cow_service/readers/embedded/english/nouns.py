@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.lexicon import SETS, words
+from cow_service.readers.embedded.english.lexicon import SETS, ObjectPhrase, words
 from cow_service.readers.embedded.english.questions import parse_noun_phrase
-from cow_service.readers.embedded.english.tokens import ObjectPhrase
+from cow_service.readers.options import plain
 from cow_service.records import Shape
 
 _SPHERES = words("ball sphere orb marble basketball football baseball balloon globe orange apple pea bead pearl bubble")
@@ -90,3 +90,16 @@ def container_form(name: str) -> ContainerForm:
     if head in _SQUARE:
         return "square"
     return "unknown" if shape_of(name) is None else "none"
+
+
+def may_name(phrase: ObjectPhrase, name: str) -> bool:
+    """Whether a phrase may mean the object of that name: they share a colour, noun or number, and differ in none."""
+    other = parse_noun_phrase(name)
+    if other is None:
+        return False
+    if plain(phrase.text) == plain(name):
+        return True
+    nouns = [each.head if each.head not in lex.GENERIC else None for each in (phrase, other)]
+    pairs = ((phrase.colour, other.colour), tuple(nouns), (phrase.number, other.number))
+    said = [(one, two) for one, two in pairs if one is not None and two is not None]
+    return bool(said) and all(one == two for one, two in said)
