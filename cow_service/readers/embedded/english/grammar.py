@@ -153,11 +153,6 @@ def may_begin(start: str, word: Word) -> bool:
     return not _grammar().firsts[start].isdisjoint(_grammar().names(word))
 
 
-def listed_words() -> Set[str]:
-    """The words of the grammar."""
-    return _grammar().terminals.keys()
-
-
 def terminals(word: str) -> Set[str]:
     """The terminals of the grammar that a word may be."""
     return _grammar().terminals.get(word, frozenset())

@@ -8,13 +8,12 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from difflib import SequenceMatcher
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import pairwise
 
 from cow_service.readers.base import Quantity
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.grammar import listed_words, read_from
+from cow_service.readers.embedded.english.grammar import read_from
 from cow_service.readers.embedded.english.interventions import (
     InterventionWords,
     TrailWords,
@@ -23,7 +22,6 @@ from cow_service.readers.embedded.english.interventions import (
     split_trail,
 )
 from cow_service.readers.embedded.english.lexicon import (
-    PUNCTUATION,
     SETS,
     Item,
     ObjectPhrase,
@@ -95,79 +93,13 @@ def without_reply_form(prompt: str) -> str:
     """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
     sentences = _BETWEEN_SENTENCES.split(_YES_NO.sub("", _HEADING.sub("", prompt)))
     kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
-    return "".join(each for each in _BETWEEN_PARTS.split(kept) if not _instructs(each))
-
-
-def _instructs(sentence: str) -> bool:
-    """Whether it says what to do, or what the images are, not what happens in them."""
-    said = re.findall(r"\w+", sentence.lower())
-    first = next((word for word in said[:2] if word != "please"), "")
-    return first in SETS["instructions"] or (first == "note" and not _PICTURES.isdisjoint(said))
-
-
-SHORTEST = 5  # letters of a word that is looked at
-_BEFORE_NOUN = lex.DETERMINERS | lex.COLOURS.keys() | lex.CONDITIONALS | lex.AUXILIARIES | PUNCTUATION | {"of"}
-_ONE_EDIT = ([("replace", 1, 1)], [("insert", 0, 1)], [("delete", 1, 0)])
-_ENDINGS = ("s", "es", "d", "ed", "r", "er")  # of listed words: no errors
-
-
-def without_typing_errors(text: str) -> tuple[str, tuple[tuple[str, str], ...]]:
-    """The text with its typing errors set right, and each of them with what it was read as.
-
-    Nouns are an open set: where one may stand, a word is left as it is, but for the names of directions.
-    """
-    found, errors, end, kept = tokens(text), dict[str, str](), 0, list[str]()
-    for at, item in enumerate(found):
-        meant = _meant(found, at)
-        if meant is not None:
-            errors[text[item.start : item.end]] = meant
-            kept += [text[end : item.start], meant]
-            end = item.end
-    return "".join([*kept, text[end:]]), tuple(errors.items())
-
-
-def _meant(found: Sequence[Item], at: int) -> str | None:
-    key = found[at].key
-    if len(key) < SHORTEST or not key.isalpha() or _is_known(key):
-        return None
-    among = _vocabulary().get(key[0], ())
-    near = [word for word in among if abs(len(word) - len(key)) < 2 and _is_one_edit(key, word)]
-    if len(near) != 1 or (_may_be_noun(found, at) and near[0] not in lex.SETS["misspelt_nouns"]):
-        return None
-    return near[0]
-
-
-def _is_known(key: str) -> bool:
-    bare = {key, *(key.removesuffix(ending) for ending in _ENDINGS)}
-    return not bare.isdisjoint(_vocabulary().get(key[0], ())) or key in lex.SETS["no_errors"]
-
-
-def _may_be_noun(found: Sequence[Item], at: int) -> bool:
-    """Whether a noun may stand at a place: behind a determiner, say, and with no noun behind it."""
-    before, after = key_at(found, at - 1), key_at(found, at + 1)
-    closed = after in PUNCTUATION or after in lex.FUNCTION_WORDS | lex.VERBS.keys() | lex.PLACES | lex.DETERMINERS
-    return closed and (before in _BEFORE_NOUN or lex.is_modifier(before))
-
-
-def _is_one_edit(one: str, other: str) -> bool:
-    """Whether two words differ by one letter, or by two neighbours that have changed places."""
-    pairs = [(a, b) for a, b in zip(one, other, strict=False) if a != b]
-    if len(one) == len(other) and len(pairs) == 2 and pairs[0] == pairs[1][::-1]:
-        return "".join(pair[0] for pair in pairs) in one
-    if len(set(one) ^ set(other)) > 2:
-        return False
-    codes = SequenceMatcher(None, one, other, autojunk=False).get_opcodes()
-    return [(tag, b - a, d - c) for tag, a, b, c, d in codes if tag != "equal"] in _ONE_EDIT
-
-
-@cache
-def _vocabulary() -> dict[str, frozenset[str]]:
-    """The words of the closed lists and of the grammar by their first letters."""
-    words = lex.FUNCTION_WORDS | lex.DETERMINERS | lex.COLOURS.keys() | lex.VERBS.keys() | listed_words()
-    words = words.union(*lex.SETS.values()) - lex.SETS["no_errors"]
-    plurals = {f"{noun}s" for noun in lex.SETS["nouns"]}
-    letters = {word[0] for word in words}
-    return {letter: frozenset(word for word in words | plurals if word[0] == letter) for letter in letters}
+    parts: list[str] = []
+    for part in _BETWEEN_PARTS.split(kept):
+        said = re.findall(r"\w+", part.lower())
+        first = next((word for word in said[:2] if word != "please"), "")
+        if not (first in SETS["instructions"] or (first == "note" and not _PICTURES.isdisjoint(said))):
+            parts.append(part)  # the others say what to do, or what the images are
+    return "".join(parts)
 
 
 MAX_WORDS = 240  # of a question that are read
@@ -202,7 +134,6 @@ class Question:
     clause: tuple[Item, ...]
     mentions_arrow: bool
     names_direction: bool
-    errors: tuple[tuple[str, str], ...] = ()  # of typing, each with what it was read as
     beyond: str = ""  # how what is not read any more begins
     pronoun: str = ""  # that stands for the mover where it may stand for two things
     read: frozenset[int] = frozenset()
@@ -215,9 +146,13 @@ class Question:
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    text, beyond = _cut(without_reply_form(split_options(question).rest))
-    text, errors = without_typing_errors(_SAME_TIME.sub(lambda found: "and" if found["joins"] else "", text))
-    text = without_openings(text)
+    text = without_reply_form(split_options(question).rest)
+    found = tokens(text)
+    beyond = ""
+    if len(found) > MAX_WORDS:
+        text, rest = text[: found[MAX_WORDS].start], found[MAX_WORDS : MAX_WORDS + 7]
+        beyond = " ".join(each.key for each in rest)
+    text = without_openings(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
     changes, found = split_interventions(with_places(with_nouns(with_tables(items(text)))))
     trail, found = split_trail(found)
     clauses = read_clauses(found)
@@ -228,12 +163,16 @@ def parse(question: str) -> Question:
     mover = _in_full(mover, found[:at], changes) if mover else None
     arrow = any(token.key.startswith("arrow") for token in tokens(text))
     clause, motion = _motion(found, clauses, best, mover, arrow, changes)
-    motion, fitted = replace(motion, trail=_ending(trail, motion)), frozenset[int]()
+    if trail is not None and trail.near is None and trail.side is None:
+        trail = replace(trail, side=motion.direction)  # "on along its trail to the right": its last end is there
+    motion, fitted = replace(motion, trail=trail), frozenset[int]()
     if not changes and (best is None or (best.asked and not _says_way(motion))):
         changes, fitted = implied_placing(found)
     read = motion.read.union(fitted, *(other.motion.read for other in motion.others))
     put = next((change for change in changes if change.kind == "place"), None)
-    carried = put is not None and best is not None and _is_carried(best, put)
+    # "If you lift the ball and put it into the mug": the lifting is a part of it.
+    lifted = best.subject if best is not None and best.verb in {"lift", "raise", "carry", "bring"} else None
+    carried = put is not None and lifted == put.object
     way = best is None and motion.arrow is not None and bool(clauses.question_subjects)  # "on its way along the arrow"
     if put is not None and not way and (best is None or best.asked or best.kind == "static" or carried):
         mover, motion = put.object, replace(motion, kind="place", verb="put")
@@ -247,19 +186,9 @@ def parse(question: str) -> Question:
         mentions_arrow=arrow,
         names_direction=_DIRECTION_WORDS.search(text) is not None,
         beyond=beyond,
-        errors=errors,
         pronoun=_open_pronoun(found, best, mover),
         read=read.union(item.start for item in found[clause.start : clause.stop]) if carried else read,
     )
-
-
-def _cut(text: str) -> tuple[str, str]:
-    """So much of a text as is read, and how the rest begins."""
-    found = tokens(text)
-    if len(found) <= MAX_WORDS:
-        return text, ""
-    rest = text[found[MAX_WORDS].start : found[min(MAX_WORDS + 6, len(found) - 1)].end]
-    return text[: found[MAX_WORDS].start], " ".join(rest.split())
 
 
 def _motion(
@@ -274,11 +203,8 @@ def _motion(
     at = best.at if best else len(found)
     beside = _movers_beside(found, clauses, best)
     end = min([clause_end(found, at) if best else at, *(other.start for other in beside)])
-    shared = _sharing(found, at, end)
     verb, kind = (best.verb, best.kind) if best else _falling(found, changes, mover)
-    motion = read_motion(
-        found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
-    )
+    motion = read_motion(found[at:end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow)
     start = best.start if best else 0
     motion = with_front(motion, found[start:at] if best else found, arrow_statement(found))
     speeds = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
@@ -287,7 +213,7 @@ def _motion(
         motion,
         quantities=(*motion.quantities, *(said for _, said in speeds)),
         read=motion.read.union(place for place, _ in speeds),
-        others=_other_motions(found, clauses, best, shared, end),
+        others=_other_motions(found, clauses, best, end),
     )
     return range(start if best else at, end), _with_both(motion, found)
 
@@ -302,13 +228,6 @@ def _with_both(motion: MotionWords, found: Sequence[Item]) -> MotionWords:
                 read = motion.read | {before.start, item.start}
                 return replace(motion, quantities=(*motion.quantities, item.quantity), others=others, read=read)
     return motion
-
-
-def _ending(trail: TrailWords | None, motion: MotionWords) -> TrailWords | None:
-    """ "On along its trail to the right": its last end is on the right."""
-    if trail is None or trail.near is not None or trail.side is not None or motion.direction is None:
-        return trail
-    return replace(trail, side=motion.direction)
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
@@ -337,11 +256,6 @@ def _says_way(motion: MotionWords) -> bool:
     """Whether a motion has a direction of any sort."""
     said = (motion.direction, motion.arrow, motion.forward, motion.trail)
     return bool(motion.depth) or motion.kind in {"fall", "projectile"} or any(each is not None for each in said)
-
-
-def _is_carried(best: MotionCandidate, put: InterventionWords) -> bool:
-    """ "If you lift the ball and put it into the mug": the lifting is a part of it."""
-    return best.verb in {"lift", "raise", "carry", "bring"} and best.subject == put.object
 
 
 def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhrase | None:
@@ -398,38 +312,20 @@ def _before_while(found: Sequence[Item], clauses: Clauses, best: MotionCandidate
     return told[-1] if told and best.kind not in {None, "static"} else best
 
 
-def _sharing(found: Sequence[Item], at: int, end: int) -> int | None:
-    """Where a second mover shares the verb: "the ball moves left and the car to the right"."""
-    for place in range(at + 1, end - 2):
-        phrase = found[place + 1].phrase
-        if found[place].key in {"and", "while"} and phrase is not None and phrase.is_thing:
-            way = read_motion(found[place + 1 : end], "", None, None)
-            if way.direction is not None or way.depth:
-                return place
-    return None
-
-
 def _other_motions(
-    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, shared: int | None, end: int
+    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, end: int
 ) -> tuple[OtherWords, ...]:
     """What else moves at the same time, and how."""
-    others: list[OtherWords] = []
-    if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
-        motion = read_motion(found[shared + 1 : end], best.verb, best.kind, thing)
-        others.append(OtherWords(thing, _without_lengths(motion, found[shared + 1 : end])))
-    others += _joint_motion(found, best, end)
+    others = _joint_motion(found, best, end)
     for each in _movers_beside(found, clauses, best):
         if each.subject is not None and all(each.subject != other.object for other in others):
             words = found[each.at : clause_end(found, each.at)]
             motion = read_motion(words, each.verb, each.kind, each.subject)
-            others.append(OtherWords(each.subject, _without_lengths(motion, words)))
+            # How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
+            lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
+            read = frozenset[int]() if motion.steps else motion.read - lengths
+            others.append(OtherWords(each.subject, replace(motion, read=read)))
     return tuple(others)
-
-
-def _without_lengths(motion: MotionWords, words: Sequence[Item]) -> MotionWords:
-    """How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread."""
-    lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
-    return replace(motion, read=frozenset[int]() if motion.steps else motion.read - lengths)
 
 
 def _joint_motion(found: Sequence[Item], best: MotionCandidate | None, end: int) -> list[OtherWords]:
@@ -473,7 +369,9 @@ def _others(
     for at, item, phrase in sorted(things, key=lambda each: each[0]):
         if phrase is None or is_vague(item) or _HOW_MANY.issuperset(item.words):
             continue
-        if not _is_object(phrase) or (at in clause and phrase.head in lex.AGENTS):
+        bare = phrase.head in lex.GENERIC or phrase.noun is None
+        singled_out = phrase.colour is not None or phrase.inside_box or phrase.number is not None
+        if not (singled_out if bare else phrase.is_thing) or (at in clause and phrase.head in lex.AGENTS):
             continue
         if phrase.noun in lex.ADJECTIVES and item.words[0] not in lex.DETERMINERS:
             continue  # "which ball will it hit first?"
@@ -483,13 +381,6 @@ def _others(
         if not again:
             named.append(phrase)
     return tuple(named)
-
-
-def _is_object(phrase: ObjectPhrase) -> bool:
-    """Whether a phrase names an object of its own: not the floor or the arrow, not a bare "object"."""
-    if phrase.head in lex.GENERIC or phrase.noun is None:
-        return phrase.colour is not None or phrase.inside_box or phrase.number is not None
-    return phrase.is_thing
 
 
 def _repeats(phrase: ObjectPhrase, known: ObjectPhrase) -> bool:
