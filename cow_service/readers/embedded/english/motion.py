@@ -99,7 +99,7 @@ def read_clauses(found: Sequence[Item]) -> Clauses:
             clause.offer(item.phrase)
         candidate = None
         if not opened:
-            candidate = _free_fall(item, at, clause) if item.phrase else _candidate(found, at, clause)
+            candidate = None if item.phrase else _candidate(found, at, clause)
         if candidate:
             clauses.candidates.append(candidate)
         clause.verbs += item.key in lex.VERBS
@@ -147,12 +147,6 @@ def _is_inversion(found: Sequence[Item], at: int) -> bool:
     if after >= len(found) or not _is_subject(found[after]):
         return False
     return key in lex.AUXILIARIES or (key in lex.BE and key != "'s" and not (at and _is_subject(found[at - 1])))
-
-
-def _free_fall(item: Item, at: int, clause: _Clause) -> MotionCandidate | None:
-    if item.words[-1] in {"fall", "freefall"} and "free" in item.words[-2:] + item.words[-1:]:
-        return MotionCandidate(at, clause.start, "fall", "fall", clause.subject, _RANKS[clause.kind])
-    return None
 
 
 def _candidate(found: Sequence[Item], at: int, clause: _Clause) -> MotionCandidate | None:

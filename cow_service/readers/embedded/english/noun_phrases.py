@@ -227,22 +227,13 @@ def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: b
     if key == "a" and (inside or key_at(found, at - 1) in _NUMBERED):
         return not _is_determiner(found, at)
     if key in lex.PLACES or key in {"one", "far", "can"}:
-        return determined and not has_noun and (key != "can" or _is_tin(found, at, asked))
+        return determined and not has_noun
     behind = (has_noun and key in _BEHIND) or _is_measure(found, at, has_noun)
-    if key in PUNCTUATION or key in _CLOSED or behind or _is_shared_verb(found, at, start, has_noun):
+    if key in PUNCTUATION or key in _CLOSED or behind:
         return False
     if lex.is_adverb(key) or key == "first":  # "will it hit the mug first?"
         return determined and not has_noun
     return key not in lex.VERBS or _verb_belongs(found, at, has_noun, asked, determined or inside)
-
-
-def _is_shared_verb(found: Sequence[Item], at: int, start: int, has_noun: bool) -> bool:
-    """ "The ball and the mug (both) move to the right": a verb of two subjects is in its base form."""
-    if not has_noun:
-        return at == start and key_at(found, at) in {"both", "each"} and key_at(found, at + 1) in lex.VERBS
-    verb, after = lex.VERBS.get(key_at(found, at)), key_at(found, at + 1)
-    moves = verb is not None and verb.form == "base" and verb.kind not in {None, "static"}
-    return moves and key_at(found, start - 1) == "and" and (after in lex.PLACES or after in _CLOSED)
 
 
 def _is_measure(found: Sequence[Item], at: int, has_noun: bool) -> bool:
@@ -271,12 +262,6 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
     if verb.form == "base":
         return not asked or (not goes_on and (after in lex.VERBS or after in _FINITE_BE))
     return verb.form == "s" and after in {"are", "were"}
-
-
-def _is_tin(found: Sequence[Item], at: int, asked: bool) -> bool:
-    """ "The green can"; but "the red can hit the blue"."""
-    after = lex.VERBS.get(key_at(found, at + 1))
-    return asked or after is None or after.form != "base"
 
 
 def _in_clause(key: str) -> bool:
@@ -366,9 +351,6 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             meant = things[-1] if item.words == ("the", "latter") else things[-2]
             said.append(replace(item, phrase=meant.phrase, words=meant.words))
             continue
-        if item.key == "that" and things and _acts(found, len(said)):
-            said.append(replace(item, key="", phrase=things[-1].phrase, words=things[-1].words))
-            continue
         if item.words[:1] == ("that",) and phrase is not None and (again := _last_like(phrase, things)):
             said.append(replace(item, phrase=again, words=("that", *again.text.split())))
             continue
@@ -379,8 +361,6 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             continue
         if phrase is not None and phrase.is_thing and phrase.noun and all(phrase != each.phrase for each in things):
             things.append(item)
-        if phrase is not None and kinds and _is_bare_colour(item):
-            phrase = replace(phrase, noun=None)  # "which mug does it hit first, the blue or the white?"
         if phrase is not None and phrase.noun is None and _singles_out(item, phrase) and len(nouns) == 1:
             said.append(replace(item, phrase=_of_kind(phrase, next(iter(nouns)))))
         else:
@@ -396,23 +376,10 @@ def _last_like(phrase: ObjectPhrase, things: Sequence[Item]) -> ObjectPhrase | N
     return next((each.phrase for each in reversed(things) if each.phrase and each.phrase.noun == phrase.noun), None)
 
 
-def _acts(found: Sequence[Item], at: int) -> bool:
-    """ "Will that then knock into the cube?": what was named last."""
-    verb = lex.lemma(key_at(found, at + 1 + (key_at(found, at + 1) in {"then", "also"})))
-    return key_at(found, at - 1) in lex.AUXILIARIES and verb in lex.TOUCH | lex.OCCLUDE | {"tip", "topple"}
-
-
 def _singles_out(item: Item, phrase: ObjectPhrase) -> bool:
     """ "The red one", "the left one", "the one on the left"."""
     words = phrase.text.lower().split()
     return phrase.colour is not None or (item.words[-1:] == ("one",) and len(words) > 1)
-
-
-def _is_bare_colour(item: Item) -> bool:
-    """ "The blue"; but "the orange" may be the fruit."""
-    return (
-        len(item.words) == 2 and item.words[0] == "the" and item.words[1] in lex.COLOURS and item.words[1] != "orange"
-    )
 
 
 def _is_asked_for(found: Sequence[Item], at: int) -> bool:

@@ -9,7 +9,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
 
 from cow_service.readers.base import Quantity
 from cow_service.readers.embedded.english import lexicon as lex
@@ -26,7 +25,6 @@ from cow_service.readers.embedded.english.lexicon import (
     Item,
     ObjectPhrase,
     key_at,
-    phrase_at,
     tokens,
     words,
 )
@@ -103,7 +101,6 @@ def without_reply_form(prompt: str) -> str:
 
 
 MAX_WORDS = 240  # of a question that are read
-_EACH_OF_TWO = lex.words("both each together")
 _HOW_MANY = lex.words("the all both either none two three")
 _SAME_TIME = re.compile(
     r"\b(?:at the (?:very )?same (?:time|moment|instant)|simultaneously)\b(?P<joins> as\b)?", re.IGNORECASE
@@ -213,21 +210,9 @@ def _motion(
         motion,
         quantities=(*motion.quantities, *(said for _, said in speeds)),
         read=motion.read.union(place for place, _ in speeds),
-        others=_other_motions(found, clauses, best, end),
+        others=_other_motions(found, clauses, best),
     )
-    return range(start if best else at, end), _with_both(motion, found)
-
-
-def _with_both(motion: MotionWords, found: Sequence[Item]) -> MotionWords:
-    """With "both slowly", which is said of two movers."""
-    for before, item in pairwise(found):
-        if item.quantity is not None and item.quantity.speed is not None and "both" in (before.key, *before.words[-1:]):
-            paced = [replace(other.motion, quantities=(item.quantity,)) for other in motion.others]
-            others = tuple(replace(o, motion=each) for o, each in zip(motion.others, paced, strict=True))
-            if others and item.quantity not in motion.quantities:
-                read = motion.read | {before.start, item.start}
-                return replace(motion, quantities=(*motion.quantities, item.quantity), others=others, read=read)
-    return motion
+    return range(start if best else at, end), motion
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
@@ -312,11 +297,9 @@ def _before_while(found: Sequence[Item], clauses: Clauses, best: MotionCandidate
     return told[-1] if told and best.kind not in {None, "static"} else best
 
 
-def _other_motions(
-    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, end: int
-) -> tuple[OtherWords, ...]:
+def _other_motions(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> tuple[OtherWords, ...]:
     """What else moves at the same time, and how."""
-    others = _joint_motion(found, best, end)
+    others: list[OtherWords] = []
     for each in _movers_beside(found, clauses, best):
         if each.subject is not None and all(each.subject != other.object for other in others):
             words = found[each.at : clause_end(found, each.at)]
@@ -326,24 +309,6 @@ def _other_motions(
             read = frozenset[int]() if motion.steps else motion.read - lengths
             others.append(OtherWords(each.subject, replace(motion, read=read)))
     return tuple(others)
-
-
-def _joint_motion(found: Sequence[Item], best: MotionCandidate | None, end: int) -> list[OtherWords]:
-    """The second of two subjects of one verb: "the ball and the mug both move to the right"."""
-    if best is None or best.asked or best.kind in {None, "static"} or best.subject is None:
-        return []
-    if found[best.at].key in lex.VERBS and lex.VERBS[found[best.at].key].form == "s":
-        return []  # "the ball between the cube and the mug rolls": one thing moves
-    at = best.at - (key_at(found, best.at - 1) in _EACH_OF_TWO)
-    thing, joined = phrase_at(found, at - 1), key_at(found, at - 2) == "and"
-    if thing is None or not thing.is_thing or not joined or phrase_at(found, at - 3) != best.subject:
-        return []
-    words = found[best.at : end]
-    motion = read_motion(words, best.verb, best.kind, thing)
-    if motion.steps or any(item.quantity is not None and item.quantity.speed is None for item in words):
-        return []  # of the first mover alone the reader tells how far it goes
-    both = {found[each].start for each in range(at, best.at)}
-    return [OtherWords(thing, replace(motion, read=motion.read | both))]
 
 
 def _in_full(mover: ObjectPhrase, before: Sequence[Item], changes: Sequence[InterventionWords]) -> ObjectPhrase:
