@@ -178,6 +178,7 @@ _STARTS = lex.SETS["starts"]
 _OPENERS = lex.words(", and then so but now please")
 _CLAIM = ("true", "or", "false")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
+_SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
 _SUBJECTS_KINDS = frozenset({"PRONOUN", "M", "T", "S"})
 _CONDITIONS = lex.words("if when once after as while upon assuming given provided suppose supposing")
 _MAX_TRIES = 8  # of one sentence: each takes some ms
@@ -409,7 +410,15 @@ def _opens(before: Sequence[str]) -> bool:
     last = rest[max((at for at, token in enumerate(rest) if token == ","), default=-1) + 1 :]
     closed = len(rest) < len(before) or any(token in lex.CONDITIONALS for token in last)
     clause = closed or any(token in lex.VERBS for token in last)
-    return clause and _ASKING.isdisjoint(last) and last[-1] != "not"
+    follows = zip(last, [*last[1:], ""], strict=True)
+    related = all(_relates(token, after) for token, after in follows if token in {"which", "when", "where"})
+    return clause and related and _ASKING.isdisjoint(last) and last[-1] != "not"
+
+
+def _relates(token: str, after: str) -> bool:
+    """Whether a clause follows on "which", "when" or "where": then nothing is asked with them."""
+    subject = after[:1] in {"M", "T", "S", "X"} or after in _SUBJECTS or after.startswith("OBJ")
+    return subject or (token == "when" and after in lex.VERBS)
 
 
 def _into_hollow(asking: Asking, tokens: Sequence[str], phrases: dict[str, ObjectPhrase]) -> Asking | None:

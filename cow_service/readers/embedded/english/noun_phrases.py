@@ -361,6 +361,11 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             continue
         if phrase is not None and phrase.is_thing and phrase.noun and all(phrase != each.phrase for each in things):
             things.append(item)
+        colour_alone = (
+            len(item.words) == 2 and item.words[0] == "the" and item.words[1] in lex.COLOURS.keys() - {"orange"}
+        )
+        if phrase is not None and kinds and colour_alone:
+            phrase = replace(phrase, noun=None)  # "which mug does it hit first, the blue or the white?"
         if phrase is not None and phrase.noun is None and _singles_out(item, phrase) and len(nouns) == 1:
             said.append(replace(item, phrase=_of_kind(phrase, next(iter(nouns)))))
         else:

@@ -200,8 +200,11 @@ def _motion(
     at = best.at if best else len(found)
     beside = _movers_beside(found, clauses, best)
     end = min([clause_end(found, at) if best else at, *(other.start for other in beside)])
+    shared = _sharing(found, at, end)
     verb, kind = (best.verb, best.kind) if best else _falling(found, changes, mover)
-    motion = read_motion(found[at:end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow)
+    motion = read_motion(
+        found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
+    )
     start = best.start if best else 0
     motion = with_front(motion, found[start:at] if best else found, arrow_statement(found))
     speeds = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
@@ -210,7 +213,7 @@ def _motion(
         motion,
         quantities=(*motion.quantities, *(said for _, said in speeds)),
         read=motion.read.union(place for place, _ in speeds),
-        others=_other_motions(found, clauses, best),
+        others=_other_motions(found, clauses, best, shared, end),
     )
     return range(start if best else at, end), motion
 
@@ -297,18 +300,35 @@ def _before_while(found: Sequence[Item], clauses: Clauses, best: MotionCandidate
     return told[-1] if told and best.kind not in {None, "static"} else best
 
 
-def _other_motions(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> tuple[OtherWords, ...]:
+def _other_motions(
+    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, shared: int | None, end: int
+) -> tuple[OtherWords, ...]:
     """What else moves at the same time, and how."""
     others: list[OtherWords] = []
+    if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
+        others.append(_other_motion(thing, best, found[shared + 1 : end]))
     for each in _movers_beside(found, clauses, best):
         if each.subject is not None and all(each.subject != other.object for other in others):
-            words = found[each.at : clause_end(found, each.at)]
-            motion = read_motion(words, each.verb, each.kind, each.subject)
-            # How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
-            lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
-            read = frozenset[int]() if motion.steps else motion.read - lengths
-            others.append(OtherWords(each.subject, replace(motion, read=read)))
+            others.append(_other_motion(each.subject, each, found[each.at : clause_end(found, each.at)]))
     return tuple(others)
+
+
+def _sharing(found: Sequence[Item], at: int, end: int) -> int | None:
+    """Where a second mover shares the verb: "the ball moves left and the car to the right"."""
+    for place in range(at + 1, end - 2):
+        phrase = found[place + 1].phrase
+        if found[place].key in {"and", "while"} and phrase is not None and phrase.is_thing:
+            way = read_motion(found[place + 1 : end], "", None, None)
+            if way.direction is not None or way.depth:
+                return place
+    return None
+
+
+def _other_motion(thing: ObjectPhrase, verb: MotionCandidate, words: Sequence[Item]) -> OtherWords:
+    motion = read_motion(words, verb.verb, verb.kind, thing)
+    # How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
+    lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
+    return OtherWords(thing, replace(motion, read=frozenset[int]() if motion.steps else motion.read - lengths))
 
 
 def _in_full(mover: ObjectPhrase, before: Sequence[Item], changes: Sequence[InterventionWords]) -> ObjectPhrase:
