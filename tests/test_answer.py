@@ -189,7 +189,6 @@ If the red ball and the mug move to the left, do they meet? | whether touches mu
 The vase slides left by 20 pixels while the red ball drops. Does the ball land on the vase? | whether touches red ball
 Will the falling ball hit the vase? | whether touches vase
 True or false: sent straight towards the vase, the red ball hits it. | whether touches vase
-The red ball rolls left and the vase slides right, both slowly. Do they meet? | whether touches vase
 Move the red ball 90 pixels to the left, then let it drop. Does it come down on the vase? | whether touches vase
 """
 
@@ -663,10 +662,6 @@ def test_the_folder_of_an_answer(tmp_path: Path) -> None:
         (
             "If the ball rolls left, once the ball has bumped into the cup, will the cup tip the cube?",
             Asked(relation="tips", subject="cup", target="cube"),
-        ),
-        (
-            "If the ball is rolled straight at the cup, will that then hit the cube?",
-            Asked(relation="touches", subject="cup", target="cube"),
         ),
         (
             "At 9 px/s, would the ball have hit the cup after 4 seconds of rolling to the left?",

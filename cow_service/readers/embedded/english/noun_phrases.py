@@ -229,11 +229,20 @@ def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: b
     if key in lex.PLACES or key in {"one", "far", "can"}:
         return determined and not has_noun
     behind = (has_noun and key in _BEHIND) or _is_measure(found, at, has_noun)
-    if key in PUNCTUATION or key in _CLOSED or behind:
+    if key in PUNCTUATION or key in _CLOSED or behind or _is_shared_verb(found, at, start, has_noun):
         return False
     if lex.is_adverb(key) or key == "first":  # "will it hit the mug first?"
         return determined and not has_noun
     return key not in lex.VERBS or _verb_belongs(found, at, has_noun, asked, determined or inside)
+
+
+def _is_shared_verb(found: Sequence[Item], at: int, start: int, has_noun: bool) -> bool:
+    """ "The ball and the mug (both) move to the right": a verb of two subjects is in its base form."""
+    if not has_noun:
+        return at == start and key_at(found, at) in {"both", "each"} and key_at(found, at + 1) in lex.VERBS
+    verb, after = lex.VERBS.get(key_at(found, at)), key_at(found, at + 1)
+    moves = verb is not None and verb.form == "base" and verb.kind not in {None, "static"}
+    return moves and key_at(found, start - 1) == "and" and (after in lex.PLACES or after in _CLOSED)
 
 
 def _is_measure(found: Sequence[Item], at: int, has_noun: bool) -> bool:

@@ -25,6 +25,7 @@ from cow_service.readers.embedded.english.lexicon import (
     Item,
     ObjectPhrase,
     key_at,
+    phrase_at,
     tokens,
     words,
 )
@@ -101,6 +102,7 @@ def without_reply_form(prompt: str) -> str:
 
 
 MAX_WORDS = 240  # of a question that are read
+_EACH_OF_TWO = lex.words("both each together")
 _HOW_MANY = lex.words("the all both either none two three")
 _SAME_TIME = re.compile(
     r"\b(?:at the (?:very )?same (?:time|moment|instant)|simultaneously)\b(?P<joins> as\b)?", re.IGNORECASE
@@ -307,6 +309,7 @@ def _other_motions(
     others: list[OtherWords] = []
     if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
         others.append(_other_motion(thing, best, found[shared + 1 : end]))
+    others += _joint_motion(found, best, end)
     for each in _movers_beside(found, clauses, best):
         if each.subject is not None and all(each.subject != other.object for other in others):
             others.append(_other_motion(each.subject, each, found[each.at : clause_end(found, each.at)]))
@@ -329,6 +332,24 @@ def _other_motion(thing: ObjectPhrase, verb: MotionCandidate, words: Sequence[It
     # How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
     lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
     return OtherWords(thing, replace(motion, read=frozenset[int]() if motion.steps else motion.read - lengths))
+
+
+def _joint_motion(found: Sequence[Item], best: MotionCandidate | None, end: int) -> list[OtherWords]:
+    """The second of two subjects of one verb: "the ball and the mug both move to the right"."""
+    if best is None or best.asked or best.kind in {None, "static"} or best.subject is None:
+        return []
+    if found[best.at].key in lex.VERBS and lex.VERBS[found[best.at].key].form == "s":
+        return []  # "the ball between the cube and the mug rolls": one thing moves
+    at = best.at - (key_at(found, best.at - 1) in _EACH_OF_TWO)
+    thing, joined = phrase_at(found, at - 1), key_at(found, at - 2) == "and"
+    if thing is None or not thing.is_thing or not joined or phrase_at(found, at - 3) != best.subject:
+        return []
+    words = found[best.at : end]
+    motion = read_motion(words, best.verb, best.kind, thing)
+    if motion.steps or any(item.quantity is not None and item.quantity.speed is None for item in words):
+        return []  # of the first mover alone the reader tells how far it goes
+    both = {found[each].start for each in range(at, best.at)}
+    return [OtherWords(thing, replace(motion, read=motion.read | both))]
 
 
 def _in_full(mover: ObjectPhrase, before: Sequence[Item], changes: Sequence[InterventionWords]) -> ObjectPhrase:
