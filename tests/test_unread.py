@@ -15,7 +15,7 @@ from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.english.asked import read_asked, unread
 from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.records import Asked, Grounding
+from cow_service.records import Grounding
 from cow_service.vision.scene import Scene
 
 RED, BLUE, GREEN = (200, 30, 30), (50, 80, 200), (50, 150, 50)
