@@ -13,11 +13,20 @@ from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, words
 from cow_service.readers.embedded.english.noun_phrases import TABLES
-from cow_service.readers.embedded.english.nouns import Kind, kind_of, may_name
+from cow_service.readers.embedded.english.nouns import (
+    Kind,
+    container_form,
+    is_cube,
+    is_vehicle,
+    kind_of,
+    may_name,
+    shape_of,
+)
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.outlines import contradicts, form_of, is_cut, log_ratio
+from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT
-from cow_service.records import BBox, LocatedObject
+from cow_service.records import BBox, LocatedObject, ObjectPrior
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region
 from cow_service.vision.scene import Scene
@@ -362,3 +371,23 @@ def noun_warnings(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> l
         elif contradicts(region, phrase.head):
             warnings.append(f"'{phrase.text}' was taken for what is {place}, which does not look like '{phrase.head}'.")
     return warnings
+
+
+def read_name(name: str) -> ObjectPrior:
+    """What a noun says of a thing's shape."""
+    opening = container_form(name)
+    return ObjectPrior(
+        shape=shape_of(name),
+        elongated=is_vehicle(name),
+        equal_sided=is_cube(name),
+        opening=None if opening == "unknown" else opening,
+    )
+
+
+def names_meant(words: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Those of a kind such as "both mugs", where there are as many as is said; else the words themselves."""
+    kind = kind_of(words)
+    if kind is None or any(plain(name) == plain(words) for name in names):
+        return (words,)
+    found = tuple(name for name in names if may_name(kind.phrase, name))
+    return found if found and kind.count in (None, len(found)) else (words,)

@@ -35,7 +35,9 @@ from cow_service.readers.embedded.matching import (
     is_kind_asked,
     is_known,
     match_one,
+    names_meant,
     noun_warnings,
+    read_name,
     things_of_kinds,
 )
 from cow_service.readers.embedded.motions import (
@@ -46,7 +48,6 @@ from cow_service.readers.embedded.motions import (
     scene_of_mover,
     step_readings,
 )
-from cow_service.readers.embedded.names import names_meant, read_name
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import (
     DIRECTED_KINDS,
