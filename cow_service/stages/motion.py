@@ -53,7 +53,9 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     reading = _given_motion(request, grounding)
     source: Source = "request"
     if reading is None:
-        reading, source = _ask_reader(run, grounding, hints), run.reader.source
+        with run.cpu():
+            given = run.reader_input("motion", run.scene_of(grounding, None if hints is None else hints.cue))
+        reading, source = run.reader.read_motion(given, grounding, hints), run.reader.source
     reading, unused = _fitting(_with_request(reading, request.motion, grounding))
     motion = _complete(run.image.info.width, grounding, reading, source, request.law)
     if motion.cue == "trail":
@@ -82,12 +84,6 @@ def _given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReadi
     if grounding.source == "request" and placed_mover(grounding) is not None:
         return MotionReading("place", None, "request")
     return None
-
-
-def _ask_reader(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHints | None) -> MotionReading:
-    with run.cpu():
-        given = run.reader_input("motion", run.scene_of(grounding, None if hints is None else hints.cue))
-    return run.reader.read_motion(given, grounding, hints)
 
 
 def _along(path: TrajectoryRequest) -> MotionReading:

@@ -63,7 +63,10 @@ def record_trajectory(situation: Situation, result: EnsembleResult, path: FreePa
     """
     world, shown, request = result.world, result.shown.worlds, situation.request
     grounding, around = situation.grounding, None if result.ensemble is None else result.ensemble.worlds
-    camera, bodies = camera_record(world.fit, shown, around), _shown_bodies(world.bodies, shown)
+    camera, bodies = (
+        camera_record(world.fit, shown, around),
+        tuple(shown_body(body, i, shown) for i, body in enumerate(world.bodies)),
+    )
     if path is None:
         paths = path_records(world.bodies, grounding.point, shown, situation.size, around)
     else:
@@ -170,11 +173,6 @@ def _placement(name: str, shown: Placements, ensemble: Placements | None) -> Pla
         clearance=clearance if math.isfinite(clearance) else None,
         above_rim=above_rim if math.isfinite(above_rim) else None,
     )
-
-
-def _shown_bodies(bodies: Sequence[SeenBody], worlds: Worlds) -> tuple[SeenBody, ...]:
-    """Bodies of the image as the first draw has them when the motion begins."""
-    return tuple(shown_body(body, index, worlds) for index, body in enumerate(bodies))
 
 
 def shown_body(body: SeenBody, index: int, worlds: Worlds) -> SeenBody:

@@ -89,6 +89,10 @@ def reconstruct(situation: Situation, path: FreePath | None) -> tuple[WorldInput
     goals = placement_goals(situation, present, follows_path=path is not None)
     in_air = flies(bodies[0], motion) and bodies[0].shape == "sphere"
     target = None if query is None else query.target
+    prescribed = None
+    if path is not None:
+        to_foot = np.array(bodies[0].foot) - np.array(situation.grounding.point)
+        prescribed = PrescribedMotion(path.states[:, :3], path.points + to_foot)
     world = WorldInput(
         bodies=_with_openings(present, goals if goal is None else (*goals, goal)),
         motion=motion,
@@ -98,7 +102,7 @@ def reconstruct(situation: Situation, path: FreePath | None) -> tuple[WorldInput
         fps=request.fps,
         # People aim at what they ask about; where that is put elsewhere, not at its place in the image.
         asked=None if target in [each.body for each in goals] else target,
-        prescribed=None if path is None else _prescribed(path, bodies[0], situation.grounding),
+        prescribed=prescribed,
         others={} if path is not None else _motions_of_others(bodies, motion),
         removed=bodies[len(present) :],
         turns_wanted=query is not None and query.asked.relation == "tips",
@@ -117,10 +121,6 @@ def free_path(situation: Situation) -> FreePath | None:
         return given_path(camera, request.trajectory, times)
     is_free = motion.law == "ballistic" and motion.kind != "place"
     return ballistic_path(camera, situation.grounding, motion, times) if is_free else None
-
-
-def _prescribed(path: FreePath, mover: SeenBody, grounding: Grounding) -> PrescribedMotion:
-    return PrescribedMotion(path.states[:, :3], path.points + np.array(mover.foot) - np.array(grounding.point))
 
 
 def _motions_of_others(bodies: Sequence[SeenBody], motion: Motion) -> dict[int, Motion]:
@@ -151,22 +151,18 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
 
 
 def _seen_body(scene: Scene, seen: Obstacle, located: LocatedObject | None) -> SeenBody:
-    prior = None if located is None else located.prior
+    prior, region = None if located is None else located.prior, scene.region_of(seen.bbox)
+    # Where nothing is said of its shape, a disc is a sphere, and the rest stands upright.
+    seen_shape: Shape = "sphere" if region is not None and region.is_disc else "cylinder"
     return SeenBody(
         name=seen.name,
         bbox=seen.bbox,
         mask=seen.mask,
-        shape=_outline_shape(scene, seen.bbox) if prior is None or prior.shape is None else prior.shape,
+        shape=seen_shape if prior is None or prior.shape is None else prior.shape,
         source=(None if located is None else located.source) or "embedded",
         confidence=seen.confidence,
         prior=prior,
     )
-
-
-def _outline_shape(scene: Scene, bbox: BBox) -> Shape:
-    """A disc is a sphere, the rest stands upright."""
-    region = scene.region_of(bbox)
-    return "sphere" if region is not None and region.is_disc else "cylinder"
 
 
 def query_of(grounding: Grounding, bodies: Sequence[SeenBody]) -> Query | None:

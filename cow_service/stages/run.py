@@ -212,7 +212,13 @@ class Run(Generic[Request_co]):
         started = time.perf_counter()
         self.report(name, 0.0)
         key = key_of(
-            name, self.image.info.sha256, self.request, inputs, self._identity, self.repeats_answers, self._heeds_seed
+            name,
+            self.image.info.sha256,
+            self.request,
+            inputs,
+            self._identity,
+            self.repeats_answers,
+            lambda: bool(getattr(self.reader, "heeds_seed", True)),
         )
         try:
             result, reused = self.step(name, key, lambda: self._compute(name, function, inputs))
@@ -284,9 +290,6 @@ class Run(Generic[Request_co]):
         """Whether the reader's answers are the same each time; one of another package that does not say is sampled."""
         repeats = getattr(self.reader, "repeats_answers", None)
         return repeats is not None and repeats(votes)
-
-    def _heeds_seed(self) -> bool:
-        return bool(getattr(self.reader, "heeds_seed", True))
 
     def usage(self, *stages: Stage) -> Usage:
         """What some stages of this request asked of a multimodal LLM, failed ones of this process included."""
