@@ -63,10 +63,8 @@ def record_trajectory(situation: Situation, result: EnsembleResult, path: FreePa
     """
     world, shown, request = result.world, result.shown.worlds, situation.request
     grounding, around = situation.grounding, None if result.ensemble is None else result.ensemble.worlds
-    camera, bodies = (
-        camera_record(world.fit, shown, around),
-        tuple(shown_body(body, i, shown) for i, body in enumerate(world.bodies)),
-    )
+    camera = camera_record(world.fit, shown, around)
+    bodies = tuple(shown_body(body, index, shown) for index, body in enumerate(world.bodies))
     if path is None:
         paths = path_records(world.bodies, grounding.point, shown, situation.size, around)
     else:
