@@ -12,7 +12,7 @@ import torch
 from wan_models import Case
 
 from cow_service.errors import CowError
-from cow_service.generators.wan.execution import within_memory
+from cow_service.generators.wan.memory import within_memory
 from cow_service.weights.device import cpu_threads
 
 

@@ -52,11 +52,11 @@ from wan_rows import build_seconds, measure_rows, reckoned, refused, rows, total
 from wan_table import PARTS, table
 
 from cow_service.errors import CowError, GeneratorUnavailable
+from cow_service.generators.wan.acceleration import FIRST_LAYERS
 from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
 from cow_service.generators.wan.capabilities import ATTENTION_BACKENDS, detect_capabilities, refusals
 from cow_service.generators.wan.pipeline import image_token_count
 from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
-from cow_service.generators.wan.step_caches import FIRST_LAYERS
 from cow_service.generators.wan.tracks import nearest_lengths
 from cow_service.weights.device import choose_device
 from cow_service.weights.manifests import load_manifests

@@ -6,14 +6,15 @@ import re
 import uuid
 from functools import partial
 from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar, cast
 
 from cow_service import errors
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.generators.base import Generator, Limits
-from cow_service.media.artifact_stores import open_artifact_store
-from cow_service.media.artifacts import Patience, media_type_of, try_once
+from cow_service.media.artifacts import ArtifactStore, DiskArtifacts, RetryPolicy, media_type_of, try_once
 from cow_service.media.images import DecodedImage, decode, decode_data_url
 from cow_service.net import ImageUrls
 from cow_service.observability.metrics import Metrics
@@ -36,8 +37,8 @@ from cow_service.stages.run import (
     priority_of,
 )
 from cow_service.vision.scene import SeenImages
-from cow_service.weights.lock import ready
 from cow_service.weights.manifests import find_manifest, load_manifests
+from cow_service.weights.repositories import ready
 
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
 WORD_READER = "embedded"  # it needs no weights: it reads the words of requests whose images another reader looks at
@@ -99,7 +100,7 @@ class Service:
         progress: Progress = ignore_progress,
         image: DecodedImage | None = None,
         step: Step = compute_directly,
-        patience: Patience = try_once,
+        retry_policy: RetryPolicy = try_once,
         run_id: str | None = None,
         created_at: str | None = None,
         turn: int = 0,
@@ -117,7 +118,9 @@ class Service:
         # Also with an image at hand: a run begins in its turn, and its job counts as queued until then.
         with self.cpu.held(priority_of(turn, created_at), partial(progress, None, 0.0)):
             image = image or self.image_of(request.image)[1]
-        return Run(request, image, backends, progress, step, patience, run_id or str(uuid.uuid4()), created_at, turn)
+        return Run(
+            request, image, backends, progress, step, retry_policy, run_id or str(uuid.uuid4()), created_at, turn
+        )
 
     def keep_masks(self, request: Request) -> Request:
         """The request with its masks as artifacts: those that are data URLs are kept, and not decoded before they are
@@ -268,6 +271,20 @@ class Service:
             pull=None if here else f"cow models pull {name}",
             defaults=manifest.defaults,
         )
+
+
+def open_artifact_store(settings: Settings) -> ArtifactStore:
+    """The store of COW_ARTIFACTS. Raises `SettingsError` where its library is missing or cannot be set up."""
+    place = settings.artifacts
+    if place is None or "://" not in place:
+        return DiskArtifacts(Path(place).expanduser() if place else settings.data_dir / "artifacts")
+    if find_spec("obstore") is None:
+        raise SettingsError(
+            f"Bad settings: COW_ARTIFACTS={place!r} needs obstore, not installed: pip install 'cow-service[objects]'."
+        )
+    from cow_service.media.object_artifacts import ObjectArtifacts  # noqa: PLC0415 - an optional library
+
+    return ObjectArtifacts(place, settings.data_dir / "scratch")
 
 
 def is_url(ref: ImageRef) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.concurrency import PrioritySemaphore
-from cow_service.media.disk_artifacts import DiskArtifacts
+from cow_service.media.artifacts import DiskArtifacts
 from cow_service.media.images import DecodedImage, encode_png
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import ImageInfo

@@ -17,9 +17,8 @@ from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobTable
 from cow_service.jobs.maintenance import collect_artifacts
 from cow_service.media import object_artifacts
-from cow_service.media.artifact_stores import open_artifact_store
 from cow_service.media.artifacts import ArtifactStore
-from cow_service.service import Service
+from cow_service.service import Service, open_artifact_store
 from cow_service.settings import Settings, SettingsError, load_settings
 
 DATA = b"frame" * 1000
@@ -88,16 +87,16 @@ def test_what_a_killed_process_left_goes_after_a_while(store, settings):
         assert not list(settings.data_dir.rglob("*.part"))
 
 
-def test_every_put_of_a_batch_is_done_by_the_patience_of_its_owner(store):
+def test_every_put_of_a_batch_follows_the_retry_policy_of_its_owner(store):
     done = []
 
-    def patience(work):
+    def retry(work):
         done.append(work())
         return done[-1]
 
-    with store.batch(patience) as batch:
+    with store.batch(retry) as batch:
         first = batch.put(DATA, "image/png")
-        batch.put(DATA, "image/png")  # one that is known to be there is asked for with the same patience
+        batch.put(DATA, "image/png")  # one that is known to be there is asked for with the same policy
         with batch.scratch() as path:
             path.write_bytes(DATA * 2)
             clip = batch.put_file(path, "video/mp4")

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from cow_service.errors import ArtifactNotFound, StorageUnavailable
-from cow_service.media.artifacts import MEDIA_TYPES
-from cow_service.media.disk_artifacts import DiskArtifacts
+from cow_service.media.artifacts import MEDIA_TYPES, DiskArtifacts
 
 DATA = b"frame" * 1000
 SHA256 = hashlib.sha256(DATA).hexdigest()

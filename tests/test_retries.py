@@ -8,7 +8,7 @@ import pytest
 
 from cow_service.errors import StorageUnavailable
 from cow_service.jobs.readiness import StorageCheck
-from cow_service.media.disk_artifacts import DiskArtifacts
+from cow_service.media.artifacts import DiskArtifacts
 
 
 def test_who_waits_for_a_job_is_told_of_a_store_that_is_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

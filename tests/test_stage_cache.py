@@ -13,7 +13,7 @@ from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.jobs.computing import KeyLocks, Outages, StoredStep
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobTable
-from cow_service.media.disk_artifacts import DiskArtifacts
+from cow_service.media.artifacts import DiskArtifacts
 from cow_service.observability.metrics import Metrics
 from cow_service.records import MetresPerPixel, Motion
 from cow_service.settings import Settings

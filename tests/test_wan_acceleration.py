@@ -25,7 +25,7 @@ from torch import Tensor
 
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
 from cow_service.generators.wan import acceleration as subject
-from cow_service.generators.wan.acceleration import accelerate
+from cow_service.generators.wan.acceleration import accelerate, reset_cache
 from cow_service.generators.wan.capabilities import (
     ATTENTION_BACKENDS,
     MINIMUM_VERSIONS,
@@ -33,9 +33,8 @@ from cow_service.generators.wan.capabilities import (
     detect_capabilities,
     refusals,
 )
-from cow_service.generators.wan.lora import add_lora
+from cow_service.generators.wan.checkpoints import add_lora
 from cow_service.generators.wan.profiles import Acceleration
-from cow_service.generators.wan.step_caches import reset_cache
 
 CPU = torch.device("cpu")
 WIDTH = 24  # of the toy's hidden states

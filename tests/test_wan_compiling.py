@@ -13,8 +13,7 @@ from torch._dynamo.testing import CompileCounter
 
 from cow_service.generators.wan import acceleration, conditioning, generator, loading
 from cow_service.generators.wan.capabilities import detect_capabilities
-from cow_service.generators.wan.compiling import ClipSize, compile_for
-from cow_service.generators.wan.generator import WanGenerator
+from cow_service.generators.wan.generator import ClipSize, WanGenerator, compile_for
 from cow_service.generators.wan.profiles import Acceleration, profile_of
 from cow_service.settings import Settings
 from cow_service.weights.device import cpu_threads

@@ -21,8 +21,8 @@ from cow_service.errors import (
     GeneratorUnavailable,
     InvalidRequest,
 )
-from cow_service.generators.wan.execution import wait_until_done
 from cow_service.generators.wan.generator import WanGenerator
+from cow_service.generators.wan.memory import wait_until_done
 from cow_service.generators.wan.pipeline import WanTrackPipeline
 from cow_service.generators.wan.profiles import profile_of
 from cow_service.records import Simulation
@@ -135,7 +135,7 @@ def test_progress_after_every_step(toys: Service) -> None:
 
 def test_a_step_is_told_when_the_device_has_done_it(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[str] = []
-    monkeypatch.setattr("cow_service.generators.wan.denoising.wait_until_done", lambda device: heard.append("done"))
+    monkeypatch.setattr("cow_service.generators.wan.pipeline.wait_until_done", lambda device: heard.append("done"))
     simulate(toys, lambda stage, done: heard.append("told") if stage == "generation" and 0 < done < 0.95 else None)
     assert heard == ["done", "told"] * 4
 
@@ -359,7 +359,7 @@ def test_parts_that_are_moved_one_by_one_leave_before_the_steps(toys: Service, m
 def test_nothing_of_the_steps_is_kept_while_a_clip_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Service(Settings(data_dir=tmp_path, profile="fast", generator="tiny-ati")) as service:
         pipeline, held = pipeline_of(service), list[int]()
-        decode, step = pipeline.decode, "cow_service.generators.wan.denoising.wait_until_done"
+        decode, step = pipeline.decode, "cow_service.generators.wan.pipeline.wait_until_done"
         monkeypatch.setattr(step, lambda device: held.append(kept_states(pipeline)))
         monkeypatch.setattr(
             pipeline, "decode", lambda latents: (held.append(kept_states(pipeline)), decode(latents))[1]
@@ -481,8 +481,8 @@ def test_parts_of_ones_own_carry_no_pulled_revision(tmp_path: Path) -> None:
     """A whole pipeline of one's own brings its own other parts, whatever was pulled."""
     from cow_service.generators.wan.loading import _revisions
     from cow_service.generators.wan.profiles import profile_of
-    from cow_service.weights.lock import Lock, folder_of, write_lock
     from cow_service.weights.manifests import load_manifests
+    from cow_service.weights.repositories import Lock, folder_of, write_lock
 
     manifest = load_manifests()["ati"]
     profile = profile_of(manifest, "portable")

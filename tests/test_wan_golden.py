@@ -11,9 +11,9 @@ from golden import figures, image_embeds, original_folder, tensors
 
 from cow_service.generators.wan.checkpoints import load_transformer
 from cow_service.generators.wan.conditioning import ati_condition, wan_move_condition, wan_move_latent
-from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline
-from cow_service.generators.wan.sampling import Sampling
-from cow_service.generators.wan.tiny import make_tiny
+from cow_service.generators.wan.loading import make_tiny
+from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, make_schedule
+from cow_service.generators.wan.profiles import Sampling
 from cow_service.generators.wan.tracks import to_ati_tensor
 from cow_service.weights.manifests import load_manifests
 
@@ -93,13 +93,13 @@ def test_the_whole_sampling(pipeline: WanTrackPipeline) -> None:
 
 
 def test_the_schedule() -> None:
-    found = Sampling(steps=4, shift=5.0, guidance_scale=5.0).schedule(CPU).timesteps
+    found = make_schedule(Sampling(steps=4, shift=5.0, guidance_scale=5.0), CPU).timesteps
     assert found.tolist() == tensors("tiny_denoise")["timesteps_s4_shift5.0"].tolist()
 
 
 @pytest.mark.parametrize(("solver", "steps", "shift"), [("unipc", 100, 12), ("unipc", 40, 1e-9), ("euler", 60, 50)])
 def test_steps_whose_times_round_to_the_same(solver: str, steps: int, shift: float) -> None:
-    schedule = Sampling(solver=solver, steps=steps, shift=shift, guidance_scale=1.0).schedule(CPU)
+    schedule = make_schedule(Sampling(solver=solver, steps=steps, shift=shift, guidance_scale=1.0), CPU)
     sample = torch.ones(1, 1, 1, 2, 2)
     for time in schedule.timesteps:
         sample = schedule.step(torch.zeros_like(sample), time, sample, return_dict=False)[0]

@@ -10,10 +10,9 @@ from safetensors.torch import load_file, save_file
 
 from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan import memory
-from cow_service.generators.wan.components import assemble
+from cow_service.generators.wan.loading import assemble, make_tiny
 from cow_service.generators.wan.memory import check_memory, need_of
 from cow_service.generators.wan.profiles import profile_of
-from cow_service.generators.wan.tiny import make_tiny
 from cow_service.weights.manifests import load_manifests
 
 ATI = load_manifests()["ati"]
@@ -49,17 +48,17 @@ def test_it_is_what_the_loaded_parts_take(checkpoint: Path) -> None:
     parts = assemble(make_tiny(TOY).transformer.to(torch.bfloat16), checkpoint, torch.bfloat16, torch.float32)
     models = [part for part in parts.components.values() if isinstance(part, torch.nn.Module)]
     taken = sum(weight.numel() * weight.element_size() for model in models for weight in model.parameters())
-    found = memory._parameters(checkpoint, checkpoint)
+    found = memory._read_headers(checkpoint, checkpoint)
     assert found is not None
-    assert need_of(profile_of(ATI, "exact"), found, 2).device == pytest.approx(taken, rel=0.03)
+    assert need_of(profile_of(ATI, "exact"), found[0], 2).device == pytest.approx(taken, rel=0.03)
 
 
 def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """There is no GPU here: its size, and what it can do, are fakes."""
     monkeypatch.setattr(memory, "check_device", lambda wanted, device: None)
-    found = memory._parameters(checkpoint, checkpoint)
+    found = memory._read_headers(checkpoint, checkpoint)
     assert found is not None
-    need = {name: need_of(profile_of(ATI, name), found, ATI.architecture["num_layers"]) for name in ATI.profiles}
+    need = {name: need_of(profile_of(ATI, name), found[0], ATI.architecture["num_layers"]) for name in ATI.profiles}
     monkeypatch.setattr(memory, "_room", lambda device: need["fast"].device)
     monkeypatch.setattr(memory, "_host", lambda: need["small"].host)
     check_memory(ATI, "fast", checkpoint, checkpoint, GPU)

@@ -27,15 +27,11 @@ from cow_service.errors import (
 )
 from cow_service.generators.wan import conditioning, loading
 from cow_service.generators.wan.acceleration import accelerate_transformer
-from cow_service.generators.wan.compiling import CONDITION_CHANNELS
-from cow_service.generators.wan.denoising import Conditioning, denoise
-from cow_service.generators.wan.generator import LoadedModel
-from cow_service.generators.wan.pipeline import latent_shape
-from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
-from cow_service.generators.wan.rank_group import MODULE, RankGroup
-from cow_service.generators.wan.sampling import Sampling
-from cow_service.generators.wan.sharing import Sharing
-from cow_service.generators.wan.tiny import make_tiny
+from cow_service.generators.wan.generator import CONDITION_CHANNELS, LoadedModel
+from cow_service.generators.wan.loading import make_tiny
+from cow_service.generators.wan.pipeline import Conditioning, denoise, latent_shape
+from cow_service.generators.wan.profiles import Acceleration, Profile, Sampling, profile_of
+from cow_service.generators.wan.ranks import MODULE, RankGroup, Sharing
 from cow_service.settings import Settings
 from cow_service.weights.manifests import load_manifests
 

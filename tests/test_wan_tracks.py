@@ -13,7 +13,6 @@ from hypothesis.extra import numpy as arrays
 
 from cow_service.errors import InvalidRequest
 from cow_service.generators.wan.conditioning import ati_condition, wan_move_latent
-from cow_service.generators.wan.track_files import read_tracks, write_tracks
 from cow_service.generators.wan.tracks import (
     FILE_SAMPLES,
     MAX_FRAMES,
@@ -21,9 +20,11 @@ from cow_service.generators.wan.tracks import (
     Tracks,
     from_ati_file,
     nearest_lengths,
+    read_tracks,
     to_ati_file,
     to_ati_tensor,
     tracks_of,
+    write_tracks,
 )
 from cow_service.records import Trajectory
 

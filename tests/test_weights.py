@@ -21,10 +21,22 @@ from typer.testing import CliRunner
 
 from cow_service.cli.main import app
 from cow_service.errors import WeightsUnavailable
-from cow_service.weights import hub as weights_hub
-from cow_service.weights.hub import DownloadProgress, ProgressCallback, download, resolve
-from cow_service.weights.lock import Lock, LockedFile, check, examine, folder_of, read_lock, ready, verify
+from cow_service.weights import repositories
 from cow_service.weights.manifests import Manifest, Source, load_manifests
+from cow_service.weights.repositories import (
+    DownloadProgress,
+    Lock,
+    LockedFile,
+    ProgressCallback,
+    check,
+    download,
+    examine,
+    folder_of,
+    read_lock,
+    ready,
+    resolve,
+    verify,
+)
 
 TOY = "acme/toy"
 CONFIG = Blob(b'{"layers": 2}', lfs=False)
@@ -160,7 +172,7 @@ def test_a_pull_that_was_killed_goes_on_with_its_revision(hub: Hub, folder: Path
     hub.stall["vae/model.safetensors"] = 1000
     arguments = SOURCE.model_dump_json(), str(folder), hub.address
     code = (
-        "import sys; from pathlib import Path; from cow_service.weights.hub import download, resolve; "
+        "import sys; from pathlib import Path; from cow_service.weights.repositories import download, resolve; "
         "from cow_service.weights.manifests import Source; "
         "source, folder, hub = Source.model_validate_json(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]; "
         "download([resolve(source, folder, endpoint=hub)], folder, endpoint=hub)"
@@ -329,14 +341,14 @@ def test_the_exceptions_that_have_reasons_exist() -> None:
     import huggingface_hub.errors
 
     transport = sys.modules[huggingface_hub.errors.HTTPError.__module__.split(".", maxsplit=1)[0]]
-    for name, _, _ in weights_hub.REASONS:
+    for name, _, _ in repositories.REASONS:
         assert any(hasattr(home, name) for home in (huggingface_hub.errors, transport, builtins)), name
 
 
 def test_progress_is_told_where_files_come_in_chunks_by_the_other_protocol() -> None:
     from huggingface_hub.utils._xet_progress_reporting import XetDownloadProgressReporter
 
-    from cow_service.weights.hub import _progress_bar
+    from cow_service.weights.repositories import _progress_bar
 
     told: list[int] = []
     with XetDownloadProgressReporter(

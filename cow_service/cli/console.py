@@ -59,7 +59,7 @@ def run_simulation(
 ) -> Simulation:
     """Simulates with progress of each stage, writes the results into a folder, and prints a summary.
 
-    `formats` are names of `animations.FORMATS`. Raises `InvalidRequest` where one is wanted and no video.
+    `formats` are names of `video.FORMATS`. Raises `InvalidRequest` where one is wanted and no video.
     """
     if formats and not body["video"]:
         raise InvalidRequest("--format makes its file of the video: leave --no-video out.")
@@ -188,7 +188,7 @@ def _save_formats(out: Path, formats: Sequence[str]) -> list[str]:
     """Writes the clip of a folder in other forms; returns their names."""
     if not formats:
         return []
-    from cow_service.media.animations import FORMATS, frames_of  # noqa: PLC0415 # FFmpeg's bindings take long to import
+    from cow_service.media.video import FORMATS, frames_of  # noqa: PLC0415 # FFmpeg's bindings take long to import
 
     frames, fps = frames_of((out / "video.mp4").read_bytes())
     made = dict(FORMATS[each] for each in formats)

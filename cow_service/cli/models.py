@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
     from rich.console import Console
 
-    from cow_service.weights.hub import Download, DownloadProgress, ProgressCallback
     from cow_service.weights.manifests import Manifest, Source
+    from cow_service.weights.repositories import Download, DownloadProgress, ProgressCallback
 
 
 app = typer.Typer(rich_markup_mode=None, help="List readers and generators; pull and check weights.")
@@ -60,8 +60,7 @@ def pull(
     from rich.console import Console  # noqa: PLC0415
     from rich.filesize import decimal  # noqa: PLC0415
 
-    from cow_service.weights.hub import download  # noqa: PLC0415
-    from cow_service.weights.lock import folder_of  # noqa: PLC0415
+    from cow_service.weights.repositories import download, folder_of  # noqa: PLC0415
 
     weights_dir = _weights_dir()
     console = Console(highlight=False, soft_wrap=True, markup=False)
@@ -84,7 +83,7 @@ def check(name: Name, as_json: AsJson = False) -> None:
     """Say whether a model's weights are here and are those that were pulled; exit code 1 if not."""
     import json  # noqa: PLC0415
 
-    from cow_service.weights import lock as weights  # noqa: PLC0415
+    from cow_service.weights import repositories as weights  # noqa: PLC0415
 
     manifest, weights_dir = _manifest(name), _weights_dir()
     findings = {part: weights.check(source, weights_dir) for part, source in manifest.sources.items()}
@@ -155,7 +154,7 @@ def _revisions(manifest: Manifest, wanted: list[str]) -> dict[str, str]:
 
 def _downloads(manifest: Manifest, weights_dir: Path, revisions: dict[str, str]) -> list[Download]:
     """One download for each repository: parts that come from the same one share its folder and its revision."""
-    from cow_service.weights.hub import resolve  # noqa: PLC0415
+    from cow_service.weights.repositories import resolve  # noqa: PLC0415
 
     sources: dict[str, Source] = {}
     chosen: dict[str, str] = {}
@@ -227,8 +226,7 @@ def export_tracks(
     """Write a simulation's tracks, in pixels of its input image: of what moves, the mover's first, then the anchors."""
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from cow_service.generators.wan.track_files import write_tracks  # noqa: PLC0415
-    from cow_service.generators.wan.tracks import tracks_of  # noqa: PLC0415
+    from cow_service.generators.wan.tracks import tracks_of, write_tracks  # noqa: PLC0415
     from cow_service.records import Simulation  # noqa: PLC0415
 
     try:
@@ -266,7 +264,7 @@ def import_tracks(
     import numpy as np  # noqa: PLC0415
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from cow_service.generators.wan.track_files import read_tracks  # noqa: PLC0415
+    from cow_service.generators.wan.tracks import read_tracks  # noqa: PLC0415
     from cow_service.requests import TrajectoryRequest  # noqa: PLC0415
 
     read = read_tracks(file, visibility)

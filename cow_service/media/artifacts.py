@@ -1,19 +1,32 @@
-"""What keeps images, frames, masks and clips: bytes that are named by their SHA-256.
+"""The store of images, frames, masks and clips: bytes that are named by their SHA-256.
 
-Bytes that are no longer those of their name are removed when that is seen: it is then as if they had never been kept,
-and they come back when the same bytes are sent or computed again.
+`ArtifactStore` says what a store does. `DiskArtifacts`, here, keeps files in a folder; `ObjectArtifacts`, in a module
+of its own because it needs obstore, keeps objects in S3 and the like. (obstore's own store for folders does not sync
+what it writes to the disk, and keeps neither media types nor the time of last use.)
+
+Bytes that no longer match their name are removed when that is noticed, as if they had never been stored. They come back
+when the same bytes are sent or computed again.
 """
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import logging
+import os
 import re
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import BinaryIO, Protocol, TypeVar
+from uuid import uuid4
 
-from cow_service.errors import ArtifactNotFound
+from filelock import FileLock
+
+from cow_service.errors import ArtifactNotFound, StorageUnavailable
 from cow_service.records import Artifact
 
 MEDIA_TYPES = {
@@ -24,22 +37,15 @@ MEDIA_TYPES = {
     "application/json": "json",
 }
 MAX_VERIFIED = 10_000  # digests that a process remembers to have compared with their bytes
+TEMPORARY_SUFFIX = ".part"
 
 Value = TypeVar("Value")
 
-_SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 _DIGEST = re.compile(r"[0-9a-f]{64}")
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 _MAX_SHOWN_CHARACTERS = 80
 
-
-def media_type_of(data: bytes) -> str | None:
-    """The media type of an image or MP4 file, by its first 12 bytes; None for anything else."""
-    for signature, media_type in _SIGNATURES.items():
-        if data.startswith(signature):
-            return media_type
-    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return "image/webp"
-    return "video/mp4" if data[4:8] == b"ftyp" else None
+log = logging.getLogger("cow_service")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +57,8 @@ class ListedArtifact:
     used_at: float
 
 
-class Patience(Protocol):
-    """Does what writes to a store, and tries it again while the store is away, for as long as its owner waits."""
+class RetryPolicy(Protocol):
+    """Does what writes to a store, and repeats it while the store is away."""
 
     def __call__(self, work: Callable[[], Value], /) -> Value:
         """What `work` returns. Raises `StorageUnavailable` after the last try, and `Canceled`."""
@@ -60,88 +66,338 @@ class Patience(Protocol):
 
 
 def try_once(work: Callable[[], Value], /) -> Value:
-    """A `Patience` that has none."""
+    """The `RetryPolicy` that repeats nothing."""
     return work()
 
 
-class ArtifactWriter(Protocol):
+class ArtifactWriter(ABC):
     """Stores bytes under their digests. Every method raises `StorageUnavailable` where the store cannot be written."""
 
+    @abstractmethod
     def put(self, data: bytes, media_type: str) -> Artifact:
         """Stores bytes, also where those that are stored under their digest are damaged; marks them as used now.
 
         Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
         """
-        ...
 
+    @abstractmethod
     def put_file(self, path: Path, media_type: str) -> Artifact:
         """Moves in a finished file of `scratch`; afterwards `path` no longer exists. Raises as `put` does."""
-        ...
 
+    @abstractmethod
     def scratch(self) -> AbstractContextManager[Path]:
         """A path on this machine for a temporary file; deleted afterwards unless `put_file` moved it."""
-        ...
 
 
-class ArtifactStore(ArtifactWriter, Protocol):
+class ArtifactStore(ArtifactWriter):
     """Keeps bytes under their digests. Safe to share between threads.
 
     Every method raises `StorageUnavailable` where the store cannot be read or written.
     """
 
+    def __init__(self, scratch_folder: Path) -> None:
+        self._scratch_folder = scratch_folder
+        self._guard = threading.Lock()
+        self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
+
     @property
+    @abstractmethod
     def address(self) -> str:
         """Names the store, the same for every process that shares it. It holds no credentials."""
-        ...
 
+    @abstractmethod
     def get(self, sha256: str) -> Artifact:
         """Finds an artifact. Raises `ArtifactNotFound` if there is none, or if it is not a digest at all."""
-        ...
 
+    @abstractmethod
     def read(self, sha256: str) -> bytes:
         """The bytes of an artifact, which are those of its digest; marks it as used now. Raises as `get` does."""
-        ...
 
+    @abstractmethod
     def touch(self, *sha256: str) -> None:
         """Marks artifacts whose bytes are those of their digests as used now. Raises as `get` does."""
-        ...
 
+    @abstractmethod
     def local_file(self, sha256: str) -> AbstractContextManager[Path]:
         """A file with the bytes of an artifact, which is there inside the block. Raises as `get` does."""
-        ...
 
+    @abstractmethod
     def signed_url(self, sha256: str, seconds: float) -> str | None:
         """A URL under which anybody can get an artifact for so long; None where the store has none."""
-        ...
 
+    @abstractmethod
     def delete(self, sha256: str, untouched_since: float) -> bool:
         """Deletes an artifact unless it was used after that time (seconds since 1970). Returns whether it did."""
-        ...
 
+    @abstractmethod
     def listed(self) -> Iterator[ListedArtifact]:
         """All artifacts, in no particular order."""
-        ...
 
-    def batch(self, patience: Patience = try_once) -> AbstractContextManager[ArtifactWriter]:
+    @abstractmethod
+    def batch(self, retry: RetryPolicy = try_once) -> AbstractContextManager[ArtifactWriter]:
         """A writer several of whose puts may run at the same time; all are done when its block ends.
 
-        Each of them is done by `patience`: what is written took long to make, and is not made again for an outage. The
-        end of the block raises what any of them raises.
+        `retry` does each of them: what is written took long to make, and is not made again for an outage. The end of
+        the block raises what any of them raises.
         """
-        ...
+
+    @abstractmethod
+    def check(self) -> None:
+        """Writes a small thing and removes or replaces it. Raises `StorageUnavailable` if that fails."""
+
+    @contextmanager
+    def scratch(self) -> Generator[Path]:
+        """A path for a temporary file in the folder of the store, or beside the jobs where the store has no folder."""
+        with disk_errors():
+            self._scratch_folder.mkdir(parents=True, exist_ok=True)
+        path = self._scratch_folder / f".{uuid4().hex}{TEMPORARY_SUFFIX}"
+        try:
+            yield path
+        finally:
+            path.unlink(missing_ok=True)
 
     def remove_leftovers(self, untouched_since: float) -> None:
         """Removes temporary files of processes that were killed: those not written to after that time."""
-        ...
+        with disk_errors():
+            for path in self._scratch_folder.rglob(f".*{TEMPORARY_SUFFIX}"):
+                with suppress(FileNotFoundError):  # its process has just ended its work
+                    if path.stat().st_mtime <= untouched_since:
+                        path.unlink()
+
+    def _note_verified(self, sha256: str, version: object) -> None:
+        with self._guard:
+            if len(self._verified) >= MAX_VERIFIED:
+                self._verified.clear()
+            self._verified[sha256] = version
+
+
+class DiskArtifacts(ArtifactStore):
+    """Files `<folder>/<first two digits>/<digest>.<extension>`; the extension keeps the media type.
+
+    The folder is made when it is first needed. The time of a file is that of its last use.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._folder = folder
+        self._commit_lock = threading.Lock()
+
+    @property
+    def address(self) -> str:
+        """A random name that lies in the folder: other machines may see the folder under another path."""
+        name = self._folder / "name"
+        with disk_errors():
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with FileLock(self._folder / "name.lock"):
+                if not name.exists():
+                    name.write_text(uuid4().hex)
+                return f"folder:{name.read_text()}"
+
+    def put(self, data: bytes, media_type: str) -> Artifact:
+        """Stores bytes. Bytes that are stored already keep their first media type."""
+        extension = extension_of(media_type)
+        sha256 = hashlib.sha256(data).hexdigest()
+        with disk_errors():
+            if (known := self._find_intact(sha256)) is not None:
+                self._mark_used(known)
+                return _artifact_at(known)
+            with self.scratch() as temporary:
+                with temporary.open("xb") as file:
+                    file.write(data)
+                    _sync(file)
+                return self._commit(temporary, sha256, extension)
+
+    def put_file(self, path: Path, media_type: str) -> Artifact:
+        """Moves in a file, hashing it in chunks."""
+        extension = extension_of(media_type)
+        with disk_errors():
+            with path.open("rb+") as file:
+                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+                _sync(file)
+            return self._commit(path, sha256, extension)
+
+    def _commit(self, temporary: Path, sha256: str, extension: str) -> Artifact:
+        with self._commit_lock:  # two threads may store the same bytes under two media types: the first one decides
+            stored = self._find_intact(sha256)
+            if stored is None:
+                stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
+                stored.parent.mkdir(parents=True, exist_ok=True)
+                temporary.replace(stored)
+                self._note_verified(sha256, _version(stored))
+            else:
+                temporary.unlink()
+            return _artifact_at(stored)
+
+    def get(self, sha256: str) -> Artifact:
+        """Finds an artifact whose bytes are those of its digest."""
+        with disk_errors(sha256):
+            return _artifact_at(self._get(sha256))
+
+    def read(self, sha256: str) -> bytes:
+        """Reads the file."""
+        with disk_errors(sha256):
+            path = self._get(sha256)
+            self._mark_used(path)
+            return path.read_bytes()
+
+    def touch(self, *sha256: str) -> None:
+        """Sets the times of the files."""
+        for one in sha256:
+            with disk_errors(one):
+                self._mark_used(self._get(one))
+
+    @contextmanager
+    def local_file(self, sha256: str) -> Generator[Path]:
+        """The file itself."""
+        with disk_errors(sha256):
+            path = self._get(sha256)
+        yield path
+
+    def signed_url(self, sha256: str, seconds: float) -> str | None:
+        """There is none."""
+        return None
+
+    def delete(self, sha256: str, untouched_since: float) -> bool:
+        """Deletes the file."""
+        with disk_errors():
+            path = self._find(sha256)
+            if path is None or path.stat().st_mtime > untouched_since:
+                return False
+            path.unlink(missing_ok=True)
+        return True
+
+    def listed(self) -> Iterator[ListedArtifact]:
+        """All files that are named by a digest."""
+        with disk_errors():
+            for folder in self._folder.glob("[0-9a-f][0-9a-f]"):
+                with suppress(NotADirectoryError), os.scandir(folder) as entries:
+                    for entry in entries:
+                        sha256, _, extension = entry.name.partition(".")
+                        with suppress(FileNotFoundError):  # deleted meanwhile
+                            if extension and is_digest(sha256):
+                                status = entry.stat()
+                                yield ListedArtifact(sha256, status.st_size, status.st_mtime)
+
+    @contextmanager
+    def batch(self, retry: RetryPolicy = try_once) -> Generator[ArtifactWriter]:
+        """One after another: a disk writes no faster for several threads."""
+        yield _RetryingWriter(self, retry)
 
     def check(self) -> None:
-        """Writes a small thing and removes or replaces it. Raises `StorageUnavailable` if that fails."""
-        ...
+        """Writes, syncs and removes a small file."""
+        with disk_errors(), self.scratch() as temporary, temporary.open("xb") as file:
+            file.write(b"\0")
+            _sync(file)
+
+    def _find(self, sha256: str) -> Path | None:
+        for extension in MEDIA_TYPES.values():
+            path = self._folder / sha256[:2] / f"{sha256}.{extension}"
+            with suppress(FileNotFoundError):
+                path.stat()
+                return path
+        return None
+
+    def _find_intact(self, sha256: str) -> Path | None:
+        """A stored file that holds what its name says, compared once for as long as it is not changed."""
+        path = self._find(sha256)
+        try:
+            if path is None or self._verified.get(sha256) == _version(path):
+                return path
+            with path.open("rb") as file:
+                found = hashlib.file_digest(file, "sha256").hexdigest()
+            if found == sha256:
+                self._note_verified(sha256, _version(path))
+                return path
+        except FileNotFoundError:  # it was deleted just now
+            return None
+        log.error("artifact %s is damaged and was removed", sha256)
+        path.unlink(missing_ok=True)
+        return None
+
+    def _get(self, sha256: str) -> Path:
+        check_digest(sha256)
+        path = self._find_intact(sha256)
+        if path is None:
+            raise not_found(sha256)
+        return path
+
+    def _mark_used(self, path: Path) -> None:
+        os.utime(path)  # maintenance deletes by this time
+        self._note_verified(path.stem, _version(path))
+
+
+class _RetryingWriter(ArtifactWriter):
+    """Waits while the disk is full or away."""
+
+    def __init__(self, store: ArtifactStore, retry: RetryPolicy) -> None:
+        self._store, self._retry = store, retry
+
+    def put(self, data: bytes, media_type: str) -> Artifact:
+        return self._retry(lambda: self._store.put(data, media_type))
+
+    def put_file(self, path: Path, media_type: str) -> Artifact:
+        return self._retry(lambda: self._store.put_file(path, media_type))
+
+    def scratch(self) -> AbstractContextManager[Path]:
+        return self._store.scratch()
+
+
+def _artifact_at(path: Path) -> Artifact:
+    media_type = next(name for name, extension in MEDIA_TYPES.items() if path.suffix == f".{extension}")
+    return artifact_of(path.stem, media_type, path.stat().st_size)
+
+
+def _version(path: Path) -> tuple[int, ...]:
+    """What changes with the bytes of a file, unless the disk itself damages them."""
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _sync(file: BinaryIO) -> None:
+    file.flush()
+    os.fsync(file.fileno())
+
+
+@contextmanager
+def disk_errors(sha256: str | None = None) -> Generator[None]:
+    """Turns an `OSError` into `StorageUnavailable`, without its text, which holds the path.
+
+    With a digest, a file that is not there becomes `ArtifactNotFound`.
+    """
+    try:
+        yield
+    except OSError as error:
+        if sha256 is not None and isinstance(error, FileNotFoundError):
+            raise not_found(sha256) from error
+        if error.errno in _FULL:
+            raise StorageUnavailable("The disk of the data folder is full: free some space and try again.") from error
+        reason = os.strerror(error.errno) if error.errno else type(error).__name__
+        raise StorageUnavailable(
+            f"The data folder cannot be used ({reason}): make it a folder that the server may read and write."
+        ) from error
 
 
 def artifact_of(sha256: str, media_type: str, size: int) -> Artifact:
     """The record of an artifact of so many bytes."""
     return Artifact(sha256=sha256, url=f"/artifacts/{sha256}", media_type=media_type, size=size)
+
+
+def media_type_of(data: bytes) -> str | None:
+    """The media type of an image or MP4 file, by its first 12 bytes; None for anything else."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "image/png"
+    if data.startswith(b"\xff\xd8\xff"):
+        return "image/jpeg"
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return "image/webp"
+    return "video/mp4" if data[4:8] == b"ftyp" else None
+
+
+def extension_of(media_type: str) -> str:
+    """The extension of files of a media type. Raises `ValueError` if it is not in `MEDIA_TYPES`."""
+    if media_type not in MEDIA_TYPES:
+        raise ValueError(f"The media type {media_type!r} is not kept: use one of {', '.join(MEDIA_TYPES)}.")
+    return MEDIA_TYPES[media_type]
 
 
 def is_digest(name: str) -> bool:
@@ -162,10 +418,3 @@ def not_found(sha256: str) -> ArtifactNotFound:
     return ArtifactNotFound(
         f"No artifact has the SHA-256 {sha256}: send the image again, or run the simulation that made it."
     )
-
-
-def extension_of(media_type: str) -> str:
-    """The extension of files of a media type. Raises `ValueError` if it is not in `MEDIA_TYPES`."""
-    if media_type not in MEDIA_TYPES:
-        raise ValueError(f"The media type {media_type!r} is not kept: use one of {', '.join(MEDIA_TYPES)}.")
-    return MEDIA_TYPES[media_type]

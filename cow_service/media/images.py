@@ -149,7 +149,11 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     Raises `ImageTypeUnsupported` for other types and for animations, `ImageTooLarge` above `max_megapixels` (millions
     of pixels), and `ImageUnreadable` for damaged files and for sides under `MIN_SIDE` px.
     """
-    kind = _kind(data)
+    if not data:
+        raise ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
+    kind = _KINDS.get(media_type_of(data) or "")
+    if kind is None:
+        raise ImageTypeUnsupported(f"The image is {_describe_foreign(data)}: send it as PNG, JPEG or WebP.")
     try:
         pixels = _decode_as(kind, data, max_megapixels)
     except OverfullError as error:
@@ -217,15 +221,6 @@ def fit_within(pixels: NDArray[np.uint8], max_side: int | None) -> NDArray[np.ui
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _kind(data: bytes) -> str:
-    if not data:
-        raise ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
-    kind = _KINDS.get(media_type_of(data) or "")
-    if kind is None:
-        raise ImageTypeUnsupported(f"The image is {_describe_foreign(data)}: send it as PNG, JPEG or WebP.")
-    return kind
-
-
 def _describe_foreign(data: bytes) -> str:
     head = data[:_SNIFFED_BYTES]
     for signature, name in _FOREIGN_SIGNATURES:
@@ -238,16 +233,14 @@ def _describe_foreign(data: bytes) -> str:
         return "an SVG file"
     if markup.startswith((b"<!doctype html", b"<html")):
         return "an HTML page"
-    return "text" if _is_text(head) else f"of no known type (it begins with the bytes {data[:8].hex(' ')})"
-
-
-def _is_text(head: bytes) -> bool:
     try:
         # An incremental decoder waits for the rest of a character that the end of the sample cut in two.
         text = codecs.getincrementaldecoder("utf-8")().decode(head)
     except UnicodeDecodeError:
-        return False
-    return "".join(text.split()).isprintable()
+        text = "\0"
+    if "".join(text.split()).isprintable():
+        return "text"
+    return f"of no known type (it begins with the bytes {data[:8].hex(' ')})"
 
 
 def _decode_as(kind: str, data: bytes, max_megapixels: float) -> NDArray[np.uint8]:
@@ -259,7 +252,9 @@ def _decode_as(kind: str, data: bytes, max_megapixels: float) -> NDArray[np.uint
     stripped, orientation = strip(data) if strip else (data, UPRIGHT)
     with _OPENERS[kind](io.BytesIO(stripped)) as image:
         _check_size(image.width, image.height, max_megapixels)
-        _check_still(kind, image)
+        frames = int(getattr(image, "n_frames", 1))
+        if frames > 1:
+            raise ImageTypeUnsupported(f"The image is an animated {kind} of {frames} frames: send one frame of it.")
         rgb = _to_rgb(image)
         if kind == "WebP":
             orientation = _exif_orientation(image.info.get("exif", b""))
@@ -294,15 +289,15 @@ def _check_size(width: int, height: int, max_megapixels: float) -> None:
         )
 
 
-def _check_still(kind: str, image: ImageFile) -> None:
-    frames = int(getattr(image, "n_frames", 1))
-    if frames > 1:
-        raise ImageTypeUnsupported(f"The image is an animated {kind} of {frames} frames: send one frame of it.")
-
-
 def _to_rgb(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):
-        return Image.fromarray(_grey16_to_8(image)).convert("RGB")
+        # 16 bits. Pillow's own conversion clips at 255 instead of scaling.
+        values = np.asarray(image).astype(np.uint32)
+        grey = ((values + 128) // 257).astype(np.uint8)
+        transparent = image.info.get("transparency")
+        if isinstance(transparent, int):
+            grey[values == transparent] = 255
+        return Image.fromarray(grey).convert("RGB")
     if image.has_transparency_data:
         white = Image.new("RGBA", image.size, "white")
         return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
@@ -310,16 +305,6 @@ def _to_rgb(image: Image.Image) -> Image.Image:
         return image.convert("RGB")
     image.load()
     return image
-
-
-def _grey16_to_8(image: Image.Image) -> NDArray[np.uint8]:
-    # Pillow's own conversion clips at 255 instead of scaling.
-    values = np.asarray(image).astype(np.uint32)
-    grey = ((values + 128) // 257).astype(np.uint8)
-    transparent = image.info.get("transparency")
-    if isinstance(transparent, int):
-        grey[values == transparent] = 255
-    return grey
 
 
 def _damaged(kind: str, data: bytes) -> ImageUnreadable:

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import threading
 import time
 from collections.abc import Generator, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
@@ -25,22 +24,21 @@ import obstore
 from obstore import exceptions
 from obstore.store import from_url
 
-from cow_service.errors import StorageUnavailable
+from cow_service.errors import ArtifactNotFound, StorageUnavailable
 from cow_service.media.artifacts import (
-    MAX_VERIFIED,
     MEDIA_TYPES,
+    ArtifactStore,
     ArtifactWriter,
     ListedArtifact,
-    Patience,
+    RetryPolicy,
     artifact_of,
     check_digest,
+    disk_errors,
     extension_of,
     is_digest,
     not_found,
     try_once,
 )
-from cow_service.media.object_batch import ObjectBatch, scratch_errors, take_file
-from cow_service.media.temporary_files import remove_temporary_files, temporary_beside
 from cow_service.records import Artifact
 from cow_service.settings import SettingsError
 
@@ -50,7 +48,6 @@ RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request
 FIRST_BACKOFF_SECONDS, MAX_BACKOFF_SECONDS = 0.1, 2.0
 MAX_PARALLEL = 8  # requests for one job
 CHECKED = "check"  # the object that shows that the store can be written and read
-_REFUSED = (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)
 
 log = logging.getLogger("cow_service")
 
@@ -66,15 +63,34 @@ class _Object:
         return time.time() - self.used_at < RENEWED_AFTER_SECONDS
 
 
-class ObjectArtifacts:
+class ObjectArtifacts(ArtifactStore):
     """An `ArtifactStore` in an object store. Temporary files lie in a folder of this machine."""
 
     def __init__(self, url: str, scratch_folder: Path) -> None:
+        """Connects to nothing yet. Raises `SettingsError` for a store that cannot be set up."""
+        super().__init__(scratch_folder)
         self._url = url.rstrip("/")
-        self._scratch_folder = scratch_folder
-        self._verified: dict[str, str] = {}  # ETags of the objects whose bytes were compared with their digests
-        self._guard = threading.Lock()
-        self._store = _open(url)
+        try:
+            self._store: Any = from_url(
+                url,
+                client_options={
+                    "allow_http": True,  # for an endpoint of the environment that is one of http://
+                    "timeout": timedelta(seconds=REQUEST_SECONDS),
+                    "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
+                },
+                retry_config={
+                    "max_retries": MAX_RETRIES,
+                    "retry_timeout": timedelta(seconds=RETRY_SECONDS),
+                    "backoff": {
+                        "init_backoff": timedelta(seconds=FIRST_BACKOFF_SECONDS),
+                        "max_backoff": timedelta(seconds=MAX_BACKOFF_SECONDS),
+                        "base": 2,
+                    },
+                },
+            )
+        except (exceptions.BaseError, ValueError) as error:
+            reason = str(error).partition("\n")[0]
+            raise SettingsError(f"Bad settings: the object store of COW_ARTIFACTS cannot be used: {reason}.") from error
 
     @property
     def address(self) -> str:
@@ -84,20 +100,28 @@ class ObjectArtifacts:
     def put(self, data: bytes, media_type: str) -> Artifact:
         """Sends bytes, unless this process knows that the same bytes are there."""
         extension_of(media_type)
-        return self._put(hashlib.sha256(data).hexdigest(), data, media_type)
+        sha256 = hashlib.sha256(data).hexdigest()
+        if sha256 in self._verified:
+            try:
+                found = self._head(sha256)
+                if found.is_fresh and self._is_verified(found):
+                    return found.artifact
+            except ArtifactNotFound:
+                pass
+        self._send(sha256, data, media_type)
+        return artifact_of(sha256, media_type, len(data))
 
     def put_file(self, path: Path, media_type: str) -> Artifact:
         """Sends the bytes of a file, and deletes it."""
         extension_of(media_type)
-        return self.put(take_file(path), media_type)
+        return self.put(_take_file(path), media_type)
 
     def get(self, sha256: str) -> Artifact:
         """Finds an object. Its bytes are not compared: whoever gets them from a signed URL can."""
-        return self._found(sha256).artifact
+        return self._head(sha256).artifact
 
     def read(self, sha256: str) -> bytes:
         """Gets the bytes and compares them."""
-        check_digest(sha256)
         found, data = self._fetch(sha256)
         if not found.is_fresh:
             self._send(sha256, data, found.artifact.media_type)
@@ -105,26 +129,22 @@ class ObjectArtifacts:
 
     def touch(self, *sha256: str) -> None:
         """Gets bytes only where they were not compared, or where they must be sent again."""
-        if len(sha256) <= 1:
-            for one in sha256:
-                self._touch(one)
-            return
-        with ThreadPoolExecutor(min(len(sha256), MAX_PARALLEL)) as pool:
-            for _ in pool.map(self._touch, sha256):
-                pass  # what one of them raises is raised here
 
-    def _touch(self, sha256: str) -> None:
-        found = self._found(sha256)
-        if not (found.is_fresh and self._is_verified(found)):
-            self.read(sha256)
+        def touch_one(sha256: str) -> None:
+            found = self._head(sha256)
+            if not (found.is_fresh and self._is_verified(found)):
+                self.read(sha256)
+
+        with ThreadPoolExecutor(MAX_PARALLEL) as pool:
+            for _ in pool.map(touch_one, sha256):
+                pass  # what one of them raises is raised here
 
     @contextmanager
     def local_file(self, sha256: str) -> Generator[Path]:
         """A temporary copy."""
-        check_digest(sha256)
         _, data = self._fetch(sha256)
         with self.scratch() as path:
-            with scratch_errors():
+            with disk_errors():
                 path.write_bytes(data)
             yield path
 
@@ -137,13 +157,12 @@ class ObjectArtifacts:
             return None
 
     def delete(self, sha256: str, untouched_since: float) -> bool:
-        """Deletes the object unless it was used after that time (seconds since 1970)."""
-        with _store_errors():
-            try:
-                used_at = obstore.head(self._store, sha256)["last_modified"].timestamp()
-            except FileNotFoundError:
-                return False
-        if used_at > untouched_since:
+        """Deletes the object."""
+        try:
+            with _store_errors(sha256):
+                if obstore.head(self._store, sha256)["last_modified"].timestamp() > untouched_since:
+                    return False
+        except ArtifactNotFound:
             return False
         self._remove(sha256)
         return True
@@ -157,29 +176,13 @@ class ObjectArtifacts:
                         yield ListedArtifact(one["path"], one["size"], one["last_modified"].timestamp())
 
     @contextmanager
-    def scratch(self) -> Generator[Path]:
-        """A path in the folder for temporary files."""
-        with ExitStack() as stack:
-            with scratch_errors():
-                path = stack.enter_context(temporary_beside(self._scratch_folder / "scratch"))
-            yield path
-
-    @contextmanager
-    def batch(self, patience: Patience = try_once) -> Generator[ArtifactWriter]:
+    def batch(self, retry: RetryPolicy = try_once) -> Generator[ArtifactWriter]:
         """Sends in threads."""
-
-        def send(sha256: str, data: bytes, media_type: str) -> Artifact:
-            return patience(partial(self._put, sha256, data, media_type))
-
         with ThreadPoolExecutor(MAX_PARALLEL, thread_name_prefix="cow-artifacts") as pool:
-            batch = ObjectBatch(pool, send, self.scratch)
-            yield batch
-            batch.wait()
-
-    def remove_leftovers(self, untouched_since: float) -> None:
-        """Looks for them in the folder for temporary files."""
-        with scratch_errors():
-            remove_temporary_files(self._scratch_folder, untouched_since)
+            writer = _ParallelWriter(self, retry, pool)
+            yield writer
+            for each in writer.sent:
+                each.result()
 
     def check(self) -> None:
         """Sends a small object and gets it. Deleting needs a permission, too, but only once artifacts are old."""
@@ -187,38 +190,17 @@ class ObjectArtifacts:
             obstore.put(self._store, CHECKED, b"\0", use_multipart=False)
             obstore.get(self._store, CHECKED).bytes()
 
-    def _put(self, sha256: str, data: bytes, media_type: str) -> Artifact:
-        if sha256 in self._verified:
-            found = self._head(sha256)
-            if found is not None and found.is_fresh and self._is_verified(found):
-                return found.artifact
-        self._send(sha256, data, media_type)
-        return artifact_of(sha256, media_type, len(data))
-
-    def _found(self, sha256: str) -> _Object:
+    def _head(self, sha256: str) -> _Object:
         check_digest(sha256)
-        found = self._head(sha256)
-        if found is None:
-            raise not_found(sha256)
-        return found
-
-    def _head(self, sha256: str) -> _Object | None:
-        with _store_errors():
-            try:
-                return _object(sha256, obstore.get(self._store, sha256, options={"head": True}))
-            except FileNotFoundError:
-                return None
+        with _store_errors(sha256):
+            return _object(sha256, obstore.get(self._store, sha256, options={"head": True}))
 
     def _fetch(self, sha256: str) -> tuple[_Object, bytes]:
         """An object and its bytes, which are those of its digest. Raises `ArtifactNotFound`."""
-        with _store_errors():
-            try:
-                result = obstore.get(self._store, sha256)
-                found, data = _object(sha256, result), bytes(result.bytes())
-            except FileNotFoundError as error:
-                raise not_found(sha256) from error
-        if found is None:
-            raise not_found(sha256)
+        check_digest(sha256)
+        with _store_errors(sha256):
+            result = obstore.get(self._store, sha256)
+            found, data = _object(sha256, result), bytes(result.bytes())
         if hashlib.sha256(data).hexdigest() != sha256:
             log.error("artifact %s is damaged and was removed", sha256)
             self._remove(sha256)
@@ -234,68 +216,65 @@ class ObjectArtifacts:
         self._note_verified(sha256, result["e_tag"])
 
     def _remove(self, sha256: str) -> None:
-        with self._guard:
-            self._verified.pop(sha256, None)
+        self._verified.pop(sha256, None)
         with _store_errors():
             obstore.delete(self._store, sha256)
 
     def _is_verified(self, found: _Object) -> bool:
         return found.e_tag is not None and self._verified.get(found.artifact.sha256) == found.e_tag
 
-    def _note_verified(self, sha256: str, e_tag: str | None) -> None:
-        with self._guard:
-            if len(self._verified) >= MAX_VERIFIED:
-                self._verified.clear()
-            if e_tag is not None:
-                self._verified[sha256] = e_tag
+
+class _ParallelWriter(ArtifactWriter):
+    """Hands the bytes to other threads. It belongs to one thread."""
+
+    def __init__(self, store: ObjectArtifacts, retry: RetryPolicy, threads: ThreadPoolExecutor) -> None:
+        self._store, self._retry, self._threads = store, retry, threads
+        self.sent: list[Future[Artifact]] = []
+
+    def put(self, data: bytes, media_type: str) -> Artifact:
+        extension_of(media_type)
+        self.sent.append(self._threads.submit(self._retry, partial(self._store.put, data, media_type)))
+        return artifact_of(hashlib.sha256(data).hexdigest(), media_type, len(data))
+
+    def put_file(self, path: Path, media_type: str) -> Artifact:
+        extension_of(media_type)
+        return self.put(_take_file(path), media_type)
+
+    def scratch(self) -> AbstractContextManager[Path]:
+        return self._store.scratch()
 
 
-def _open(url: str) -> Any:
-    try:
-        return from_url(
-            url,
-            client_options={
-                "allow_http": True,  # for an endpoint of the environment that is one of http://
-                "timeout": timedelta(seconds=REQUEST_SECONDS),
-                "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
-            },
-            retry_config={
-                "max_retries": MAX_RETRIES,
-                "retry_timeout": timedelta(seconds=RETRY_SECONDS),
-                "backoff": {
-                    "init_backoff": timedelta(seconds=FIRST_BACKOFF_SECONDS),
-                    "max_backoff": timedelta(seconds=MAX_BACKOFF_SECONDS),
-                    "base": 2,
-                },
-            },
-        )
-    except (exceptions.BaseError, ValueError) as error:
-        reason = str(error).partition("\n")[0]
-        raise SettingsError(f"Bad settings: the object store of COW_ARTIFACTS cannot be used: {reason}.") from error
+def _take_file(path: Path) -> bytes:
+    """The bytes of a file, which is deleted."""
+    with disk_errors():
+        data = path.read_bytes()
+        path.unlink()
+        return data
 
 
-def _object(sha256: str, result: obstore.GetResult) -> _Object | None:
+def _object(sha256: str, result: obstore.GetResult) -> _Object:
     meta, media_type = result.meta, result.attributes.get("Content-Type", "")
     if media_type not in MEDIA_TYPES:  # an object that somebody else has put there
-        return None
+        raise not_found(sha256)
     return _Object(artifact_of(sha256, media_type, meta["size"]), meta["e_tag"], meta["last_modified"].timestamp())
 
 
 @contextmanager
-def _store_errors() -> Generator[None]:
-    """Translates obstore's errors. Their own text is for the log: it is long, and holds addresses."""
+def _store_errors(sha256: str | None = None) -> Generator[None]:
+    """Translates obstore's errors; a missing object, where a digest is given, becomes a missing artifact.
+
+    Their own text is for the log: it is long, and holds addresses.
+    """
     try:
         yield
-    except _REFUSED as error:
-        raise _unavailable("it refuses the credentials; see those of its provider, such as AWS_*", error) from error
-    except FileNotFoundError as error:
-        raise _unavailable("there is no such bucket", error) from error
-    except exceptions.BaseError as error:
-        raise _unavailable(
-            f"no answer, or no credentials ({type(error).__name__}): the log says more", error
-        ) from error
-
-
-def _unavailable(reason: str, error: Exception) -> StorageUnavailable:
-    log.warning("object store: %s", str(error).partition("\n")[0])
-    return StorageUnavailable(f"The object store of COW_ARTIFACTS cannot be used: {reason}.")
+    except (FileNotFoundError, exceptions.BaseError) as error:
+        if isinstance(error, FileNotFoundError):
+            if sha256 is not None:
+                raise not_found(sha256) from error
+            reason = "there is no such bucket"
+        elif isinstance(error, exceptions.PermissionDeniedError | exceptions.UnauthenticatedError):
+            reason = "it refuses the credentials; see those of its provider, such as AWS_*"
+        else:
+            reason = f"no answer, or no credentials ({type(error).__name__}): the log says more"
+        log.warning("object store: %s", str(error).partition("\n")[0])
+        raise StorageUnavailable(f"The object store of COW_ARTIFACTS cannot be used: {reason}.") from error

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.records import BBox, Encounter, Grounding, Motion, Path, Trajectory
+from cow_service.records import BBox, Grounding, Motion, Path, Trajectory
 from cow_service.records.world import MEETINGS
 
 LETTERS = 0.42  # size of the letters, in OpenCV's unit, for a picture whose unit is 1
@@ -43,23 +43,18 @@ def draw_labels(
     placed: list[Plate] = []
     spots = np.array(points, np.float64).reshape(-1, 2)
     for label in labels:
-        text = _fitted(label.text.encode("ascii", "replace").decode(), size, weight, width - 2 * pad)
+        whole = text = label.text.encode("ascii", "replace").decode()
         (across, up), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, weight)
+        while len(text) > 4 and across > width - 2 * pad:  # cut to the width of the picture
+            whole = whole[:-1]
+            text = whole.rstrip() + "..."
+            (across, up), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, weight)
         plate = _free_place(label, across + 2 * pad, up + base + 2 * pad, pad, (width, height), placed, spots)
         placed.append(plate)
         cv2.rectangle(canvas, plate[:2], (plate[2] - 1, plate[3] - 1), dark, -1)
         origin = plate[0] + pad, plate[1] + pad + up
         cv2.putText(canvas, text, origin, cv2.FONT_HERSHEY_SIMPLEX, size, label.colour, weight, cv2.LINE_AA)
     return tuple(placed)
-
-
-def _fitted(text: str, size: float, weight: int, width: int) -> str:
-    """The text, cut to a width (px)."""
-    shown = text
-    while len(shown) > 4 and cv2.getTextSize(shown, cv2.FONT_HERSHEY_SIMPLEX, size, weight)[0][0] > width:
-        text = text[:-1]
-        shown = text.rstrip() + "..."
-    return shown
 
 
 def _free_place(
@@ -78,26 +73,20 @@ def _free_place(
     places = [(x, y) for y in rows for x in (x0, x1 - width)] + [(x1 + gap, y0), (x0 - gap - width, y0)]
     for step in range(1, STEPS):
         places += [(x0, below + step * (height + 1)), (x0, above - step * (height + 1))]
-    tried = [_inside(x, y, width, height, size) for x, y in places]
-    tried += [(0, row, width, row + height) for row in range(0, max(1, size[1] - height), height + 1)]
-    return min(tried, key=lambda plate: (sum(_shared(plate, other) for other in placed), _count_in(plate, points)))
+    tried = [(int(max(0, min(x, size[0] - width))), int(max(0, min(y, size[1] - height)))) for x, y in places] + [
+        (0, row) for row in range(0, max(1, size[1] - height), height + 1)
+    ]
 
+    def covered(plate: Plate) -> tuple[int, int]:
+        """Pixels of other labels, and points."""
+        left, top, right, bottom = plate
+        pixels = sum(
+            max(0, min(right, other[2]) - max(left, other[0])) * max(0, min(bottom, other[3]) - max(top, other[1]))
+            for other in placed
+        )
+        return pixels, int(np.count_nonzero(((points >= plate[:2]) & (points < plate[2:])).all(axis=1)))
 
-def _count_in(plate: Plate, points: Floats) -> int:
-    inside = (points >= plate[:2]) & (points < plate[2:])
-    return int(np.count_nonzero(inside[:, 0] & inside[:, 1]))
-
-
-def _inside(x: float, y: float, width: int, height: int, size: tuple[int, int]) -> Plate:
-    left, top = (
-        int(max(0, min(v, whole - part))) for v, part, whole in zip((x, y), (width, height), size, strict=True)
-    )
-    return left, top, left + width, top + height
-
-
-def _shared(a: Plate, b: Plate) -> int:
-    """Pixels that two plates have in common."""
-    return max(0, min(a[2], b[2]) - max(a[0], b[0])) * max(0, min(a[3], b[3]) - max(a[1], b[1]))
+    return min(((left, top, left + width, top + height) for left, top in tried), key=covered)
 
 
 OUTLINE, PATH, ARROW, LIGHT, DARK = (255, 196, 0), (0, 229, 255), (255, 64, 129), (255, 255, 255), (20, 20, 20)
@@ -170,10 +159,11 @@ def draw_overlay(
             cv2.arrowedLine(canvas, _fixed(start), _fixed(tip), colour, width, cv2.LINE_AA, SUBPIXEL, 0.28)
     _dot(canvas, grounding.point, unit, LIGHT)
     labels = [Label(grounding.object, grounding.bbox, OUTLINE, below=False)]
-    labels += [
-        Label(_words(encounter, trajectory.fps), encounter.bbox, ENCOUNTERS[encounter.kind], below=True)
-        for encounter in trajectory.encounters
-    ]
+    for encounter in trajectory.encounters:  # as in: hits white cube 1.1 s, 93%
+        kind = "hits" if encounter.kind == "touches" else MEETINGS[encounter.kind]
+        sure = "" if encounter.probability is None else f", {round(100 * encounter.probability)}%"
+        text = f"{kind} {encounter.object} {encounter.first_frame / trajectory.fps:.1f} s{sure}"
+        labels.append(Label(text, encounter.bbox, ENCOUNTERS[encounter.kind], below=True))
     labels += [Label(f"{name}, taken away", bbox, REMOVED, below=False) for name, bbox, _ in removed]
     labels += [Label(f"{each.name}, as it is", each.old_bbox, PLACED, below=False) for each in placed]
     labels += [Label(f"{each.name}, put {each.place}", each.bbox, PLACED, below=False) for each in placed]
@@ -197,13 +187,6 @@ def _draw_removed(canvas: Image, mask: Mask, colour: Colour, thin: int) -> None:
     dashed = (edge > 0) & ((rows // (DASH * thin) + columns // (DASH * thin)) % 2 == 0)
     canvas[edge > 0] = DARK
     canvas[dashed] = colour
-
-
-def _words(encounter: Encounter, fps: float) -> str:
-    """As in: hits white cube 1.1 s, 93%."""
-    kind = "hits" if encounter.kind == "touches" else MEETINGS[encounter.kind]
-    sure = "" if encounter.probability is None else f", {round(100 * encounter.probability)}%"
-    return f"{kind} {encounter.object} {encounter.first_frame / fps:.1f} s{sure}"
 
 
 def _draw_band(canvas: Image, path: Path, colour: Colour, thin: int) -> None:

@@ -1,11 +1,16 @@
-"""Frames to an MP4 file that every browser plays. This is the seam to FFmpeg."""
+"""Frames to an MP4 file that every browser plays, and from there to a GIF, a WebP and a contact sheet.
+
+This is the seam to FFmpeg.
+"""
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable
+import io
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -16,8 +21,10 @@ from av.error import FFmpegError
 from av.video.reformatter import ColorRange, Colorspace
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
+from PIL import Image
 
-from cow_service.errors import CowError, InternalError, StorageUnavailable
+from cow_service.errors import InternalError, StorageUnavailable
+from cow_service.media.images import encode_png, fit_within
 
 _RED, _BLUE = 0.2126, 0.0722
 _LUMA = np.array([_RED, 1 - _RED - _BLUE, _BLUE])
@@ -101,7 +108,9 @@ def write_mp4(
     `StorageUnavailable` if the disk is full; `InternalError` if FFmpeg fails otherwise. What `frames` raises passes
     through. After an error no file is left.
     """
-    rate = _rate(fps)
+    rate = Fraction(fps).limit_denominator(_MAX_DENOMINATOR) if 0 < fps < float("inf") else Fraction(0)
+    if rate == 0:
+        raise ValueError(f"fps is {fps}: give at least {1 / _MAX_DENOMINATOR:.4f} frames per second.")
     if width < 1 or height < 1:
         raise ValueError(f"The video is {width} x {height} px: both sides must be at least 1 px.")
     with ExitStack() as on_error:
@@ -111,20 +120,16 @@ def write_mp4(
                 stream = _add_stream(container, rate, width, height, crf)
                 count = _encode(frames, container, stream, (height, width, 3))
         except FFmpegError as error:
-            raise _translated(error) from error
+            if error.errno in _FULL:
+                raise StorageUnavailable(
+                    "The disk is full, the video could not be written: free some space and try again."
+                ) from error
+            # The number and its name alone: the text of the error holds the path.
+            raise InternalError(f"The video could not be encoded (FFmpeg: {error.strerror}).") from error
         if count == 0:
             raise ValueError("There are no frames: a video needs at least one.")
         on_error.pop_all()
     return count
-
-
-def _rate(fps: float) -> Fraction:
-    if not 0 < fps < float("inf"):
-        raise ValueError(f"fps is {fps}: give a positive number of frames per second.")
-    rate = Fraction(fps).limit_denominator(_MAX_DENOMINATOR)
-    if rate == 0:
-        raise ValueError(f"fps is {fps}: give at least {1 / _MAX_DENOMINATOR:.4f} frames per second.")
-    return rate
 
 
 def _add_stream(container: OutputContainer, rate: Fraction, width: int, height: int, crf: int) -> VideoStream:
@@ -154,7 +159,10 @@ def _encode(
     for pixels in frames:
         if pixels.shape != shape or pixels.dtype != np.uint8:
             raise ValueError(f"Frame {count} is {pixels.shape} of {pixels.dtype}: it must be {shape} of uint8.")
-        frame = _to_frame(planes.converted(_even(pixels)))
+        if (height, width) != shape[:2]:
+            pixels = np.pad(pixels, ((0, height - shape[0]), (0, width - shape[1]), (0, 0)), mode="edge")  # noqa: PLW2901
+        frame = av.VideoFrame.from_ndarray(planes.converted(np.ascontiguousarray(pixels)), format="yuv420p")
+        frame.colorspace, frame.color_range = Colorspace.ITU709, ColorRange.MPEG
         frame.pts, frame.time_base = count, stream.codec_context.time_base
         container.mux(stream.encode(frame))
         count += 1
@@ -163,22 +171,75 @@ def _encode(
     return count
 
 
-def _even(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Contiguous, with even sides."""
-    height, width = pixels.shape[:2]
-    if height % 2 or width % 2:
-        pixels = np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    return np.ascontiguousarray(pixels)
+MAX_SIDE = 480  # px of an animated picture: a GIF has no compression to speak of
+GIF_FPS = 12.5  # that browsers show as they should: times of a GIF are hundredths of a second
+SHEET_COLUMNS, SHEET_ROWS, SHEET_SIDE, SHEET_GAP = 4, 3, 320, 4  # px
+WEBP_QUALITY = 80
+
+Pixels = NDArray[np.uint8]
 
 
-def _to_frame(planes: NDArray[np.uint8]) -> av.VideoFrame:
-    frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
-    frame.colorspace, frame.color_range = Colorspace.ITU709, ColorRange.MPEG
-    return frame
+def frames_of(video: bytes, max_side: int | None = None) -> tuple[list[Pixels], float]:
+    """All frames [h, w, 3] of an mp4, RGB, at most `max_side` px, and how many there are in a second."""
+    with av.open(io.BytesIO(video), "r") as container:
+        stream = container.streams.video[0]
+        rate = float(stream.average_rate or 1)
+        frames = (np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in container.decode(stream))
+        return [fit_within(frame, max_side) for frame in frames], rate
 
 
-def _translated(error: FFmpegError) -> CowError:
-    # The number and its name alone: the text of the error holds the path.
-    if error.errno in _FULL:
-        return StorageUnavailable("The disk is full, the video could not be written: free some space and try again.")
-    return InternalError(f"The video could not be encoded (FFmpeg: {error.strerror}).")
+def gif(frames: Sequence[Pixels], fps: float) -> bytes:
+    """An animated GIF that goes on for ever, at most `MAX_SIDE` px and `GIF_FPS` frames a second."""
+    every = max(1, round(fps / GIF_FPS))
+    shown = [Image.fromarray(fit_within(frame, MAX_SIDE)) for frame in frames[::every]]
+    # One palette for all frames: with one for each, what stands still would flicker. The octree keeps small things'
+    # colours, for which the methods that count pixels have none left.
+    palette = _sheet(shown, columns=8).quantize(256, method=Image.Quantize.FASTOCTREE)
+    drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in shown]
+    times = [10 * round(100 * every * place / fps) for place in range(len(shown) + 1)]  # ms, whole hundredths
+    return _saved(drawn, "GIF", duration=[after - time for time, after in pairwise(times)], disposal=1)
+
+
+def webp(frames: Sequence[Pixels], fps: float) -> bytes:
+    """An animated WebP that goes on for ever, at most `MAX_SIDE` px."""
+    shown = [Image.fromarray(fit_within(frame, MAX_SIDE)) for frame in frames]
+    return _saved(shown, "WEBP", duration=round(1000 / fps), quality=WEBP_QUALITY, method=4)
+
+
+def contact_sheet(frames: Sequence[Pixels], fps: float) -> bytes:
+    """A PNG with frames from all over the clip, in rows from left to right."""
+    wanted = min(len(frames), SHEET_COLUMNS * SHEET_ROWS)
+    chosen = np.linspace(0, len(frames) - 1, wanted).round().astype(int)
+    shown = [Image.fromarray(fit_within(frames[index], SHEET_SIDE)) for index in chosen]
+    return encode_png(np.asarray(_sheet(shown, SHEET_COLUMNS)))
+
+
+FORMATS: dict[str, tuple[str, Callable[[Sequence[Pixels], float], bytes]]] = {
+    "gif": ("clip.gif", gif),
+    "webp": ("clip.webp", webp),
+    "sheet": ("sheet.png", contact_sheet),
+}
+"""By the name of a format: the file that it makes, and what makes its bytes of frames and their rate."""
+
+
+def animation(video: bytes, format: str) -> bytes:
+    """The file of a format of `FORMATS`, made of an mp4. Its frames are held as small as they will be in the file."""
+    frames, fps = frames_of(video, SHEET_SIDE if format == "sheet" else MAX_SIDE)
+    return FORMATS[format][1](frames, fps)
+
+
+def _sheet(pictures: Sequence[Image.Image], columns: int) -> Image.Image:
+    width, height = pictures[0].size
+    columns = min(columns, len(pictures))
+    rows = -(-len(pictures) // columns)
+    size = columns * (width + SHEET_GAP) - SHEET_GAP, rows * (height + SHEET_GAP) - SHEET_GAP
+    sheet = Image.new("RGB", size, (255, 255, 255))
+    for place, picture in enumerate(pictures):
+        sheet.paste(picture, (place % columns * (width + SHEET_GAP), place // columns * (height + SHEET_GAP)))
+    return sheet
+
+
+def _saved(pictures: Sequence[Image.Image], format: str, **options: int | list[int]) -> bytes:
+    out = io.BytesIO()
+    pictures[0].save(out, format, save_all=True, append_images=pictures[1:], loop=0, **options)
+    return out.getvalue()

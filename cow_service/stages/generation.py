@@ -111,7 +111,7 @@ def generate(
 
     Raises `InvalidRequest`, `GeneratorOutOfMemory`, `Canceled`.
     """
-    with run.backends.artifacts.batch(run.patience) as artifacts:
+    with run.backends.artifacts.batch(run.retry_policy) as artifacts:
         clip = _clip(run, grounding, motion, trajectory, artifacts)
     frames = (*clip.frames, *clip.factual_frames)
     pictures = (*(frame.sha256 for frame in frames), *([] if clip.video is None else [clip.video.sha256]))

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part
 from cow_service.generators.base import Generator, Limits
-from cow_service.media.artifacts import ArtifactStore, Patience, try_once
+from cow_service.media.artifacts import ArtifactStore, RetryPolicy, try_once
 from cow_service.media.images import DecodedImage, decode_own
 from cow_service.observability.logging import rfc3339
 from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Reader, ReaderInput, WordReader
@@ -124,7 +124,7 @@ class Run(Generic[Request_co]):
     backends: Backends
     progress: Progress = ignore_progress
     step: Step = compute_directly
-    patience: Patience = try_once  # for the store of the artifacts
+    retry_policy: RetryPolicy = try_once  # for the store of the artifacts
     id: str = field(default_factory=lambda: str(uuid.uuid4()))
     created_at: str = field(default_factory=now)
     turn: int = 0  # of the job, among those of all callers: the lower comes first

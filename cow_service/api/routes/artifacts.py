@@ -26,8 +26,8 @@ from cow_service.api.routes.page import is_known
 from cow_service.api.submission import Engine, Owner
 from cow_service.errors import DownloadUnavailable, StorageUnavailable
 from cow_service.jobs.engine import JobEngine
-from cow_service.media.animations import animation
 from cow_service.media.artifacts import extension_of
+from cow_service.media.video import animation
 from cow_service.records import Answer, Job, Simulation, artifacts_of, documents_of
 
 CACHE_CONTROL = "max-age=31536000, immutable"  # bytes never change under their digest
@@ -151,7 +151,7 @@ def make_zip(engine: JobEngine, job_id: str, owner: str | None) -> tuple[FilePat
 
 
 def make_animation(engine: JobEngine, job_id: str, owner: str | None, wanted: str) -> bytes:
-    """The video of a job in a format of `animations.FORMATS`. Blocks, and raises as `make_zip` does."""
+    """The video of a job in a format of `video.FORMATS`. Blocks, and raises as `make_zip` does."""
     job, result = _find_succeeded(engine, job_id, owner)
     again = f"Change GET /jobs/{job.id}/request and send it again"
     simulation = result.simulation if isinstance(result, Answer) else result

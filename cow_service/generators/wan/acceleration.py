@@ -1,15 +1,23 @@
 """Applies the acceleration of a profile to a loaded pipeline.
 
 The order of `accelerate` follows how the parts enclose each other: weights, attention, the compiled block, the cache
-that skips blocks, memory; at last context parallelism around the cache, which `sharing` adds. A block compiled together
-with its cache hooks breaks its graph (first-block) or is not compiled at all (mag); a cache around context parallelism
-would compare a whole tensor with a shard.
+that skips blocks, memory, and last, in `ranks`, context parallelism around the cache. A block compiled together with
+its cache hooks breaks its graph (first-block) or is not compiled at all (mag); a cache around context parallelism would
+compare a whole tensor with a shard.
+
+Private parts of libraries, for which there is no public way:
+- torch `_set_lru_cache`: which of several compiled versions of a block is tried first;
+- diffusers `_reset_stateful_cache` and `_cache_config`: forget the last clip without removing and adding all hooks,
+  which would change their order;
+- cache-dit `_is_cached`, `_context_names` and `_context_manager`: the same for its cache.
 """
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Generator, Mapping
+import sys
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -18,9 +26,11 @@ from torch import nn
 
 from cow_service.errors import CowError, GeneratorUnavailable
 from cow_service.generators.wan.capabilities import detect_capabilities, refusals
-from cow_service.generators.wan.float8 import check_float8
 from cow_service.generators.wan.profiles import Acceleration
-from cow_service.generators.wan.step_caches import enable_cache
+
+WARM_UP_SHARE = 5  # dbcache never skips in the first fifth of the steps, as mag does not
+MAX_SKIPPED = 3  # steps in a row that dbcache skips, as mag does
+FIRST_LAYERS = 5  # dbcache computes a fifth of the layers in every step, and decides by them
 
 
 def check_device(
@@ -28,49 +38,62 @@ def check_device(
 ) -> None:
     """Raises `GeneratorUnavailable` listing everything that the device cannot do. Nothing is loaded.
 
-    `others`: those of the model's profiles, of which the error names the ones that the device can run.
+    `others`: the model's profiles, of which the error names those that the device can run.
     """
-    with translated(f"device: {device}"):
+    with naming_option(f"device: {device}"):
         machine = detect_capabilities(device)
-    sentences = refusals(acceleration, machine)
-    if sentences:
+    if sentences := refusals(acceleration, machine):
         able = ", ".join(name for name, each in (others or {}).items() if not refusals(each, machine))
         remedy = f"This machine can run: {able}" if able else "Another profile may do"
         raise GeneratorUnavailable(f"{' '.join(sentences)} {remedy} (COW_PROFILE).")
 
 
-def accelerate(pipeline: object, acceleration: Acceleration, device: torch.device) -> None:
+def accelerate(pipeline: Any, wanted: Acceleration, device: torch.device) -> None:
     """Applies every option to the pipeline's parts and moves them to the device. Call it once per pipeline.
 
     Raises `GeneratorUnavailable`: for what the device cannot do, before anything is changed, or naming the option that
     failed. Compilation happens in the first clip.
     """
-    wanted, parts = acceleration, cast(Any, pipeline)
-    accelerate_transformer(parts.transformer, wanted, device)
-    _apply(
-        ("vae_tiling", wanted.vae_tiling, lambda: parts.vae.enable_tiling()),  # noqa: PLW0108 - there may be no VAE
-        (f"offload: {wanted.offload}", True, lambda: _place(parts, wanted.offload, device)),
-    )
+    accelerate_transformer(pipeline.transformer, wanted, device)
+    if wanted.vae_tiling:
+        with naming_option("vae_tiling"):
+            pipeline.vae.enable_tiling()
+    with naming_option(f"offload: {wanted.offload}"):
+        if wanted.offload == "none":
+            pipeline.to(device)
+        elif wanted.offload == "model":
+            pipeline.enable_model_cpu_offload(device=device)
+        elif wanted.offload == "sequential":
+            pipeline.enable_sequential_cpu_offload(device=device)
+        else:
+            _offload_groups(pipeline, device)
 
 
 def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch.device) -> None:
     """The same for a transformer without the other parts, which stays where it is."""
     check_device(wanted, device)
-    _apply(
-        (f"fp8: {wanted.fp8}", wanted.fp8 in {"weights", "dynamic"}, lambda: _quantise(transformer, wanted, device)),
-        ("fp8: stored", wanted.fp8 == "stored", lambda: check_float8(transformer)),
-        (f"attention: {wanted.attention}", True, lambda: transformer.set_attention_backend(wanted.attention)),
-        ("compile: regional", wanted.compile != "none", lambda: _compile(transformer)),
-        (f"cache: {wanted.cache}", wanted.cache != "none", lambda: enable_cache(transformer, wanted)),
-    )
+    with naming_option(f"fp8: {wanted.fp8}"):
+        if wanted.fp8 == "stored":
+            if all(type(layer.weight) is nn.Parameter for layer in _linear_layers(transformer)):
+                raise ValueError("the checkpoint holds no weights in float8: give one that does (COW_CHECKPOINTS)")
+        elif wanted.fp8 != "none":
+            _quantise(transformer, wanted, device)
+    with naming_option(f"attention: {wanted.attention}"):
+        transformer.set_attention_backend(wanted.attention)
+    if wanted.compile != "none":
+        with naming_option("compile: regional"):
+            # Try the code that was compiled for one size before that for any size, which fits as well and is slower:
+            # by default the newest comes first.
+            cast(Any, torch)._C._dynamo.eval_frame._set_lru_cache(False)
+            # Not `compile_repeated_blocks`: that also compiles the wrappers around `forward`, with the hooks of caches.
+            for block in transformer.blocks:
+                block.forward = torch.compile(block.forward)
+    with naming_option(f"cache: {wanted.cache}"):
+        _enable_cache(transformer, wanted)
 
 
-def _apply(*steps: tuple[str, bool, Callable[[], object]]) -> None:
-    """Those that apply, in order; an error names the option."""
-    for option, applies, apply in steps:
-        if applies:
-            with translated(option):
-                apply()
+def _linear_layers(transformer: Any) -> list[nn.Linear]:
+    return [layer for layer in transformer.blocks.modules() if isinstance(layer, nn.Linear)]
 
 
 def _quantise(transformer: Any, wanted: Acceleration, device: torch.device) -> None:
@@ -88,37 +111,81 @@ def _quantise(transformer: Any, wanted: Acceleration, device: torch.device) -> N
         if wanted.offload != "none":
             block.to("cpu")
     # torchao silently skips layers whose shape its kernels do not support.
-    layers = transformer.blocks.modules()
-    if any(isinstance(layer, nn.Linear) and type(layer.weight) is nn.Parameter for layer in layers):
+    if any(type(layer.weight) is nn.Parameter for layer in _linear_layers(transformer)):
         raise ValueError("the sides of some weights are not multiples of 16")
 
 
-def _compile(transformer: Any) -> None:
-    # Code that was compiled for one size is looked for before that for any size, which would fit as well and is slower:
-    # by default the newest comes first.
-    cast(Any, torch)._C._dynamo.eval_frame._set_lru_cache(False)
-    # Not `compile_repeated_blocks`: that also compiles the wrappers around `forward`, where the cache hooks are.
-    for block in transformer.blocks:
-        block.forward = torch.compile(block.forward)
+def _enable_cache(transformer: Any, wanted: Acceleration) -> None:
+    if wanted.cache == "first-block":
+        from diffusers.hooks.first_block_cache import FirstBlockCacheConfig  # noqa: PLC0415
+
+        transformer.enable_cache(FirstBlockCacheConfig(threshold=wanted.cache_threshold))
+    elif wanted.cache == "mag":
+        from diffusers.hooks.mag_cache import MagCacheConfig  # noqa: PLC0415
+
+        ratios = torch.tensor(wanted.mag_ratios)
+        config: Any = MagCacheConfig(
+            threshold=wanted.cache_threshold, num_inference_steps=len(ratios), mag_ratios=ratios
+        )
+        config.measured = ratios
+        transformer.enable_cache(config)
+    elif wanted.cache == "dbcache":
+        os.environ.setdefault("CACHE_DIT_LOG_LEVEL", "WARNING")
+        import cache_dit  # noqa: PLC0415
+
+        if _has_dbcache(transformer):
+            raise ValueError("a cache has already been enabled")
+        dbcache = cache_dit.DBCacheConfig(
+            Fn_compute_blocks=max(1, len(transformer.blocks) // FIRST_LAYERS),
+            residual_diff_threshold=wanted.cache_threshold,
+            max_continuous_cached_steps=MAX_SKIPPED,
+            enable_separate_cfg=True,
+        )
+        order = wanted.cache_taylor_order
+        # Without the encoder's: the text is the same in every step.
+        taylor = cache_dit.TaylorSeerCalibratorConfig(taylorseer_order=order, enable_encoder_calibrator=False)
+        cache_dit.enable_cache(transformer, cache_config=dbcache, calibrator_config=taylor if order else None)
 
 
-def _place(parts: Any, offload: str, device: torch.device) -> None:
-    if offload == "none":
-        parts.to(device)
-    elif offload == "model":
-        parts.enable_model_cpu_offload(device=device)
-    elif offload == "sequential":
-        parts.enable_sequential_cpu_offload(device=device)
-    else:
-        _offload_groups(parts, device)
+def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2) -> None:
+    """Clears the step cache. Call it before every clip, so that no residual of one clip enters the next.
+
+    `steps`: denoising steps of the coming clip; by default one per ratio of mag. `branches`: passes of each step here.
+    Run every pass in `transformer.cache_context("cond")` or `("uncond")`, one after the other: each has its own state.
+    """
+    if "cache_dit" in sys.modules and _has_dbcache(transformer):
+        import cache_dit  # noqa: PLC0415
+
+        changed = cache_dit.DBCacheConfig().reset(
+            num_inference_steps=steps,
+            max_warmup_steps=None if steps is None else -(-steps // WARM_UP_SHARE),
+            enable_separate_cfg=branches == 2,
+        )
+        cache_dit.refresh_context(transformer, cache_config=changed)
+        for name in transformer._context_names:  # else the old one would be held until the next pass
+            transformer._context_manager.set_context(name)
+        return
+    from diffusers.hooks.mag_cache import MagCacheConfig, nearest_interp  # noqa: PLC0415
+
+    transformer._reset_stateful_cache()
+    config = transformer._cache_config
+    if isinstance(config, MagCacheConfig):  # the hooks of all blocks share this one object
+        ratios = config.measured  # pyright: ignore[reportAttributeAccessIssue] - of `_enable_cache`
+        config.num_inference_steps = steps or len(ratios)
+        config.mag_ratios = nearest_interp(ratios, config.num_inference_steps)
 
 
-def _offload_groups(parts: Any, device: torch.device) -> None:
+def _has_dbcache(transformer: Any) -> bool:
+    return getattr(transformer, "_is_cached", False)
+
+
+def _offload_groups(pipeline: Any, device: torch.device) -> None:
     """Offloads the transformer by block and the encoders by layer; the VAE is small and stays on the device."""
     from diffusers.hooks.group_offloading import apply_group_offloading  # noqa: PLC0415
 
-    models = {name: part for name, part in parts.components.items() if isinstance(part, nn.Module)}
-    for name, model in models.items():
+    for name, model in pipeline.components.items():
+        if not isinstance(model, nn.Module):
+            continue
         if name == "vae":
             model.to(device)
         elif name == "transformer":
@@ -135,7 +202,7 @@ def _offload_groups(parts: Any, device: torch.device) -> None:
 def pin(module: nn.Module) -> None:
     """Puts weights into pinned memory, one by one: the memory of each is free again before the next one is pinned.
 
-    diffusers pins copies of all before it lets go of any; what is pinned already it takes as it is.
+    diffusers pins copies of all weights before it releases any; those that are pinned already it takes as they are.
     """
     for tensor in (*module.parameters(), *module.buffers()):
         if names := getattr(type(tensor), "tensor_data_names", ()):  # torchao's, which are made of others
@@ -146,7 +213,7 @@ def pin(module: nn.Module) -> None:
 
 
 @contextmanager
-def translated(option: str) -> Generator[None]:
+def naming_option(option: str) -> Generator[None]:
     """Turns any exception of a library into `GeneratorUnavailable` naming the option and the reason, without paths."""
     try:
         yield

@@ -1,6 +1,6 @@
 """Which attention backend is the fastest for a clip: those that a machine has are timed once, at the clip's shape.
 
-It cannot be told beforehand: cuDNN's is the faster one on some GPUs and the slower one on others, and lacks shapes.
+No rule tells: cuDNN's is the faster one on some GPUs and the slower one on others, and lacks shapes.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from torch import Tensor
 
 from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities, is_from_hub, refusals
 from cow_service.generators.wan.checkpoints import diffusers_config
-from cow_service.generators.wan.execution import has_failed, wait_until_done
+from cow_service.generators.wan.memory import has_failed, wait_until_done
 from cow_service.generators.wan.pipeline import token_count
 from cow_service.generators.wan.profiles import Acceleration, Profile
 from cow_service.weights.device import is_out_of_memory
 
 NATIVE = "native"  # what the others are compared with
 TRIALS = 3  # after one that is not counted
-MARGIN = 1.05  # within which the first one is taken: else noise would choose, each time another
+MARGIN = 1.05  # of two that are closer, the first one is taken: else noise would choose, each time another
 MAX_ERROR = 0.02  # of the largest value: the roundings of bfloat16 stay below it
 FRAMES = 81  # of the longest clip
 
@@ -58,6 +58,11 @@ class TimedBackend:
         """Whether it computes the same to rounding."""
         return self.seconds is not None and self.error is not None and self.error <= MAX_ERROR
 
+    def __str__(self) -> str:
+        if self.seconds is None or self.error is None:
+            return f"{self.name} cannot be used ({self.reason})"
+        return f"{self.name} {1000 * self.seconds:.3g} ms" + ("" if self.usable else f", off by {self.error:.2g}")
+
 
 def shape_of(architecture: Mapping[str, Any], width: int, height: int, num_frames: int = FRAMES) -> AttentionShape:
     """The shape at which a model attends to a clip of that size (px)."""
@@ -73,7 +78,32 @@ def time_backends(
     drawn = torch.Generator(device).manual_seed(0)
     q, k, v = (torch.randn(1, *shape, generator=drawn, device=device).to(dtype) for _ in range(3))
     expected = _attended(NATIVE, q, k, v)
-    return tuple(_timed(name, expected, q, k, v) for name in names)
+
+    def timed(name: str) -> TimedBackend:
+        try:
+            found = _attended(name, q, k, v)
+            error = float((found - expected).abs().max() / expected.abs().max())
+            del found
+            seconds: list[float] = []
+            for _ in range(TRIALS):
+                begun = time.perf_counter()
+                _attended(name, q, k, v)
+                seconds.append(time.perf_counter() - begun)
+            return TimedBackend(name, statistics.median(seconds), error)
+        except Exception as problem:
+            if isinstance(problem, RuntimeError) and not is_out_of_memory(problem) and has_failed(device, problem):
+                raise  # nothing can be computed on the device any more
+            return TimedBackend(name, None, None, _first_line(problem))
+
+    return tuple(timed(name) for name in names)
+
+
+@torch.no_grad()
+def _attended(name: str, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    with attention_backend(name):
+        found = dispatch_attention_fn(q, k, v)
+    wait_until_done(q.device)
+    return found
 
 
 def fastest(timed: Iterable[TimedBackend]) -> str:
@@ -91,10 +121,10 @@ def with_attention(
     device: torch.device,
     kept: Path | None = None,
 ) -> Profile:
-    """The profile with the backend that `attention: auto` comes to on this device; any other profile as it is.
+    """The profile with the backend that `attention: auto` chooses on this device; any other profile as it is.
 
-    `width`, `height`: px of a clip. `kept`: file of earlier choices, so that another start of the same versions on the
-    same GPU does not choose another one, by which clips would not be found again.
+    `width`, `height`: px of a clip. `kept`: file of earlier choices. Without it another start of the same versions on
+    the same GPU might choose another backend, and cached clips would not be found.
     """
     wanted = profile.acceleration
     if wanted.attention != AUTO:
@@ -102,17 +132,28 @@ def with_attention(
     machine, shape = detect_capabilities(device), shape_of(architecture, width, height)
     names = backends_for_auto(wanted, machine)
     situation = repr((machine.name, torch.__version__, diffusers.__version__, profile.dtype, tuple(shape), names))
-    before = _read(kept)
+    before = _read_choices(kept)
     chosen = before.get(situation)
     if chosen in names and _fetched(chosen) is None:
         log.info("attention: %s, as was chosen before", chosen)
     else:
         timed = () if len(names) < 2 else time_backends(names, shape, getattr(torch, profile.dtype), device)
         chosen = fastest(timed)
-        log.info("attention: %s%s", chosen, "".join(f"; {_words(one)}" for one in timed))
+        log.info("attention: %s", "; ".join(map(str, (chosen, *timed))))
         if kept is not None and all(one.seconds is not None for one in timed):  # else one may be there the next time
-            _write(kept, before | {situation: chosen})
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            part = kept.with_name(f"{kept.name}.{os.getpid()}")
+            part.write_text(json.dumps(before | {situation: chosen}, indent=2) + "\n")
+            part.replace(kept)
     return profile.model_copy(update={"acceleration": wanted.model_copy(update={"attention": chosen})})
+
+
+def _read_choices(kept: Path | None) -> dict[str, str]:
+    try:
+        found: Any = {} if kept is None else json.loads(kept.read_text())
+    except (OSError, ValueError):  # there is none yet, or it is damaged
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def fetch_kernels(wanted: Iterable[Acceleration], device: torch.device) -> dict[str, str | None]:
@@ -128,54 +169,13 @@ def fetch_kernels(wanted: Iterable[Acceleration], device: torch.device) -> dict[
 
 
 def _fetched(name: str) -> str | None:
+    """Fetches a backend's kernel where it has one. Returns why that failed; None where it did not."""
     try:
         with attention_backend(name):
             return None
     except Exception as problem:  # noqa: BLE001 - of the hub, of the package kernels, or of the kernel's own code
-        return f"{type(problem).__name__}: {(str(problem).splitlines() or [''])[0]}"
+        return _first_line(problem)
 
 
-def _read(kept: Path | None) -> dict[str, str]:
-    try:
-        found: Any = {} if kept is None else json.loads(kept.read_text())
-    except (OSError, ValueError):  # there is none yet, or what is there is no use
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
-def _write(kept: Path, choices: dict[str, str]) -> None:
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    part = kept.with_name(f"{kept.name}.{os.getpid()}")
-    part.write_text(json.dumps(choices, indent=2) + "\n")
-    part.replace(kept)
-
-
-def _timed(name: str, expected: Tensor, q: Tensor, k: Tensor, v: Tensor) -> TimedBackend:
-    try:
-        found = _attended(name, q, k, v)
-        error = float((found - expected).abs().max() / expected.abs().max())
-        del found
-        seconds: list[float] = []
-        for _ in range(TRIALS):
-            begun = time.perf_counter()
-            _attended(name, q, k, v)
-            seconds.append(time.perf_counter() - begun)
-        return TimedBackend(name, statistics.median(seconds), error)
-    except Exception as problem:
-        if isinstance(problem, RuntimeError) and not is_out_of_memory(problem) and has_failed(q.device, problem):
-            raise  # nothing can be computed on the device any more
-        return TimedBackend(name, None, None, f"{type(problem).__name__}: {(str(problem).splitlines() or [''])[0]}")
-
-
-@torch.no_grad()
-def _attended(name: str, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    with attention_backend(name):
-        found = dispatch_attention_fn(q, k, v)
-    wait_until_done(q.device)
-    return found
-
-
-def _words(one: TimedBackend) -> str:
-    if one.seconds is None or one.error is None:
-        return f"{one.name} cannot be used ({one.reason})"
-    return f"{one.name} {1000 * one.seconds:.3g} ms" + ("" if one.usable else f", off by {one.error:.2g}")
+def _first_line(problem: Exception) -> str:
+    return f"{type(problem).__name__}: {(str(problem).splitlines() or [''])[0]}"

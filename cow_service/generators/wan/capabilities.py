@@ -81,18 +81,17 @@ class Capabilities(Record):
     @property
     def description(self) -> str:
         """The device in words, for messages."""
-        kind = "" if self.compute_capability is None else f" of compute capability {dotted(self.compute_capability)}"
-        return f"this device is {self.name}{kind}" if kind else f"this device is the {self.device.upper()}"
-
-
-def dotted(capability: ComputeCapability) -> str:
-    """A compute capability as NVIDIA writes it."""
-    return f"{capability[0]}.{capability[1]}"
+        if self.compute_capability is None:
+            return f"this device is the {self.device.upper()}"
+        return f"this device is {self.name} of compute capability {_dotted(self.compute_capability)}"
 
 
 def detect_capabilities(device: torch.device) -> Capabilities:
     """What this machine supports on a device."""
     gpu = torch.cuda.get_device_properties(device) if device.type == "cuda" else None
+    # PyTorch's compiler builds C++ for the CPU, and Triton a C launcher for the GPU, both against Python's headers.
+    header = Path(sysconfig.get_paths()["include"]) / "Python.h"
+    compilers = os.environ.get("CXX", "g++"), "clang++"
     return Capabilities(
         device=device.type,
         name=gpu.name if gpu else platform.machine(),
@@ -100,14 +99,8 @@ def detect_capabilities(device: torch.device) -> Capabilities:
         memory=gpu.total_memory if gpu else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         gpus=max(0, torch.cuda.device_count() - (device.index or 0)),
         packages=tuple(name for name, least in MINIMUM_VERSIONS.items() if _is_installed(name, least)),
-        compiler=_has_compiler(),
+        compiler=header.is_file() and any(shutil.which(name) for name in compilers),
     )
-
-
-def refusals(acceleration: Acceleration, available: Capabilities) -> tuple[str, ...]:
-    """One sentence, with reason and remedy, for each option that is not supported; empty if all are."""
-    checks = (_attention, _compiling, _caching, _float8, _offloading, _splitting)
-    return tuple(sentence for check in checks for sentence in check(acceleration, available))
 
 
 def backends_for_auto(acceleration: Acceleration, available: Capabilities) -> tuple[str, ...]:
@@ -117,7 +110,7 @@ def backends_for_auto(acceleration: Acceleration, available: Capabilities) -> tu
         for name, backend in ATTENTION_BACKENDS.items()
         if backend.in_auto
         and (backend.context_parallel or acceleration.context_parallel == 1)
-        and not any(_attention(acceleration.model_copy(update={"attention": name}), available))
+        and not any(_refuse_attention(acceleration.model_copy(update={"attention": name}), available))
     )
 
 
@@ -127,7 +120,13 @@ def is_from_hub(name: str) -> bool:
     return backend is not None and backend.package == "kernels"
 
 
-def _attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+def refusals(acceleration: Acceleration, available: Capabilities) -> tuple[str, ...]:
+    """One sentence, with reason and remedy, for each option that is not supported; empty if all are."""
+    checks = _refuse_attention, _refuse_computing, _refuse_placing
+    return tuple(sentence for refuse in checks for sentence in refuse(acceleration, available))
+
+
+def _refuse_attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     name, backend = wanted.attention, ATTENTION_BACKENDS.get(wanted.attention)
     if name == AUTO:
         if available.device != "cuda":
@@ -138,75 +137,66 @@ def _attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
         return
     low, high, own = backend.at_least, backend.at_most, available.compute_capability
     if low and (own is None or not low <= own <= (high or own)):
-        least = dotted(low) if low == high else f"{dotted(low)} or more"
-        needed = f"a GPU of compute capability {least}"
-        yield f"attention: '{name}' needs {needed}, and {available.description}; choose native."
+        needed = _dotted(low) if low == high else f"{_dotted(low)} or more"
+        remedy = f"and {available.description}; choose native"
+        yield f"attention: '{name}' needs a GPU of compute capability {needed}, {remedy}."
     if backend.package and backend.package not in available.packages:
         others = f"{HUB[backend.package]} or native" if backend.package in HUB else "native"
         yield f"attention: '{name}' needs {_package(backend.package)}; install it, or choose {others}."
 
 
-def _compiling(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
-    if wanted.compile == "none":
-        return
-    if available.device == "cuda" and "triton" not in available.packages:
-        yield f"compile: regional needs {_package('triton')}; install it, or choose none."
-    if not available.compiler:
-        yield "compile: regional needs a C++ compiler and Python's headers; install them, or choose none."
-    if wanted.offload == "sequential":
-        yield "compile: sequential offload moves every layer by itself, which leaves nothing to compile; choose none."
-
-
-def _caching(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+def _refuse_computing(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+    """What `compile`, `cache` and `fp8` lack."""
+    if wanted.compile != "none":
+        if available.device == "cuda" and "triton" not in available.packages:
+            yield f"compile: regional needs {_package('triton')}; install it, or choose none."
+        if not available.compiler:
+            yield "compile: regional needs a C++ compiler and Python's headers; install them, or choose none."
+        if wanted.offload == "sequential":
+            remedy = "which leaves nothing to compile; choose none"
+            yield f"compile: sequential offload moves every layer by itself, {remedy}."
     if wanted.cache == "mag" and not wanted.mag_ratios:
         yield "cache: mag needs `mag_ratios`, measured on these weights; give them, or choose first-block."
-    if wanted.cache == "dbcache":
-        if "cache-dit" not in available.packages:
-            yield f"cache: dbcache needs {_package('cache-dit')}; install it, or choose first-block."
-        if wanted.ranks > 1:  # it counts passes, of which each GPU sees its own
-            yield "cache: dbcache is for one GPU; choose mag or none."
+    if wanted.cache == "dbcache" and "cache-dit" not in available.packages:
+        yield f"cache: dbcache needs {_package('cache-dit')}; install it, or choose first-block."
+    if wanted.cache == "dbcache" and wanted.ranks > 1:  # it counts passes, of which each GPU sees its own
+        yield "cache: dbcache is for one GPU; choose mag or none."
     if wanted.cache == "first-block" and wanted.context_parallel > 1:
         # Each GPU measures the change of its own shard; if only some skip, the others wait for their tensors forever.
         yield "cache: GPUs that share a video would not skip the same steps with first-block; choose mag or none."
-
-
-def _float8(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
-    if wanted.fp8 == "none":
-        return
-    if "torchao" not in available.packages:
+    if wanted.fp8 != "none" and "torchao" not in available.packages:
         yield f"fp8: {wanted.fp8} needs {_package('torchao')}; install it, or choose none."
-    own, needed = available.compute_capability, f"compute capability {dotted(ADA)} or more"
-    if wanted.fp8 == "dynamic" and (own or (0, 0)) < ADA:
+    own, needed = available.compute_capability, f"compute capability {_dotted(ADA)} or more"
+    if wanted.fp8 == "dynamic" and (own is None or own < ADA):
         yield f"fp8: dynamic needs a GPU of {needed}, and {available.description}; choose none."
-    held = wanted.fp8 in {"stored", "weights"}
-    if held and wanted.compile != "none" and own and own < ADA:  # Triton has no float8 there
-        remedy = "choose `compile: none`"
-        yield f"fp8: {wanted.fp8} can only be compiled for {needed}, and {available.description}; {remedy}."
+    if wanted.fp8 in {"stored", "weights"} and wanted.compile != "none" and own and own < ADA:  # Triton lacks it there
+        remedy = f"and {available.description}; choose `compile: none`"
+        yield f"fp8: {wanted.fp8} can only be compiled for {needed}, {remedy}."
 
 
-def _offloading(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
-    if wanted.offload == "none":
-        return
-    if available.device != "cuda":
-        yield f"offload: {wanted.offload} needs a GPU to move weights to, and {available.description}; choose none."
-    if "accelerate" not in available.packages:
-        yield f"offload: {wanted.offload} needs {_package('accelerate')}; install it, or choose none."
-
-
-def _splitting(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
-    if wanted.ranks == 1:
-        return
-    if available.device == "cuda" and available.gpus < wanted.ranks:
-        yield f"{wanted.ranks} GPUs are to share a clip, from that of COW_DEVICE on, and there are {available.gpus}."
+def _refuse_placing(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
+    """What `offload`, `context_parallel` and `guidance_parallel` lack."""
     if wanted.offload != "none":
-        yield f"offload: {wanted.offload} is for one GPU, and {wanted.ranks} are to share a clip; choose none."
-    if wanted.context_parallel == 1:
-        return
-    if available.device != "cuda":
-        yield f"context_parallel: {wanted.context_parallel} needs GPUs, and {available.description}; choose 1."
-    if not ATTENTION_BACKENDS.get(wanted.attention, ATTENTION_BACKENDS["native"]).context_parallel:
-        able = ", ".join(name for name, backend in ATTENTION_BACKENDS.items() if backend.context_parallel)
-        yield f"context_parallel: attention '{wanted.attention}' cannot be split among GPUs; choose one of {able}."
+        if available.device != "cuda":
+            yield f"offload: {wanted.offload} needs a GPU to move weights to, and {available.description}; choose none."
+        if "accelerate" not in available.packages:
+            yield f"offload: {wanted.offload} needs {_package('accelerate')}; install it, or choose none."
+    if wanted.ranks > 1:
+        if available.device == "cuda" and available.gpus < wanted.ranks:
+            needed = f"{wanted.ranks} GPUs are to share a clip, from that of COW_DEVICE on"
+            yield f"{needed}, and there are {available.gpus}."
+        if wanted.offload != "none":
+            yield f"offload: {wanted.offload} is for one GPU, and {wanted.ranks} are to share a clip; choose none."
+    if wanted.context_parallel > 1:
+        if available.device != "cuda":
+            yield f"context_parallel: {wanted.context_parallel} needs GPUs, and {available.description}; choose 1."
+        if not ATTENTION_BACKENDS.get(wanted.attention, ATTENTION_BACKENDS["native"]).context_parallel:
+            able = ", ".join(name for name, backend in ATTENTION_BACKENDS.items() if backend.context_parallel)
+            yield f"context_parallel: attention '{wanted.attention}' cannot be split among GPUs; choose one of {able}."
+
+
+def _dotted(capability: ComputeCapability) -> str:
+    return f"{capability[0]}.{capability[1]}"
 
 
 def _package(name: str) -> str:
@@ -215,16 +205,8 @@ def _package(name: str) -> str:
 
 def _is_installed(name: str, least: str) -> bool:
     try:
-        return _numbers(metadata.version(name)) >= _numbers(least)
+        found = metadata.version(name)
     except metadata.PackageNotFoundError:
         return False
-
-
-def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])
-
-
-def _has_compiler() -> bool:
-    """PyTorch's compiler builds C++ for the CPU, and Triton a C launcher for the GPU, both against Python's headers."""
-    header = Path(sysconfig.get_paths()["include"]) / "Python.h"
-    return header.is_file() and any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "clang++"))
+    numbers, wanted = ([int(number) for number in re.findall(r"\d+", version)[:3]] for version in (found, least))
+    return numbers >= wanted

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
-from typing import cast
+from pathlib import Path
+from typing import NamedTuple, cast
 
 import torch
 
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.generators.base import GeneratorInput
-from cow_service.generators.wan.compiling import FRAMES, ClipSize, compile_for
 from cow_service.generators.wan.conditioning import TrackConditioning
-from cow_service.generators.wan.denoising import Conditioning, Denoise
-from cow_service.generators.wan.embedding_cache import EmbeddingCache
-from cow_service.generators.wan.execution import exclusive_use, within_memory
-from cow_service.generators.wan.options import WanLimits, WanOptions
-from cow_service.generators.wan.pipeline import WanTrackPipeline, latent_shape
-from cow_service.generators.wan.profiles import Profile
-from cow_service.generators.wan.rank_group import RankGroup
-from cow_service.generators.wan.sampling import Sampling
+from cow_service.generators.wan.memory import exclusive_use, within_memory
+from cow_service.generators.wan.pipeline import (
+    TEXT_LENGTH,
+    Conditioning,
+    Denoise,
+    EmbeddingCache,
+    WanTrackPipeline,
+    image_token_count,
+    latent_shape,
+)
+from cow_service.generators.wan.profiles import Profile, Sampling, WanLimits, WanOptions
+from cow_service.generators.wan.ranks import RankGroup
 from cow_service.generators.wan.tracks import tracks_of
 from cow_service.records import GeneratorInfo
 from cow_service.vision.masks import Image
@@ -31,6 +38,19 @@ USUAL_SIDES = 832, 480  # their ratio
 SIDE_MULTIPLE = 16  # px: the sides of a clip are multiples of it
 MAX_SIDE = 1024 * SIDE_MULTIPLE  # px: the model has 1024 positions each way
 DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
+# Frames of the two clips to compile for: the longest, which is the default of most requests, then any other.
+COMPILED_FRAMES = (81, 17)
+CONDITION_CHANNELS = 20
+
+log = logging.getLogger("cow_service")
+
+
+class ClipSize(NamedTuple):
+    """Pixels, and frames."""
+
+    width: int
+    height: int
+    num_frames: int
 
 
 def clip_size(max_area: int, width: int, height: int) -> tuple[int, int]:
@@ -49,7 +69,7 @@ class LoadedModel:
     repository: str | None
     revision: str | None
     revisions: dict[str, str]  # of the other parts that were pulled
-    weights_identity: str  # as `weights.lock.weights_identity`, taken before the weights were loaded
+    weights_identity: str  # as `weights_identity`, taken before the weights were loaded
     pipeline: WanTrackPipeline
     group: RankGroup | None  # of processes that denoise with this one
     device: torch.device
@@ -105,7 +125,7 @@ class WanGenerator(WanLimits):
         if model.profile.acceleration.compile == "none":
             return
         width, height = self.size(*USUAL_SIDES)
-        sizes = [ClipSize(width, height, frames) for frames in FRAMES]
+        sizes = [ClipSize(width, height, frames) for frames in COMPILED_FRAMES]
         with (
             exclusive_use(model.device, lambda: None),
             cpu_threads(model.threads),
@@ -219,3 +239,29 @@ def _options(given: GeneratorInput) -> WanOptions:
 def _prompt(given: GeneratorInput) -> str:
     prompt = _options(given).prompt
     return given.motion.sentence if prompt is None else prompt
+
+
+def keep_compiled_code(folder: Path) -> None:
+    """Makes PyTorch keep compiled code in a folder for the next start, unless the environment names another one."""
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
+
+
+def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling, sizes: Iterable[ClipSize]) -> None:
+    """One denoising step for a clip of each size, with zeros in place of text, image and noise; logs what it takes.
+
+    PyTorch compiles a block for the first size that it meets, and once more, for any size, when it meets a second one.
+    The first code stays for its own size, and is the faster one: so the size of most clips comes first.
+
+    `denoise`: the pipeline's, or that of several processes.
+    """
+    step = sampling.model_copy(update={"steps": 1})
+    config, device = pipeline.transformer.config, pipeline.compute_device
+    text = torch.zeros(1, TEXT_LENGTH, config.text_dim, device=device)
+    image = torch.zeros(1, image_token_count(pipeline.image_encoder), config.image_dim, device=device)
+    for size in sizes:
+        begun = time.perf_counter()
+        noise = torch.zeros(latent_shape(*size))
+        condition = torch.zeros(CONDITION_CHANNELS, *noise.shape[2:])
+        given = Conditioning(text, text if step.guided else None, image, condition, condition)
+        denoise(noise, given, step, lambda done, total: None)
+        log.info("compiled for %d x %d px and %d frames in %.1f s", *size, time.perf_counter() - begun)

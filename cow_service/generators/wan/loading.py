@@ -1,35 +1,55 @@
-"""Makes the video generators: finds and checks their weights, loads them, applies the profile."""
+"""Makes the video generators: finds and checks their weights, loads them, applies the profile.
+
+`create_...` are the factories of the entry points in pyproject.toml. Those of the tiny models have the real classes at
+toy size, with seeded random weights and a toy tokenizer: they make a clip in a second on a CPU. Its frames mean
+nothing; it is for tests, and to try a deployment out.
+"""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
-from diffusers import WanTransformer3DModel
+from diffusers import AutoencoderKLWan, WanTransformer3DModel
+from safetensors import SafetensorError
+from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
 from torch import distributed, nn
+from transformers import (
+    AutoTokenizer,
+    CLIPImageProcessor,
+    CLIPVisionConfig,
+    CLIPVisionModel,
+    PreTrainedTokenizerFast,
+    UMT5Config,
+    UMT5EncoderModel,
+)
 
-from cow_service.errors import GeneratorOutOfMemory, GeneratorUnavailable
+from cow_service.errors import CheckpointInvalid, GeneratorOutOfMemory, GeneratorUnavailable
 from cow_service.generators.wan import conditioning
-from cow_service.generators.wan.acceleration import accelerate, accelerate_transformer, check_device, translated
+from cow_service.generators.wan.acceleration import accelerate, accelerate_transformer, check_device, naming_option
 from cow_service.generators.wan.attention import with_attention
-from cow_service.generators.wan.checkpoints import checkpoint_files, load_transformer
-from cow_service.generators.wan.compiling import keep_compiled_code
-from cow_service.generators.wan.components import assemble
-from cow_service.generators.wan.execution import within_memory
-from cow_service.generators.wan.generator import USUAL_SIDES, LoadedModel, WanGenerator, clip_size
-from cow_service.generators.wan.lora import add_lora
-from cow_service.generators.wan.memory import check_memory
-from cow_service.generators.wan.pipeline import WanTrackPipeline
-from cow_service.generators.wan.profiles import Profile, profile_of
-from cow_service.generators.wan.rank_group import RankGroup
-from cow_service.generators.wan.tiny import make_tiny
+from cow_service.generators.wan.checkpoints import (
+    add_lora,
+    checkpoint_files,
+    counted,
+    diffusers_config,
+    load_transformer,
+)
+from cow_service.generators.wan.generator import USUAL_SIDES, LoadedModel, WanGenerator, clip_size, keep_compiled_code
+from cow_service.generators.wan.memory import check_memory, within_memory
+from cow_service.generators.wan.pipeline import LATENT_CHANNELS, WanTrackPipeline, compose
+from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
+from cow_service.generators.wan.ranks import RankGroup
 from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device
-from cow_service.weights.lock import folder_of, read_lock, verify, weights_identity
 from cow_service.weights.manifests import Manifest, load_manifests
+from cow_service.weights.repositories import folder_of, read_lock, verify, weights_identity
+
+TINY_SEED = 0
 
 log = logging.getLogger("cow_service")
 
@@ -90,7 +110,6 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     return generator
 
 
-# The factories of the entry points in pyproject.toml.
 create_ati = partial(load, "ati", conditioning.ati)
 create_wan_move = partial(load, "wan-move", conditioning.wan_move)
 create_tiny_ati = partial(load, "tiny-ati", conditioning.ati)
@@ -117,9 +136,15 @@ def load_rank(name: str, profile: Profile, settings: Settings, device: torch.dev
 def _loaded(
     manifest: Manifest, profile: Profile, settings: Settings, device: torch.device
 ) -> tuple[WanTrackPipeline, RankGroup | None]:
-    """The pipeline on its device, and the processes that share its clips, which load at the same time."""
+    """The pipeline on its device, and the processes that share its clips, which load at the same time.
+
+    Weights that cannot fit are refused before any is read, and so are files that are not those that were pulled.
+    """
     if manifest.sources:
-        _check_weights(manifest, profile, settings, device)
+        transformer, base = (_folder(part, manifest, settings) for part in ("transformer", "base"))
+        check_memory(manifest, settings.profile, transformer, base, device)
+        for part in _pulled_parts(manifest, profile, settings):
+            verify(manifest.sources[part], settings.weights_dir, manifest.name)
     if profile.acceleration.ranks > 1 and distributed.is_initialized():
         raise GeneratorUnavailable(
             f"'{manifest.name}': another model of this process shares the GPUs. Use one of them."
@@ -135,7 +160,7 @@ def _loaded(
         pipeline.set_progress_bar_config(disable=True)
         accelerate(pipeline, profile.acceleration, device)
         if group is not None:
-            with translated(f"{profile.acceleration.ranks} GPUs"):
+            with naming_option(f"{profile.acceleration.ranks} GPUs"):
                 group.join(pipeline.transformer)
     except BaseException:
         if group is not None:
@@ -144,13 +169,18 @@ def _loaded(
     return pipeline, group
 
 
-def _check_weights(manifest: Manifest, profile: Profile, settings: Settings, device: torch.device) -> None:
-    """Raises for weights that cannot fit, before any is read, and for files that are not those that were pulled."""
-    transformer, base = (_folder(part, manifest, settings) for part in ("transformer", "base"))
-    check_memory(manifest, settings.profile, transformer, base, device)
-    parts = {"transformer", "base"} | ({profile.lora.source} if profile.lora is not None else set())
-    for part in sorted(parts - set(settings.own_parts(manifest.name))):
-        verify(manifest.sources[part], settings.weights_dir, manifest.name)
+def _pulled_parts(manifest: Manifest, profile: Profile, settings: Settings) -> list[str]:
+    """The parts that the model is made of and that are not the user's own."""
+    lora = {profile.lora.source} if profile.lora is not None else set[str]()
+    used = ({"transformer", "base"} | lora) & manifest.sources.keys()
+    return sorted(used - set(settings.own_parts(manifest.name)))
+
+
+def _revisions(manifest: Manifest, profile: Profile, settings: Settings) -> dict[str, str]:
+    """The revision of every pulled part that the model is made of."""
+    repositories = {part: manifest.sources[part].repository for part in _pulled_parts(manifest, profile, settings)}
+    locks = {part: read_lock(settings.weights_dir, repository) for part, repository in repositories.items()}
+    return {part: lock.revision for part, lock in locks.items() if lock is not None}
 
 
 def _folder(part: str, manifest: Manifest, settings: Settings) -> Path:
@@ -180,14 +210,88 @@ def _transformer(
     return transformer
 
 
-def _revisions(manifest: Manifest, profile: Profile, settings: Settings) -> dict[str, str]:
-    """The revision of every pulled part that the model is made of."""
-    used = {"transformer", "base"} - set(settings.own_parts(manifest.name))
-    if profile.lora is not None:
-        used.add(profile.lora.source)
-    locks = {
-        part: read_lock(settings.weights_dir, source.repository)
-        for part, source in manifest.sources.items()
-        if part in used
-    }
-    return {part: lock.revision for part, lock in locks.items() if lock is not None}
+def assemble(
+    transformer: WanTransformer3DModel, base: Path, dtype: torch.dtype, vae_dtype: torch.dtype
+) -> WanTrackPipeline:
+    """The pipeline of a transformer and the other parts in the diffusers folder `base`, all still on the CPU.
+
+    The image encoder has `IMAGE_ENCODER_DTYPE`, whatever `dtype` is.
+    Raises `CheckpointInvalid` naming the part and what does not fit.
+    """
+    text_encoder = _model(UMT5EncoderModel, base, "text_encoder", dtype)
+    image_encoder = _model(CLIPVisionModel, base, "image_encoder", getattr(torch, IMAGE_ENCODER_DTYPE))
+    sizes: Any = transformer.config
+    for name, wanted, found in (
+        ("text_encoder", sizes.text_dim, text_encoder.config.d_model),
+        ("image_encoder", sizes.image_dim, image_encoder.config.hidden_size),
+    ):
+        if wanted != found:
+            raise CheckpointInvalid(f"'{name}' is {found} wide, and the transformer takes {wanted}.")
+    return compose(
+        transformer=transformer,
+        vae=_model(AutoencoderKLWan, base, "vae", vae_dtype),
+        text_encoder=text_encoder,
+        image_encoder=image_encoder,
+        tokenizer=_part(AutoTokenizer, base, "tokenizer"),
+        image_processor=_part(CLIPImageProcessor, base, "image_processor"),
+    )
+
+
+def _model(kind: Any, base: Path, part: str, dtype: torch.dtype) -> Any:
+    """A model whose checkpoint fits it name by name: the libraries only warn, and initialise the rest at random."""
+    model, report = _part(kind, base, part, torch_dtype=dtype, use_safetensors=True, output_loading_info=True)
+    kinds = {"unknown": "unexpected_keys", "missing": "missing_keys", "of another shape": "mismatched_keys"}
+    misfits = counted({kind: sorted(map(str, report.get(key) or ())) for kind, key in kinds.items()})
+    if misfits:
+        raise CheckpointInvalid(f"The weights of '{part}' do not fit. {misfits}.")
+    return model.eval().requires_grad_(False)
+
+
+def _part(kind: Any, base: Path, part: str, **options: Any) -> Any:
+    if not (base / part).is_dir():
+        raise CheckpointInvalid(f"The checkpoint has no folder '{part}'.")
+    try:
+        return kind.from_pretrained(str(base / part), local_files_only=True, **options)
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+        reason = (str(error).replace(str(base), "").splitlines() or [type(error).__name__])[0]
+        raise CheckpointInvalid(f"'{part}' cannot be loaded: {reason}") from error
+
+
+def make_tiny(architecture: Mapping[str, Any]) -> WanTrackPipeline:
+    """A pipeline of these sizes (as in a manifest); the same sizes give the same weights."""
+    # Every byte is a token; 0 pads and 1 ends, as in T5.
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    vocabulary = {token: i for i, token in enumerate(["<pad>", "</s>", *alphabet])}
+    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
+    text_width, image_width = architecture["text_dim"], architecture["image_dim"]
+    text_config = UMT5Config(
+        vocab_size=len(vocabulary), d_model=text_width, d_kv=8, d_ff=2 * text_width, num_layers=1, num_heads=2
+    )
+    image_config = CLIPVisionConfig(
+        hidden_size=image_width, intermediate_size=2 * image_width, num_hidden_layers=2, num_attention_heads=2,
+        image_size=32, patch_size=8,
+    )  # fmt: skip
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(TINY_SEED)
+        parts = {  # in this order, by which the seed gives the same weights
+            "transformer": WanTransformer3DModel(**diffusers_config(architecture)),
+            "vae": AutoencoderKLWan(
+                base_dim=4,
+                z_dim=LATENT_CHANNELS,
+                dim_mult=[1, 1, 1, 1],
+                num_res_blocks=1,
+                temperal_downsample=[False, True, True],
+            ),
+            "text_encoder": UMT5EncoderModel(text_config),
+            "image_encoder": CLIPVisionModel(image_config),
+        }
+    for part in parts.values():
+        part.eval().requires_grad_(False)
+    return compose(
+        tokenizer=PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", eos_token="</s>"),
+        image_processor=CLIPImageProcessor(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}),
+        **parts,
+    )

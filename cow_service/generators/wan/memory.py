@@ -1,30 +1,39 @@
-"""What a profile's weights take of a device's and of the machine's memory, known before any of them is read."""
+"""The memory of a device: whether a model's weights fit, who uses it, and what happens when it runs out."""
 
 from __future__ import annotations
 
+import gc
+import math
 import os
-from collections.abc import Iterable, Mapping
+import traceback
+from collections import defaultdict
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 
 import torch
 from safetensors import SafetensorError, safe_open
 
-from cow_service.errors import CheckpointInvalid, GeneratorUnavailable
+from cow_service.errors import CheckpointInvalid, DeviceFailed, GeneratorOutOfMemory, GeneratorUnavailable
 from cow_service.generators.wan.acceleration import check_device
-from cow_service.generators.wan.checkpoints import FLOAT8 as FLOAT8_DTYPES
-from cow_service.generators.wan.checkpoints import checkpoint_files
+from cow_service.generators.wan.checkpoints import FLOAT8, checkpoint_files
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
+from cow_service.weights.device import is_out_of_memory
 from cow_service.weights.manifests import Manifest
 
 BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
-FLOAT8 = 1
 BLOCKS_AT_ONCE = 2  # of the transformer's, with `offload: group`: one computes while the next one comes
 # Of blocks that are moved one by one and pinned for it: PyTorch rounds every pinned tensor up to a power of two. In the
 # 14B model's blocks, 10 matrices of 52 MB take 67 MB each, and 2 of 142 MB 268 MB.
 PINNED = 1.5
 BASE_PARTS = ("text_encoder", "image_encoder", "vae")
 CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes or "max"
+CANCEL_POLL_SECONDS = 0.2  # how often a caller that waits for the device checks whether it was canceled
+
+_locks: defaultdict[str, Lock] = defaultdict(Lock)
+_locks_guard = Lock()
 
 
 @dataclass(frozen=True)
@@ -38,75 +47,67 @@ class Need:
 def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Need:
     """What a profile's weights take, by the number of parameters of each part and of the transformer's blocks."""
     wanted = profile.acceleration
-    sizes = {
+    loaded = {
         "transformer": parameters["transformer"] * BYTES[profile.dtype],
         "text_encoder": parameters["text_encoder"] * BYTES[profile.dtype],
         "image_encoder": parameters["image_encoder"] * BYTES[IMAGE_ENCODER_DTYPE],
         "vae": parameters["vae"] * BYTES[profile.vae_dtype],
     }
-    whole = sum(sizes.values())
-    stored = sizes | ({"transformer": parameters["transformer"] * FLOAT8} if wanted.fp8 != "none" else {})
-    held = {
-        "none": sum(stored.values()),
-        "model": max(stored.values()),
-        "group": stored["vae"] + BLOCKS_AT_ONCE * stored["transformer"] // blocks,
+    kept = loaded | ({"transformer": parameters["transformer"]} if wanted.fp8 != "none" else {})  # a byte each in fp8
+    on_device = {
+        "none": sum(kept.values()),
+        "model": max(kept.values()),
+        "group": kept["vae"] + BLOCKS_AT_ONCE * kept["transformer"] // blocks,
         "sequential": 0,
     }[wanted.offload]
-    through_host = wanted.offload != "none" or wanted.fp8 in {"weights", "dynamic"}
-    if wanted.fp8 == "stored":
-        whole = sum(stored.values())
-    more = int((PINNED - 1) * stored["transformer"]) if wanted.offload == "group" else 0
-    return Need(held, wanted.ranks * (whole + more) if through_host else 0)
+    if wanted.offload == "none" and wanted.fp8 not in {"weights", "dynamic"}:  # read straight to the device
+        return Need(on_device, 0)
+    on_host = sum((kept if wanted.fp8 == "stored" else loaded).values())
+    if wanted.offload == "group":
+        on_host += int((PINNED - 1) * kept["transformer"])
+    return Need(on_device, wanted.ranks * on_host)
 
 
 def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, device: torch.device) -> None:
     """Raises `GeneratorUnavailable` where the weights of the profile of that name cannot fit, naming those that can.
 
-    What lies in the folders is not read but for the shapes in its headers; where that fails, loading says why.
+    Of the files only the headers are read; where that fails, loading says why.
     """
-    parameters = _parameters(checkpoint, base)
-    if parameters is None:
+    found = _read_headers(checkpoint, base)
+    if found is None:
         return
-    has_float8 = any(dtype in FLOAT8_DTYPES for dtype in _dtypes(checkpoint_files(checkpoint)[1]))
+    parameters, has_float8 = found
+    profiles = {each: profile_of(manifest, each) for each in manifest.profiles}
     if profile_of(manifest, name).acceleration.fp8 == "stored" and not has_float8:
         raise GeneratorUnavailable(
             f"The profile '{name}' keeps the float8 of a checkpoint, and that of '{manifest.name}' has none: give one "
             "that does (COW_CHECKPOINTS), or set COW_PROFILE."
         )
-    blocks = int(manifest.architecture["num_layers"])
-    room = _room(device), _host()
-    need = need_of(profile_of(manifest, name), parameters, blocks)
-    short = _short(need, room, device)
-    if short is None:
-        return
-    fitting = [
-        other
-        for other in manifest.profiles
-        if _short(need_of(profile_of(manifest, other), parameters, blocks), room, device) is None
-        and _runs(profile_of(manifest, other), device)
-        and (has_float8 or profile_of(manifest, other).acceleration.fp8 != "stored")
-    ]
-    remedy = f"Of its profiles fit: {', '.join(fitting)} (COW_PROFILE)." if fitting else "None of its profiles fits."
-    raise GeneratorUnavailable(f"The weights of '{manifest.name}' with the profile '{name}' take {short}. {remedy}")
+    room = Need(_room(device), _host())
 
+    def shortage(profile: Profile) -> str | None:
+        need = need_of(profile, parameters, int(manifest.architecture["num_layers"]))
+        if device.type == "cpu":  # where both are the same memory
+            need = Need(0, max(need.device, need.host))
+        if need.device > room.device:
+            return f"{need.device / 1e9:.0f} GB of the GPU's memory, and it has {room.device / 1e9:.0f} GB"
+        if need.host > room.host:
+            return f"{need.host / 1e9:.0f} GB of this machine's memory, and it has {room.host / 1e9:.0f} GB"
+        return None
 
-def _short(need: Need, room: tuple[int, int], device: torch.device) -> str | None:
-    """What there is too little of, in words; None where all fits. On a CPU both are the same memory."""
-    if device.type == "cpu":
-        need = Need(0, max(need.device, need.host))
-    if need.device > room[0]:
-        return f"{need.device / 1e9:.0f} GB of the GPU's memory, and it has {room[0] / 1e9:.0f} GB"
-    if need.host > room[1]:
-        return f"{need.host / 1e9:.0f} GB of this machine's memory, and it has {room[1] / 1e9:.0f} GB"
-    return None
+    def runs(profile: Profile) -> bool:
+        try:
+            check_device(profile.acceleration, device)
+        except GeneratorUnavailable:
+            return False
+        return has_float8 or profile.acceleration.fp8 != "stored"
 
-
-def _runs(profile: Profile, device: torch.device) -> bool:
-    try:
-        check_device(profile.acceleration, device)
-    except GeneratorUnavailable:
-        return False
-    return True
+    if (short := shortage(profiles[name])) is not None:
+        fitting = [other for other, profile in profiles.items() if shortage(profile) is None and runs(profile)]
+        remedy = (
+            f"Of its profiles fit: {', '.join(fitting)} (COW_PROFILE)." if fitting else "None of its profiles fits."
+        )
+        raise GeneratorUnavailable(f"The weights of '{manifest.name}' with the profile '{name}' take {short}. {remedy}")
 
 
 def _room(device: torch.device) -> int:
@@ -121,27 +122,90 @@ def _host() -> int:
     return min(there, int(limit)) if limit.isdecimal() else there
 
 
-def _parameters(checkpoint: Path, base: Path) -> dict[str, int] | None:
-    """How many numbers each part has by its files' headers; None where they cannot be read."""
+def _read_headers(checkpoint: Path, base: Path) -> tuple[dict[str, int], bool] | None:
+    """How many numbers each part has, and whether the transformer has some in float8; None where it cannot be read."""
+    counts: dict[str, int] = {}
+    has_float8 = False
     try:
-        counts = {"transformer": _count(checkpoint_files(checkpoint)[1])}
-        counts |= {part: _count(sorted((base / part).glob("*.safetensors"))) for part in BASE_PARTS}
+        files: dict[str, Sequence[Path]] = {"transformer": checkpoint_files(checkpoint)[1]}
+        files |= {part: sorted((base / part).glob("*.safetensors")) for part in BASE_PARTS}
+        for part, file in ((part, file) for part, some in files.items() for file in some):
+            with safe_open(file, framework="pt") as opened:
+                for tensor in map(opened.get_slice, tuple(opened.keys())):
+                    counts[part] = counts.get(part, 0) + math.prod(tensor.get_shape())
+                    has_float8 |= part == "transformer" and tensor.get_dtype() in FLOAT8
     except (CheckpointInvalid, SafetensorError, OSError):
         return None
-    return counts if all(counts.values()) else None
+    return (counts, has_float8) if len(counts) == len(files) else None
 
 
-def _dtypes(files: Iterable[Path]) -> set[str]:
-    found: set[str] = set()
-    for file in files:
-        with safe_open(file, framework="pt") as held:
-            found |= {held.get_slice(name).get_dtype() for name in held.keys()}  # noqa: SIM118
-    return found
+@contextmanager
+def exclusive_use(device: torch.device, check_canceled: Callable[[], None]) -> Generator[None]:
+    """Holds the device for one clip. While another clip has it, `check_canceled` is called, and may raise."""
+    with _locks_guard:
+        lock = _locks[str(device)]
+    while not lock.acquire(timeout=CANCEL_POLL_SECONDS):
+        check_canceled()
+    try:
+        yield
+    finally:
+        lock.release()
 
 
-def _count(files: Iterable[Path]) -> int:
-    total = 0
-    for file in files:
-        with safe_open(file, framework="pt") as held:
-            total += sum(torch.Size(held.get_slice(name).get_shape()).numel() for name in held.keys())  # noqa: SIM118
-    return total
+def wait_until_done(device: torch.device) -> None:
+    """Waits for what was given to the device so far: a GPU takes work long before it does it."""
+    if device.type == "cuda":
+        done = torch.cuda.Event()
+        done.record(torch.cuda.current_stream(device))
+        done.synchronize()
+
+
+@contextmanager
+def within_memory(device: torch.device, clear_caches: Callable[[], None], what: str) -> Generator[None]:
+    """Turns running out of memory into `GeneratorOutOfMemory`, after `clear_caches` and after freeing all tensors.
+
+    A GPU that fails becomes `DeviceFailed`: nothing can be computed on it in this process any more. `what` begins the
+    messages: what was being made.
+    """
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    try:
+        yield
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            if not has_failed(device, error):
+                raise
+            reason = (str(error).splitlines() or [""])[0][:200]
+            raise DeviceFailed(
+                f"{what} was not finished: the GPU failed ({reason}). A worker process is replaced, and the job tried "
+                "again; without workers (COW_WORKERS=false) restart the server. If it fails again and again, look at "
+                "`nvidia-smi` and at the Xid messages of the system's log: the GPU may need a reset."
+            ) from error
+        # The frames of the failed call hold its tensors, and live as long as the traceback does.
+        traceback.clear_frames(error.__traceback__)
+        remedy = " of this machine. Ask for fewer frames."
+        if device.type == "cuda":
+            peak = torch.cuda.max_memory_allocated(device) / 1e9
+            remedy = (
+                f": {peak:.1f} GB were in use at the peak, of {_room(device) / 1e9:.1f} GB. "
+                "Ask for fewer frames, or start the server with a profile that offloads or tiles (COW_PROFILE)."
+            )
+        failure = GeneratorOutOfMemory(f"{what} does not fit into memory{remedy}")
+    else:
+        return
+    clear_caches()
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+    raise failure
+
+
+def has_failed(device: torch.device, error: RuntimeError) -> bool:
+    """Whether the GPU can be used no more after an error of whatever library. Not every error of CUDA is so."""
+    if device.type != "cuda":
+        return isinstance(error, torch.AcceleratorError)
+    try:
+        torch.cuda.synchronize(device)
+    except RuntimeError:
+        return True
+    return False

@@ -1,25 +1,40 @@
 """diffusers' image-to-video pipeline in three parts that can be timed, cached and canceled: encode, denoise, decode.
 
-The encoding methods and the models are those of the parent class.
+The encoding methods and the models are those of the parent class. Other than in its own loop, the condition differs
+between the guided and the unconditional pass, guidance holds for a window of steps, several processes can share the
+steps of a clip, and a callback is called after every step.
 """
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from hashlib import sha256
+from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 import torch
-from diffusers import UniPCMultistepScheduler, WanImageToVideoPipeline
+from diffusers import FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler, WanImageToVideoPipeline
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from cow_service.generators.wan.acceleration import reset_cache
 from cow_service.generators.wan.checkpoints import TEXT_LENGTH
-from cow_service.generators.wan.denoising import Conditioning, StepCallback, denoise
-from cow_service.generators.wan.sampling import Sampling
+from cow_service.generators.wan.memory import wait_until_done
+from cow_service.generators.wan.profiles import Sampling
 
 LATENT_CHANNELS = 16
+TRAIN_STEPS = 1000
+MAX_TEXTS = 64  # embeddings kept; one is 4 MB in bfloat16
+MAX_IMAGES = 8  # embeddings kept; one is 11 MB at 832 x 480 x 81
+
+Branch: TypeAlias = Literal["cond", "uncond"]  # the guided and the unconditional pass of a step
+StepCallback: TypeAlias = Callable[[int, int], None]
+# The result of a pass, a tensor like the last argument, whoever computes it: the function may be called, or not.
+Share: TypeAlias = Callable[[Branch, Callable[[], Tensor], Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -30,13 +45,18 @@ class ImageEmbedding:
     condition: Tensor  # [20, T, h, w] float32: 4 mask channels, 16 latent channels
 
 
-def compose(**parts: Any) -> WanTrackPipeline:
-    """A pipeline of `transformer`, `vae`, `text_encoder`, `image_encoder`, `tokenizer` and `image_processor`.
+@dataclass(frozen=True)
+class Conditioning:
+    """All that conditions the denoising of one clip."""
 
-    The parent class requires a scheduler, which is not used: every clip is sampled with one of its own.
-    """
-    scheduler = UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True, flow_shift=3.0)
-    return WanTrackPipeline(scheduler=scheduler, **parts)  # pyright: ignore[reportArgumentType]: any flow scheduler
+    prompt: Tensor  # [1, 512, C] text embeddings
+    negative_prompt: Tensor | None  # [1, 512, C]; None where no step is guided
+    image: Tensor  # [1, tokens, C] of the image encoder
+    condition: Tensor  # [20, T, h, w] of the guided pass
+    unconditional: Tensor  # [20, T, h, w] of the unconditional pass
+
+
+Denoise: TypeAlias = Callable[[Tensor, Conditioning, Sampling, StepCallback], Tensor]
 
 
 def latent_shape(width: int, height: int, num_frames: int) -> tuple[int, int, int, int, int]:
@@ -56,8 +76,22 @@ def image_token_count(image_encoder: Any) -> int:
     return (config.image_size // config.patch_size) ** 2 + 1
 
 
+def compose(**parts: Any) -> WanTrackPipeline:
+    """A pipeline of `transformer`, `vae`, `text_encoder`, `image_encoder`, `tokenizer` and `image_processor`.
+
+    The parent class requires a scheduler, which is not used: every clip is sampled with one of its own.
+    """
+    scheduler = UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True, flow_shift=3.0)
+    return WanTrackPipeline(scheduler=scheduler, **parts)  # pyright: ignore[reportArgumentType]: any flow scheduler
+
+
 class WanTrackPipeline(WanImageToVideoPipeline):
     """The steps of making one clip. Not safe for two clips at a time."""
+
+    @property
+    def compute_device(self) -> torch.device:
+        """Where the parts compute, also where their weights are offloaded."""
+        return self._execution_device
 
     @torch.no_grad()
     def embed_text(self, text: str) -> Tensor:
@@ -66,14 +100,14 @@ class WanTrackPipeline(WanImageToVideoPipeline):
             prompt=text,
             do_classifier_free_guidance=False,
             max_sequence_length=TEXT_LENGTH,
-            device=self._execution_device,
+            device=self.compute_device,
         )
         return embeds
 
     @torch.no_grad()
     def embed_image(self, image: NDArray[np.uint8], width: int, height: int, num_frames: int) -> ImageEmbedding:
         """Both encodings of the first frame, RGB [H, W, 3] of any size, for a clip of `width` x `height` px."""
-        device = self._execution_device
+        device = self.compute_device
         picture = Image.fromarray(image)
         # The image encoder takes a square: the whole image is squeezed, as in the public implementation. The pipeline's
         # own processor would crop its centre.
@@ -94,14 +128,14 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         return ImageEmbedding(embeds, condition[0])
 
     def denoise(self, noise: Tensor, given: Conditioning, sampling: Sampling, on_step: StepCallback) -> Tensor:
-        """As `denoising.denoise`, in this process alone."""
-        return denoise(self.transformer, self._execution_device, noise, given, sampling, on_step)
+        """As the function `denoise`, in this process alone."""
+        return denoise(self.transformer, self.compute_device, noise, given, sampling, on_step)
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> NDArray[np.uint8]:
         """Frames RGB [F, height, width, 3] of latents [1, 16, T, h, w]."""
         vae = self.vae
-        latents = latents.to(self._execution_device, vae.dtype)
+        latents = latents.to(self.compute_device, vae.dtype)
         mean, std = (
             torch.tensor(values, device=latents.device, dtype=latents.dtype).view(1, -1, 1, 1, 1)
             for values in (vae.config.latents_mean, vae.config.latents_std)
@@ -109,3 +143,107 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         video = vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
         pixels = (video.float() / 2 + 0.5).clamp(0, 1).mul(255).round().to(torch.uint8)
         return pixels.permute(1, 2, 3, 0).cpu().numpy()
+
+
+class EmbeddingCache:
+    """Encodes the same text or image once. Drops the least recently used. Not safe for two threads at a time."""
+
+    def __init__(self, pipeline: WanTrackPipeline) -> None:
+        self._pipeline = pipeline
+        self._images: OrderedDict[tuple[object, ...], ImageEmbedding] = OrderedDict()
+
+        @lru_cache(MAX_TEXTS)
+        def embed_text(text: str) -> Tensor:
+            return pipeline.embed_text(text)
+
+        self.text = embed_text
+
+    def image(self, image: NDArray[np.uint8], width: int, height: int, num_frames: int) -> ImageEmbedding:
+        """Embedding of the first frame of a clip of this size (px) and length."""
+        key = (sha256(image.tobytes()).digest(), image.shape, width, height, num_frames)
+        if key not in self._images:
+            self._images[key] = self._pipeline.embed_image(image, width, height, num_frames)
+        self._images.move_to_end(key)
+        if len(self._images) > MAX_IMAGES:
+            self._images.popitem(last=False)
+        return self._images[key]
+
+    def clear(self) -> None:
+        """Drops everything."""
+        self.text.cache_clear()
+        self._images.clear()
+
+
+def make_schedule(sampling: Sampling, device: torch.device) -> Any:
+    """A fresh scheduler of diffusers with its steps set; it holds the state of one clip.
+
+    UniPC starts at the noise level of the public Wan2.1 implementation, 0.999 before the shift (diffusers: 1.0).
+    """
+    if sampling.solver == "euler":
+        # Distilled weights know the noise levels 1, 1 - 1/n, ... before the shift (lightx2v: 1000, 750, 500, 250).
+        schedule = FlowMatchEulerDiscreteScheduler(num_train_timesteps=TRAIN_STEPS, shift=sampling.shift)
+        sigmas = [1 - i / sampling.steps for i in range(sampling.steps)]
+    else:
+        schedule = UniPCMultistepScheduler(
+            num_train_timesteps=TRAIN_STEPS,
+            prediction_type="flow_prediction",
+            use_flow_sigmas=True,
+            flow_shift=sampling.shift,
+        )
+        sigmas = np.linspace(1 - 1 / TRAIN_STEPS, 0, sampling.steps + 1)[:-1]
+    schedule.set_timesteps(sigmas=cast(Any, sigmas), device=device)
+    # Steps are counted: found by their times, which are whole numbers, two with the same would be taken for one.
+    schedule.set_begin_index(0)
+    return schedule
+
+
+@torch.no_grad()
+def denoise(
+    transformer: Any,
+    device: torch.device,
+    noise: Tensor,
+    given: Conditioning,
+    sampling: Sampling,
+    on_step: StepCallback,
+    share: Share = lambda branch, compute, like: compute(),
+) -> Tensor:
+    """Latents [1, 16, T, h, w] from noise of that shape.
+
+    `on_step(done, total)` is called when the device has done a step, and may raise to cancel.
+    """
+    dtype = cast(torch.dtype, transformer.dtype)  # found by a walk over all weights: once per clip
+    schedule = make_schedule(sampling, device)
+    latents = noise.to(device, torch.float32)
+    guided, unguided = (part.to(latents)[None] for part in (given.condition, given.unconditional))
+    image, prompt = given.image.to(device, dtype), given.prompt.to(device, dtype)
+    negative = None if given.negative_prompt is None else given.negative_prompt.to(device, dtype)
+
+    def velocity_of(branch: Branch, condition: Tensor, time: Tensor, text: Tensor) -> Tensor:
+        """[1, 16, T, h, w] in float32, so that guidance and solver lose nothing to bfloat16."""
+
+        def compute() -> Tensor:
+            with transformer.cache_context(branch):
+                return transformer(
+                    hidden_states=torch.cat([latents, condition], dim=1).to(dtype),
+                    timestep=time.expand(1),
+                    encoder_hidden_states=text,
+                    encoder_hidden_states_image=image,
+                    return_dict=False,
+                )[0].float()
+
+        return share(branch, compute, latents)
+
+    branches = 1 if negative is None else 2
+    reset_cache(transformer, sampling.steps, branches)
+    try:
+        for step, time in enumerate(schedule.timesteps):
+            velocity = velocity_of("cond", guided, time, prompt)
+            if negative is not None and sampling.guides(step):
+                plain = velocity_of("uncond", unguided, time, negative)
+                velocity = plain + sampling.guidance_scale * (velocity - plain)
+            latents = schedule.step(velocity, time, latents, return_dict=False)[0]
+            wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
+            on_step(step + 1, sampling.steps)
+    finally:  # what was kept for the next step would lie in memory while the clip is decoded
+        reset_cache(transformer, sampling.steps, branches)
+    return latents

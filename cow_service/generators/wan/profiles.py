@@ -1,18 +1,56 @@
-"""Named ways to run a model, as its manifest lists them: sampling, precision and acceleration together."""
+"""How a video model is run: what a request may ask for, and named profiles of sampling, precision and acceleration.
+
+Without the model's libraries: a server that has none checks requests and passes them on.
+"""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cow_service.errors import GeneratorUnavailable
-from cow_service.generators.wan.sampling import Sampling
+from cow_service.generators.wan.tracks import nearest_lengths
 from cow_service.records import Record
 from cow_service.weights.manifests import Manifest
 
 Precision = Literal["float32", "bfloat16", "float16"]
 IMAGE_ENCODER_DTYPE: Precision = "float32"  # in every profile: the public implementations do not run it in bfloat16
+
+
+class Sampling(Record):
+    """Steps, noise schedule and guidance of one clip."""
+
+    solver: Literal["unipc", "euler"] = Field(
+        default="unipc", description="unipc for the model as trained; euler for weights distilled to a few steps."
+    )
+    steps: int = Field(ge=1, le=200, description="Denoising steps; the time grows with them.")
+    shift: float = Field(
+        gt=0, le=50, description="Above 1 more steps are spent at high noise, where motion is settled."
+    )
+    guidance_scale: float = Field(
+        ge=0, le=30, description="How strongly the prompt steers; at 1 the second pass of each step falls away."
+    )
+    guidance_window: tuple[float, float] = Field(
+        default=(0.0, 1.0),
+        description="Share of the steps, from and to, that are guided; each step outside takes half the time.",
+    )
+
+    @model_validator(mode="after")
+    def _window_is_ordered(self) -> Sampling:
+        if not 0 <= self.guidance_window[0] <= self.guidance_window[1] <= 1:
+            raise ValueError(f"`guidance_window` [from, to] lies within 0 to 1 in order, got {self.guidance_window}")
+        return self
+
+    def guides(self, step: int) -> bool:
+        """Whether step 0 <= `step` < `steps` takes the second, unconditional pass."""
+        begin, end = self.guidance_window
+        return self.guidance_scale != 1 and begin <= step / self.steps < end
+
+    @property
+    def guided(self) -> bool:
+        """Whether any step takes the second pass."""
+        return any(self.guides(step) for step in range(self.steps))
 
 
 class Acceleration(Record):
@@ -138,3 +176,26 @@ def profile_of(manifest: Manifest, name: str) -> Profile:
     except ValidationError as error:
         problems = "; ".join(f"{'.'.join(str(p) for p in item['loc'])}: {item['msg']}" for item in error.errors())
         raise GeneratorUnavailable(f"Profile '{name}' of '{manifest.name}' is not valid: {problems}.") from error
+
+
+class WanOptions(BaseModel):
+    """What `generator_options` may hold for a video model. What is not given is as the profile says."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    steps: int | None = Field(default=None, ge=1, le=200, description="Denoising steps.")
+    shift: float | None = Field(default=None, gt=0, le=50, description="Shift of the noise schedule.")
+    guidance_scale: float | None = Field(default=None, ge=0, le=30, description="1 does without guidance.")
+    prompt: str | None = Field(default=None, max_length=4000, description="By default the sentence of the motion.")
+    negative_prompt: str | None = Field(default=None, max_length=4000, description="By default that of the model.")
+    clean_cues: bool = Field(default=True, description="Take drawn arrows and boxes out of the first frame.")
+
+
+class WanLimits:
+    """Options and lengths of a clip."""
+
+    options_model = WanOptions
+
+    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
+        """4n + 1 frames, 5 to 81."""
+        return nearest_lengths(num_frames)

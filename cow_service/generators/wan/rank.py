@@ -15,15 +15,14 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
 import torch
-from torch import Tensor, distributed
+from torch import distributed
 
 from cow_service.concurrency import leave_decisions_to_the_parent
 from cow_service.errors import CowError, unforeseen
-from cow_service.generators.wan.denoising import Conditioning, denoise
-from cow_service.generators.wan.execution import within_memory
 from cow_service.generators.wan.loading import load_rank
-from cow_service.generators.wan.rank_messages import Array, Failed, FromRank, Join, Load, Loaded, Share, ToRank
-from cow_service.generators.wan.sharing import HOST, Sharing
+from cow_service.generators.wan.memory import within_memory
+from cow_service.generators.wan.pipeline import denoise
+from cow_service.generators.wan.ranks import HOST, Failed, FromRank, Join, Load, Loaded, Share, Sharing, ToRank
 from cow_service.observability import logging as logs
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import load_manifests
@@ -32,16 +31,24 @@ log = logging.getLogger("cow_service")
 
 
 class _Stopped(Exception):
-    """Rank 0 wants no more steps."""
+    """Rank 0 takes no more steps of a clip."""
 
 
 def work(pipe: Connection[FromRank, ToRank]) -> None:
     """Loads the model, joins the others, and shares clips until the pipe ends."""
     messages: SimpleQueue[ToRank] = SimpleQueue()
+
+    def listen() -> None:
+        try:
+            while True:
+                messages.put(pipe.recv())
+        except (EOFError, OSError):
+            os._exit(0)
+
     given = pipe.recv()
     assert isinstance(given, Load)
     logs.set_up(given.settings)
-    threading.Thread(target=_listen, args=(pipe, messages), name="pipe", daemon=True).start()
+    threading.Thread(target=listen, name="pipe", daemon=True).start()
     device = torch.device(given.device)
     if device.type == "cuda":
         torch.cuda.set_device(device)
@@ -54,40 +61,16 @@ def work(pipe: Connection[FromRank, ToRank]) -> None:
         wanted = given.profile.acceleration
         store = distributed.TCPStore(HOST, join.port, wanted.ranks, is_master=False)
         sharing = Sharing(transformer, wanted, given.rank, device, store)
+
+        def on_step(done: int, total: int) -> None:
+            if not sharing.goes_on():
+                raise _Stopped
+
         while isinstance(clip := messages.get(), Share):
-            with within_memory(device, lambda: None, f"A share of a clip on {device}"):
-                _share(clip, transformer, device, sharing)
-
-
-def _listen(pipe: Connection[FromRank, ToRank], messages: SimpleQueue[ToRank]) -> None:
-    try:
-        while True:
-            messages.put(pipe.recv())
-    except (EOFError, OSError):
-        os._exit(0)
-
-
-def _share(clip: Share, transformer: object, device: torch.device, sharing: Sharing) -> None:
-    def on_step(done: int, total: int) -> None:
-        if not sharing.hear():
-            raise _Stopped
-
-    negative = None if clip.negative_prompt is None else _tensor(clip.negative_prompt)
-    given = Conditioning(
-        prompt=_tensor(clip.prompt),
-        negative_prompt=negative,
-        image=_tensor(clip.image),
-        condition=_tensor(clip.condition),
-        unconditional=_tensor(clip.unconditional),
-    )
-    noise = _tensor(clip.noise)
-    sharing.prepare(noise)
-    with suppress(_Stopped):
-        denoise(transformer, device, noise, given, clip.sampling, on_step, sharing)
-
-
-def _tensor(array: Array) -> Tensor:
-    return torch.from_numpy(array)
+            with within_memory(device, lambda: None, f"A share of a clip on {device}"), suppress(_Stopped):
+                noise, conditioning = clip.unpack()
+                sharing.prepare(noise)
+                denoise(transformer, device, noise, conditioning, clip.sampling, on_step, sharing)
 
 
 def main(descriptor: int) -> None:

@@ -31,8 +31,8 @@ from cow_service.readers.mllm.models import mllm_manifests
 from cow_service.records import Record
 from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed
-from cow_service.weights.lock import verify
 from cow_service.weights.manifests import Manifest
+from cow_service.weights.repositories import verify
 
 MAX_LISTED = 4  # weights in an error
 

@@ -7,8 +7,8 @@ from cow_service.readers.mllm.client import MllmClient
 from cow_service.readers.mllm.models import ConfiguredModel, resolve_model
 from cow_service.readers.mllm.reader import MllmReader
 from cow_service.settings import Settings
-from cow_service.weights.lock import weights_identity
 from cow_service.weights.manifests import load_families
+from cow_service.weights.repositories import weights_identity
 
 
 def create(settings: Settings) -> MllmReader:

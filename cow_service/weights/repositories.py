@@ -1,0 +1,522 @@
+"""Weights of repositories on the Hugging Face hub: downloaded once, recorded, and checked against the record.
+
+The layout is `<folder>/<owner>--<name>/`, shared by all manifests that use the repository: its files under their own
+names, and `cow.lock.json`, which pins their revision, sizes and digests. It is written before the first file comes, so
+that an interrupted download continues with the same revision and only the missing files.
+
+`check`, `verify` and `ready` need no network. `resolve` finds out what there is to download, from the hub or a server
+with its API (HF_ENDPOINT), and changes nothing here; `download` carries it out. Exceptions of the hub's library become
+`WeightsUnavailable` here and nowhere else.
+
+huggingface_hub's `verify_repo_checksums` asks the hub for the digests, so that it cannot check offline, and
+`snapshot_download` lists the repository at each call and reports one bar for all files: both are not used.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Container, Generator, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from uuid import uuid4
+
+from pydantic import AfterValidator, Field, ValidationError
+
+from cow_service import __version__
+from cow_service.errors import CowError, WeightsUnavailable
+from cow_service.records import Record
+from cow_service.settings import Settings
+from cow_service.weights.manifests import Manifest, Source
+
+if TYPE_CHECKING:
+    from filelock import FileLock
+    from huggingface_hub import HfApi
+    from huggingface_hub.hf_api import RepoSibling
+
+LOCK_NAME = "cow.lock.json"
+PICKLED = (".bin", ".ckpt", ".pickle", ".pkl", ".pt", ".pth")  # reading one of these can run code that it holds
+
+_CHUNK_BYTES = 8 * 2**20
+_MAX_LISTED = 10
+_LISTING_SECONDS = 30.0  # timeout
+_LOG_IN = "Log in with `hf auth login`, or set HF_TOKEN, for an account that may read it"
+_REACH = "Check the network, the proxy and HF_ENDPOINT, and run it again"
+_AGAIN = "Run it again: files that are whole stay"
+
+# By the names of exceptions, because those of the HTTP library differ between versions of huggingface_hub. The first
+# that fits is told: the reason, then the remedy.
+REASONS: tuple[tuple[str, str, str], ...] = (
+    ("GatedRepoError", "its owner has not granted access", f"Ask for it on the repository's page. {_LOG_IN}"),
+    ("RepositoryNotFoundError", "the hub knows no such repository, or it is private", f"Check the name. {_LOG_IN}"),
+    ("RevisionNotFoundError", "it has no revision '{revision}'", "Name one that it has, such as --revision main"),
+    ("RemoteEntryNotFoundError", "a file is no longer there", "Choose another revision, such as --revision main"),
+    ("DisabledRepoError", "the hub has disabled it", "Choose another revision or another model"),
+    ("OfflineModeIsEnabled", "HF_HUB_OFFLINE is set", "Unset it to download"),
+    ("FileMetadataError", "what answered does not speak like the hub", "Check HF_ENDPOINT, the proxy and the firewall"),
+    ("TimeoutException", "the hub did not answer in time", _AGAIN),
+    ("TimeoutError", "the hub did not answer in time", _AGAIN),
+    ("TransportError", "the hub cannot be reached", _REACH),
+    ("ConnectionError", "the hub cannot be reached", _REACH),
+)
+
+
+def inside(path: str) -> str:
+    """The path itself, where it names a file of the repository. Raises `ValueError` where it could lead elsewhere.
+
+    Refused are absolute paths, `..`, what Windows reads as a drive, and the names that the download keeps for itself.
+    """
+    parts = path.split("/")
+    if any(part in ("", ".", "..") for part in parts) or "\\" in path or ":" in path or not path.isprintable():
+        raise ValueError(f"{path!r} could lead out of the folder of its repository")
+    if path.casefold() == LOCK_NAME or parts[0].casefold() == ".cache":
+        raise ValueError(f"{path!r} is a name that the download needs for itself")
+    return path
+
+
+class LockedFile(Record):
+    """One file as the hub records it. It does not say whether the file is here."""
+
+    path: Annotated[str, AfterValidator(inside)] = Field(description="Relative to the repository, with slashes.")
+    size: int = Field(ge=0, description="Bytes.")
+    algorithm: Literal["sha256", "git-sha1"] = Field(
+        description="git-sha1 is that of a git blob: SHA-1 of 'blob <size>', a zero byte and the data."
+    )
+    digest: str = Field(pattern=r"^([0-9a-f]{40}|[0-9a-f]{64})$")
+
+
+class Lock(Record):
+    """What was chosen of one repository, at one revision. Written before the first file comes."""
+
+    version: Literal[1] = 1
+    repository: str
+    revision: str = Field(pattern=r"^[0-9a-f]{40}$", description="The commit.")
+    patterns: tuple[str, ...] = Field(description="The glob patterns by which files were chosen.")
+    files: tuple[LockedFile, ...]
+
+
+class Finding(Record):
+    """Something about weights that is not as it should be."""
+
+    file: str = Field(description="Relative to the repository; a pattern where its files were never pulled.")
+    problem: Literal["missing", "wrong-size", "wrong-digest", "not-pulled", "not-recorded"]
+    wanted: str | None = None
+    found: str | None = None
+
+    @property
+    def message(self) -> str:
+        """The finding in words."""
+        if self.problem == "not-pulled":
+            return f"{self.file} was not pulled"
+        if self.problem == "not-recorded":
+            return f"{self.file} lies there but is not of this revision: delete it"
+        return f"{self.file} is missing" if self.found is None else f"{self.file} has {self.found}, not {self.wanted}"
+
+
+def folder_of(weights_dir: Path, repository: str) -> Path:
+    """The folder for a repository's files. Manifests that use the same repository share it."""
+    return weights_dir / repository.replace("/", "--")
+
+
+def check(source: Source, weights_dir: Path, digests: bool = True) -> tuple[Finding, ...]:
+    """Compares the files of a source with their record; empty when all is right.
+
+    Without `digests` only sizes are compared. Raises `WeightsUnavailable` where something cannot be read.
+    """
+    lock = read_lock(weights_dir, source.repository)
+    if lock is None:
+        return tuple(Finding(file=pattern, problem="not-pulled") for pattern in source.files)
+    folder, known = folder_of(weights_dir, lock.repository), {file.path for file in lock.files}
+    # Weights that are not in the record, such as shards of another revision: a loader would read them, too.
+    with disk_errors(lock.repository):
+        here = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.safetensors*") if path.is_file())
+    strangers = [
+        path
+        for path in here
+        if path not in known and not path.startswith(".") and any(fnmatchcase(path, glob) for glob in source.files)
+    ]
+    return (
+        *(Finding(file=name, problem="not-pulled") for name in source.files if name not in lock.patterns),
+        *(Finding(file=path, problem="not-recorded") for path in strangers),
+        *examine(lock, chosen(lock, source.files), weights_dir, digests),
+    )
+
+
+def verify(source: Source, weights_dir: Path, name: str) -> Path:
+    """The folder of a source's files, where every one has the digest that was recorded; `name` is the manifest's.
+
+    Raises `WeightsUnavailable`, saying what is wrong and how to mend it.
+    """
+    findings = check(source, weights_dir)
+    if findings:
+        messages = [finding.message for finding in findings[:_MAX_LISTED]]
+        if len(findings) > _MAX_LISTED:
+            messages.append(f"and {len(findings) - _MAX_LISTED} more")
+        raise WeightsUnavailable(
+            f"'{name}' cannot use its weights of '{source.repository}': {'; '.join(messages)}. "
+            f"Run `cow models pull {name}`."
+        )
+    return folder_of(weights_dir, source.repository)
+
+
+def ready(manifest: Manifest, weights_dir: Path, without: Container[str] = ()) -> bool:
+    """All files that the manifest needs, but those of the parts `without`, are here with the right sizes.
+
+    Quick: nothing is hashed.
+    """
+    sources = [source for part, source in manifest.sources.items() if part not in without]
+    try:
+        return not any(check(source, weights_dir, digests=False) for source in sources)
+    except WeightsUnavailable:
+        return False
+
+
+def weights_identity(manifest: Manifest, settings: Settings) -> str:
+    """Changes with the weights: revisions of what was pulled; names, sizes and times of the user's own files."""
+    own = settings.checkpoints.get(manifest.name)
+    parts: list[object] = []
+    if own is not None:
+        files = [own] if own.is_file() else sorted(path for path in own.rglob("*") if path.is_file())
+        parts += [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    for part, source in sorted(manifest.sources.items()):
+        lock = read_lock(settings.weights_dir, source.repository)
+        parts.append((part, None if lock is None else lock.revision))
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def read_lock(weights_dir: Path, repository: str) -> Lock | None:
+    """The record of a repository's files; None before the first pull. Raises `WeightsUnavailable` for a spoilt one."""
+    path = folder_of(weights_dir, repository) / LOCK_NAME
+    with disk_errors(repository):
+        try:
+            return Lock.model_validate_json(path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except ValidationError as error:
+            raise WeightsUnavailable(
+                f"The record of the weights of '{repository}', {path.parent.name}/{LOCK_NAME}, is spoilt: "
+                f"delete it and pull them again."
+            ) from error
+
+
+def write_lock(weights_dir: Path, lock: Lock) -> None:
+    """Writes the record; a reader sees the old one or the new one. Raises `OSError`."""
+    path = folder_of(weights_dir, lock.repository) / LOCK_NAME
+    temporary = path.with_name(f"{LOCK_NAME}.{uuid4().hex}")
+    try:
+        with temporary.open("x", encoding="utf-8") as file:
+            file.write(lock.model_dump_json(indent=2) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def chosen(lock: Lock, patterns: Iterable[str]) -> tuple[LockedFile, ...]:
+    """The recorded files that match one of the glob patterns, in which `*` takes slashes too."""
+    wanted = tuple(patterns)
+    return tuple(file for file in lock.files if any(fnmatchcase(file.path, pattern) for pattern in wanted))
+
+
+def examine(lock: Lock, files: Iterable[LockedFile], weights_dir: Path, digests: bool = True) -> tuple[Finding, ...]:
+    """Compares files with their record, hashing several at a time. Raises `WeightsUnavailable` if one is unreadable."""
+    folder = folder_of(weights_dir, lock.repository)
+    stop = Event()
+
+    def compare(file: LockedFile) -> Finding | None:
+        path = folder / file.path
+        try:
+            size = path.stat().st_size if path.is_file() else None
+        except (FileNotFoundError, NotADirectoryError):
+            size = None
+        if size is None:
+            return Finding(file=file.path, problem="missing")
+        if size != file.size:
+            return Finding(file=file.path, problem="wrong-size", wanted=f"{file.size} bytes", found=f"{size} bytes")
+        if digests and (found := _digest(path, file, stop)) != file.digest:
+            wanted, found = f"{file.algorithm} {file.digest}", f"{file.algorithm} {found}"
+            return Finding(file=file.path, problem="wrong-digest", wanted=wanted, found=found)
+        return None
+
+    # Hashing releases the GIL, so threads are enough; beyond a few, the disk is the limit.
+    with disk_errors(lock.repository), ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        try:
+            findings = tuple(pool.map(compare, files))
+        except BaseException:
+            stop.set()  # else an interrupted check would first finish the files in progress
+            raise
+    return tuple(finding for finding in findings if finding is not None)
+
+
+def _digest(path: Path, file: LockedFile, stop: Event) -> str:
+    state = hashlib.sha256() if file.algorithm == "sha256" else hashlib.sha1(usedforsecurity=False)
+    if file.algorithm == "git-sha1":
+        state.update(b"blob %d\0" % file.size)
+    buffer = memoryview(bytearray(min(_CHUNK_BYTES, max(file.size, 1))))
+    with path.open("rb", buffering=0) as data:
+        while (count := data.readinto(buffer)) and not stop.is_set():
+            state.update(buffer[:count])
+    return state.hexdigest()
+
+
+@contextmanager
+def disk_errors(repository: str) -> Generator[None]:
+    """Turns an `OSError` into `WeightsUnavailable` with the reason, without the path that the OSError's text holds."""
+    try:
+        yield
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else type(error).__name__
+        raise WeightsUnavailable(
+            f"The weights of '{repository}' cannot be read or written ({reason}): make the folder for weights "
+            f"(COW_MODELS_DIR) one that may be."
+        ) from error
+
+
+@dataclass(frozen=True)
+class DownloadProgress:
+    """How far one file has come. `done` and `size` are bytes; a file in the state `done` has the recorded digest."""
+
+    repository: str
+    file: str
+    state: Literal["downloading", "checking", "done"]
+    done: int
+    size: int
+
+
+ProgressCallback = Callable[[DownloadProgress], None]
+
+
+@dataclass(frozen=True)
+class Download:
+    """What is to be downloaded: the record to write, the files of the source, and those that are not here yet."""
+
+    lock: Lock
+    files: tuple[LockedFile, ...]
+    pending: tuple[LockedFile, ...]
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(file.size for file in self.files)
+
+    @property
+    def pending_size(self) -> int:
+        """Bytes to download."""
+        return sum(file.size for file in self.pending)
+
+
+def resolve(source: Source, weights_dir: Path, revision: str | None = None, *, endpoint: str | None = None) -> Download:
+    """What is missing of a source. The hub is asked only for what is not recorded. Raises `WeightsUnavailable`.
+
+    `revision` is a branch, tag or commit; by default the recorded one, or at first the newest. `endpoint` is the hub's
+    address, by default HF_ENDPOINT or the public one.
+    """
+    lock = read_lock(weights_dir, source.repository)
+    if lock is None or revision not in (None, lock.revision) or not {*source.files} <= {*lock.patterns}:
+        wanted = revision or (lock.revision if lock else None)
+        lock = _list(source, wanted, lock.patterns if lock else (), endpoint)
+    files = chosen(lock, source.files)
+    wrong = {finding.file for finding in examine(lock, files, weights_dir)}
+    return Download(lock, files, tuple(file for file in files if file.path in wrong))
+
+
+def download(
+    downloads: Sequence[Download],
+    weights_dir: Path,
+    progress: ProgressCallback = lambda progress: None,
+    *,
+    endpoint: str | None = None,
+) -> None:
+    """Downloads from different repositories. Raises `WeightsUnavailable`, before the first byte if disks are full."""
+    recorded = {each.lock.repository: read_lock(weights_dir, each.lock.repository) for each in downloads}
+    downloads = [each for each in downloads if each.pending or each.lock != recorded[each.lock.repository]]
+    if not downloads:
+        return
+    hub = _hub(endpoint)
+    with ExitStack() as held:
+        for each in downloads:
+            held.callback(_locked(folder_of(weights_dir, each.lock.repository), each.lock.repository).release)
+        _check_free_space(downloads, weights_dir)
+        for each in downloads:
+            lock, old = each.lock, read_lock(weights_dir, each.lock.repository)
+            if old is not None and old.revision == lock.revision:  # another download may have ended meanwhile
+                files = {file.path: file for file in (*old.files, *lock.files)}
+                both = {
+                    "patterns": tuple(dict.fromkeys((*old.patterns, *lock.patterns))),
+                    "files": tuple(files[path] for path in sorted(files)),
+                }
+                lock = lock.model_copy(update=both)
+            with disk_errors(lock.repository):
+                write_lock(weights_dir, lock)
+            for file in each.pending:
+                _download_file(hub, each.lock, file, weights_dir, progress)
+
+
+def _download_file(hub: HfApi, lock: Lock, file: LockedFile, weights_dir: Path, progress: ProgressCallback) -> None:
+    folder = folder_of(weights_dir, lock.repository)
+
+    def report(state: Literal["downloading", "checking", "done"], done: int) -> None:
+        progress(DownloadProgress(lock.repository, file.path, state, done, file.size))
+
+    report("downloading", 0)
+    with _hub_errors(lock.repository, lock.revision):
+        # The library trusts an existing file by its modification time; this one has a wrong digest.
+        (folder / file.path).unlink(missing_ok=True)
+        hub.hf_hub_download(
+            lock.repository,
+            file.path,
+            revision=lock.revision,
+            local_dir=folder,
+            tqdm_class=cast(Any, _progress_bar(lambda done: report("downloading", done))),
+        )
+    report("checking", file.size)
+    for finding in examine(lock, (file,), weights_dir):
+        with disk_errors(lock.repository):
+            (folder / file.path).unlink(missing_ok=True)
+        why = f"what came is not what the hub lists: {finding.message}"
+        raise _unavailable(lock.repository, why, "The file was deleted: run it again")
+    report("done", file.size)
+
+
+def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoint: str | None) -> Lock:
+    """The repository's files at a revision that match the source, and those that other sources of it have chosen."""
+    hub = _hub(endpoint)
+    with _hub_errors(source.repository, revision):
+        info = hub.model_info(source.repository, revision=revision, files_metadata=True, timeout=_LISTING_SECONDS)
+        siblings = {sibling.rfilename: sibling for sibling in info.siblings or ()}
+        names: set[str] = set()
+        patterns: list[str] = []
+        for pattern in dict.fromkeys((*source.files, *others)):
+            matching = {name for name in siblings if fnmatchcase(name, pattern)}
+            if found := {name for name in matching if not name.lower().endswith(PICKLED)}:
+                names |= found
+                patterns.append(pattern)
+            elif pattern in source.files:
+                pickled = "only pickled files, which can run code when they are read, match"
+                why = f"{pickled if matching else 'no file matches'} '{pattern}'"
+                raise _unavailable(source.repository, why, "Choose a revision that has such files as safetensors")
+        files = tuple(_record(source.repository, siblings[name]) for name in sorted(names))
+        return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=files)
+
+
+def _record(repository: str, sibling: RepoSibling) -> LockedFile:
+    try:
+        path = inside(sibling.rfilename)
+    except ValueError as error:
+        raise _unavailable(repository, f"in its listing, {error}", "Do not use this repository") from error
+    if sibling.lfs is not None:  # files in large-file storage, xet included
+        return LockedFile(path=path, size=sibling.lfs.size, algorithm="sha256", digest=sibling.lfs.sha256)
+    if sibling.size is None or sibling.blob_id is None:
+        raise _unavailable(repository, f"the hub lists no size or no digest of '{path}'", "Run it again")
+    return LockedFile(path=path, size=sibling.size, algorithm="git-sha1", digest=sibling.blob_id)
+
+
+def _check_free_space(downloads: Sequence[Download], weights_dir: Path) -> None:
+    needed: Counter[int] = Counter()
+    for each in downloads:
+        with disk_errors(each.lock.repository):
+            folder = folder_of(weights_dir, each.lock.repository)  # which may be a link to another disk
+            device, free = folder.stat().st_dev, shutil.disk_usage(folder).free
+        needed[device] += each.pending_size
+        if needed[device] > free:
+            why = f"its disk has {free / 1e9:.1f} GB free, and {needed[device] / 1e9:.1f} GB are needed"
+            raise _unavailable(each.lock.repository, why, "Free some space, or set COW_MODELS_DIR to a larger disk")
+
+
+def _locked(folder: Path, repository: str) -> FileLock:
+    """Locks the folder against other downloads, and deletes what killed downloads have left incomplete."""
+    from filelock import FileLock, Timeout  # noqa: PLC0415
+
+    kept = folder / ".cache"
+    with disk_errors(repository):
+        kept.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(kept / "cow.lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout as error:
+            raise _unavailable(repository, "another pull is downloading it", "Wait for that to end") from error
+        # Their names are unique to one download: the library never resumes them.
+        for left in kept.rglob("*.*.*.incomplete"):
+            left.unlink(missing_ok=True)
+        return lock
+
+
+def _hub(endpoint: str | None) -> HfApi:
+    try:
+        from huggingface_hub import HfApi  # noqa: PLC0415
+    except ImportError as error:
+        why = 'Downloading weights needs huggingface_hub, which is not installed: pip install "cow-service[wan]".'
+        raise WeightsUnavailable(why) from error
+    return HfApi(endpoint=endpoint, library_name="cow-service", library_version=__version__)
+
+
+def _progress_bar(report: Callable[[int], None]) -> type:
+    """A stand-in for tqdm that passes the bytes so far to `report`, and shows nothing."""
+
+    class Bar:
+        def __init__(self, *args: Any, initial: int = 0, total: int | None = None, **options: Any) -> None:
+            self.n, self.total = initial, total
+
+        def __enter__(self) -> Bar:
+            return self
+
+        def __exit__(self, *error: object) -> None:
+            pass
+
+        def update(self, count: float = 1) -> None:
+            self.n += int(count)
+            report(self.n)
+
+        def _ignore(self, *args: Any, **options: Any) -> None:
+            pass
+
+        # Having `update_transfer`, it gets one bar per file, and not a second one for bytes on the network.
+        update_transfer = set_transfer_postfix_str = set_postfix_str = refresh = close = _ignore
+
+    return Bar
+
+
+@contextmanager
+def _hub_errors(repository: str, revision: str | None) -> Generator[None]:
+    """Turns whatever the library raises into `WeightsUnavailable` with the reason and a remedy."""
+    try:
+        yield
+    except CowError:
+        raise
+    except Exception as error:
+        cause: BaseException = error
+        # By which the library replaces the network's own error.
+        while type(cause).__name__ == "LocalEntryNotFoundError" and cause.__cause__ is not None:
+            cause = cause.__cause__
+        reason, remedy = _reason(cause)
+        raise _unavailable(repository, reason.format(revision=revision or "main"), remedy) from error
+
+
+def _unavailable(repository: str, reason: str, remedy: str) -> WeightsUnavailable:
+    return WeightsUnavailable(f"'{repository}' cannot be downloaded: {reason}. {remedy}.")
+
+
+def _reason(error: BaseException) -> tuple[str, str]:
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    for name, reason, remedy in REASONS:
+        if name in kinds:
+            return reason, remedy
+    status = getattr(getattr(error, "response", None), "status_code", None)
+    if status in (401, 403):
+        return f"it is not open to this account (HTTP {status})", _LOG_IN
+    if status is not None:
+        return f"the hub answered with HTTP {status}", "Wait a little and run it again"
+    if isinstance(error, OSError) and error.errno:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return "the disk is full", "Free some space, or set COW_MODELS_DIR to a folder on a larger disk"
+        return f"the folder for weights cannot be used ({errno.errorcode.get(error.errno)})", "Make it writable"
+    return f"the download failed ({type(error).__name__})", _AGAIN
