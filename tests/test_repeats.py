@@ -324,7 +324,8 @@ def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
     answers(mllm, list("ABA"), looking="B")
     database = Database(Settings(data_dir=tmp_path))
     database.create_tables()
-    add_job(database, "one")
+    for job in ("one", "two"):
+        add_job(database, job)
     step = StoredStep(
         "one",
         None,
