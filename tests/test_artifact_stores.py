@@ -260,7 +260,7 @@ def test_the_file_of_the_database_gives_room_back(tmp_path: Path):
     database.give_room_back(lambda: False)
     file = tmp_path / "jobs.sqlite3"
     full = file.stat().st_size
-    assert full > 15_000_000
+    assert full > 10_000_000
     JobTable(database).delete(jobs)
     database.give_room_back(lambda: False)
     assert file.stat().st_size < full / 4
