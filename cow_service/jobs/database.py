@@ -206,10 +206,10 @@ class Database:
         """Runs a query that always succeeds where the database can be used."""
         self.read(sa.text("SELECT 1"))
 
-    def read(self, query: sa.Executable) -> Sequence[Any]:
-        """The rows of a single query."""
+    def read(self, query: sa.Executable, values: dict[str, Any] | None = None) -> Sequence[Any]:
+        """The rows of a single query, with the values of its parameters."""
         with database_errors(), self._reading.connect() as connection:
-            return connection.execute(query).all()
+            return connection.execute(query, values).all()
 
     @contextmanager
     def transaction(self) -> Generator[sa.Connection]:

@@ -162,12 +162,7 @@ class JobTable:
     def load(self, owner: str | None, queue: str = "") -> Load:
         """What a new job of an owner adds to."""
 
-        def number_of(condition: sa.ColumnElement[bool]) -> sa.ColumnElement[int]:
-            return sa.func.coalesce(sa.func.sum(sa.case((condition, 1), else_=0)), 0)
-
-        waiting = sa.and_(JOBS.c.queue == queue, JOBS.c.executor.is_(None))
-        counts = sa.func.count(), number_of(JOBS.c.owner.is_not_distinct_from(owner)), number_of(waiting)
-        (row,) = self._database.read(sa.select(*counts).where(JOBS.c.status.in_(OPEN)))
+        (row,) = self._database.read(_LOAD, {"owner": owner, "queue": queue})
         return Load(*row)
 
     def insert(
@@ -179,10 +174,9 @@ class JobTable:
         """
         run = uuid4().hex
         with self._database.transaction() as connection:
-            own = sa.select(JOBS.c.id, JOBS.c.owner, JOBS.c.turn, JOBS.c.priority)
-            own = own.where(JOBS.c.queue == queue, JOBS.c.status.in_(OPEN))
-            first: Sequence[Any] = connection.execute(own.order_by(JOBS.c.turn).limit(1)).all()
-            jobs: Sequence[Any] = connection.execute(own.where(JOBS.c.owner.is_not_distinct_from(owner))).all()
+            given = {"owner": owner, "queue": queue}
+            first: Sequence[Any] = connection.execute(_FIRST_TURN, given).all()
+            jobs: Sequence[Any] = connection.execute(_TURNS_OF_OWNER, given).all()
             turn = next_turn([*first, *jobs], owner, spec.priority, step)
             spec = spec.model_copy(update={"turn": turn})
             row = {
@@ -192,10 +186,10 @@ class JobTable:
                 **{"executor": executor, "run": None if executor is None else run, "starts": int(executor is not None)},
                 "spec": packed(spec.model_dump_json()),
             }
-            if connection.execute(self._insert(JOBS, [row]).returning(JOBS.c.id)).one_or_none() is None:
+            if connection.execute(self._insert(JOBS).returning(JOBS.c.id), row).one_or_none() is None:
                 return None
             needed = [{"sha256": sha256, "job_id": job_id} for sha256 in {spec.image, *spec.masks}]
-            connection.execute(self._insert(REFERENCES, needed))
+            connection.execute(self._insert(REFERENCES), needed)
             if behind := [job.id for job in jobs if moves(job, owner, spec.priority, turn)]:
                 waits = JOBS.c.id.in_(behind), JOBS.c.executor.is_(None)
                 connection.execute(sa.update(JOBS).where(*waits).values(turn=JOBS.c.turn + step))
@@ -227,7 +221,7 @@ class JobTable:
                 connection.execute(sa.select(sa.func.pg_advisory_xact_lock(CLAIM_LOCK)))
             rows = connection.execute(taken).all()
         return [
-            TakenJob(row.id, _spec(row.spec).model_copy(update={"turn": row.turn}), row.owner, queue, row.run)
+            TakenJob(row.id, JobSpec.model_validate(unpacked(row.spec) | {"turn": row.turn}), row.owner, queue, row.run)
             for row in sorted(rows, key=lambda row: (row.turn, row.created_at, row.id))
         ]
 
@@ -334,7 +328,7 @@ class JobTable:
     def spec(self, job_id: str) -> JobSpec | None:
         """What a job has to do."""
         rows = self._database.read(sa.select(JOBS.c.spec).where(JOBS.c.id == job_id))
-        return _spec(rows[0].spec) if rows else None
+        return JobSpec.model_validate(unpacked(rows[0].spec)) if rows else None
 
     def may_read(self, sha256: str, owner: str) -> bool:
         """Whether a job of an owner needs an artifact."""
@@ -373,10 +367,10 @@ class JobTable:
             connection.execute(sa.delete(JOBS).where(JOBS.c.id.in_(jobs)))
         return artifacts - self._database.referenced(artifacts)
 
-    def _insert(self, table: sa.Table, rows: list[dict[str, Any]]) -> postgresql.Insert | sqlite.Insert:
+    def _insert(self, table: sa.Table) -> postgresql.Insert | sqlite.Insert:
         """An insertion that skips rows that are there."""
         dialect = postgresql if self._database.file is None else sqlite
-        return dialect.insert(table).values(rows).on_conflict_do_nothing()
+        return dialect.insert(table).on_conflict_do_nothing()
 
     def _end(self, job_id: str, status: JobStatus, run: str | None = None, **values: Any) -> bool:
         """Ends an open job, and has its webhook called. Of an attempt: only if it is the latest."""
@@ -406,10 +400,19 @@ class JobTable:
 
 _WAITS = JOBS.c.status == "queued", JOBS.c.executor.is_(None), JOBS.c.version == VERSION
 _RELEASED = {"status": "queued", "executor": None, "run": None}
-_SHOWN = tuple(
+_OF_OWNER = JOBS.c.owner.is_not_distinct_from(sa.bindparam("owner", type_=sa.Text))
+_OF_QUEUE = JOBS.c.queue == sa.bindparam("queue", type_=sa.Text)
+_LOAD = sa.select(
+    sa.func.count(),
+    sa.func.count(sa.case((_OF_OWNER, 1))),
+    sa.func.count(sa.case((sa.and_(_OF_QUEUE, JOBS.c.executor.is_(None)), 1))),
+).where(JOBS.c.status.in_(OPEN))
+_TURNS = sa.select(JOBS.c.id, JOBS.c.owner, JOBS.c.turn, JOBS.c.priority).where(_OF_QUEUE, JOBS.c.status.in_(OPEN))
+_FIRST_TURN, _TURNS_OF_OWNER = _TURNS.order_by(JOBS.c.turn).limit(1), _TURNS.where(_OF_OWNER)
+_SHOWN = [
     JOBS.c[name]
-    for name in ("id", "kind", "owner", "status", "created_at", "ended", "generator", "question", "image", "error")
-)
+    for name in ["id", "kind", "owner", "status", "created_at", "ended", "generator", "question", "image", "error"]
+]
 
 
 def error_as_json(error: CowError) -> dict[str, Any]:
@@ -443,10 +446,6 @@ def _within_limit(queue: str, limit: int) -> sa.Select[Any]:
         .outerjoin(taken, taken.c.owner == waiting.c.owner)
         .where(sa.or_(waiting.c.owner.is_(None), number <= limit))
     )
-
-
-def _spec(kept: bytes) -> JobSpec:
-    return JobSpec.model_validate(unpacked(kept))
 
 
 def _state(row: sa.Row[Any], at: At | None) -> JobState:

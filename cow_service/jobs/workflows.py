@@ -277,6 +277,7 @@ class Dispatcher:
         self._held: Counter[str] = Counter()  # the places of each queue that are held
         self._handed: SimpleQueue[tuple[TakenJob, DecodedImage | None]] = SimpleQueue()
         self._woken, self._stopping = threading.Event(), threading.Event()
+        self._look = True  # at the queues: there may be jobs that wait
         self._thread: threading.Thread | None = None
         self._executor = ""
 
@@ -301,6 +302,7 @@ class Dispatcher:
 
     def wake(self) -> None:
         """Has the queues looked at now: there is a new job, or a place."""
+        self._look = True
         self._woken.set()
 
     def hold_place(self, queue: str) -> bool:
@@ -321,20 +323,22 @@ class Dispatcher:
     def hand_over(self, job: TakenJob, image: DecodedImage) -> None:
         """Has a job started that holds a place already."""
         self._handed.put((job, image))
-        self.wake()
+        self._woken.set()
 
     def _dispatch(self) -> None:
         while not self._stopping.is_set():
             self._woken.clear()
+            look, self._look = self._look, False
             try:
                 self._start_handed()
-                for queue in self._parts.jobs.waiting_queues():
+                for queue in self._parts.jobs.waiting_queues() if look else ():
                     self._fill(queue)
             except CowError as error:
                 log.warning("no jobs are taken: %s", error.detail)
             except Exception:
                 log.exception("no jobs were taken")
-            self._woken.wait(POLL_SECONDS)
+            if not self._woken.wait(POLL_SECONDS):
+                self._look = True
         self._start_handed()
 
     def _start_handed(self) -> None:
