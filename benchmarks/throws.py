@@ -30,7 +30,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit, FloorCamera, fit_shadow, prior
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.engine import RigidShape, run_worlds
-from cow_service.physics.events import find_events
+from cow_service.physics.events import find_world_events
 from cow_service.physics.outcome import SURE
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
@@ -179,9 +179,9 @@ def probability(throw: Throw, size: int) -> tuple[float, bool]:
     fit: CameraFit = fit_shadow(prior(), box, throw.shadow, (WIDTH, HEIGHT)) or prior()
     world = WorldInput(bodies, motion, fit, (WIDTH, HEIGHT), FRAMES, FPS, asked=1)
     shown, rows = likeliest(), ensemble(size)
-    single = find_events(run_world(world, shown), bodies, FPS, shown)
-    found = find_events(run_world(world, rows, 2), bodies, FPS, rows)
-    return float(found.happens("touches")[:, 1].mean()), bool(single.happens("touches")[0, 1])
+    single = find_world_events(run_world(world, shown), bodies, FPS, shown, (WIDTH, HEIGHT)).of[0]
+    found = find_world_events(run_world(world, rows, 2), bodies, FPS, rows, (WIDTH, HEIGHT)).of[0]
+    return float(np.isfinite(found.times["touches"][:, 1]).mean()), bool(np.isfinite(single.times["touches"][0, 1]))
 
 
 def best_probability(throw: Throw, size: int, rng: np.random.Generator) -> float:

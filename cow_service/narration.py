@@ -246,8 +246,8 @@ class _Facts:
     def sentence(self) -> str:
         """What happens in the likeliest world: a clause for the mover, then one for each other body that matters."""
         meeting = [each.subject for each in self._trajectory.encounters if each.subject and each.kind == "touches"]
-        chosen = dict.fromkeys([*([self._subject] if self._subject else []), *meeting])
-        others = [body for body in chosen if body in self._paths or body == self._subject][:MAX_MET]
+        chosen: list[int] = [*([self._subject] if self._subject else []), *meeting]
+        others = [body for body in dict.fromkeys(chosen) if body in self._paths or body == self._subject][:MAX_MET]
         clauses = [self._clause(body) for body in (0, *others)]
         became = self._became()
         return "; ".join([clauses[0], *(_lowered(clause) for clause in (*clauses[1:], *([became] if became else [])))])

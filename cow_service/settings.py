@@ -39,47 +39,47 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(default_factory=lambda: user_data_path("cow", appauthor=False))
     """Folder for artifacts, the job database and temporary files; made if missing."""
-    artifacts: str | None = Field(None, min_length=1)
+    artifacts: str | None = Field(default=None, min_length=1)
     """Where artifacts are kept: a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX; by
     default the folder `artifacts` of the data folder."""
     artifacts_redirect: bool = True
     """Whether callers are sent to the object store for artifacts, by signed URLs; if not, the server passes the bytes
     on."""
-    artifacts_max_gb: float | None = Field(None, gt=0)
+    artifacts_max_gb: float | None = Field(default=None, gt=0)
     """Artifacts that are kept, in GB (10^9 bytes): beyond, those that no job used for longest are removed; by default
     age alone decides."""
     host: str = "127.0.0.1"
     """Address the server listens on."""
-    port: int = Field(8000, ge=0, le=65535)
+    port: int = Field(default=8000, ge=0, le=65535)
     """Port the server listens on; 0 takes a free one."""
-    mllm: str | None = Field(None, min_length=1)
+    mllm: str | None = Field(default=None, min_length=1)
     """Multimodal LLM to ask: a manifest's name, or provider:model."""
-    mllm_base_url: str | None = Field(None, pattern=r"^https?://")
+    mllm_base_url: str | None = Field(default=None, pattern=r"^https?://")
     """Address of the server that serves it, OpenAI-compatible."""
     mllm_api_key: SecretStr | None = None
     """Its key; by default that of the provider's own environment variable."""
-    mllm_model: str | None = Field(None, min_length=1)
+    mllm_model: str | None = Field(default=None, min_length=1)
     """Name under which it is served, where that is not the manifest's."""
-    mllm_timeout: float = Field(60, gt=0, le=3600)
+    mllm_timeout: float = Field(default=60, gt=0, le=3600)
     """Longest wait for one reply, seconds."""
-    mllm_budget: float = Field(180, gt=0, le=7200)
+    mllm_budget: float = Field(default=180, gt=0, le=7200)
     """Longest wait with all retries, seconds."""
-    mllm_concurrency: int = Field(8, ge=1, le=1024)
+    mllm_concurrency: int = Field(default=8, ge=1, le=1024)
     """Calls of it at the same time; others wait."""
     reader: str = Field(default_factory=lambda values: "mllm" if values.get("mllm") else "embedded")
     """Reader where a request names none; `mllm` where COW_MLLM is set."""
     generator: str = "cutout"
     """Generator where a request names none."""
-    max_image_megapixels: float = Field(25, gt=0, le=500)
+    max_image_megapixels: float = Field(default=25, gt=0, le=500)
     """Largest image taken, in millions of pixels."""
-    max_body_mb: float = Field(32, gt=0, le=4096)
+    max_body_mb: float = Field(default=32, gt=0, le=4096)
     """Largest request body taken, in MB (10^6 bytes)."""
-    max_bodies_mb: float = Field(256, gt=0, le=65536)
+    max_bodies_mb: float = Field(default=256, gt=0, le=65536)
     """Request bodies that are held at the same time, in MB; more are refused with 503."""
     allow_image_urls: tuple[str, ...] = ()
     """Hosts from which images given by URL are fetched, as JSON: names, name:port, *.name for all below it, * for every
     public host; none by default."""
-    body_timeout: float = Field(30, gt=0, le=3600)
+    body_timeout: float = Field(default=30, gt=0, le=3600)
     """Longest wait for a whole request body, seconds."""
     models_dir: Path | None = None
     """Folder for weights; by default the folder `models` of the data folder."""
@@ -88,9 +88,9 @@ class Settings(BaseSettings):
     pull` brings, by name of the generator or multimodal LLM, as JSON."""
     profile: str = "exact"
     """How video models run: a profile of their manifest."""
-    device: str = Field("auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
+    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
     """Where models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU."""
-    concurrency: int = Field(2, ge=1, le=256)
+    concurrency: int = Field(default=2, ge=1, le=256)
     """Requests computed at the same time; others wait."""
     workers: bool = True
     """Compute in processes of their own, one per request at a time; 0: in that of the server, where a crash ends every
@@ -98,21 +98,21 @@ class Settings(BaseSettings):
     role: Literal["all", "api"] = "all"
     """What a server does: api takes requests and computes nothing, for which `cow worker` runs beside it on the same
     job database; all does both."""
-    metrics_port: int | None = Field(None, ge=1, le=65535)
+    metrics_port: int | None = Field(default=None, ge=1, le=65535)
     """Port on which `cow worker` serves its metrics, at the address of COW_HOST; by default none. Servers have GET
     /metrics."""
     queues: tuple[str, ...] = ()
     """Queues from which jobs are taken, as JSON: light, and the name of each backend with a device of its own, such as
     ati; by default all."""
-    worker_memory_mb: float | None = Field(None, gt=0)
+    worker_memory_mb: float | None = Field(default=None, gt=0)
     """Memory that one worker process may take, MB; its job fails with worker-ended beyond that. By default 80% of the
     machine's."""
-    worker_jobs: int = Field(1000, ge=1)
+    worker_jobs: int = Field(default=1000, ge=1)
     """Jobs after which a worker process is replaced by a new one."""
     warmup: bool = True
     """Compute something small before /readyz says ready, and compile a video model for clips of any size when it is
     loaded; else the first requests take several times as long."""
-    job_timeout: float = Field(3600, gt=0, le=604_800)
+    job_timeout: float = Field(default=3600, gt=0, le=604_800)
     """Seconds that one job may compute in a worker process; beyond that it fails with job-timeout."""
     generator_concurrency: dict[str, Annotated[int, Field(ge=1, le=256)]] = Field(default_factory=dict)
     """Clips that a generator makes at the same time, by its name, as JSON; by default 1 of a video model, and of others
@@ -122,7 +122,7 @@ class Settings(BaseSettings):
     )
     """Who may call, as JSON: name to the hash of its key, as `cow keys new NAME` prints them; by default whoever
     reaches the server."""
-    rate_limit: int | None = Field(None, ge=1, le=1_000_000)
+    rate_limit: int | None = Field(default=None, ge=1, le=1_000_000)
     """Requests a minute with one key, or from one address where there are no keys."""
     cors_origins: tuple[Annotated[str, Field(pattern=ORIGIN)], ...] = ()
     """Origins of web pages that may use the server, as JSON, such as https://app.example.org; * for all of them where
@@ -136,20 +136,20 @@ class Settings(BaseSettings):
     migrate: bool = True
     """Create and update the tables of the job database at the start; false where `cow migrate` does so before, with
     rights that servers and workers need not have."""
-    queue_limit: int = Field(1000, ge=1, le=1_000_000)
+    queue_limit: int = Field(default=1000, ge=1, le=1_000_000)
     """Jobs that wait or run; more are refused with queue-full."""
-    queue_limit_per_key: int | None = Field(None, ge=1, le=1_000_000)
+    queue_limit_per_key: int | None = Field(default=None, ge=1, le=1_000_000)
     """Of them, those of one key; by default half of them where there are several keys."""
-    running_limit_per_key: int | None = Field(None, ge=1, le=1_000_000)
+    running_limit_per_key: int | None = Field(default=None, ge=1, le=1_000_000)
     """Jobs of one key that are computed at the same time, in all processes together; to be set for workers, too. By
     default as many as there are places."""
     key_weights: dict[str, Annotated[float, Field(ge=0.01, le=100)]] = Field(default_factory=dict)
     """Shares of keys while several have jobs that wait, by their names, as JSON; by default 1 for each."""
-    job_retention_hours: float = Field(168, gt=0, le=87_600)
+    job_retention_hours: float = Field(default=168, gt=0, le=87_600)
     """Age at which finished jobs are removed, hours."""
-    shutdown_grace: float = Field(10, ge=0, le=3600)
+    shutdown_grace: float = Field(default=10, ge=0, le=3600)
     """Seconds that running jobs are given when the server stops; what is not done then goes on at the next start."""
-    outage_budget: float = Field(600, ge=0, le=86400)
+    outage_budget: float = Field(default=600, ge=0, le=86400)
     """Seconds that a running job waits for a database or a disk that is away, before it fails."""
     webhook_secret: SecretStr | None = None
     """Secret that signs webhooks (Standard Webhooks, whsec_...); without it none are called. Two with a space between

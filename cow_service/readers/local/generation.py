@@ -362,8 +362,9 @@ class BatchGenerator:
         self._tokenizer: PreTrainedTokenizerFast = self._processor.tokenizer
         advice = model.generation_config or GenerationConfig()
         given = {name: getattr(advice, name) for name in ("temperature", "top_p", "top_k")}
-        known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        self.default_sampling = Sampling(**{"temperature": 1.0, **known}) if advice.do_sample else Sampling()
+        known: dict[str, Any] = {"temperature": 1.0}
+        known |= {name: value for name, value in given.items() if value is not None}
+        self.default_sampling = Sampling(**known) if advice.do_sample else Sampling()
         ends = advice.eos_token_id
         self._ends = _as_tuple(self._tokenizer.eos_token_id if ends is None else ends)
         padding = self._tokenizer.pad_token_id
