@@ -35,8 +35,9 @@ from cow_service.physics.outcome import SURE
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
 from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, throw_speed
-from cow_service.vision.masks import CroppedMask, Floats
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.shadows import Shadow
+from cow_service.vision.types import Floats
 
 WIDTH, HEIGHT = 832, 480  # px
 RADIUS = 0.15  # m, of the ball

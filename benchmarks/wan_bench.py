@@ -13,9 +13,9 @@ from wan_result import rounded
 
 from cow_service.generators.wan.acceleration import accelerate, accelerate_transformer, reset_cache
 from cow_service.generators.wan.checkpoints import IN_CHANNELS, TEXT_LENGTH
-from cow_service.generators.wan.loading import make_tiny
 from cow_service.generators.wan.pipeline import compose, image_token_count, latent_shape
 from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
+from cow_service.generators.wan.tiny import make_tiny
 
 SHORT_FRAMES = 17, 9  # of a second size
 KERNELS = 15

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from cow_service.generators.wan.checkpoints import load_transformer
-from cow_service.generators.wan.loading import make_tiny
 from cow_service.generators.wan.pipeline import Conditioning
 from cow_service.generators.wan.profiles import Sampling
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.weights.manifests import load_manifests
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))

@@ -29,9 +29,9 @@ from cow_service.generators.wan import conditioning
 from cow_service.generators.wan.acceleration import accelerate
 from cow_service.generators.wan.attention import with_attention
 from cow_service.generators.wan.checkpoints import diffusers_config
-from cow_service.generators.wan.loading import make_tiny
 from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, latent_shape, token_count
 from cow_service.generators.wan.profiles import Profile, Sampling
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.generators.wan.tracks import Tracks
 from cow_service.weights.manifests import Manifest, load_manifests
 

@@ -93,7 +93,7 @@ def test_each_queue_is_scaled_by_its_own_jobs() -> None:
         container = container_of(DEPLOYMENTS[scaled["spec"]["scaleTargetRef"]["name"]])
         (trigger,) = scaled["spec"]["triggers"]
         queue = container["args"][container["args"].index("--queues") + 1]
-        assert f"attributes ->> 'queue' = '{queue}'" in trigger["metadata"]["query"]
+        assert f"queue = '{queue}'" in trigger["metadata"]["query"]
         given = {one["name"]: one["value"] for one in container["env"]}
         assert trigger["metadata"]["targetQueryValue"] == given.get("COW_CONCURRENCY", "1")
 

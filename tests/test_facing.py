@@ -20,8 +20,9 @@ from cow_service.readers.embedded.facing import DARK, OTHER, PAINT, VehicleModel
 from cow_service.readers.embedded.reader import EmbeddedReader, create
 from cow_service.records import Grounding
 from cow_service.settings import Settings
-from cow_service.vision.masks import Image, Mask, bbox_of, iou
+from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.scene import Scene
+from cow_service.vision.types import Image, Mask
 
 WIDTH, HEIGHT = 640, 400
 COLOURS = {PAINT: (190, 40, 40), DARK: (18, 18, 18), OTHER: (110, 125, 145)}

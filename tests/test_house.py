@@ -90,11 +90,8 @@ UNAVOIDABLE = {
     "_cache_config": "diffusers: the cache of a model that was set up by another clip",
     "_reset_stateful_cache": "diffusers: nothing of one clip stays in a cache for the next",
     "_keep_in_fp32_modules": "diffusers: the layers that a checkpoint must keep in float32",
-    "_execution_device": "diffusers: where a pipeline computes whose weights may be offloaded",
     "_context_manager": "cache-dit: nothing of one clip stays in a cache for the next",
     "_context_names": "cache-dit: as `_context_manager`",
-    "_is_cached": "cache-dit: whether a model has a cache",
-    "_parse_range_header": "starlette: its refusals of a range are plain text, ours are problems",
 }
 
 

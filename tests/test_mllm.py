@@ -678,7 +678,15 @@ def test_the_frames_follow_the_image_and_encounters_are_a_hypothesis(mllm: MllmS
     (x0, y0, x1, y1) = scene.meta["bbox"]
     bbox = [x0 / 832 * 1000, y0 / 480 * 1000, x1 / 832 * 1000, y1 / 480 * 1000]
     mllm.say(
-        json.dumps({"object": "yellow ball", "others": ["blue mug"], "kind": "linear", "sentence": "The ball rolls."}),
+        json.dumps(
+            {
+                "asked": {"relation": "touches", "target": "blue mug"},
+                "object": "yellow ball",
+                "others": ["blue mug"],
+                "kind": "linear",
+                "sentence": "The ball rolls.",
+            }
+        ),
         json.dumps({"label": "yellow ball", "bbox_2d": bbox, "direction": [330, 470, 700, 540], "cue": "arrow"}),
         '{"reasoning": "It rolls into it.", "answer": "A"}',
     )

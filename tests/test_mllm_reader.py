@@ -197,8 +197,9 @@ def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm: MllmServ
         motion = run.stage("motion", read_motion, found, run.hints)
         assert motion.cue == "trail"
         assert [round(x) for x, _ in motion.trail] == pytest.approx([120, 215], abs=2)
-        assert {region.colour for region in run.scene.regions} == {"orange", "green"}
-        assert len(run.scene.regions) == 2, "the earlier positions are taken out of the image"
+        regions = run.scene_of(found, motion.cue).regions
+        assert {region.colour for region in regions} == {"orange", "green"}
+        assert len(regions) == 2, "the earlier positions are taken out of the image"
 
 
 @pytest.mark.parametrize("source", ["request", "mllm"])

@@ -29,7 +29,8 @@ from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
-from cow_service.vision.masks import CroppedMask, Image
+from cow_service.vision.masks import CroppedMask
+from cow_service.vision.types import Image
 
 RED, BLUE, GREEN = (200, 30, 30), (40, 60, 200), (40, 160, 60)
 MOVER, GOAL, BETWEEN = (80, 210, 130, 260), (480, 196, 550, 274), (280, 200, 350, 272)

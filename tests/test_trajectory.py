@@ -17,8 +17,9 @@ from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.reconstruction import Situation
 from cow_service.stages.trajectory import compute_trajectory, simulate_world
-from cow_service.vision.masks import CroppedMask, Image
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.scene import Obstacle, Scene
+from cow_service.vision.types import Image
 
 RED, BLUE, GREEN = (200, 30, 30), (40, 60, 200), (40, 160, 60)
 MOVER = {"object": "red ball", "bbox": (80, 210, 130, 260)}

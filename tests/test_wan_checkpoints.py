@@ -15,7 +15,8 @@ from safetensors.torch import load_file, save_file
 
 from cow_service.errors import CheckpointInvalid
 from cow_service.generators.wan.checkpoints import diffusers_config, load_transformer
-from cow_service.generators.wan.loading import assemble, make_tiny
+from cow_service.generators.wan.loading import assemble
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.weights.manifests import load_manifests
 
 CPU = torch.device("cpu")

@@ -11,9 +11,9 @@ from golden import figures, image_embeds, original_folder, tensors
 
 from cow_service.generators.wan.checkpoints import load_transformer
 from cow_service.generators.wan.conditioning import ati_condition, wan_move_condition, wan_move_latent
-from cow_service.generators.wan.loading import make_tiny
 from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, make_schedule
 from cow_service.generators.wan.profiles import Sampling
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.generators.wan.tracks import to_ati_tensor
 from cow_service.weights.manifests import load_manifests
 

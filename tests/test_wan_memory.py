@@ -10,9 +10,10 @@ from safetensors.torch import load_file, save_file
 
 from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan import memory
-from cow_service.generators.wan.loading import assemble, make_tiny
+from cow_service.generators.wan.loading import assemble
 from cow_service.generators.wan.memory import check_memory, need_of
 from cow_service.generators.wan.profiles import profile_of
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.weights.manifests import load_manifests
 
 ATI = load_manifests()["ati"]

@@ -28,10 +28,10 @@ from cow_service.errors import (
 from cow_service.generators.wan import conditioning, loading
 from cow_service.generators.wan.acceleration import accelerate_transformer
 from cow_service.generators.wan.generator import CONDITION_CHANNELS, LoadedModel
-from cow_service.generators.wan.loading import make_tiny
 from cow_service.generators.wan.pipeline import Conditioning, denoise, latent_shape
 from cow_service.generators.wan.profiles import Acceleration, Profile, Sampling, profile_of
 from cow_service.generators.wan.ranks import MODULE, RankGroup, Sharing
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
 from cow_service.weights.manifests import load_manifests
 

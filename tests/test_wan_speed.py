@@ -17,8 +17,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from cow_service.generators.wan import acceleration
 from cow_service.generators.wan.checkpoints import load_transformer
-from cow_service.generators.wan.loading import make_tiny
 from cow_service.generators.wan.profiles import Profile, Sampling
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.weights.manifests import load_manifests
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"

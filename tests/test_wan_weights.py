@@ -18,7 +18,8 @@ from hub import Blob, Hub, running
 from safetensors.torch import save
 
 from cow_service.errors import CheckpointInvalid, WeightsUnavailable
-from cow_service.generators.wan.loading import create_ati, make_tiny
+from cow_service.generators.wan.loading import create_ati
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.records import Simulation
 from cow_service.settings import Settings
 from cow_service.weights.manifests import load_manifests

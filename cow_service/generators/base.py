@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from cow_service.records import GeneratorInfo, Grounding, Motion, Trajectory
-from cow_service.vision.scene import Obstacle, Scene
+
+if TYPE_CHECKING:  # it needs OpenCV, which a machine for video models may lack
+    from cow_service.vision.scene import Obstacle, Scene
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from cow_service.generators.cutout.shadows import take_shadows
 from cow_service.media.images import fit_within
 from cow_service.physics.camera import FloorCamera
 from cow_service.records import BBox, Body, Path, Point, Trajectory
-from cow_service.vision.masks import CroppedMask, Image, Mask, hull, resized_mask
+from cow_service.vision.masks import CroppedMask, hull, resized_mask
+from cow_service.vision.types import Image, Mask
 
 AWAY = 1e6  # px: where the path of what is taken away ends
 CHANGED = 3  # grey levels: what differs less is as it was

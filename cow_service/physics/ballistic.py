@@ -14,7 +14,7 @@ import numpy as np
 from cow_service.physics.camera import Camera
 from cow_service.records import Grounding, Motion, Vector
 from cow_service.requests import TrajectoryRequest
-from cow_service.vision.masks import Floats, Mask
+from cow_service.vision.types import Floats, Mask
 
 GRAVITY = 9.81  # m/s^2
 DEFAULT_SPEED = 0.26  # image widths per second

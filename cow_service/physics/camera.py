@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox, CameraEstimate, CameraSource
-from cow_service.vision.masks import Floats
 from cow_service.vision.shadows import Shadow
+from cow_service.vision.types import Floats
 
 FREE_PITCH = math.radians(30)  # how far the camera looks down on a floor, for motion towards or away from it
 NEAREST_FREE = 0.08  # of the first depth: closer than this the object has passed the camera

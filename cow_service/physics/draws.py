@@ -7,7 +7,7 @@ from statistics import NormalDist
 import numpy as np
 
 from cow_service.records import Doubt
-from cow_service.vision.masks import Floats
+from cow_service.vision.types import Floats
 
 PARAMETERS: dict[str, Doubt] = {
     "pitch": "camera",

@@ -29,8 +29,8 @@ from rapier3d import (
 from cow_service.physics.ballistic import GRAVITY, Course
 from cow_service.physics.draws import COLUMN
 from cow_service.records import Shape
-from cow_service.vision.masks import Floats, Mask
 from cow_service.vision.openings import SeenOpening
+from cow_service.vision.types import Floats, Mask
 
 ROUND_SIDES = 16  # wall segments of a round container: the opening is wider by at most 2% at their joints
 BOX_SIDES = 4

@@ -13,7 +13,7 @@ from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.events import WorldEvents, find_world_events
 from cow_service.physics.outcome import Decided, Query, answers_of, decide, decide_change
 from cow_service.physics.world import WorldInput, Worlds, run_world
-from cow_service.vision.masks import Floats
+from cow_service.vision.types import Floats
 
 EVERY = 2  # frames between those that are recorded of the ensemble
 TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does

@@ -14,7 +14,7 @@ from cow_service.physics.engine import RigidShape, WorldRun
 from cow_service.physics.projection import SeenPaths, seen_paths, shares, turned
 from cow_service.physics.world import Worlds
 from cow_service.records import Encounter, EncounterKind
-from cow_service.vision.masks import Floats, Mask
+from cow_service.vision.types import Floats, Mask
 
 NEVER = math.inf
 DISPLACED = 0.1  # of a body's half width: what is displaced less was not set in motion

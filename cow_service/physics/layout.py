@@ -14,7 +14,7 @@ from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN, quantiles
 from cow_service.physics.lift import FARTHEST, NEAREST, Cameras, LiftedBody, above, in_the_air
 from cow_service.records import FALLING_KINDS, Cue, Motion
-from cow_service.vision.masks import Floats
+from cow_service.vision.types import Floats
 
 HUNG = 4.0  # how much likelier it hangs over that than where the camera's priors have it
 HUNG_SIGMA = 0.3  # of the mover's half width: how far ahead of the other it is

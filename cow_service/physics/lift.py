@@ -12,7 +12,7 @@ import numpy as np
 from cow_service.physics.camera import HORIZON, CameraFit, axes_of
 from cow_service.physics.draws import COLUMN
 from cow_service.records import BBox, Shape
-from cow_service.vision.masks import Floats
+from cow_service.vision.types import Floats
 
 SIZE_SIGMA = 0.08  # of a body's width: boxes are inexact, and a thing is not as deep as wide
 FOOT_SIGMA = 0.02  # of a body's height in the image: where it meets the floor

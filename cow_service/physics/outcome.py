@@ -15,7 +15,7 @@ import numpy as np
 from cow_service.physics.draws import NAMES, PARAMETERS
 from cow_service.physics.events import NEVER, WorldEvents
 from cow_service.records import Asked, AskedForm, AskedRelation, Doubt, EncounterKind
-from cow_service.vision.masks import Floats, Mask
+from cow_service.vision.types import Floats, Mask
 
 SURE = 0.7  # share of the worlds from which an answer is given
 ROBUST = 0.9

@@ -17,8 +17,8 @@ import numpy as np
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import BOX_SIDES, Hollow, Meeting, RigidShape, WorldRun, hollow_of, run_worlds
 from cow_service.records import PlacementResult, PlaceRelation
-from cow_service.vision.masks import Floats, Mask
 from cow_service.vision.openings import SeenOpening
+from cow_service.vision.types import Floats, Mask
 
 CARRIED = 1.0  # s that it takes, at most
 MOST_CARRIED = 0.5  # of the clip

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from cow_service.physics.world import Worlds
 from cow_service.records import Path
-from cow_service.vision.masks import CroppedMask, Floats, Mask, scaled_size
+from cow_service.vision.masks import CroppedMask, scaled_size
+from cow_service.vision.types import Floats, Mask
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion x, y, z, w
 MOST_LEAN = np.radians(25)

@@ -18,7 +18,7 @@ from cow_service.physics.layout import VEHICLE_WIDTH, Layout, flies, lay_out, sp
 from cow_service.physics.lift import BOX_SIDE, FARTHEST
 from cow_service.physics.placement import PlacementGoal, Placements, Settled, carry, new_supports, settle
 from cow_service.records import FALLING_KINDS, Motion
-from cow_service.vision.masks import Floats, Mask
+from cow_service.vision.types import Floats, Mask
 
 FRICTION, FRICTION_SIGMA = 0.5, 0.3  # of a body; one standard deviation of the logarithm
 RESTITUTION, RESTITUTION_SIGMA = 0.5, 0.15

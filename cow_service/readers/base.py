@@ -31,8 +31,8 @@ from cow_service.records import (
     Usage,
     Vector,
 )
-from cow_service.vision.masks import Image, Mask
 from cow_service.vision.scene import Scene
+from cow_service.vision.types import Image, Mask
 
 SpeedWord = Literal["slow", "normal", "fast"]
 Unit = Literal["px", "m", "widths", "px/s", "m/s", "widths/s"]  # `widths`: of the image

@@ -19,7 +19,7 @@ from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.reconstruction import obstacles_of
 from cow_service.stages.run import Run
-from cow_service.vision.masks import Image, Mask
+from cow_service.vision.types import Image, Mask
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,10 @@ from cow_service.records import Artifact, Asked, BBox, Estimate, Grounding, Inte
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
-from cow_service.vision.masks import Mask, bbox_of, iou
+from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
 from cow_service.vision.scene import Scene
+from cow_service.vision.types import Mask
 
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice

@@ -43,7 +43,8 @@ from cow_service.records import (
 )
 from cow_service.records.world import BAND_PERCENTILES
 from cow_service.stages.reconstruction import Situation, placed_before
-from cow_service.vision.masks import CroppedMask, Floats, turning
+from cow_service.vision.masks import CroppedMask, turning
+from cow_service.vision.types import Floats
 
 UPRIGHT = 1.0  # degrees: with less, the box of what leans stays that of what stands upright
 MOVED = 0.5  # px: what moves less in the image stays where it is

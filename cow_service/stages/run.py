@@ -23,8 +23,8 @@ from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Read
 from cow_service.records import Artifact, BBox, Cue, Grounding, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
-from cow_service.vision.masks import Mask
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
+from cow_service.vision.types import Mask
 
 
 def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import Floats, Mask
 from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask, full_size
+from cow_service.vision.types import Floats, Mask
 
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
 HEAD, HOLLOW_HEAD = 1.8, 1.3  # of the shaft's width: the least width of a head, and of a hollow drawing's

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision.contrast import lab_gradients
-from cow_service.vision.masks import Floats, Floats32, Image, Mask, lab_of, scaled
+from cow_service.vision.masks import lab_of, scaled
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
 EDGE = 1.0, 2.2  # Lab units per px, and times the median gradient; the larger counts

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, EDGE_THRESHOLDS, View
-from cow_service.vision.masks import Floats, Floats32, Mask, hull, outline_of, window_of
+from cow_service.vision.masks import hull, outline_of, window_of
+from cow_service.vision.types import Floats, Floats32, Mask
 
 TRIES = 120  # circles through three points of the outline
 NEAR = 1.3  # px at the working size: an outline point this close lies on the circle

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import Floats32, Image, lab_of, scaled
+from cow_service.vision.masks import lab_of, scaled
+from cow_service.vision.types import Floats32, Image
 
 CHROMA_STEP = 9.0  # Lab units from the surroundings: an object
 BRIGHT_STEP = 5.0  # Lab lightness above the surroundings: an object

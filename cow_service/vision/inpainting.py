@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import Floats, Floats32, Image, Mask, scaled_size, three_channels, window_of
+from cow_service.vision.masks import scaled_size, three_channels, window_of
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 INPAINT_RADIUS = 4  # px
 WIDE = 0.6  # of the hole's size: so far around it exemplars are looked for

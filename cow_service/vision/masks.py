@@ -7,15 +7,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox
-
-Image = NDArray[np.uint8]  # RGB [H, W, 3]
-Mask = NDArray[np.bool_]  # [H, W]
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 _FIRST_PIXEL = slice(0, 1), slice(0, 1)  # the window that stands for an empty mask
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import CroppedMask, Floats, Floats32, Image
+from cow_service.vision.masks import CroppedMask
+from cow_service.vision.types import Floats, Floats32, Image
 
 FLATTEST, ROUNDEST = 0.12, 0.7  # of the ellipse's width: its height
 LEAST_RIM = 0.75  # of half the width of the mask: a narrower rim beside a handle is not looked for

@@ -18,19 +18,8 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision.completion import as_disc, is_underside, neck_between, standing_on, white_sides
 from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, View, colour_name, colour_names, view_of
-from cow_service.vision.masks import (
-    CroppedMask,
-    Floats32,
-    Image,
-    Mask,
-    bbox_of,
-    enlarged,
-    iou,
-    lab_of,
-    outline_of,
-    scaled,
-    window_of,
-)
+from cow_service.vision.masks import CroppedMask, bbox_of, enlarged, iou, lab_of, outline_of, scaled, window_of
+from cow_service.vision.types import Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
 SHARP_SHARE = 0.65  # of an outline that must lie on edges

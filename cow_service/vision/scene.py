@@ -15,12 +15,13 @@ import numpy as np
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import CroppedMask, Image, Mask, bbox_of, iou, without_holes
+from cow_service.vision.masks import CroppedMask, bbox_of, iou, without_holes
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region, disc_region, find_regions, region_of
 from cow_service.vision.segmentation import CutQuality, cut_quality, mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
+from cow_service.vision.types import Image, Mask
 
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
 DOUBTFUL = 0.75  # confidence below which the same holds of a small region that touches another obstacle

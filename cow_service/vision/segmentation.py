@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
-from cow_service.vision.masks import Floats, Floats32, Image, Mask, bbox_of, outline_of, scaled
+from cow_service.vision.masks import bbox_of, outline_of, scaled
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
 POINT_SIDE = 1280  # px: an object is looked for around a point in an image of at most this size

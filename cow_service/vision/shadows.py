@@ -14,8 +14,9 @@ import numpy as np
 
 from cow_service.records import BBox
 from cow_service.vision.inpainting import quadratic_terms
-from cow_service.vision.masks import Floats, Floats32, Mask, lab_of, resized_mask, scaled
+from cow_service.vision.masks import lab_of, resized_mask, scaled
 from cow_service.vision.scene import Scene
+from cow_service.vision.types import Floats, Floats32, Mask
 
 WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
 LEAST_WIDTH = 14.0  # px in the image: a smaller shadow is lost in the floor's texture

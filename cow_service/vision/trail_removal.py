@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 
 from cow_service.vision.inpainting import fill_hole
-from cow_service.vision.masks import Floats, Floats32, Image, Mask, lab_of, scaled, window_of
+from cow_service.vision.masks import lab_of, scaled, window_of
 from cow_service.vision.trails import FADED, Position, Trail
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 RIM, LEAST_RIM = 0.06, 2.0  # of the radius, px: around a position, mixed with the background
 APART = 0.03  # of the radius by which a place must lie outside all earlier positions to be surely the present one's

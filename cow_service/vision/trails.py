@@ -16,7 +16,8 @@ import numpy as np
 
 from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
-from cow_service.vision.masks import Floats, Image, Mask, iou
+from cow_service.vision.masks import iou
+from cow_service.vision.types import Floats, Image, Mask
 
 UNLIKE, LEAST_CONTRAST = 0.3, 12.0  # difference of appearance over the contrast, at most; grey levels of that contrast
 LEAST_OPACITY = 0.08

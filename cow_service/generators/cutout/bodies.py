@@ -14,7 +14,8 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.physics.camera import NEAREST, FloorCamera
 from cow_service.records import FALLING_KINDS, BBox, Body, Path, Shape
 from cow_service.vision.inpainting import push_pull
-from cow_service.vision.masks import Floats, Floats32, Image, Mask, hull, resized_mask, turning, window_of
+from cow_service.vision.masks import hull, resized_mask, turning, window_of
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 TOUCHING = 0.25  # of the smaller height: how deep one body may seem to stand in the one beneath it
 EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge

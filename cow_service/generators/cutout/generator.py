@@ -18,7 +18,8 @@ from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, Layers
 from cow_service.physics.camera import has_passed
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.masks import Floats, Floats32, Image, scaled_size, three_channels
+from cow_service.vision.masks import scaled_size, three_channels
+from cow_service.vision.types import Floats, Floats32, Image
 
 
 class CutoutGenerator:

@@ -23,8 +23,9 @@ from cow_service.generators.cutout.bodies import (
 from cow_service.generators.cutout.shadows import Shadow, UnshadedScene, take_shadows
 from cow_service.media.images import fit_within
 from cow_service.vision.inpainting import fill_hole
-from cow_service.vision.masks import CroppedMask, Image, Mask, hull, iou, resized_mask, window_of
+from cow_service.vision.masks import CroppedMask, hull, iou, resized_mask, window_of
 from cow_service.vision.openings import SeenOpening, measure_opening
+from cow_service.vision.types import Image, Mask
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
 HOLE_GROWTH = 0.03  # of the object's size: the rim, mixed with the background, is inpainted too

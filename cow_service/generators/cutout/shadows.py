@@ -18,8 +18,9 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import Ground, MovingBody, StillBody, Surface, Window, clipped
 from cow_service.generators.cutout.shade import LEAST_SHADE, Shade, cast_shade, contact_shade, strongest
 from cow_service.records import Path, Vector
-from cow_service.vision.masks import Floats, Floats32, Image, Mask, bbox_of
+from cow_service.vision.masks import bbox_of
 from cow_service.vision.shadows import find_shadow
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 FADED = 0.6  # of its height: a standing thing that has risen so far has no contact shadow any more
 SKY, SHARPNESS = 1.5, 2.0  # so much of the power of that share is lost: light also comes in from beside

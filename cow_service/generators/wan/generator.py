@@ -31,7 +31,7 @@ from cow_service.generators.wan.profiles import Profile, Sampling, WanLimits, Wa
 from cow_service.generators.wan.ranks import RankGroup
 from cow_service.generators.wan.tracks import tracks_of
 from cow_service.records import GeneratorInfo
-from cow_service.vision.masks import Image
+from cow_service.vision.types import Image
 from cow_service.weights.device import cpu_threads
 
 USUAL_SIDES = 832, 480  # their ratio

@@ -8,7 +8,6 @@ nothing; it is for tests, and to try a deployment out.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -16,15 +15,11 @@ from typing import Any, cast
 import torch
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
 from safetensors import SafetensorError
-from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
 from torch import distributed, nn
 from transformers import (
     AutoTokenizer,
     CLIPImageProcessor,
-    CLIPVisionConfig,
     CLIPVisionModel,
-    PreTrainedTokenizerFast,
-    UMT5Config,
     UMT5EncoderModel,
 )
 
@@ -36,20 +31,18 @@ from cow_service.generators.wan.checkpoints import (
     add_lora,
     checkpoint_files,
     counted,
-    diffusers_config,
     load_transformer,
 )
 from cow_service.generators.wan.generator import USUAL_SIDES, LoadedModel, WanGenerator, clip_size, keep_compiled_code
 from cow_service.generators.wan.memory import check_memory, within_memory
-from cow_service.generators.wan.pipeline import LATENT_CHANNELS, WanTrackPipeline, compose
+from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
 from cow_service.generators.wan.ranks import RankGroup
+from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device
 from cow_service.weights.manifests import Manifest, load_manifests
 from cow_service.weights.repositories import folder_of, read_lock, verify, weights_identity
-
-TINY_SEED = 0
 
 log = logging.getLogger("cow_service")
 
@@ -255,43 +248,3 @@ def _part(kind: Any, base: Path, part: str, **options: Any) -> Any:
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         reason = (str(error).replace(str(base), "").splitlines() or [type(error).__name__])[0]
         raise CheckpointInvalid(f"'{part}' cannot be loaded: {reason}") from error
-
-
-def make_tiny(architecture: Mapping[str, Any]) -> WanTrackPipeline:
-    """A pipeline of these sizes (as in a manifest); the same sizes give the same weights."""
-    # Every byte is a token; 0 pads and 1 ends, as in T5.
-    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
-    vocabulary = {token: i for i, token in enumerate(["<pad>", "</s>", *alphabet])}
-    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    tokenizer.decoder = decoders.ByteLevel()
-    tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
-    text_width, image_width = architecture["text_dim"], architecture["image_dim"]
-    text_config = UMT5Config(
-        vocab_size=len(vocabulary), d_model=text_width, d_kv=8, d_ff=2 * text_width, num_layers=1, num_heads=2
-    )
-    image_config = CLIPVisionConfig(
-        hidden_size=image_width, intermediate_size=2 * image_width, num_hidden_layers=2, num_attention_heads=2,
-        image_size=32, patch_size=8,
-    )  # fmt: skip
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(TINY_SEED)
-        parts = {  # in this order, by which the seed gives the same weights
-            "transformer": WanTransformer3DModel(**diffusers_config(architecture)),
-            "vae": AutoencoderKLWan(
-                base_dim=4,
-                z_dim=LATENT_CHANNELS,
-                dim_mult=[1, 1, 1, 1],
-                num_res_blocks=1,
-                temperal_downsample=[False, True, True],
-            ),
-            "text_encoder": UMT5EncoderModel(text_config),
-            "image_encoder": CLIPVisionModel(image_config),
-        }
-    for part in parts.values():
-        part.eval().requires_grad_(False)
-    return compose(
-        tokenizer=PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", eos_token="</s>"),
-        image_processor=CLIPImageProcessor(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}),
-        **parts,
-    )

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from cow_service.errors import InvalidRequest
 from cow_service.records import Path as BodyPath
 from cow_service.records import Trajectory
-from cow_service.vision.masks import Floats, Floats32
+from cow_service.vision.types import Floats, Floats32
 
 MAX_FRAMES = 81  # of a Wan2.1 clip
 STRIDE = 4  # clip frames per latent frame, after the first

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 
 from cow_service.readers.embedded.english.lexicon import words
-from cow_service.vision.masks import Mask, hull
+from cow_service.vision.masks import hull
 from cow_service.vision.regions import Region
+from cow_service.vision.types import Mask
 
 Range = tuple[float, float]
 

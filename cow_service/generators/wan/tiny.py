@@ -1,0 +1,63 @@
+"""Wan2.1 at toy size: the real classes with seeded random weights and a toy tokenizer; without settings or OpenCV."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from diffusers import AutoencoderKLWan, WanTransformer3DModel
+from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
+from transformers import (
+    CLIPImageProcessor,
+    CLIPVisionConfig,
+    CLIPVisionModel,
+    PreTrainedTokenizerFast,
+    UMT5Config,
+    UMT5EncoderModel,
+)
+
+from cow_service.generators.wan.checkpoints import diffusers_config
+from cow_service.generators.wan.pipeline import LATENT_CHANNELS, WanTrackPipeline, compose
+
+TINY_SEED = 0
+
+
+def make_tiny(architecture: Mapping[str, Any]) -> WanTrackPipeline:
+    """A pipeline of these sizes (as in a manifest); the same sizes give the same weights."""
+    # Every byte is a token; 0 pads and 1 ends, as in T5.
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    vocabulary = {token: i for i, token in enumerate(["<pad>", "</s>", *alphabet])}
+    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
+    text_width, image_width = architecture["text_dim"], architecture["image_dim"]
+    text_config = UMT5Config(
+        vocab_size=len(vocabulary), d_model=text_width, d_kv=8, d_ff=2 * text_width, num_layers=1, num_heads=2
+    )
+    image_config = CLIPVisionConfig(
+        hidden_size=image_width, intermediate_size=2 * image_width, num_hidden_layers=2, num_attention_heads=2,
+        image_size=32, patch_size=8,
+    )  # fmt: skip
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(TINY_SEED)
+        parts = {  # in this order, by which the seed gives the same weights
+            "transformer": WanTransformer3DModel(**diffusers_config(architecture)),
+            "vae": AutoencoderKLWan(
+                base_dim=4,
+                z_dim=LATENT_CHANNELS,
+                dim_mult=[1, 1, 1, 1],
+                num_res_blocks=1,
+                temperal_downsample=[False, True, True],
+            ),
+            "text_encoder": UMT5EncoderModel(text_config),
+            "image_encoder": CLIPVisionModel(image_config),
+        }
+    for part in parts.values():
+        part.eval().requires_grad_(False)
+    return compose(
+        tokenizer=PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", eos_token="</s>"),
+        image_processor=CLIPImageProcessor(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}),
+        **parts,
+    )
