@@ -15,7 +15,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 from crash import Report, crash
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.timeout(600 * SCALE)]
-JOBS, KILLS = 6 * SCALE, 2 * SCALE - 1
+JOBS, KILLS = 6 * SCALE, 2 * SCALE
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -951,8 +951,8 @@ def hear_until_cut(served: Served, job_id: str, heard: list[str]) -> None:
 def test_after_a_crash_jobs_go_on_where_they_were(tmp_path_factory: pytest.TempPathFactory) -> None:
     with Served(tmp_path_factory.mktemp("crash"), COW_WORKERS="true") as one:
         key = {"Idempotency-Key": "crash"}
-        job = one.submit(slow(5, seed=96), **key)
         done = one.ended(one.submit({**BODY, "image": data_url(picture(7))})["id"])
+        job = one.submit(slow(5, seed=96), **key)
         one.rendering(job["id"])
         heard = events_until(one, job["id"], "grounding")
         assert numbers(heard) == [1, 2, 3]
