@@ -15,7 +15,7 @@ from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.english.asked import read_asked, unread
 from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.records import Grounding
+from cow_service.records import Asked, Grounding
 from cow_service.vision.scene import Scene
 
 RED, BLUE, GREEN = (200, 30, 30), (50, 80, 200), (50, 150, 50)
@@ -173,14 +173,17 @@ def test_the_things_of_a_kind_are_found_or_refused() -> None:
         EmbeddedReader().ground(ReaderInput(scene(), "If the blue cube slides left, does it hit all three balls?"))
 
 
-def test_a_typing_error_is_named_as_any_word_that_is_not_known() -> None:
-    question = parse("If the green ball mvoes to the right, will it touhc the trunk?")
-    assert {"mvoes", "touhc trunk"} <= set(unread(question).turning)
-    assert read_asked(question) is None
+def test_typing_errors_are_read_and_said() -> None:
+    question = parse("If the gren ball mvoes to the rigth, will it touhc the trunk?")
+    assert question.errors == (("mvoes", "moves"), ("rigth", "right"), ("touhc", "touch"))
+    assert (question.motion.verb, read_asked(question)) == ("move", Asked(relation="touches", target="trunk"))
+    given = ReaderInput(scene(), "If the red ball rools left, is the cube hit?")
+    assert "Read 'rools' as 'rolls'." in EmbeddedReader().ground(given).warnings
 
 
 @given(st.text("bcdfghjklmnpqrstvwxz", min_size=6, max_size=12))
 def test_no_sense_is_made_of_what_has_none(word: str) -> None:
     question = parse(f"If the red ball {word} left, does it hit the mug?")
+    assert question.errors == ()
     assert question.mover is not None
     assert word in question.mover.text or word in unread(question).turning  # a noun nobody knows, or named as unread

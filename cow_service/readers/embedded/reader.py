@@ -183,7 +183,8 @@ def create(settings: Settings) -> EmbeddedReader:
 
 def _unread_warnings(question: Question) -> list[str]:
     words = unread(question)
-    said = [f"The words '{each}' were not understood, so no outcome is told." for each in words.turning]
+    said = [f"Read '{error}' as '{meant}'." for error, meant in question.errors]
+    said += [f"The words '{each}' were not understood, so no outcome is told." for each in words.turning]
     return said + [f"The words '{each}' were not understood and changed nothing." for each in words.beside]
 
 

@@ -80,6 +80,11 @@ def _grammar() -> _Grammar:
     return _Grammar()
 
 
+def listed_words() -> Set[str]:
+    """The words that the grammar lists."""
+    return _grammar().terminals.keys()
+
+
 class _Parse:
     """What the rules make of some words, by rule and place: where each may end, with the first tree that ends there."""
 

@@ -43,6 +43,7 @@ from cow_service.readers.embedded.english.motion import (
     with_front,
 )
 from cow_service.readers.embedded.english.noun_phrases import items, with_nouns, with_places, with_tables
+from cow_service.readers.embedded.english.spelling import without_typing_errors
 from cow_service.readers.options import split_options
 from cow_service.records import MotionKind
 
@@ -136,6 +137,7 @@ class Question:
     beyond: str = ""  # how what is not read any more begins
     pronoun: str = ""  # that stands for the mover where it may stand for two things
     read: frozenset[int] = frozenset()
+    errors: tuple[tuple[str, str], ...] = ()  # typing errors, each with the word that it was read as
 
     def has_read(self, at: int) -> bool:
         """Whether the item at a place tells the motion and was understood."""
@@ -151,7 +153,8 @@ def parse(question: str) -> Question:
     if len(found) > MAX_WORDS:
         text, rest = text[: found[MAX_WORDS].start], found[MAX_WORDS : MAX_WORDS + 7]
         beyond = " ".join(each.key for each in rest)
-    text = without_openings(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
+    text, errors = without_typing_errors(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
+    text = without_openings(text)
     changes, found = split_interventions(with_places(with_nouns(with_tables(items(text)))))
     trail, found = split_trail(found)
     clauses = read_clauses(found)
@@ -187,6 +190,7 @@ def parse(question: str) -> Question:
         beyond=beyond,
         pronoun=_open_pronoun(found, best, mover),
         read=read.union(item.start for item in found[clause.start : clause.stop]) if carried else read,
+        errors=errors,
     )
 
 
