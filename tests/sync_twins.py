@@ -10,21 +10,16 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 CLIENT = ROOT / "cow_service" / "client"
-TWINS = {"async_client.py": "sync_client.py", "async_connection.py": "sync_connection.py"}
+TWINS = {"async_client.py": "sync_client.py", "async_results.py": "sync_results.py"}
 NAMES = {
     "AsyncAnswer": "Answer",
     "AsyncClient": "Client",
-    "AsyncConnection": "Connection",
-    "AsyncFiles": "Files",
+    "AsyncIO": "BlockingIO",
     "AsyncJobHandle": "JobHandle",
     "AsyncSimulation": "Simulation",
     "async_client": "sync_client",
-    "async_connection": "sync_connection",
     "async_io": "sync_io",
-    "aclose": "close",
-    "aclosing": "closing",
-    "aiter_sse": "iter_sse",
-    "aread": "read",
+    "async_results": "sync_results",
 }
 
 

@@ -742,7 +742,7 @@ def test_examples_in_the_docs_are_true(address: str, tmp_path: Path, monkeypatch
         own = {"client": client, "base_url": address, "asyncio": asyncio}
         found = {name: doctest.testmod(importlib.import_module(name), extraglobs=own) for name in names}
     assert not {name: each for name, each in found.items() if each.failed}
-    modules = {"sync_client", "sync_connection", "display"}
+    modules = {"sync_client", "sync_results", "display"}
     assert {name.rpartition(".")[2] for name, each in found.items() if each.attempted} >= modules
 
 

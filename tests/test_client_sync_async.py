@@ -20,15 +20,12 @@ from sync_twins import CLIENT, TWINS, twin_of
 
 from cow_service import client as sdk
 from cow_service.client import CowError
-from cow_service.client.async_connection import AsyncConnection
-from cow_service.client.sync_connection import Connection
 
 PAIRS = [
     (sdk.Client, sdk.AsyncClient),
     (sdk.JobHandle, sdk.AsyncJobHandle),
     (sdk.Simulation, sdk.AsyncSimulation),
     (sdk.Answer, sdk.AsyncAnswer),
-    (Connection, AsyncConnection),
 ]
 SPECIAL = {"__init__", "__enter__", "__exit__", "__aenter__", "__aexit__", "__repr__", "_repr_html_", "_repr_png_"}
 PHOTO = EXAMPLES / "ball-and-mug" / "image.jpg"
@@ -103,9 +100,8 @@ def test_both_take_and_say_the_same(blocking: type, awaited: type, name: str) ->
     assert [_signature(each) for each in get_overloads(_function(one))] == [
         _signature(each) for each in get_overloads(_function(other))
     ]
-    if blocking is not Connection:
-        assert _prose(one) == _prose(other)
-        assert _prose(one) or name.startswith("_")
+    assert _prose(one) == _prose(other)
+    assert _prose(one) or name.startswith("_")
 
 
 # --- what comes of calls ---

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cow_service.client import errors as errors
     from cow_service.client.async_client import AsyncClient as AsyncClient
-    from cow_service.client.async_connection import AsyncAnswer as AsyncAnswer
-    from cow_service.client.async_connection import AsyncJobHandle as AsyncJobHandle
-    from cow_service.client.async_connection import AsyncSimulation as AsyncSimulation
+    from cow_service.client.async_results import AsyncAnswer as AsyncAnswer
+    from cow_service.client.async_results import AsyncJobHandle as AsyncJobHandle
+    from cow_service.client.async_results import AsyncSimulation as AsyncSimulation
     from cow_service.client.batches import BatchResult as BatchResult
     from cow_service.client.display import Models as Models
     from cow_service.client.errors import CowError as CowError
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from cow_service.client.protocol import Event as Event
     from cow_service.client.request import ImageLike as ImageLike
     from cow_service.client.sync_client import Client as Client
-    from cow_service.client.sync_connection import Answer as Answer
-    from cow_service.client.sync_connection import JobHandle as JobHandle
-    from cow_service.client.sync_connection import Simulation as Simulation
+    from cow_service.client.sync_results import Answer as Answer
+    from cow_service.client.sync_results import JobHandle as JobHandle
+    from cow_service.client.sync_results import Simulation as Simulation
 
 # Each is imported when it is first asked for: whoever uses one client need not wait for the rest.
 _MODULES = {
     "async_client": ("AsyncClient",),
-    "async_connection": ("AsyncAnswer", "AsyncJobHandle", "AsyncSimulation"),
+    "async_results": ("AsyncAnswer", "AsyncJobHandle", "AsyncSimulation"),
     "batches": ("BatchResult",),
     "display": ("Models",),
     "errors": ("CowError",),
@@ -41,7 +41,7 @@ _MODULES = {
     "protocol": ("Event",),
     "request": ("ImageLike",),
     "sync_client": ("Client",),
-    "sync_connection": ("Answer", "JobHandle", "Simulation"),
+    "sync_results": ("Answer", "JobHandle", "Simulation"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = ["errors", *_MODULE_OF]  # noqa: PLE0604 # pyright: ignore[reportUnsupportedDunderAll]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import httpx
 
-    from cow_service.client.async_connection import AsyncAnswer, AsyncJobHandle, AsyncSimulation
+    from cow_service.client.async_results import AsyncAnswer, AsyncJobHandle, AsyncSimulation
     from cow_service.client.batches import BatchResult
     from cow_service.client.display import Models
     from cow_service.client.journal import QuestionLike
@@ -56,9 +56,10 @@ class AsyncClient:
         retries: int = RETRIES,
         http_client: httpx.AsyncClient | None = None,
     ) -> None:
-        from cow_service.client.async_connection import AsyncConnection  # noqa: PLC0415 - httpx takes 0.3 s to import
+        from cow_service.client import async_results as results  # noqa: PLC0415 - httpx takes 0.3 s to import
 
-        self._connection = AsyncConnection(base_url, api_key, timeout, retries, http_client)
+        self._connection = results.connect(base_url, api_key, timeout, retries, http_client)
+        self._run, self._iterate = results.run, results.iterate
 
     @property
     def base_url(self) -> str:
@@ -67,7 +68,7 @@ class AsyncClient:
 
     async def close(self) -> None:
         """Closes the client's connections."""
-        await self._connection.close()
+        await self._run(self._connection.io.close())
 
     async def __aenter__(self) -> Self:
         return self
@@ -95,7 +96,7 @@ class AsyncClient:
         `errors.py`, `WaitTimeout` among them.
         """
         arguments = "simulate", image, question, options, idempotency_key, fresh, minimal
-        return await self._connection.simulate_or_answer(timeout, progress, *arguments)
+        return await self._run(self._connection.simulate_or_answer(timeout, progress, *arguments))
 
     async def answer(
         self,
@@ -111,7 +112,7 @@ class AsyncClient:
     ) -> AsyncAnswer:
         """Imagines the future of an image, looks at it, then answers. Arguments and errors as for `simulate`."""
         arguments = "answer", image, question, options, idempotency_key, fresh, minimal
-        return await self._connection.simulate_or_answer(timeout, progress, *arguments)
+        return await self._run(self._connection.simulate_or_answer(timeout, progress, *arguments))
 
     @overload
     async def submit(
@@ -148,7 +149,7 @@ class AsyncClient:
         **options: Any,
     ) -> AsyncJobHandle[Any]:
         """Submits a simulation or an answer, and does not wait for it. Once this returns, the server keeps the job."""
-        return await self._connection.submit(kind, image, question, options, idempotency_key, fresh)
+        return await self._run(self._connection.submit(kind, image, question, options, idempotency_key, fresh))
 
     @overload
     def map(
@@ -191,11 +192,11 @@ class AsyncClient:
         """
         from cow_service.client.batches import Batch  # noqa: PLC0415 - not needed to call a server once
 
-        return self._connection.map(Batch(questions, kind, options))
+        return self._iterate(self._connection.map(Batch(questions, kind, options)))
 
     async def job(self, id: str) -> AsyncJobHandle[AsyncSimulation | AsyncAnswer]:
         """A job that was submitted before. Raises `JobNotFound`."""
-        return await self._connection.job(id)
+        return await self._run(self._connection.job(id))
 
     def jobs(
         self,
@@ -207,20 +208,20 @@ class AsyncClient:
     ) -> AsyncIterator[AsyncJobHandle[AsyncSimulation | AsyncAnswer]]:
         """The jobs of this key, newest first, page by page as they are asked for. A time without a zone is local."""
         filters = {"status": status, "kind": kind, "created_after": created_after, "created_before": created_before}
-        return self._connection.jobs(filters)
+        return self._iterate(self._connection.jobs(filters))
 
     async def artifact(self, sha256: str) -> bytes:
         """The bytes of an artifact; they are checked against its name."""
-        return await self._connection.artifact(sha256)
+        return await self._run(self._connection.artifact(sha256))
 
     async def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
         from cow_service.client.display import Models  # noqa: PLC0415
 
-        return await self._connection.get(Models, "/models")
+        return await self._run(self._connection.get(Models, "/models"))
 
     async def workers(self) -> Workers:
         """The processes on the server's job database, what each computes, and the queues."""
         from cow_service.records import Workers  # noqa: PLC0415
 
-        return await self._connection.get(Workers, "/workers")
+        return await self._run(self._connection.get(Workers, "/workers"))

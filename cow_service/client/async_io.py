@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager
 from typing import Any, TypeVar
+
+import httpx
+from httpx_sse import EventSource, ServerSentEvent
+
+from cow_service.client.protocol import is_event_stream
 
 Q = TypeVar("Q")
 R = TypeVar("R")
 
 
-async def sleep(seconds: float) -> None:
-    """Waits."""
-    await asyncio.sleep(seconds)
+async def run(coroutine: Coroutine[Any, Any, R]) -> R:
+    """Awaits a coroutine of `Connection`."""
+    return await coroutine
 
 
-async def call_blocking(function: Callable[[], R]) -> R:
-    """Calls a function that blocks, in a thread."""
-    return await asyncio.to_thread(function)
-
-
-def raise_if_stopped() -> None:
-    """Does nothing: tasks are canceled from outside."""
+def iterate(values: AsyncGenerator[R]) -> AsyncGenerator[R]:
+    """What a generator of `Connection` yields."""
+    return values
 
 
 def picture_bytes(files: Any, sha256: str) -> bytes | None:
@@ -29,39 +31,64 @@ def picture_bytes(files: Any, sha256: str) -> bytes | None:
     return files.held.get(sha256)
 
 
-class Shield:
-    """Work that goes on when its caller is canceled."""
+class AsyncIO:
+    """An HTTP client, closed with this where it was made here, and the tasks that wait for it."""
 
-    def __init__(self) -> None:
-        self._tasks: set[asyncio.Task[None]] = set()
+    def __init__(self, http: httpx.AsyncClient | None) -> None:
+        self._own_http = http is None
+        self.http = httpx.AsyncClient(limits=httpx.Limits(max_connections=None)) if http is None else http
+        self._shielded: set[asyncio.Task[None]] = set()
 
-    async def run(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Does the work in a task of its own: whoever is canceled may be canceled again before it is done."""
+    async def close(self) -> None:
+        """Closes the HTTP client once the server knows which callers have left."""
+        await asyncio.gather(*self._shielded, return_exceptions=True)
+        if self._own_http:
+            await self.http.aclose()
+
+    async def request(self, method: str, url: str, **arguments: Any) -> httpx.Response:
+        """The response to a request."""
+        return await self.http.request(method, url, **arguments)
+
+    @asynccontextmanager
+    async def stream(
+        self, url: str, **arguments: Any
+    ) -> AsyncGenerator[tuple[httpx.Response, AsyncIterator[ServerSentEvent]]]:
+        """The response at a URL, with its body where it is no stream of events, and the events."""
+        async with self.http.stream("GET", url, **arguments) as response:
+            if not is_event_stream(response):
+                await response.aread()
+            yield response, EventSource(response).aiter_sse()
+
+    async def sleep(self, seconds: float) -> None:
+        """Waits."""
+        await asyncio.sleep(seconds)
+
+    async def call_blocking(self, function: Callable[[], R]) -> R:
+        """Calls a function that blocks, in a thread."""
+        return await asyncio.to_thread(function)
+
+    async def shield(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Does work in a task of its own: whoever is canceled may be canceled again before it is done."""
         task = asyncio.create_task(work())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._shielded.add(task)
+        task.add_done_callback(self._shielded.discard)
         await asyncio.shield(task)
 
-    async def wait(self) -> None:
-        """Waits for all of it."""
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-
-
-async def map_concurrently(
-    ask: Callable[[Q], Coroutine[Any, Any, R]], questions: Iterator[Q], concurrency: int
-) -> AsyncGenerator[R]:
-    """Asks so many questions at the same time, and yields each result as it comes."""
-    tasks: set[asyncio.Task[R]] = set()
-    try:
-        while True:
-            while len(tasks) < concurrency and (question := next(questions, None)) is not None:
-                tasks.add(asyncio.create_task(ask(question)))
-            if not tasks:
-                return
-            done, tasks = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                yield task.result()
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+    async def map_concurrently(
+        self, ask: Callable[[Q], Coroutine[Any, Any, R]], questions: Iterator[Q], concurrency: int
+    ) -> AsyncGenerator[R]:
+        """Asks so many questions at the same time, and yields each result as it comes."""
+        tasks: set[asyncio.Task[R]] = set()
+        try:
+            while True:
+                while len(tasks) < concurrency and (question := next(questions, None)) is not None:
+                    tasks.add(asyncio.create_task(ask(question)))
+                if not tasks:
+                    return
+                done, tasks = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    yield task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)

@@ -6,8 +6,7 @@ import base64
 import io
 from collections.abc import Callable, Sequence
 from html import escape
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from cow_service import records
 from cow_service.records import (
@@ -334,42 +333,6 @@ def _name(backend: BackendInfo) -> str:
 def _commands(backend: BackendInfo) -> tuple[str, ...]:
     """The commands that bring what is missing."""
     return tuple(filter(None, (backend.install, backend.pull)))
-
-
-class HeldFiles:
-    """The artifacts of one result, by their digests: downloaded once, then held.
-
-    They are no part of what a result says: results that say the same are equal.
-    """
-
-    def __init__(self) -> None:
-        self.held: dict[str, bytes] = {}
-        self.download_failed = False
-
-    def without_connection(self, sha256: str) -> ValueError:
-        """The error of an artifact that is neither held nor can be downloaded."""
-        return ValueError(f"This result comes from a file or another process: get {sha256} by `Client.artifact`.")
-
-    def write(self, folder: Path, result: Simulation | Answer) -> Path:
-        """Writes a result and its artifacts, which are held, into a folder, which is made if missing."""
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, sha256 in records.artifacts_of(result).items():
-            (folder / name).write_bytes(self.held[sha256])
-        for name, text in records.documents_of(result).items():
-            (folder / name).write_text(text, encoding="utf-8")
-        return folder
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, HeldFiles)
-
-    __hash__ = object.__hash__
-
-    def __deepcopy__(self, _: dict[int, Any]) -> Self:
-        return self  # bytes by their digests are the same for every copy
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # A connection does not go into another process; what it has downloaded does.
-        return type(self), (), {"held": self.held}
 
 
 class SimulationView(Simulation):

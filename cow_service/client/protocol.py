@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import email.utils
 import json
+import math
 import os
 import random
 import re
@@ -255,22 +256,11 @@ def result_in(response: httpx.Response, job: Job) -> Any:
     raise with_request_id(error, response)
 
 
+def deadline(timeout: float | None) -> float:
+    """When a time in seconds will have passed, on the monotonic clock; never without one."""
+    return math.inf if timeout is None else time.monotonic() + timeout
+
+
 def job_path(job_id: str) -> str:
     """The path of a job on its server."""
     return f"/jobs/{quote(job_id, safe='')}"
-
-
-class BaseJobHandle:
-    """What the handles of both clients have in common."""
-
-    def __init__(self, connection: Any, job: Job) -> None:
-        self._connection = connection
-        self.job = job
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.job.id}: {self.job.kind}, {self.job.status}>"
-
-    @property
-    def id(self) -> str:
-        """The job's id, by which `Client.job` finds it again."""
-        return self.job.id

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from cow_service.client.journal import QuestionLike
     from cow_service.client.progress import ProgressLike
     from cow_service.client.request import ImageLike
-    from cow_service.client.sync_connection import Answer, JobHandle, Simulation
+    from cow_service.client.sync_results import Answer, JobHandle, Simulation
     from cow_service.records import JobKind, JobStatus, Workers
 
 
@@ -56,9 +56,10 @@ class Client:
         retries: int = RETRIES,
         http_client: httpx.Client | None = None,
     ) -> None:
-        from cow_service.client.sync_connection import Connection  # noqa: PLC0415 - httpx takes 0.3 s to import
+        from cow_service.client import sync_results as results  # noqa: PLC0415 - httpx takes 0.3 s to import
 
-        self._connection = Connection(base_url, api_key, timeout, retries, http_client)
+        self._connection = results.connect(base_url, api_key, timeout, retries, http_client)
+        self._run, self._iterate = results.run, results.iterate
 
     @property
     def base_url(self) -> str:
@@ -67,7 +68,7 @@ class Client:
 
     def close(self) -> None:
         """Closes the client's connections."""
-        self._connection.close()
+        self._run(self._connection.io.close())
 
     def __enter__(self) -> Self:
         return self
@@ -95,7 +96,7 @@ class Client:
         `errors.py`, `WaitTimeout` among them.
         """
         arguments = "simulate", image, question, options, idempotency_key, fresh, minimal
-        return self._connection.simulate_or_answer(timeout, progress, *arguments)
+        return self._run(self._connection.simulate_or_answer(timeout, progress, *arguments))
 
     def answer(
         self,
@@ -111,7 +112,7 @@ class Client:
     ) -> Answer:
         """Imagines the future of an image, looks at it, then answers. Arguments and errors as for `simulate`."""
         arguments = "answer", image, question, options, idempotency_key, fresh, minimal
-        return self._connection.simulate_or_answer(timeout, progress, *arguments)
+        return self._run(self._connection.simulate_or_answer(timeout, progress, *arguments))
 
     @overload
     def submit(
@@ -148,7 +149,7 @@ class Client:
         **options: Any,
     ) -> JobHandle[Any]:
         """Submits a simulation or an answer, and does not wait for it. Once this returns, the server keeps the job."""
-        return self._connection.submit(kind, image, question, options, idempotency_key, fresh)
+        return self._run(self._connection.submit(kind, image, question, options, idempotency_key, fresh))
 
     @overload
     def map(
@@ -191,11 +192,11 @@ class Client:
         """
         from cow_service.client.batches import Batch  # noqa: PLC0415 - not needed to call a server once
 
-        return self._connection.map(Batch(questions, kind, options))
+        return self._iterate(self._connection.map(Batch(questions, kind, options)))
 
     def job(self, id: str) -> JobHandle[Simulation | Answer]:
         """A job that was submitted before. Raises `JobNotFound`."""
-        return self._connection.job(id)
+        return self._run(self._connection.job(id))
 
     def jobs(
         self,
@@ -207,20 +208,20 @@ class Client:
     ) -> Iterator[JobHandle[Simulation | Answer]]:
         """The jobs of this key, newest first, page by page as they are asked for. A time without a zone is local."""
         filters = {"status": status, "kind": kind, "created_after": created_after, "created_before": created_before}
-        return self._connection.jobs(filters)
+        return self._iterate(self._connection.jobs(filters))
 
     def artifact(self, sha256: str) -> bytes:
         """The bytes of an artifact; they are checked against its name."""
-        return self._connection.artifact(sha256)
+        return self._run(self._connection.artifact(sha256))
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
         from cow_service.client.display import Models  # noqa: PLC0415
 
-        return self._connection.get(Models, "/models")
+        return self._run(self._connection.get(Models, "/models"))
 
     def workers(self) -> Workers:
         """The processes on the server's job database, what each computes, and the queues."""
         from cow_service.records import Workers  # noqa: PLC0415
 
-        return self._connection.get(Workers, "/workers")
+        return self._run(self._connection.get(Workers, "/workers"))

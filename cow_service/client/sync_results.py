@@ -1,0 +1,179 @@
+"""Results and jobs of `Client`: what they say, and their pictures, which are downloaded from the server.
+
+Written by `make unasync` from `async_results.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Generic, Self, TypeVar
+
+import httpx
+from pydantic import PrivateAttr
+
+from cow_service.client import protocol
+from cow_service.client.connection import Connection, Files
+from cow_service.client.display import AnswerView, SimulationView, picture_of, stacked
+from cow_service.client.progress import ProgressLike, reporting
+from cow_service.client.protocol import Event
+from cow_service.client.sync_io import BlockingIO, iterate, picture_bytes, run
+from cow_service.records import AcceptedRequest, Job
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from PIL import Image
+
+
+def connect(
+    base_url: str | None,
+    api_key: str | None,
+    timeout: float | httpx.Timeout | None,
+    retries: int,
+    http: httpx.Client | None,
+) -> Connection:
+    """The connection of a client."""
+    endpoint = protocol.endpoint_of(base_url, api_key, timeout)
+    kinds = {"simulate": Simulation, "answer": Answer}
+    return Connection(endpoint, retries, BlockingIO(http), kinds, JobHandle)
+
+
+class Simulation(SimulationView):
+    """A simulation, and its pictures, each downloaded when it is first asked for.
+
+    >>> question = "If the yellow ball moves to the left, will it hit the blue mug?"
+    >>> simulation = client.simulate("image.jpg", question)
+    >>> [frame.index for frame in simulation.frames]
+    [1, 3, 5]
+    >>> (simulation.numpy_frames()).shape
+    (3, 295, 512, 3)
+    """
+
+    _files: Files = PrivateAttr(default_factory=Files)
+
+    @property
+    def files(self) -> Files:
+        """Its artifacts."""
+        return self._files
+
+    def pil_frames(self) -> list[Image.Image]:
+        """The frames chosen for reasoning as PIL images, RGB, in order of time."""
+        return [picture_of(run(self._files.fetch(frame.sha256))) for frame in self.frames]
+
+    def numpy_frames(self) -> NDArray[np.uint8]:
+        """The same frames as one array (frames, height, width, 3), RGB, uint8."""
+        return stacked(self.pil_frames())
+
+    def pil_overlay(self) -> Image.Image:
+        """The input with box, point, arrow and path drawn on it, RGB."""
+        return picture_of(run(self._files.fetch(self.overlay.sha256)))
+
+    def video_bytes(self) -> bytes:
+        """The clip as mp4 (H.264). Raises `ValueError` where the request said `video=False`."""
+        if self.video is None:
+            raise ValueError("This simulation has no video: ask for one with video=True.")
+        return run(self._files.fetch(self.video.sha256))
+
+    def load(self) -> Self:
+        """Downloads overlay, frames and video now."""
+        run(self._files.load(self))
+        return self
+
+    def save(self, folder: str | Path) -> Path:
+        """Writes frame_*.png, overlay.jpg, video.mp4 and simulation.json into a folder, which is made if missing."""
+        return run(self._files.save(folder, self))
+
+    def picture_bytes(self, sha256: str) -> bytes | None:
+        """The bytes of a picture or the video for a notebook; None where they are not available."""
+        return picture_bytes(self._files, sha256)
+
+
+class Answer(AnswerView):
+    """An answer; its `simulation` has the pictures that it was reasoned on.
+
+    >>> question = "If the yellow ball moves to the left, will it hit the blue mug? (A) Yes (B) No"
+    >>> answer = client.answer("image.jpg", question)
+    >>> answer.answer, answer.option
+    ('B', 'No')
+    >>> answer.simulation.trajectory.outcome.probability
+    0.0
+    """
+
+    simulation: Simulation | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: nobody assigns it
+
+    @property
+    def files(self) -> Files:
+        """The artifacts of its simulation."""
+        return Files() if self.simulation is None else self.simulation.files
+
+    def load(self) -> Self:
+        """Downloads overlay, frames and video now."""
+        run(self.files.load(self))
+        return self
+
+    def save(self, folder: str | Path) -> Path:
+        """Writes answer.json, and what `Simulation.save` writes, into a folder, which is made if missing."""
+        return run(self.files.save(folder, self))
+
+
+R_co = TypeVar("R_co", bound=Simulation | Answer, covariant=True)
+
+
+class JobHandle(Generic[R_co]):
+    """A job on the server, which goes on whether or not anybody holds this. `job` is its last known state."""
+
+    def __init__(self, connection: Connection, job: Job) -> None:
+        self._connection = connection
+        self.job = job
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.job.id}: {self.job.kind}, {self.job.status}>"
+
+    @property
+    def id(self) -> str:
+        """The job's id, by which `Client.job` finds it again."""
+        return self.job.id
+
+    def refresh(self) -> Job:
+        """Gets the state of the job. Raises `JobNotFound` where it was deleted."""
+        self.job = run(self._connection.refresh(self.id))
+        return self.job
+
+    def request(self) -> AcceptedRequest:
+        """Gets the request that became the job: `client.submit(**request.request, kind=request.kind)` sends it again.
+
+        Raises `JobNotFound` where the job was deleted.
+        """
+        return run(self._connection.get(AcceptedRequest, f"{protocol.job_path(self.id)}/request"))
+
+    def wait(self, timeout: float | None = None, *, progress: ProgressLike = False, minimal: bool = False) -> R_co:
+        """The job's result, once it has ended; `minimal` as for `Client.simulate`.
+
+        Raises what it failed with (`errors.py`), `Canceled`, and `WaitTimeout` after `timeout` seconds.
+        """
+        until = protocol.deadline(timeout)
+        with reporting(progress) as report:
+
+            def on_update(job: Job) -> None:
+                self.job = job
+                if report is not None:
+                    report(job)
+
+            return run(self._connection.poll(self.id, timeout, until, on_update, minimal))
+
+    def cancel(self) -> Job:
+        """Cancels the job; work on it stops at the next step. One that has ended stays as it is."""
+        self.job = run(self._connection.cancel(self.id))
+        return self.job
+
+    def delete(self) -> None:
+        """Cancels the job and removes it, with artifacts that no other job holds."""
+        run(self._connection.exchange("DELETE", protocol.job_path(self.id)))
+
+    def events(self, after: int = 0) -> Iterator[Event]:
+        """What happens to the job until its end, through broken connections.
+
+        `after` leaves out events up to that number.
+        """
+        return iterate(self._connection.events(self, after))
