@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -85,6 +86,33 @@ class PrioritySemaphore:
         while self._permits and self._waiting:
             self._permits -= 1
             heapq.heappop(self._waiting).granted.set()
+
+
+class BackgroundThread(ABC):
+    """A daemon thread that works from `start` to `stop`, and can be started again."""
+
+    def __init__(self, name: str, join_seconds: float | None = None) -> None:
+        """`join_seconds`: longest that `stop` waits; by default as long as it takes."""
+        self._name, self._join_seconds = name, join_seconds
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+
+    def start(self) -> None:
+        """Starts the thread."""
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the thread."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(self._join_seconds)
+            self._thread = None
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Works until `_stop` is set."""
 
 
 OOM_SCORE = "500"  # the system ends such a process before the one that holds the jobs

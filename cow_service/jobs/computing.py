@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import psutil
 from pydantic import ValidationError
@@ -21,7 +21,7 @@ from pydantic_core import to_json
 from cow_service.errors import ArtifactNotFound, StorageUnavailable
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.database import Database
-from cow_service.jobs.job_table import JobSpec, JobTable
+from cow_service.jobs.job_table import JobTable, TakenJob
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import DecodedImage
 from cow_service.observability.metrics import gpu_memory
@@ -169,16 +169,15 @@ class EngineParts:
     database: Database
     jobs: JobTable
     active: ActiveJobs
+    executor: str = ""  # the id of this process while the engine runs
 
 
 @dataclass(frozen=True)
 class Work:
     """One job to be computed, and who hears of it."""
 
-    job_id: str
-    spec: JobSpec
-    owner: str | None
-    image: Callable[[], DecodedImage | None]  # its pixels where they are at hand: given away by the first call
+    job: TakenJob
+    image: DecodedImage | None  # its pixels where they are at hand
     progress: Progress  # raises `Canceled` where nobody wants the result any more
     check: Callable[[], None]  # raises `Canceled` as well, and says nothing
     looked_for: Callable[[Stage, bool], None]  # a stage was looked for among stored results, and whether it was there
@@ -210,41 +209,37 @@ class WorkerState:
     gpus: tuple[GpuMemory, ...] = ()
 
 
-class Computer(Protocol):
+class Computer:
     """Computes jobs, some at the same time."""
 
     def start(self) -> None:
         """Makes ready for jobs. Returns at once."""
-        ...
 
     def close(self) -> None:
         """Lets go of what it holds. No job is at work any more."""
-        ...
 
     def capacity(self, queue: str) -> int:
         """How many jobs of a queue are taken at the same time; 0 where none is."""
-        ...
+        return 0
 
     def compute(self, work: Work) -> Outcome:
         """Computes one job. Raises the `CowError` that it fails with, `Canceled` where it was canceled."""
-        ...
+        raise NotImplementedError
 
     def workers(self) -> tuple[WorkerState, ...]:
         """What computes the jobs."""
-        ...
+        return ()
 
 
-class InProcess:
+class Elsewhere(Computer):
+    """Computes no jobs: worker processes that share the job database take them from its queues."""
+
+
+class InProcess(Computer):
     """Computes jobs in the threads that ask for it."""
 
     def __init__(self, parts: EngineParts) -> None:
         self._parts, self._locks, self._jobs_done = parts, KeyLocks(), 0
-
-    def start(self) -> None:
-        """Does nothing."""
-
-    def close(self) -> None:
-        """Does nothing."""
 
     def capacity(self, queue: str) -> int:
         """Those that compute, and those that wait for an MLLM."""
@@ -252,7 +247,7 @@ class InProcess:
         return settings.concurrency + settings.mllm_concurrency
 
     def compute(self, work: Work) -> Outcome:
-        """As the protocol says."""
+        """As the base class says."""
         try:
             return compute(work, self._parts.service, self._parts.database, self._locks.held)
         finally:
@@ -264,44 +259,19 @@ class InProcess:
         return (WorkerState("server", None, os.getpid(), memory, self._jobs_done, jobs, gpu_memory()),)
 
 
-class Elsewhere(InProcess):
-    """Computes no jobs: worker processes that share the job database take them from its queues."""
-
-    def __init__(self) -> None:
-        """It needs nothing."""
-
-    def capacity(self, queue: str) -> int:
-        """None."""
-        return 0
-
-    def workers(self) -> tuple[WorkerState, ...]:
-        """None."""
-        return ()
-
-
 def compute(work: Work, service: Service, database: Database, hold_key: HoldKey) -> Outcome:
     """Computes one job with the backends of a service; stages that are stored already are taken from the database."""
-    spec = work.spec
-    outages = Outages(service.settings.outage_budget, work.check)
-    step = StoredStep(
-        job_id=work.job_id,
-        owner=work.owner,
-        fresh=spec.fresh,
-        database=database,
-        artifacts=service.artifacts,
-        looked_for=work.looked_for,
-        hold_key=hold_key,
-        outages=outages,
-    )
+    job, spec, outages = work.job, work.job.spec, Outages(service.settings.outage_budget, work.check)
+    step = StoredStep(job.id, job.owner, spec.fresh, database, service.artifacts, work.looked_for, hold_key, outages)
     request = spec.parsed()
     assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
-    given = work.progress, work.image(), step, outages.wait_through, work.job_id, spec.created_at, spec.turn
+    given = work.progress, work.image, step, outages.wait_through, job.id, spec.created_at, spec.turn
     seen = None if spec.fresh else service.seen
     if isinstance(request, AnswerRequest):
-        with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, work.owner) as run:
+        with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
             result = answer(run)
     else:
-        with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, work.owner) as run:
+        with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
             result = simulate(run)
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
     text = result.model_dump_json()

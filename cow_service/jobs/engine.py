@@ -54,10 +54,8 @@ class JobEngine:
         self.jobs = JobTable(self.database, self.webhooks.enqueue)
         self._parts = EngineParts(service, self.database, self.jobs, self.active)
         self._computer = computer or InProcess(self._parts)
-        if self.database.file is None:
-            self._notifications = PostgresNotifications(self.database)
-        else:
-            self._notifications = PolledNotifications(self.active.awaited_elsewhere, self.jobs.ended_of)
+        notifications = PostgresNotifications if self.database.file is None else PolledNotifications
+        self._notifications = notifications(self._parts, self._receive)
         self._runner = Runner(self._parts, self._computer, self.webhooks, self._notifications, self._attempt_ended)
         self._dispatcher = Dispatcher(self._parts, self._computer.capacity, self._runner.start)
         self._lease = lease_of(self.database, service.settings.data_dir / "executors")
@@ -65,7 +63,6 @@ class JobEngine:
         self.processes = Processes(self._parts, self._computer, role)
         self.storage = StorageCheck(lambda: self.service.artifacts)
         self.is_running = False
-        self._executor = ""
         self._stopping = False
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
         self._submitting = threading.Lock()
@@ -86,8 +83,8 @@ class JobEngine:
         self.service.artifacts.check()
         set_runner(self._runner)
         try:
-            self._executor = self._lease.acquire()
-            launch(self.database, self._executor, migrate=settings.migrate)
+            self._parts.executor = self._lease.acquire()
+            launch(self.database, self._parts.executor, migrate=settings.migrate)
             self.database.claim(self.service.artifacts.address)
             self.webhooks.register_queue()
         except BaseException:
@@ -95,11 +92,8 @@ class JobEngine:
             self._lease.release()
             raise
         self._stopping, self.is_running = False, True
-        self._computer.start()
-        self._notifications.start(self._executor, self._receive)
-        self._dispatcher.start(self._executor)
-        self.processes.start(self._executor)
-        self._maintenance.start(self._executor)
+        for part in (self._computer, self._notifications, self._dispatcher, self.processes, self._maintenance):
+            part.start()
 
     def drain(self) -> None:
         """Accepts no more jobs, and answers callers who wait for a job that does not run.
@@ -198,7 +192,7 @@ class JobEngine:
         with self._submitting:  # the number of jobs must not change between the check and the insertion
             starts = self.check_capacity(owner, queue) == 0 and self._dispatcher.hold_place(queue)
             try:
-                job = self.jobs.insert(job_id, spec, owner, queue, step, self._executor if starts else None)
+                job = self.jobs.insert(job_id, spec, owner, queue, step, self._parts.executor if starts else None)
             except BaseException:
                 if starts:
                     self._dispatcher.free_place(queue)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable
@@ -18,12 +19,13 @@ from dbos import error as dbos_error
 from filelock import FileLock, Timeout
 from sqlalchemy.exc import SQLAlchemyError
 
+from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError, StorageUnavailable
 from cow_service.jobs import webhooks, workflows
 from cow_service.jobs.computing import EngineParts
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.webhooks import Webhooks
-from cow_service.media.artifacts import ArtifactStore, ListedArtifact
+from cow_service.media.artifacts import ListedArtifact
 from cow_service.service import Service
 
 POLL_SECONDS = 1.0  # for processes that ended, and for jobs that run here and were canceled by another process
@@ -34,7 +36,7 @@ TURN_SECONDS = 0.9 * CLEAN_UP_SECONDS  # since the last one of any process, whic
 # they have a budget: without a reference they are kept for an hour anyway.
 LISTING_SECONDS = 0.9 * 3600.0
 MAX_REMOVED_JOBS = 200  # at a time
-JOIN_TIMEOUT_SECONDS = 5.0
+JOIN_TIMEOUT_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 # Both are longer than an object store's times of use may be wrong.
 UNREFERENCED_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
 BUDGET_GRACE_SECONDS = 900.0  # that it is kept after its last use, whatever the budget: a stage may be about to refer
@@ -89,29 +91,26 @@ class FolderLease:
             self._lock = None
 
 
-class SessionLease:
+class SessionLease(BackgroundThread):
     """The lease of a process on PostgreSQL: an advisory lock of a session, which ends after a silence.
 
     So also a process that is frozen, or whose machine is gone, loses it.
     """
 
     def __init__(self, database: Database) -> None:
+        super().__init__("cow-lease")
         self._database = database
         self._executor = ""
         self._session: psycopg.Connection[Any] | None = None
         self._guard = threading.Lock()
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self._free_since: dict[str, float] = {}
 
     def acquire(self) -> str:
         """As that of a folder."""
         self._executor = uuid4().hex
-        self._stop.clear()
         with database_errors():
             self._open()
-        self._thread = threading.Thread(target=self._beat, name="cow-lease", daemon=True)
-        self._thread.start()
+        self.start()
         return self._executor
 
     @contextmanager
@@ -138,16 +137,13 @@ class SessionLease:
 
     def release(self) -> None:
         """As that of a folder."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        self.stop()
         if self._session is not None:
             with suppress(psycopg.Error):
                 self._session.close()
             self._session = None
 
-    def _beat(self) -> None:
+    def _run(self) -> None:
         """Keeps the session alive, and takes the lease again after an outage."""
         while not self._stop.wait(BEAT_SECONDS):
             with self._guard:
@@ -183,31 +179,15 @@ def lease_of(database: Database, folder: Path) -> Lease:
     return SessionLease(database) if database.file is None else FolderLease(folder)
 
 
-class Maintenance:
+class Maintenance(BackgroundThread):
     """A thread beside an engine's own. `remove` removes jobs, and those of their artifacts not used since a time."""
 
     def __init__(
         self, parts: EngineParts, hooks: Webhooks, lease: Lease, remove: Callable[[list[str], float], None]
     ) -> None:
+        super().__init__("cow-maintenance", JOIN_TIMEOUT_SECONDS)
         self._parts, self._hooks, self._lease, self._remove = parts, hooks, lease, remove
-        self._executor = ""
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
-
-    def start(self, executor: str) -> None:
-        """Starts the thread, for a process."""
-        self._executor = executor
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._maintain, name="cow-maintenance", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Ends the thread; one that waits for a database that is down does not keep the process."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(JOIN_TIMEOUT_SECONDS)
-            self._thread = None
 
     def clean_up(self) -> None:
         """Removes jobs past their retention, and artifacts without references."""
@@ -215,7 +195,7 @@ class Maintenance:
         if not self._stop.is_set():
             collect_artifacts(self._parts.service, self._parts.database, self._stop.is_set)
 
-    def _maintain(self) -> None:
+    def _run(self) -> None:
         looked = cleaned = time.monotonic()  # recovered jobs refer to their artifacts before anything is removed
         while not self._stop.is_set():
             self._logged(self._recover)
@@ -232,9 +212,9 @@ class Maintenance:
     def _recover(self) -> None:
         """Has the jobs of processes that have ended done by others."""
         executors = self._parts.jobs.executors() | workflows.busy_executors(self._hooks.client)
-        if executors == {self._executor} or not executors:
+        if not (others := executors - {self._parts.executor}):
             return
-        with self._lease.ended(executors - {self._executor}) as ended:
+        with self._lease.ended(others) as ended:
             for job_id in workflows.recover(self._hooks.client, self._parts.jobs, ended) if ended else ():
                 log.info("recovering %s", job_id)
 
@@ -242,14 +222,14 @@ class Maintenance:
         """Another process may have canceled or deleted a job that runs here, or taken it while this one was frozen."""
         active = self._parts.active
         if running := active.runs():
-            ours = self._parts.jobs.taken_by(self._executor)
+            ours = self._parts.jobs.taken_by(self._parts.executor)
             for job_id, run in running.items():
                 if ours.get(job_id) != run:
                     active.request_cancel(job_id)
 
     def _release_stalled(self) -> None:
         """Gives back jobs of this process that no thread works on: they could not be started, for example."""
-        taken = self._parts.jobs.taken_by(self._executor)
+        taken = self._parts.jobs.taken_by(self._parts.executor)
         idle = taken.keys() - self._parts.active.runs().keys()
         for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
             log.warning("job %s was stalled, and goes back to its queue", job_id)
@@ -298,50 +278,28 @@ def collect_artifacts(service: Service, database: Database, stop: Callable[[], b
     now = time.time() if now is None else now
     store, max_gb = service.artifacts, service.settings.artifacts_max_gb
     store.remove_leftovers(now - LEFTOVER_SECONDS)
-    left = _remove_unreferenced(store, database, list(store.listed()), now - UNREFERENCED_GRACE_SECONDS, stop)
-    if max_gb is not None:
-        _keep_within(max_gb * 1e9, store, database, left, now - BUDGET_GRACE_SECONDS, stop)
-
-
-def _remove_unreferenced(
-    store: ArtifactStore, database: Database, listed: list[ListedArtifact], moment: float, stop: Callable[[], bool]
-) -> list[ListedArtifact]:
-    """Returns the artifacts that are left."""
-    needed = database.referenced(one.sha256 for one in listed if one.used_at <= moment)
+    listed, grace = list(store.listed()), now - UNREFERENCED_GRACE_SECONDS
+    needed = database.referenced(one.sha256 for one in listed if one.used_at <= grace)
     left: list[ListedArtifact] = []
     for one in listed:
-        kept = one.used_at > moment or one.sha256 in needed or stop()
-        if kept or not store.delete(one.sha256, moment):
+        kept = one.used_at > grace or one.sha256 in needed or stop()
+        if kept or not store.delete(one.sha256, grace):
             left.append(one)
     if removed := len(listed) - len(left):
         log.info("removed %d artifacts that no job refers to", removed)
-    return left
 
-
-def _keep_within(
-    max_bytes: float,
-    store: ArtifactStore,
-    database: Database,
-    listed: list[ListedArtifact],
-    moment: float,
-    stop: Callable[[], bool],
-) -> None:
-    """Removes the longest unused artifacts until all fit, none of an open job and none that was used since `moment`."""
-    total = sum(one.size for one in listed)
+    # The longest unused go until all fit: none of an open job, and none that was used just now.
+    total, max_bytes = sum(one.size for one in left), math.inf if max_gb is None else max_gb * 1e9
     if total <= max_bytes:
         return
-    needed = database.referenced_by_open_jobs()
-    removed = 0
-    for one in sorted(listed, key=lambda each: each.used_at):
-        if total <= max_bytes or one.used_at > moment or stop():
+    needed, grace, removed = database.referenced_by_open_jobs(), now - BUDGET_GRACE_SECONDS, 0
+    for one in sorted(left, key=lambda each: each.used_at):
+        if total <= max_bytes or one.used_at > grace or stop():
             break
-        if one.sha256 not in needed and store.delete(one.sha256, moment):
+        if one.sha256 not in needed and store.delete(one.sha256, grace):
             total -= one.size
             removed += 1
     log.info("removed %d artifacts for COW_ARTIFACTS_MAX_GB", removed)
     if total > max_bytes:
-        log.warning(
-            "artifacts have %.1f GB, more than COW_ARTIFACTS_MAX_GB=%g: what is left is in use",
-            total / 1e9,
-            max_bytes / 1e9,
-        )
+        shown = total / 1e9, max_gb
+        log.warning("artifacts have %.1f GB, more than COW_ARTIFACTS_MAX_GB=%g: what is left is in use", *shown)

@@ -6,9 +6,8 @@ All of it only makes things quick: what counts is in the database.
 from __future__ import annotations
 
 import json
-import threading
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -16,8 +15,9 @@ from typing import Literal
 
 import psycopg
 
+from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError
-from cow_service.jobs.database import Database
+from cow_service.jobs.computing import EngineParts
 from cow_service.requests import Stage
 
 CHANNEL = "cow_jobs"
@@ -41,42 +41,24 @@ class Notification:
 Receive = Callable[[Notification], None]
 
 
-class Notifications(ABC):
+class Notifications(BackgroundThread):
     """Sends to the other processes, and receives from them in a thread of its own."""
 
-    def __init__(self) -> None:
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._executor = ""
-
-    def start(self, executor: str, receive: Receive) -> None:
-        """Begins to receive; `executor` names this process, whose own notifications are not received."""
-        self._executor = executor
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._listen, args=(receive,), name="cow-notifications", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Ends receiving."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+    def __init__(self, parts: EngineParts, receive: Receive) -> None:
+        """`receive` is called with what other processes send."""
+        super().__init__("cow-notifications")
+        self._parts, self._receive = parts, receive
 
     @abstractmethod
     def send(self, notification: Notification) -> None:
         """Tells all processes. What cannot be told is found in the database later."""
 
-    @abstractmethod
-    def _listen(self, receive: Receive) -> None: ...
-
 
 class PostgresNotifications(Notifications):
     """By LISTEN and NOTIFY."""
 
-    def __init__(self, database: Database) -> None:
-        super().__init__()
-        self._database = database
+    def __init__(self, parts: EngineParts, receive: Receive) -> None:
+        super().__init__(parts, receive)
         self._sent: dict[str, float] = {}  # when the progress of a job was last sent
 
     def send(self, notification: Notification) -> None:
@@ -89,19 +71,19 @@ class PostgresNotifications(Notifications):
         else:
             self._sent[notification.job_id] = now
         with suppress(CowError):
-            self._database.notify(CHANNEL, json.dumps([self._executor, asdict(notification)]))
+            self._parts.database.notify(CHANNEL, json.dumps([self._parts.executor, asdict(notification)]))
 
-    def _listen(self, receive: Receive) -> None:
+    def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                with self._database.session() as session:
+                with self._parts.database.session() as session:
                     session.execute(f"LISTEN {CHANNEL}")
                     while not self._stop.is_set():
                         for message in session.notifies(timeout=LISTEN_SECONDS):
                             with suppress(ValueError, TypeError):  # of another version
                                 sender, values = json.loads(message.payload)
-                                if sender != self._executor:
-                                    receive(Notification(**values))
+                                if sender != self._parts.executor:
+                                    self._receive(Notification(**values))
             except psycopg.Error:
                 self._stop.wait(RECONNECT_SECONDS)
 
@@ -109,21 +91,15 @@ class PostgresNotifications(Notifications):
 class PolledNotifications(Notifications):
     """On SQLite, whose processes are on one machine: asks for the end of jobs that somebody waits for."""
 
-    def __init__(self, awaited: Callable[[], list[str]], ended: Callable[[list[str]], list[str]]) -> None:
-        """`awaited`: the jobs that are waited for here and computed elsewhere; `ended`: those of them that have
-        ended."""
-        super().__init__()
-        self._awaited, self._ended = awaited, ended
-
     def send(self, notification: Notification) -> None:
         """Does nothing."""
 
-    def _listen(self, receive: Receive) -> None:
+    def _run(self) -> None:
         took = 0.0
         while not self._stop.wait(max(POLL_SECONDS, POLL_SHARE * took)):
             began = time.monotonic()
-            if awaited := self._awaited():
+            if awaited := self._parts.active.awaited_elsewhere():
                 with suppress(CowError):
-                    for job_id in self._ended(awaited):
-                        receive(Notification("ended", job_id))
+                    for job_id in self._parts.jobs.ended_of(awaited):
+                        self._receive(Notification("ended", job_id))
             took = time.monotonic() - began

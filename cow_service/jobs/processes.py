@@ -16,6 +16,7 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from cow_service import __version__
+from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError, NotReady
 from cow_service.jobs.active import share_done
 from cow_service.jobs.computing import Computer, EngineParts
@@ -76,25 +77,21 @@ class ProcessTable:
         return tuple(sorted(found, key=lambda one: (one.role, one.host, one.pid)))
 
 
-class Processes:
+class Processes(BackgroundThread):
     """This process among those on the job database. A thread of its own: maintenance may take minutes."""
 
     def __init__(self, parts: EngineParts, computer: Computer, role: ProcessRole | None) -> None:
         """`role`: by default that of the settings."""
+        super().__init__("cow-processes", JOIN_TIMEOUT_SECONDS)
         self._parts, self._computer = parts, computer
         self._role: ProcessRole = role or parts.service.settings.role
         self._table = ProcessTable(parts.database)
         self.overview = Overview(parts.database, parts.service.settings)
-        self._executor = ""
         self._draining = False
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
-    def start(self, executor: str) -> None:
-        """Begins to tell, under the id of this process."""
-        self._executor = executor
+    def start(self) -> None:
+        """Begins to tell, and to count for the metrics."""
         self._draining = False
-        self._stop.clear()
         metrics, overview = self._parts.service.metrics, self.overview
         metrics.workers = self.workers
         metrics.queue_depth = lambda: _sums(
@@ -104,8 +101,7 @@ class Processes:
         metrics.queue_unserved = lambda: _sums(
             ((one.queue, one.reason), one.jobs) for one in overview.workers().unserved
         )
-        self._thread = threading.Thread(target=self._tell_on, name="cow-processes", daemon=True)
-        self._thread.start()
+        super().start()
 
     def drain(self) -> None:
         """The process takes no more jobs, and goes on with those that it has."""
@@ -113,11 +109,9 @@ class Processes:
 
     def stop(self) -> None:
         """The process ends."""
-        self._stop.set()
         if self._thread is not None:
-            self._thread.join(JOIN_TIMEOUT_SECONDS)
-            self._thread = None
-            self._try(lambda: self._table.remove(self._executor))
+            super().stop()
+            self._try(lambda: self._table.remove(self._parts.executor))
 
     def workers(self) -> tuple[WorkerInfo, ...]:
         """What computes jobs in this process and its worker processes."""
@@ -143,12 +137,12 @@ class Processes:
                 progress, seconds = share_done(active.kind, stage, done), round(time.monotonic() - active.begun, 1)
                 yield WorkerJob(id=job_id, kind=active.kind, stage=stage, progress=progress, seconds=seconds)
 
-    def _tell_on(self) -> None:
+    def _run(self) -> None:
         capacities = ((name, self._computer.capacity(name)) for name in known_queues(self._parts.service.settings))
         queues = {name: capacity for name, capacity in capacities if capacity > 0}
         while not self._stop.is_set():
             info = ProcessInfo(
-                executor_id=self._executor,
+                executor_id=self._parts.executor,
                 seen_at=rfc3339(time.time()),
                 role=self._role,
                 host=platform.node(),

@@ -13,6 +13,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
 from uuid import uuid4
@@ -21,6 +22,7 @@ from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, SetWo
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
+from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, CowError, StorageUnavailable, unforeseen
 from cow_service.jobs import webhooks
 from cow_service.jobs.active import ActiveJob
@@ -106,19 +108,31 @@ class Runner:
                 self._hooks.enqueue(connection, job_id, url, attempt + 1, wait)
 
         patient = Outages(math.inf, check)
-        wait = DBOS.run_step(
-            {"name": "call"}, call
-        )  # a step, whose outcome is kept: a crash after it does not repeat it
+        wait = DBOS.run_step({"name": "call"}, call)  # its outcome is kept: a crash after it does not repeat it
         if wait is not None:
             patient.wait_through(enqueue)
 
     def _outcome(self, job: TakenJob, image: DecodedImage | None, running: ActiveJob) -> str | CowError | None:
         """The result or the error of a job, once it is stored; None where it has none, as it was canceled."""
-        metrics, kind = self._parts.service.metrics, job.spec.kind
+        metrics, begun = self._parts.service.metrics, False
+
+        def progress(stage: Stage | None, done: float) -> None:
+            nonlocal begun
+            self._active.progress(job.id, running, stage, done)
+            if stage is None:
+                return
+            if not begun:
+                with suppress(StorageUnavailable):  # it is tried again
+                    begun = self._jobs.begin(job)
+                    if not begun:
+                        raise Canceled("The job was canceled.")
+            self._notifications.send(Notification("progress", job.id, stage, done))
+
+        traced = replace(job, spec=job.spec.model_copy(update={"traceparent": context.traceparent()}))
         patient = Outages(math.inf, running.check)  # the work is done: its outcome is not given up
         try:
             try:
-                computed = self._computer.compute(self._work(job, image, running))
+                computed = self._computer.compute(Work(traced, image, progress, running.check, metrics.stage_cache))
             except Canceled:
                 raise
             except Exception as error:
@@ -136,42 +150,13 @@ class Runner:
                 kept = job, computed.kept, computed.trajectory_key
                 stored = patient.wait_through(lambda: self._jobs.succeed(*kept))
         except Canceled:
-            self._release(job)
+            with suppress(StorageUnavailable):  # else when this process has ended, or maintenance notices
+                self._jobs.release(job.id, job.run)  # where it was interrupted; one that was canceled stays so
             return None
         if not stored:
             return None
-        metrics.job(kind, "succeeded" if isinstance(outcome, str) else "failed")
+        metrics.job(job.spec.kind, "succeeded" if isinstance(outcome, str) else "failed")
         return outcome
-
-    def _work(self, job: TakenJob, image: DecodedImage | None, running: ActiveJob) -> Work:
-        images, begun = [image], False
-
-        def progress(stage: Stage | None, done: float) -> None:
-            nonlocal begun
-            self._active.progress(job.id, running, stage, done)
-            if stage is None:
-                return
-            if not begun:
-                with suppress(StorageUnavailable):  # it is tried again
-                    begun = self._jobs.begin(job)
-                    if not begun:
-                        raise Canceled("The job was canceled.")
-            self._notifications.send(Notification("progress", job.id, stage, done))
-
-        return Work(
-            job_id=job.id,
-            spec=job.spec.model_copy(update={"traceparent": context.traceparent()}),
-            owner=job.owner,
-            image=lambda: images.pop() if images else None,
-            progress=progress,
-            check=running.check,
-            looked_for=self._parts.service.metrics.stage_cache,
-        )
-
-    def _release(self, job: TakenJob) -> None:
-        """Gives a job that was interrupted back to its queue; one that was canceled stays so."""
-        with suppress(StorageUnavailable):  # else when this process has ended, or maintenance notices
-            self._jobs.release(job.id, job.run)
 
 
 _runner: Runner | None = None
@@ -267,38 +252,28 @@ def migrate(settings: Settings) -> None:
         database.close()
 
 
-class Dispatcher:
+class Dispatcher(BackgroundThread):
     """The places of this process, and the thread that fills them. Safe to use from every thread."""
 
     def __init__(self, parts: EngineParts, capacity: Callable[[str], int], start: Start) -> None:
         """`capacity`: of a queue by its name; `start` begins the work on a job that has a place."""
+        super().__init__("cow-dispatcher", STOP_SECONDS)
         self._parts, self._capacity, self._start = parts, capacity, start
         self._places = threading.Lock()
         self._held: Counter[str] = Counter()  # the places of each queue that are held
         self._handed: SimpleQueue[tuple[TakenJob, DecodedImage | None]] = SimpleQueue()
-        self._woken, self._stopping = threading.Event(), threading.Event()
+        self._woken = threading.Event()
         self._look = True  # at the queues: there may be jobs that wait
-        self._thread: threading.Thread | None = None
-        self._executor = ""
-
-    def start(self, executor: str) -> None:
-        """Begins to take jobs for a process. DBOS runs already."""
-        self._executor = executor
-        self._stopping.clear()
-        self._thread = threading.Thread(target=self._dispatch, name="cow-dispatcher", daemon=True)
-        self._thread.start()
 
     def drain(self) -> None:
         """Takes no more jobs. Those that were handed over are started."""
-        self._stopping.set()
+        self._stop.set()
         self._woken.set()
 
     def stop(self) -> None:
         """Ends the thread."""
         self.drain()
-        if self._thread is not None:
-            self._thread.join(STOP_SECONDS)
-            self._thread = None
+        super().stop()
 
     def wake(self) -> None:
         """Has the queues looked at now: there is a new job, or a place."""
@@ -309,7 +284,7 @@ class Dispatcher:
         """Holds a place for a job that is about to be handed over; False where none is free."""
         capacity = self._capacity(queue)
         with self._places:
-            if self._stopping.is_set() or self._held[queue] >= capacity:
+            if self._stop.is_set() or self._held[queue] >= capacity:
                 return False
             self._held[queue] += 1
             return True
@@ -325,8 +300,8 @@ class Dispatcher:
         self._handed.put((job, image))
         self._woken.set()
 
-    def _dispatch(self) -> None:
-        while not self._stopping.is_set():
+    def _run(self) -> None:
+        while not self._stop.is_set():
             self._woken.clear()
             look, self._look = self._look, False
             try:
@@ -342,12 +317,9 @@ class Dispatcher:
         self._start_handed()
 
     def _start_handed(self) -> None:
-        while True:
-            try:
-                job, image = self._handed.get_nowait()
-            except Empty:
-                return
-            self._start(job, image)
+        with suppress(Empty):
+            while True:
+                self._start(*self._handed.get_nowait())
 
     def _fill(self, queue: str) -> None:
         places = 0
@@ -357,7 +329,7 @@ class Dispatcher:
         try:
             if places:
                 limit = self._parts.service.settings.running_limit_per_key
-                taken = self._parts.jobs.take(queue, self._executor, places, limit)
+                taken = self._parts.jobs.take(queue, self._parts.executor, places, limit)
         finally:
             with self._places:
                 self._held[queue] -= places - len(taken)

@@ -13,14 +13,12 @@ import time
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 
 import psutil
 
 from cow_service.concurrency import leave_decisions_to_the_parent
 from cow_service.errors import Canceled, CowError, unforeseen
-from cow_service.jobs.computing import HoldKey as HoldKeyOf
 from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import error_as_json
@@ -55,17 +53,56 @@ MIN_PROGRESS = 0.005  # of a stage, between two messages
 log = logging.getLogger("cow_service")
 
 
-@dataclass
 class _Job:
     """One job at work here."""
 
-    canceled: threading.Event = field(default_factory=threading.Event)
-    key_held: threading.Event = field(default_factory=threading.Event)
-    told: tuple[Stage | None, float] = (None, 0.0)
+    def __init__(self, start: Start, send: Callable[[FromWorker], None]) -> None:
+        self.job, self._image, self._send = start.job, start.image, send
+        self.canceled, self.key_held = threading.Event(), threading.Event()
+        self._told: tuple[Stage | None, float] = (None, 0.0)
 
-    def check(self) -> None:
+    def compute(self, service: Service, database: Database) -> Succeeded | Failed:
+        """Its end, to be sent."""
+        job_id, spec = self.job.id, self.job.spec
+        work = Work(
+            job=self.job,
+            image=self._image,
+            progress=self._progress,
+            check=self._check,
+            looked_for=lambda stage, found: self._send(LookedFor(job_id, stage, found)),
+        )
+        try:
+            with (
+                context.bound(request=spec.request_id, job=job_id),
+                tracing.span("compute", parent=spec.traceparent, job_id=job_id),
+            ):
+                return Succeeded(job_id, compute(work, service, database, self._hold_key))
+        except CowError as error:
+            return Failed(job_id, error_as_json(error))
+        except Exception:
+            log.exception("job %s failed", job_id)
+            return Failed(job_id, error_as_json(unforeseen()))
+
+    def _check(self) -> None:
         if self.canceled.is_set():
             raise Canceled("The job was canceled.")
+
+    def _progress(self, stage: Stage | None, done: float) -> None:
+        self._check()
+        if stage != self._told[0] or done >= min(1.0, self._told[1] + MIN_PROGRESS):
+            self._told = stage, done
+            self._send(Progressed(self.job.id, stage, done))
+
+    @contextmanager
+    def _hold_key(self, key: str, check_canceled: Callable[[], None]) -> Generator[None]:
+        self.key_held.clear()
+        self._send(HoldKey(self.job.id, key))
+        try:
+            while not self.key_held.wait(CANCEL_POLL_SECONDS):
+                check_canceled()
+            yield
+        finally:
+            self._send(ReleaseKey(self.job.id, key))
 
 
 class WorkerProcess:
@@ -86,8 +123,8 @@ class WorkerProcess:
         while True:
             match self._pipe.recv():
                 case Start() as start:
-                    self._jobs[start.job_id] = _Job()
-                    self._threads.submit(self._work, start)
+                    self._jobs[start.job.id] = _Job(start, self._send)
+                    self._threads.submit(self._work, start.job.id)
                 case Cancel(job_id) if job_id in self._jobs:
                     self._jobs[job_id].canceled.set()
                 case KeyHeld(job_id) if job_id in self._jobs:
@@ -108,69 +145,22 @@ class WorkerProcess:
             time.sleep(HEARTBEAT_SECONDS)
 
     def _load(self) -> None:
+        failure = None
         try:
             self._service.check()
             if self._service.settings.warmup:
                 warm_up(self._service.settings)
         except CowError as error:
-            self._send(Loaded(error_as_json(error)))
+            failure = error_as_json(error)
         except Exception:
             log.exception("the default backends could not be loaded")
-            self._send(Loaded(error_as_json(unforeseen())))
-        else:
-            self._send(Loaded(None))
+            failure = error_as_json(unforeseen())
+        self._send(Loaded(failure))
 
-    def _work(self, start: Start) -> None:
-        spec = start.spec
-        try:
-            with (
-                context.bound(request=spec.request_id, job=start.job_id),
-                tracing.span("compute", parent=spec.traceparent, job_id=start.job_id),
-            ):
-                work, hold_key = self._work_of(start), self._hold_key_of(start.job_id)
-                message = Succeeded(start.job_id, compute(work, self._service, self._database, hold_key))
-        except CowError as error:
-            message = Failed(start.job_id, error_as_json(error))
-        except Exception:
-            log.exception("job %s failed", start.job_id)
-            message = Failed(start.job_id, error_as_json(unforeseen()))
-        del self._jobs[start.job_id]
-        self._send(message)
-
-    def _work_of(self, start: Start) -> Work:
-        job_id, job, images = start.job_id, self._jobs[start.job_id], [start.image]
-
-        def progress(stage: Stage | None, done: float) -> None:
-            job.check()
-            if stage != job.told[0] or done >= min(1.0, job.told[1] + MIN_PROGRESS):
-                job.told = stage, done
-                self._send(Progressed(job_id, stage, done))
-
-        return Work(
-            job_id=job_id,
-            spec=start.spec,
-            owner=start.owner,
-            image=lambda: images.pop() if images else None,
-            progress=progress,
-            check=job.check,
-            looked_for=lambda stage, found: self._send(LookedFor(job_id, stage, found)),
-        )
-
-    def _hold_key_of(self, job_id: str) -> HoldKeyOf:
-        job = self._jobs[job_id]
-
-        @contextmanager
-        def held(key: str, check_canceled: Callable[[], None]) -> Generator[None]:
-            job.key_held.clear()
-            self._send(HoldKey(job_id, key))
-            try:
-                while not job.key_held.wait(CANCEL_POLL_SECONDS):
-                    check_canceled()
-                yield
-            finally:
-                self._send(ReleaseKey(job_id, key))
-
-        return held
+    def _work(self, job_id: str) -> None:
+        end = self._jobs[job_id].compute(self._service, self._database)
+        del self._jobs[job_id]
+        self._send(end)
 
 
 def main(descriptor: int) -> None:

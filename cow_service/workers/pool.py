@@ -17,7 +17,7 @@ import psutil
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import DeviceFailed, ShuttingDown, WorkerEnded
-from cow_service.jobs.computing import KeyLocks, Outcome, Work, WorkerState
+from cow_service.jobs.computing import Computer, KeyLocks, Outcome, Work, WorkerState
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
 from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings
@@ -37,13 +37,26 @@ log = logging.getLogger("cow_service")
 class Group:
     """The workers for one kind of jobs. They are started when they are first needed."""
 
-    def __init__(self, name: str, settings: Settings, size: int, jobs_each: int, metrics: Metrics) -> None:
-        self.name, self.size, self.jobs_each = name, size, jobs_each
-        self.places = PrioritySemaphore(size * jobs_each)
+    def __init__(self, name: str, settings: Settings, metrics: Metrics) -> None:
+        """`settings` are those of the server, of which each worker has its share."""
+        waiting = settings.mllm_concurrency if settings.mllm else 0  # jobs that wait for an MLLM, and compute nothing
+        size, cpu, computing, generator = 1, 1, 1, settings.generator
+        if name == LIGHT:
+            size, waiting = settings.concurrency, math.ceil(waiting / settings.concurrency)
+            if clips(generator, settings) is not None:
+                generator = "cutout"
+        elif name == settings.reader and places(name) is not None:  # a reader that computes on a device
+            cpu = computing = settings.concurrency
+            waiting = settings.mllm_concurrency
+        else:
+            generator, computing = name, clips(name, settings) or 1
+        share = {"concurrency": cpu, "mllm_concurrency": max(1, waiting), "generator": generator}
+        self.name, self.size, self.jobs_each = name, size, computing + waiting
+        self.places = PrioritySemaphore(self.size * self.jobs_each)
         self.workers: list[Worker] = []
         self.was_loaded = False  # whether a worker has loaded the default backends
         self.alone = threading.Lock()  # held by a job that is computed for itself, as its last worker crashed
-        self._settings, self._metrics = settings, metrics
+        self._settings, self._metrics = settings.model_copy(update=share), metrics
         self._lock = threading.Lock()
         self._taken: dict[Worker, int] = {}
         self._closed = False
@@ -79,8 +92,10 @@ class Group:
         """Its workers that are alive."""
         with self._lock:
             alive = [one for one in self._taken if one.is_alive]
-        given = ((one.name, self.name, one.pid, one.memory_bytes, one.jobs_done, one.jobs, one.gpus) for one in alive)
-        return [WorkerState(*each) for each in given]
+        return [
+            WorkerState(one.name, self.name, one.pid, one.memory_bytes, one.jobs_done, one.jobs, one.gpus)
+            for one in alive
+        ]
 
     def close(self) -> None:
         """Ends all workers."""
@@ -105,8 +120,8 @@ class Group:
         return worker
 
 
-class WorkerPool:
-    """All workers of this process. A `Computer` of a job engine."""
+class WorkerPool(Computer):
+    """All workers of this process."""
 
     def __init__(self, settings: Settings, metrics: Metrics) -> None:
         self._settings, self._metrics = settings, metrics
@@ -170,8 +185,8 @@ class WorkerPool:
 
         After a crash, or where its device failed, the job is tried again in another process.
         """
-        group = self._group(queue_of(work.spec.reader, work.spec.generator, self._settings))
-        priority = priority_of(work.spec.turn, work.spec.created_at)
+        group = self._group(queue_of(work.job.spec.reader, work.job.spec.generator, self._settings))
+        priority = priority_of(work.job.spec.turn, work.job.spec.created_at)
         crashes, alone = 0, group.jobs_each == 1
         with group.places.held(priority, partial(work.progress, None, 0.0)):
             while True:
@@ -182,12 +197,12 @@ class WorkerPool:
                     return self._computed(work, group, fresh=False)
                 except DeviceFailed:
                     crashes += 1
-                    log.warning("the device of the worker of job %s failed", work.job_id)
+                    log.warning("the device of the worker of job %s failed", work.job.id)
                     if crashes >= MAX_CRASHES:
                         raise
                 except WorkerGone as gone:
                     crashes += alone
-                    log.warning("the worker of job %s %s", work.job_id, gone)
+                    log.warning("the worker of job %s %s", work.job.id, gone)
                     if crashes >= MAX_CRASHES or (alone and gone.is_final):
                         raise WorkerEnded(f"The process that computed the job {gone}. It is not tried again.") from gone
                     alone = True  # the next crash is this job's own
@@ -207,7 +222,7 @@ class WorkerPool:
     def _group(self, name: str) -> Group:
         with self._guard:
             if name not in self._groups:
-                self._groups[name] = _new_group(name, self._settings, self._metrics)
+                self._groups[name] = Group(name, self._settings, self._metrics)
             return self._groups[name]
 
     def _watch(self) -> None:
@@ -224,21 +239,3 @@ class WorkerPool:
                 elif worker.memory_bytes > self._memory_limit:
                     reason = f"was ended, as it took {worker.memory_bytes / 1e6:.0f} MB"
                     worker.kill("memory", reason, is_final=True)
-
-
-def _new_group(name: str, settings: Settings, metrics: Metrics) -> Group:
-    waiting = settings.mllm_concurrency if settings.mllm else 0  # jobs that compute nothing, as they wait for an MLLM
-    if name == LIGHT:
-        size, cpu, generator = settings.concurrency, 1, settings.generator
-        if clips(generator, settings) is not None:
-            generator = "cutout"
-        waiting = math.ceil(waiting / size)
-        jobs_each = cpu + waiting
-    elif places(settings.reader) is None or name != settings.reader:
-        size, cpu, generator = 1, 1, name
-        jobs_each = (clips(name, settings) or 1) + waiting
-    else:  # a reader that computes on a device
-        size, cpu, generator, waiting = 1, settings.concurrency, settings.generator, settings.mllm_concurrency
-        jobs_each = cpu + waiting
-    own = {"concurrency": cpu, "mllm_concurrency": max(1, waiting), "generator": generator}
-    return Group(name, settings.model_copy(update=own), size, jobs_each, metrics)

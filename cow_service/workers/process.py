@@ -1,22 +1,19 @@
-"""A worker process as seen by the process that started it."""
+"""A worker process as seen by the process that started it, and what the two tell each other."""
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import subprocess
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
 from queue import Empty, SimpleQueue
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from cow_service.concurrency import spawn
 from cow_service.errors import Canceled, CowError, JobTimeout, WorkerEnded
 from cow_service.jobs.computing import KeyLocks, Outcome, Work
-from cow_service.jobs.job_table import JobSpec, error_from_json
+from cow_service.jobs.job_table import TakenJob, error_from_json
 from cow_service.media.images import DecodedImage
 from cow_service.records import GpuMemory
 from cow_service.requests import Stage
@@ -27,25 +24,20 @@ MODULE = "cow_service.workers"  # what a worker process runs
 # To the worker.
 
 
-@dataclass(frozen=True)
-class Start:
+class Start(NamedTuple):
     """Compute a job."""
 
-    job_id: str
-    spec: JobSpec
-    owner: str | None
+    job: TakenJob
     image: DecodedImage | None  # else it is read from the artifacts
 
 
-@dataclass(frozen=True)
-class Cancel:
+class Cancel(NamedTuple):
     """Nobody wants the result any more."""
 
     job_id: str
 
 
-@dataclass(frozen=True)
-class KeyHeld:
+class KeyHeld(NamedTuple):
     """The job holds the lock of the key that it asked for."""
 
     job_id: str
@@ -54,23 +46,20 @@ class KeyHeld:
 # From the worker.
 
 
-@dataclass(frozen=True)
-class Loaded:
+class Loaded(NamedTuple):
     """The default backends are loaded, or the error, as JSON, for which they are not."""
 
     error: dict[str, Any] | None
 
 
-@dataclass(frozen=True)
-class Heartbeat:
+class Heartbeat(NamedTuple):
     """The process is alive. `memory_bytes` is its resident set."""
 
     memory_bytes: int
     gpus: tuple[GpuMemory, ...]
 
 
-@dataclass(frozen=True)
-class Progressed:
+class Progressed(NamedTuple):
     """A job has come so far in a stage, 0 to 1."""
 
     job_id: str
@@ -78,8 +67,7 @@ class Progressed:
     done: float
 
 
-@dataclass(frozen=True)
-class LookedFor:
+class LookedFor(NamedTuple):
     """A stage was looked for among stored results."""
 
     job_id: str
@@ -87,32 +75,28 @@ class LookedFor:
     found: bool
 
 
-@dataclass(frozen=True)
-class HoldKey:
+class HoldKey(NamedTuple):
     """A job wants the lock of a key: what one job computes, another one waits for, whatever worker it has."""
 
     job_id: str
     key: str
 
 
-@dataclass(frozen=True)
-class ReleaseKey:
+class ReleaseKey(NamedTuple):
     """The job gives the lock of a key back."""
 
     job_id: str
     key: str
 
 
-@dataclass(frozen=True)
-class Succeeded:
+class Succeeded(NamedTuple):
     """The job is done."""
 
     job_id: str
     outcome: Outcome
 
 
-@dataclass(frozen=True)
-class Failed:
+class Failed(NamedTuple):
     """The job failed with an error, as JSON; `Canceled` where it was canceled."""
 
     job_id: str
@@ -132,8 +116,6 @@ END_SECONDS = 5.0  # that a process is given to end by itself
 
 # Why a process ended: renewed and stopped in peace; timeout: it went on with a job that had to end.
 EndReason = Literal["crashed", "frozen", "memory", "timeout", "renewed", "stopped"]
-
-log = logging.getLogger("cow_service")
 
 
 class WorkerGone(Exception):
@@ -195,13 +177,13 @@ class Worker:
 
     def run(self, work: Work, locks: KeyLocks) -> Outcome:
         """Computes a job. Raises the `CowError` that it fails with, `Canceled`, `JobTimeout`, `WorkerGone`."""
-        inbox = self._inboxes[work.job_id] = SimpleQueue()
+        inbox = self._inboxes[work.job.id] = SimpleQueue()
         try:
-            with ExitStack() as stack:
-                self._send(Start(work.job_id, work.spec, work.owner, work.image()))
-                return self._follow(work, inbox, _Keys(self, work, locks, stack))
+            with ExitStack() as keys:
+                self._send(Start(work.job, work.image))
+                return self._follow(work, inbox, locks, keys)
         finally:
-            del self._inboxes[work.job_id]
+            del self._inboxes[work.job.id]
             self.jobs_done += 1
 
     def kill(self, end_reason: EndReason, reason: str, *, is_final: bool = False) -> None:
@@ -223,65 +205,62 @@ class Worker:
         self._ended.wait()
         self._pipe.close()
 
-    def check_alive(self) -> None:
+    def _follow(self, work: Work, inbox: SimpleQueue[OfJob | None], locks: KeyLocks, keys: ExitStack) -> Outcome:
+        """Does what the messages about a job ask for, until its outcome. `keys` gives back those it still holds."""
+        until, canceled, begun = time.monotonic() + START_SECONDS + self._job_timeout, False, False
+        held: dict[str, ExitStack] = {}
+
+        def check() -> None:
+            self._check_alive()
+            work.check()
+
+        while True:
+            message = None
+            try:
+                if not canceled:
+                    work.check()
+                with suppress(Empty):
+                    message = inbox.get(timeout=POLL_SECONDS)
+                if isinstance(message, HoldKey):
+                    held[message.key] = keys.enter_context(ExitStack())
+                    held[message.key].enter_context(locks.held(message.key, check))
+                    self._send(KeyHeld(work.job.id))
+                elif isinstance(message, Progressed) and not canceled:
+                    work.progress(message.stage, message.done)
+            except Canceled:
+                canceled, until = True, time.monotonic() + CANCEL_SECONDS
+                self._send(Cancel(work.job.id))
+            if isinstance(message, Succeeded):
+                return message.outcome
+            if isinstance(message, Failed):
+                raise error_from_json(message.error)
+            if isinstance(message, LookedFor):
+                work.looked_for(message.stage, message.found)
+            elif isinstance(message, ReleaseKey) and message.key in held:
+                held.pop(message.key).close()
+            elif message is None:
+                self._check_alive()
+            if message is not None and not (begun or canceled):  # a new process had to start before
+                begun, until = True, time.monotonic() + self._job_timeout
+            if time.monotonic() > until:
+                self.kill("timeout", "was ended, as another job of it had to end")  # this one goes on in it
+                late = f"The job computed for more than {self._job_timeout:g} s, which COW_JOB_TIMEOUT allows."
+                raise Canceled("The job was canceled.") if canceled else JobTimeout(late)
+
+    def _check_alive(self) -> None:
         """Raises `WorkerGone`."""
         if self._ended.is_set():
             code = self._process.wait()
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             raise WorkerGone(f"{self._reason} ({how})", is_final=self._is_final)
 
-    def _follow(self, work: Work, inbox: SimpleQueue[OfJob | None], keys: _Keys) -> Outcome:
-        until, canceled, begun = time.monotonic() + START_SECONDS + self._job_timeout, False, False
-        while True:
-            message = None
-            try:
-                if not canceled:
-                    work.check()
-                with contextlib.suppress(Empty):
-                    message = inbox.get(timeout=POLL_SECONDS)
-                if isinstance(message, HoldKey):
-                    keys.hold(message.key)
-                elif isinstance(message, Progressed) and not canceled:
-                    work.progress(message.stage, message.done)
-            except Canceled:
-                canceled, until = True, time.monotonic() + CANCEL_SECONDS
-                self._send(Cancel(work.job_id))
-            if isinstance(message, Succeeded):
-                return message.outcome
-            self._note(message, work, keys)
-            if message is not None and not (begun or canceled):  # a new process had to start before
-                begun, until = True, time.monotonic() + self._job_timeout
-            if time.monotonic() > until:
-                raise self._too_late(canceled=canceled)
-
-    def _note(self, message: OfJob | None, work: Work, keys: _Keys) -> None:
-        """Does what a message asks for. Raises the error that the job failed with, `WorkerGone`."""
-        match message:
-            case Failed(error=error):
-                raise error_from_json(error)
-            case LookedFor(stage=stage, found=found):
-                work.looked_for(stage, found)
-            case ReleaseKey(key=key):
-                keys.release(key)
-            case None:
-                self.check_alive()
-            case _:
-                pass
-
-    def _too_late(self, *, canceled: bool) -> CowError:
-        """Ends the process, as a job in it goes on after its time."""
-        self.kill("timeout", "was ended, as another job of it had to end")
-        if canceled:
-            return Canceled("The job was canceled.")
-        return JobTimeout(f"The job computed for more than {self._job_timeout:g} s, which COW_JOB_TIMEOUT allows.")
-
     def _send(self, message: ToWorker) -> None:
-        with self._sending, contextlib.suppress(OSError):  # its end is noticed where its messages are read
+        with self._sending, suppress(OSError):  # its end is noticed where its messages are read
             self._pipe.send(message)
 
     def _listen(self) -> None:
         """Hands each message to the job that it is about, until the process has ended."""
-        with contextlib.suppress(EOFError, OSError):
+        with suppress(EOFError, OSError):
             while True:
                 match self._pipe.recv():
                     case Heartbeat(memory_bytes=memory_bytes, gpus=gpus):
@@ -299,27 +278,3 @@ class Worker:
         for inbox in list(self._inboxes.values()):
             inbox.put(None)
         self._on_end(self._end_reason)
-
-
-class _Keys:
-    """The keys that a job holds; all are given back with `stack`."""
-
-    def __init__(self, worker: Worker, work: Work, locks: KeyLocks, stack: ExitStack) -> None:
-        self._worker, self._work, self._locks, self._stack = worker, work, locks, stack
-        self._held: dict[str, ExitStack] = {}
-
-    def hold(self, key: str) -> None:
-        """Waits for a key and tells the worker. Raises `Canceled` and `WorkerGone`."""
-
-        def check() -> None:
-            self._worker.check_alive()
-            self._work.check()
-
-        held = self._held[key] = self._stack.enter_context(ExitStack())
-        held.enter_context(self._locks.held(key, check))
-        self._worker._send(KeyHeld(self._work.job_id))  # pyright: ignore[reportPrivateUsage]
-
-    def release(self, key: str) -> None:
-        """Gives a key back, if the job holds it."""
-        if key in self._held:
-            self._held.pop(key).close()
