@@ -156,3 +156,24 @@ def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service, pixe
         with pytest.raises(InvalidRequest, match=told) as caught:
             service.keep_masks(asked.model_copy(update={"objects": (wrong,)}))
         assert caught.value.errors[0].pointer == "/objects/0/mask"
+
+
+@pytest.mark.parametrize(
+    ("asked", "question", "missing"),
+    [
+        ({"relation": "touches", "target": "blue mug"}, "?", ["blue mug"]),
+        ({"relation": "touches", "subject": "lid", "target": "crate"}, "?", ["lid"]),
+        ({"relation": "touches", "target": "crate"}, "?", []),
+        ({"relation": "touches", "target": "ball"}, "?", []),
+        (None, "If the ball moves to the right, will it hit the blue mug?", ["blue mug"]),
+        (None, "If the ball moves to the right, will it hit the crate?", []),
+    ],
+)
+def test_what_is_asked_about_and_was_not_located_is_warned_of(
+    pixels: np.ndarray, asked: dict | None, question: str, missing: list[str]
+) -> None:
+    mover = {"bbox": MOVER, "object": "ball"}
+    given = {"question": question, "grounding": mover, "objects": [{"object": "crate", "bbox": CUBE}]}
+    result = ground(run_of(pixels, **given, **({} if asked is None else {"asked": asked})))
+    told = [each for each in result.warnings if each.startswith("What is asked about, ")]
+    assert [each.split("'")[1] for each in told] == missing

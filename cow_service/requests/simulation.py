@@ -13,10 +13,12 @@ from cow_service.records import (
     AnswerOption,
     Asked,
     BBox,
+    Estimate,
     FramePolicy,
     InterventionKind,
     Law,
     MotionKind,
+    ObjectPrior,
     ObjectRole,
     PlaceRelation,
     Point,
@@ -47,6 +49,14 @@ class PlaceRequest(Record):
     shape: Shape | None = None
     size: Annotated[Finite, Field(ge=1e-4, le=1000)] | None = Field(default=None, description="Its longest side, m.")
     stands_on: ObjectWords | None = Field(default=None, description="`floor`, `air`, or an object in words.")
+
+    @property
+    def prior(self) -> ObjectPrior | None:
+        """What it says of the object beside its place, taken as exact."""
+        if self.shape is None and self.size is None and self.stands_on is None:
+            return None
+        size = None if self.size is None else Estimate(value=self.size, deviation=0.0)
+        return ObjectPrior(shape=self.shape, size=size, stands_on=self.stands_on)
 
     @model_validator(mode="after")
     def _one_place(self) -> PlaceRequest:

@@ -8,7 +8,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -133,10 +133,20 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
+def is_same_object(a: BBox, b: BBox) -> bool:
+    """Whether two boxes are of one object."""
+    return iou(a, b) >= SAME_OBJECT_IOU
+
+
+def is_among(bbox: BBox, others: Iterable[BBox]) -> bool:
+    """Whether a box is of the same object as one of some others."""
+    return any(is_same_object(bbox, other) for other in others)
+
+
 def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
     """The region that best overlaps a box [x0, y0, x1, y1], if it is the same object."""
     best = max(regions, key=lambda region: iou(region.bbox, bbox), default=None)
-    return best if best is not None and iou(best.bbox, bbox) >= SAME_OBJECT_IOU else None
+    return best if best is not None and is_same_object(best.bbox, bbox) else None
 
 
 def disc_region(image: Image, disc: Mask) -> Region:
