@@ -151,37 +151,24 @@ class HostList:
     """
 
     def __init__(self, entries: Iterable[str]) -> None:
-        self._entries = tuple(_entry(each) for each in entries)
+        self._entries: list[tuple[str, frozenset[int]]] = []  # a name, *.name or *; and its ports
+        for text in entries:
+            wrong = ValueError(f"{text!r} is none of: a host name, name:port, *.name, *")
+            try:
+                url = httpx.URL(f"any://{text}")  # a scheme without a port of its own: every port written is seen
+            except httpx.InvalidURL as error:
+                raise wrong from error
+            raw, ports = url.raw_host.decode("ascii"), WEB_PORTS if url.port is None else frozenset((url.port,))
+            name = raw.removeprefix("*.")
+            known = raw if raw == "*" else host_name(name)
+            if known is None or set(text) & set("/?#@") or not all(0 < port < 65536 for port in ports):
+                raise wrong
+            self._entries.append((raw.removesuffix(name) + known, ports))
 
     def has(self, host: str, port: int) -> bool:
         """Whether a host, as `host_name` gives it, may be asked at this port."""
-        return any(entry.fits(host, port) for entry in self._entries)
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """One entry of the list."""
-
-    name: str  # empty for every host
-    below: bool  # the names below it, and not itself
-    ports: frozenset[int]
-
-    def fits(self, host: str, port: int) -> bool:
-        named = not self.name or (host.endswith(f".{self.name}") if self.below else host == self.name)
-        return named and port in self.ports
-
-
-def _entry(text: str) -> _Entry:
-    wrong = ValueError(f"{text!r} is none of: a host name, name:port, *.name, *")
-    try:
-        url = httpx.URL(f"any://{text}")  # a scheme without a port of its own, so that every port written is seen
-    except httpx.InvalidURL as error:
-        raise wrong from error
-    raw = url.raw_host.decode("ascii")
-    name = "" if raw == "*" else host_name(raw.removeprefix("*."))
-    if name is None or set(text) & set("/?#@") or not 0 < (80 if url.port is None else url.port) < 65536:
-        raise wrong
-    return _Entry(name, raw.startswith("*."), WEB_PORTS if url.port is None else frozenset((url.port,)))
+        above = ["*." + host[place + 1 :] for place, letter in enumerate(host) if letter == "."]
+        return any(name in ("*", host, *above) and port in ports for name, ports in self._entries)
 
 
 class Egress:
@@ -212,7 +199,7 @@ class Egress:
 
     def fetch(self, url: str, most_bytes: int) -> bytes:
         """The body at a URL, at most so long. Raises `NotAllowed` or `Unreachable`."""
-        deadline = _Deadline(self._seconds)
+        deadline = _Deadline(monotonic() + self._seconds)
         target = self._target(url, "The URL")
         for _ in range(MAX_REDIRECTS + 1):
             with _translated(target.host), self._exchange("GET", target, deadline) as response:
@@ -231,11 +218,8 @@ class Egress:
         `headers` says its type and whatever else; host, length and encoding are put in here. Raises `NotAllowed` or
         `Unreachable`.
         """
-        target = self._target(url, "The URL")
-        with (
-            _translated(target.host),
-            self._exchange("POST", target, _Deadline(self._seconds), body, headers) as response,
-        ):
+        target, deadline = self._target(url, "The URL"), _Deadline(monotonic() + self._seconds)
+        with _translated(target.host), self._exchange("POST", target, deadline, body, headers) as response:
             return response.status
 
     def check(self, url: str) -> None:
@@ -296,18 +280,6 @@ class Egress:
 
     def _addresses(self, target: _Target, deadline: _Deadline) -> list[str]:
         """Where a host is now. Raises `NotAllowed` where any of it may not be connected to."""
-        addresses = [target.host] if is_address(target.host) else self._looked_up(target, deadline)
-        if not addresses:
-            raise Unreachable(f"The host name '{target.host}' has no address.")
-        self._check_addresses(target, addresses)
-        return addresses
-
-    def _check_addresses(self, target: _Target, addresses: list[str]) -> None:
-        if not all(self._permitted(address) for address in addresses):
-            raise NotAllowed(f"{target.what} leads to the host '{target.host}', whose address is not a public one.")
-
-    def _looked_up(self, target: _Target, deadline: _Deadline) -> list[str]:
-        # The system's resolver takes no time limit. Where it is too slow, its thread is left to end by itself.
         answer: Future[list[str]] = Future()
 
         def ask() -> None:
@@ -316,8 +288,19 @@ class Egress:
             except Exception as error:  # noqa: BLE001 - raised where the answer is waited for
                 answer.set_exception(error)
 
-        Thread(target=ask, name="cow-look-up", daemon=True).start()
-        return answer.result(deadline.left())
+        if is_address(target.host):
+            answer.set_result([target.host])
+        else:  # the system's resolver takes no time limit: where it is too slow, its thread is left to end by itself
+            Thread(target=ask, name="cow-look-up", daemon=True).start()
+        addresses = answer.result(deadline.left())
+        if not addresses:
+            raise Unreachable(f"The host name '{target.host}' has no address.")
+        self._check_addresses(target, addresses)
+        return addresses
+
+    def _check_addresses(self, target: _Target, addresses: list[str]) -> None:
+        if not all(self._permitted(address) for address in addresses):
+            raise NotAllowed(f"{target.what} leads to the host '{target.host}', whose address is not a public one.")
 
     @cached_property
     def _tls(self) -> ssl.SSLContext:
@@ -341,71 +324,71 @@ class _Target:
         return host if self.port == _DEFAULT_PORTS[self.url.scheme] else f"{host}:{self.port}"
 
 
+@dataclass(frozen=True)
 class _Deadline:
     """The time limit of a whole exchange."""
 
-    def __init__(self, seconds: float) -> None:
-        self._end = monotonic() + seconds
+    end: float  # by the monotonic clock, s
 
     def left(self) -> float:
         """Seconds, more than none. Raises `TimeoutError` after the end."""
-        left = self._end - monotonic()
+        left = self.end - monotonic()
         if left <= 0:
             raise TimeoutError("the time for this exchange is over")
         return left
 
 
+@dataclass(frozen=True)
 class _PinnedBackend(httpcore.NetworkBackend):
     """Connects to addresses that were checked, whatever the host name."""
 
-    def __init__(self, addresses: list[str], deadline: _Deadline, seconds: float) -> None:
-        self._addresses = addresses
-        self._deadline = deadline
-        self._seconds = seconds
+    addresses: list[str]
+    deadline: _Deadline
+    seconds: float  # for one connection
 
     def connect_tcp(self, host: str, port: int, *_: Any, **__: Any) -> httpcore.NetworkStream:
         """A connection to the first address that takes one. Raises `OSError`."""
         failed: OSError = OSError("no address")
-        for address in self._addresses:
+        for address in self.addresses:
             try:
-                connection = socket.create_connection((address, port), min(self._seconds, self._deadline.left()))
+                connection = socket.create_connection((address, port), min(self.seconds, self.deadline.left()))
             except OSError as error:  # the last one is raised
                 failed = error
             else:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                return _Stream(connection, self._deadline)
+                return _Stream(connection, self.deadline)
         raise failed
 
 
+@dataclass(frozen=True)
 class _Stream(httpcore.NetworkStream):
     """A connection whose every operation ends with the deadline. Raises `OSError`."""
 
-    def __init__(self, connection: socket.socket, deadline: _Deadline) -> None:
-        self._socket = connection
-        self._deadline = deadline
+    connection: socket.socket
+    deadline: _Deadline
 
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
-        self._socket.settimeout(self._deadline.left())
-        return self._socket.recv(max_bytes)
+        self.connection.settimeout(self.deadline.left())
+        return self.connection.recv(max_bytes)
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:
         rest = memoryview(buffer)
         while rest:  # not sendall, which with TLS begins its time limit anew for every piece
-            self._socket.settimeout(self._deadline.left())
-            rest = rest[self._socket.send(rest) :]
+            self.connection.settimeout(self.deadline.left())
+            rest = rest[self.connection.send(rest) :]
 
     def close(self) -> None:
-        self._socket.close()
+        self.connection.close()
 
     def start_tls(
         self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
     ) -> httpcore.NetworkStream:
         """The same connection with TLS, for the name in the URL. Raises `OSError`."""
         try:
-            self._socket.settimeout(self._deadline.left())
-            return _Stream(ssl_context.wrap_socket(self._socket, server_hostname=server_hostname), self._deadline)
+            self.connection.settimeout(self.deadline.left())
+            return _Stream(ssl_context.wrap_socket(self.connection, server_hostname=server_hostname), self.deadline)
         except BaseException:
-            self._socket.close()
+            self.connection.close()
             raise
 
 
@@ -444,8 +427,6 @@ class ImageUrls:
         self._most_bytes = int(settings.max_body_mb * 1e6)
         self._egress = egress
         if egress is None and settings.allow_image_urls:
-            # Only here: a server that fetches nothing starts without an HTTP client (0.15 s).
-
             try:
                 self._egress = Egress(settings.allow_image_urls)
             except ValueError as error:
@@ -458,7 +439,6 @@ class ImageUrls:
         """
         if self._egress is None:
             raise ImageUrlNotAllowed("This server fetches no images. Send the image as a data URL or as a file part.")
-
         try:
             return self._egress.fetch(url, self._most_bytes)
         except NotAllowed as error:

@@ -18,7 +18,7 @@ from cow_service.api.middleware.access import PROBES, Callers, Gate, KeyRing, Or
 from cow_service.api.middleware.access_log import AccessLog
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.openai import routes as chats
-from cow_service.api.openai.routes import Completer, document_chat
+from cow_service.api.openai.completer import Completer
 from cow_service.api.problems import documented, install_problem_handlers
 from cow_service.api.routes import artifacts, health, jobs, page, simulate
 from cow_service.api.routes.artifacts import MAX_CONCURRENT_DOWNLOADS
@@ -78,6 +78,7 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
         docs_url=None,  # the framework's page loads its script from elsewhere; ours is in `routes/page.py`
         redoc_url=None,
         redirect_slashes=False,
+        generate_unique_id_function=lambda route: route.name,  # the ids of operations
         lifespan=lifespan,
     )
     app.state.engine, app.state.readiness = engine, readiness or Readiness(service)
@@ -140,31 +141,23 @@ def contract(app: FastAPI) -> dict[str, Any]:
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(schema.pop("$defs", {}))
             schemas[model.__name__] = schema
-        for operations in document["paths"].values():
+        scheme = {"type": "http", "scheme": "bearer", "description": "Needed where the server has COW_API_KEYS."}
+        document["components"]["securitySchemes"] = {"key": scheme}
+        for path, operations in document["paths"].items():
+            refusals = (OriginNotAllowed,) if path in PROBES else (Unauthorized, OriginNotAllowed, RateLimited)
             for operation in operations.values():
-                if "application/json" in operation["responses"].get("422", {}).get("content", {}):
-                    del operation["responses"]["422"]  # the framework's own; ours are problems
-        _document_middleware(document)
-        document_chat(document)
+                responses = operation["responses"]
+                if "application/json" in responses.get("422", {}).get("content", {}):
+                    del responses["422"]  # the framework's own; ours are problems
+                operation["security"] = [] if path in PROBES else [{"key": []}, {}]
+                for status, response in documented(*refusals).items():
+                    known = responses.setdefault(str(status), response)
+                    if known is not response:
+                        known["description"] += ", " + response["description"]
+                operation["responses"] = dict(sorted(responses.items()))
+        chats.document_chat(document)
         for name in FRAMEWORK_SCHEMAS:
             schemas.pop(name, None)
         document["components"]["schemas"] = dict(sorted(schemas.items()))
         app.openapi_schema = document
     return app.openapi_schema
-
-
-def _document_middleware(document: dict[str, Any]) -> None:
-    """Adds the API key, and what the middleware may answer, to each operation."""
-    scheme = {"type": "http", "scheme": "bearer", "description": "Needed where the server has COW_API_KEYS."}
-    document["components"]["securitySchemes"] = {"key": scheme}
-    for path, operations in document["paths"].items():
-        for operation in operations.values():
-            probe = path in PROBES
-            operation["security"] = [] if probe else [{"key": []}, {}]
-            refusals = (OriginNotAllowed,) if probe else (Unauthorized, OriginNotAllowed, RateLimited)
-            responses = operation["responses"]
-            for status, response in documented(*refusals).items():
-                known = responses.setdefault(str(status), response)
-                if known is not response:
-                    known["description"] += ", " + response["description"]
-            operation["responses"] = dict(sorted(responses.items()))

@@ -98,9 +98,17 @@ def install_problem_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def framework_error(request: Request, error: HTTPException) -> Response:
-        response = respond(_translated(error, request), request.scope)
+        path, status = errors.shortened(request.url.path, SHOWN_CHARACTERS), error.status_code
+        if status == HTTPStatus.NOT_FOUND:
+            ours = errors.NotFound(f"Nothing is served at {path}. GET /openapi.json lists what is.")
+        elif status == HTTPStatus.METHOD_NOT_ALLOWED:
+            ours = errors.MethodNotAllowed(f"{path} does not take {request.method}.")
+        else:
+            is_theirs = HTTPStatus.BAD_REQUEST <= status < HTTPStatus.INTERNAL_SERVER_ERROR
+            ours = (errors.MalformedBody if is_theirs else errors.InternalError)(f"{error.detail}.")
+        response = respond(ours, request.scope)
         response.headers.update(error.headers or {})
-        if response.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        if status == HTTPStatus.METHOD_NOT_ALLOWED:
             # Several routes may have the address, of which the framework names the first one's methods.
             routers = (getattr(each, "original_router", None) for each in app.routes)
             routes = [*app.routes, *(route for router in routers if router is not None for route in router.routes)]
@@ -130,14 +138,3 @@ def documented(*errors: type[errors.CowError]) -> dict[int | str, dict[str, Any]
             "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
         }
     return by_status
-
-
-def _translated(error: HTTPException, request: Request) -> errors.CowError:
-    path = errors.shortened(request.url.path, SHOWN_CHARACTERS)
-    if error.status_code == HTTPStatus.NOT_FOUND:
-        return errors.NotFound(f"Nothing is served at {path}. GET /openapi.json lists what is.")
-    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-        return errors.MethodNotAllowed(f"{path} does not take {request.method}.")
-    if HTTPStatus.BAD_REQUEST <= error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
-        return errors.MalformedBody(f"{error.detail}.")
-    return errors.InternalError(f"{error.detail}.")

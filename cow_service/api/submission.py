@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-from collections.abc import AsyncGenerator, Callable
-from contextlib import asynccontextmanager
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
@@ -82,13 +83,11 @@ class Submission:
         return self.prefer != Preferences(fresh=self.prefer.fresh, minimal=self.prefer.minimal)
 
 
-@dataclass
 class Submitter:
     """Makes jobs of requests, and responses of their outcomes. Bodies are decoded in threads."""
 
-    engine: JobEngine
-
-    def __post_init__(self) -> None:
+    def __init__(self, engine: JobEngine) -> None:
+        self.engine = engine
         self._limiter = CapacityLimiter(MAX_CONCURRENT_BODIES)
         self._fetches = CapacityLimiter(MAX_CONCURRENT_FETCHES)
 
@@ -146,12 +145,12 @@ class Submitter:
             created_at = await self.submit(submission, body, image)
             if submission.prefer.respond_async and not submission.prefer.wait:
                 return None
-            async with disconnected(request) as gone:
-                try:
-                    return await self.outcome(submission, waiter, created_at, gone, submission.prefer.wait)
-                except StorageUnavailable as error:  # the job itself waits until it is over
-                    error.headers |= {"Location": f"/jobs/{submission.job_id}"} | RETRY_AFTER
-                    raise
+            outcome = self.outcome(submission, waiter, created_at, submission.prefer.wait)
+            try:
+                return await unless_disconnected(request, outcome, partial(self.leave, submission, created_at))
+            except StorageUnavailable as error:  # the job itself waits until it is over
+                error.headers |= {"Location": f"/jobs/{submission.job_id}"} | RETRY_AFTER
+                raise
 
     async def accepted(self, submission: Submission) -> Response:
         """The job, for a caller who does not wait for its end."""
@@ -174,7 +173,6 @@ class Submitter:
         submission: Submission,
         waiter: Waiter,
         created_at: str | None,
-        gone: asyncio.Event,
         wait: float | None = None,
         *,
         may_have_ended: bool = False,
@@ -184,32 +182,23 @@ class Submitter:
         `created_at` is that of a job that this request submitted: another of the same id is not taken for it.
         `may_have_ended`: the waiter was made after the job, and may have missed its end.
         """
-        loop = asyncio.get_running_loop()
-        until = None if wait is None else loop.time() + wait
-        left = asyncio.ensure_future(gone.wait())
+        until = None if wait is None else time.monotonic() + wait
         look = may_have_ended or created_at is None
-        try:
-            while True:
-                if look and (result := await to_thread.run_sync(self._result, submission, created_at)) is not None:
-                    return result
-                rest = POLL_SECONDS if until is None else min(POLL_SECONDS, until - loop.time())
-                if rest <= 0:
-                    return None
-                ended = asyncio.ensure_future(waiter.ended.wait())
-                await asyncio.wait({ended, left}, timeout=rest, return_when=asyncio.FIRST_COMPLETED)
-                ended.cancel()
-                look = True
-                if waiter.ended.is_set():
-                    outcome, outcome_of = waiter.take()
-                    if outcome is not None and outcome_of in (None, created_at):
-                        if isinstance(outcome, CowError):
-                            raise outcome
-                        return outcome
-                elif left.done():
-                    await self.leave(submission, created_at)
-                    raise Canceled("The caller went away before the work was done.")
-        finally:
-            left.cancel()
+        while True:
+            if look and (result := await to_thread.run_sync(self._result, submission, created_at)) is not None:
+                return result
+            rest = POLL_SECONDS if until is None else min(POLL_SECONDS, until - time.monotonic())
+            if rest <= 0:
+                return None
+            with suppress(TimeoutError):
+                await asyncio.wait_for(waiter.ended.wait(), rest)
+            look = True
+            if waiter.ended.is_set():
+                outcome, outcome_of = waiter.take()
+                if outcome is not None and outcome_of in (None, created_at):
+                    if isinstance(outcome, CowError):
+                        raise outcome
+                    return outcome
 
     async def leave(self, submission: Submission, created_at: str | None) -> None:
         """The caller has disconnected: cancels a new job that nobody can ask for."""
@@ -277,27 +266,35 @@ def json_response(body: str, status: int = HTTPStatus.OK, headers: dict[str, str
     return Response(body, status, headers, media_type="application/json")
 
 
-@asynccontextmanager
-async def disconnected(request: Request) -> AsyncGenerator[asyncio.Event]:
-    """An event that is set when the caller has closed the connection."""
-    gone = asyncio.Event()
+async def do_nothing() -> None:
+    """Does nothing."""
+
+
+async def unless_disconnected(
+    request: Request, work: Awaitable[Made], leave: Callable[[], Awaitable[None]] = do_nothing
+) -> Made:
+    """The result of the work. Where the caller goes away before, `leave` is called, the work is canceled, and
+    `Canceled` is raised."""
 
     async def watch() -> None:
         while (await request.receive())["type"] != "http.disconnect":
             pass  # an empty rest of the body
-        gone.set()
 
-    task = asyncio.create_task(watch())
+    task, gone = asyncio.ensure_future(work), asyncio.ensure_future(watch())
     try:
-        yield gone
+        await asyncio.wait({task, gone}, return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            return task.result()
+        await leave()
+        raise Canceled("The caller went away before the work was done.")
     finally:
-        task.cancel()
+        for each in (task, gone):
+            each.cancel()
+        await asyncio.gather(task, gone, return_exceptions=True)
 
 
 MAX_WAIT_SECONDS = 600
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
-
-
 MINIMAL_APPLIED = {"Preference-Applied": "return=minimal"}
 
 

@@ -16,7 +16,7 @@ from typing import Any, cast
 from uuid import uuid4
 
 import sqlalchemy as sa
-from pydantic import Field
+from pydantic import AwareDatetime, BaseModel, Field
 from pydantic_core import to_json
 from sqlalchemy.dialects import postgresql, sqlite
 
@@ -95,16 +95,17 @@ class TakenJob:
     run: str
 
 
-@dataclass(frozen=True)
-class JobFilters:
-    """Which jobs a caller wants to see."""
+class JobFilters(BaseModel):
+    """Which jobs a caller wants to see: the query of `GET /jobs`."""
 
-    status: tuple[JobStatus, ...] = ()
+    status: list[JobStatus] | None = Field(default=None, description="May be repeated.")
     kind: JobKind | None = None
-    created_after: datetime | None = None
-    created_before: datetime | None = None
-    limit: int = 50
-    cursor: str | None = None
+    created_after: AwareDatetime | None = Field(default=None, description="RFC 3339; included.")
+    created_before: AwareDatetime | None = Field(default=None, description="RFC 3339; included.")
+    limit: int = Field(default=50, ge=1, le=500)
+    cursor: str | None = Field(
+        default=None, max_length=40_000, pattern=r"^[A-Za-z0-9_-]*$", description="`next` of the page before."
+    )
 
 
 @dataclass(frozen=True)

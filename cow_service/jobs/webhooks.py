@@ -95,12 +95,13 @@ class Webhooks:
         """Adds an attempt, to be made `delay` seconds after the transaction of the connection."""
         if self._secret is None:
             return
+        receiver = urlsplit(url).netloc.rpartition("@")[2].lower()  # host and port
         options: EnqueueOptions = {
             "workflow_name": WORKFLOW,
             "queue_name": QUEUE,
             "workflow_id": attempt_ids(job_id)[attempt - 1],
             "app_version": VERSION,
-            "queue_partition_key": _receiver(url),
+            "queue_partition_key": hashlib.sha256(receiver.encode()).hexdigest()[:32],  # of bounded length
         }
         if delay is not None:
             options["delay_seconds"] = delay
@@ -113,11 +114,18 @@ class Webhooks:
         """Makes one attempt; returns the seconds until the next one, or None where none follows."""
         from cow_service.net import NotAllowed, Unreachable  # noqa: PLC0415
 
+        assert self._secret is not None
         event = {"type": f"job.{job.status}", "timestamp": job.finished_at, "data": job.model_dump(mode="json")}
         body = json.dumps(event, separators=(",", ":")).encode()
-        message = f"msg_{job.id}"
+        message, moment, secrets = f"msg_{job.id}", str(int(time.time())), self._secret.get_secret_value().split(" ")
+        headers = {
+            "Content-Type": "application/json",
+            "webhook-id": message,
+            "webhook-timestamp": moment,
+            "webhook-signature": " ".join(sign(each, message, moment, body) for each in secrets),
+        }
         try:
-            status = self._egress.post(url, body, self._headers(message, body))
+            status = self._egress.post(url, body, headers)
         except NotAllowed as error:
             log.warning("webhook of job %s: %s", job.id, error)
             self._metrics.webhook("not-allowed")
@@ -136,21 +144,6 @@ class Webhooks:
             self._metrics.webhook_given_up()
             return None
         return RETRY_SECONDS[attempt - 1] * random.uniform(1 - JITTER, 1 + JITTER)  # so that retries spread
-
-    def _headers(self, message: str, body: bytes) -> dict[str, str]:
-        assert self._secret is not None
-        secrets, moment = self._secret.get_secret_value().split(" "), str(int(time.time()))
-        return {
-            "Content-Type": "application/json",
-            "webhook-id": message,
-            "webhook-timestamp": moment,
-            "webhook-signature": " ".join(sign(each, message, moment, body) for each in secrets),
-        }
-
-
-def _receiver(url: str) -> str:
-    """Who is called by a URL: its host and port, as a key of bounded length."""
-    return hashlib.sha256(urlsplit(url).netloc.rpartition("@")[2].lower().encode()).hexdigest()[:32]
 
 
 def attempt_ids(job_id: str) -> list[str]:

@@ -95,10 +95,12 @@ class Callers:
             if path in PROBES or path in PAGES or path.startswith(PAGE_FILES):
                 return None
         if self._keys:
-            key = _bearer(scope)
-            owner = state["owner"] = None if key is None else self._keys.owner_of(key)
+            sent = Headers(scope=scope).getlist("authorization")
+            scheme, _, rest = sent[0].strip().partition(" ") if len(sent) == 1 else ("", "", "")
+            key = rest.strip() if scheme.lower() == "bearer" else ""
+            owner = state["owner"] = self._keys.owner_of(key) if key else None
             if owner is None:
-                return self._unauthorized(scope, "no key" if key is None else "a key that is none of this server's")
+                return self._unauthorized(scope, "a key that is none of this server's" if key else "no key")
         if self._requests is None:
             return None
         whose = "your address" if owner is None else "this key"
@@ -121,13 +123,6 @@ def rate_limited(detail: str, wait: float) -> RateLimited:
     """The error for a caller who is to wait so many seconds."""
     seconds = max(1, math.ceil(wait))
     return RateLimited(f"{detail} Try again in {seconds} s.", headers={"Retry-After": str(seconds)})
-
-
-def _bearer(scope: Scope) -> str | None:
-    """The key that was sent; None where there is none, or more than one."""
-    sent = Headers(scope=scope).getlist("authorization")
-    scheme, _, key = sent[0].strip().partition(" ") if len(sent) == 1 else ("", "", "")
-    return key.strip() or None if scheme.lower() == "bearer" else None
 
 
 def address_of(scope: Scope) -> str:

@@ -54,35 +54,31 @@ class AccessLog:
         headers = Headers(scope=scope)
         given = headers.get("x-request-id", "")
         request_id = given if _REQUEST_ID.fullmatch(given) else secrets.token_hex(16)
-        with tracing.request_span(scope["method"], headers.get("traceparent")), context.bound(request=request_id):
-            ids = {"X-Request-Id": request_id, "traceparent": context.traceparent() or ""}
-            await self._observe(scope, receive, send, ids | {"X-Content-Type-Options": "nosniff"})
-
-    async def _observe(self, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
-        """Passes a request on, adds the headers to its response, and records both."""
-        started = time.perf_counter()
-        status, complete = 0, False
+        added = {"X-Request-Id": request_id, "X-Content-Type-Options": "nosniff"}
+        started, status, complete = time.perf_counter(), 0, False
 
         async def observed(message: Message) -> None:
             nonlocal status, complete
             if message["type"] == "http.response.start":
                 status = message["status"]
-                MutableHeaders(scope=message).update(headers)
+                MutableHeaders(scope=message).update(added)
             elif message["type"] == "http.response.body":
                 complete = not message.get("more_body", False)
             await send(message)
 
-        try:
-            await self.app(scope, receive, observed)
-        except Exception as error:
-            if not status:
-                log.error("%s %s failed", scope["method"], _shown(scope), exc_info=error)
-                await respond(unforeseen(), scope)(scope, receive, observed)
-            elif not complete:
-                raise  # the server must break the connection off: the caller would take the part for the whole
-            # Else the framework has answered and logged it, and raised it again only to tell the server.
-        finally:
-            self._record(scope, status or CLIENT_CLOSED, time.perf_counter() - started)
+        with tracing.request_span(scope["method"], headers.get("traceparent")), context.bound(request=request_id):
+            added["traceparent"] = context.traceparent() or ""
+            try:
+                await self.app(scope, receive, observed)
+            except Exception as error:
+                if not status:
+                    log.error("%s %s failed", scope["method"], _shown(scope), exc_info=error)
+                    await respond(unforeseen(), scope)(scope, receive, observed)
+                elif not complete:
+                    raise  # the server must break the connection off: the caller would take the part for the whole
+                # Else the framework has answered and logged it, and raised it again only to tell the server.
+            finally:
+                self._record(scope, status or CLIENT_CLOSED, time.perf_counter() - started)
 
     def _record(self, scope: Scope, status: int, seconds: float) -> None:
         method = scope["method"] if scope["method"] in METHODS else "other"

@@ -42,13 +42,6 @@ class Whole:
         return self.status == HTTPStatus.OK
 
 
-@dataclass(frozen=True)
-class Events:
-    """A reply as server-sent events, each whole, with the blank line at its end."""
-
-    events: AsyncGenerator[bytes]
-
-
 class Forwarder:
     """One connection pool for all chats, used from one event loop; `COW_MLLM_CONCURRENCY` of them at a time."""
 
@@ -65,8 +58,11 @@ class Forwarder:
             self._client = None
 
     @asynccontextmanager
-    async def send(self, upstream: Upstream, body: dict[str, Any]) -> AsyncGenerator[Whole | Events]:
-        """The reply to a chat, sent once. Raises `InvalidRequest`, `MllmUnavailable`, `MllmBadReply`."""
+    async def send(self, upstream: Upstream, body: dict[str, Any]) -> AsyncGenerator[Whole | AsyncGenerator[bytes]]:
+        """The reply to a chat, sent once: whole, or its events, each with the blank line at its end.
+
+        Raises `InvalidRequest`, `MllmUnavailable`, `MllmBadReply`.
+        """
         try:
             content = json.dumps(body, allow_nan=False)
         except ValueError as error:
@@ -75,7 +71,14 @@ class Forwarder:
         if upstream.key is not None:
             headers["Authorization"] = f"Bearer {upstream.key}"
         url = f"{upstream.base_url}/chat/completions"
-        request = self._pool().build_request("POST", url, content=content, headers=headers)
+        if self._client is None:
+            self._client = httpx.AsyncClient(
+                timeout=httpx.Timeout(self._timeout, connect=CONNECT_SECONDS, pool=None),
+                limits=httpx.Limits(max_connections=None, max_keepalive_connections=self._permits),
+                headers={"User-Agent": f"cow-service/{__version__}"},
+            )
+        client = self._client
+        request = client.build_request("POST", url, content=content, headers=headers)
         try:
             async with asyncio.timeout(self._budget):
                 await self._slots.acquire()
@@ -87,24 +90,15 @@ class Forwarder:
         async with AsyncExitStack() as stack:
             stack.callback(self._slots.release)
             with _translated():
-                response = await self._pool().send(request, stream=True)
+                response = await client.send(request, stream=True)
             stack.push_async_callback(response.aclose)
             is_stream = response.headers.get("content-type", "").startswith("text/event-stream")
             if response.status_code == HTTPStatus.OK and is_stream:
-                yield Events(_events(response))
+                yield _events(response)
             else:
                 with _translated():
                     await response.aread()
                 yield _whole(response, upstream)
-
-    def _pool(self) -> httpx.AsyncClient:
-        if self._client is None:
-            self._client = httpx.AsyncClient(
-                timeout=httpx.Timeout(self._timeout, connect=CONNECT_SECONDS, pool=None),
-                limits=httpx.Limits(max_connections=None, max_keepalive_connections=self._permits),
-                headers={"User-Agent": f"cow-service/{__version__}"},
-            )
-        return self._client
 
 
 @contextmanager
@@ -147,6 +141,7 @@ async def split_events(chunks: AsyncIterator[bytes]) -> AsyncGenerator[bytes]:
 
 
 def _whole(response: httpx.Response, upstream: Upstream) -> Whole:
+    """A reply, or what the server says went wrong, in OpenAI's form. Raises `MllmBadReply`, `MllmUnavailable`."""
     status = response.status_code
     text, value = response.content.decode("utf-8", errors="replace"), None
     with suppress(ValueError, RecursionError):
@@ -165,8 +160,19 @@ def _whole(response: httpx.Response, upstream: Upstream) -> Whole:
         for name, value in response.headers.items()
         if name in PASSED_HEADERS or name.startswith(PASSED_PREFIX)
     }
-    is_text = response.headers.get("content-type", "").startswith("text/plain")
-    error = _error_of(status, value, text if is_text else "")
+    error = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
+    if not isinstance(error.get("error"), dict):  # else it is in OpenAI's form already
+        plain = text.strip() if response.headers.get("content-type", "").startswith("text/plain") else ""
+        said = error.get("message") or error.get("error") or error.get("detail") or plain
+        message = shortened(said if isinstance(said, str) else as_json(said), MAX_ERROR_CHARACTERS)
+        error = {
+            "error": {
+                "message": message or f"The server of the multimodal LLM answered with status {status}.",
+                "type": error.get("type", "upstream_error"),
+                "param": error.get("param"),
+                "code": error.get("code", str(status)),
+            }
+        }
     return Whole(_without(error, upstream.key) if upstream.key else error, status, headers)
 
 
@@ -177,21 +183,3 @@ def _without(value: Any, key: str) -> Any:
     if isinstance(value, list):
         return [_without(held, key) for held in cast("list[Any]", value)]
     return value.replace(key, "***") if isinstance(value, str) else value
-
-
-def _error_of(status: int, value: Any, text: str) -> dict[str, Any]:
-    """What a server says went wrong, in OpenAI's form; as it is where that is its form."""
-    given = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
-    if isinstance(given.get("error"), dict):
-        return given
-    said = given.get("message") or given.get("error") or given.get("detail") or text.strip()
-    message = said if isinstance(said, str) else as_json(said)
-    return {
-        "error": {
-            "message": shortened(message, MAX_ERROR_CHARACTERS)
-            or f"The server of the multimodal LLM answered with status {status}.",
-            "type": given.get("type", "upstream_error"),
-            "param": given.get("param"),
-            "code": given.get("code", str(status)),
-        }
-    }

@@ -38,121 +38,114 @@ def chat_fields(body: dict[str, Any]) -> dict[str, Any]:
     if body.get("stream") is True:
         chat.setdefault("stream_options", {"include_usage": True})  # a response always says its usage
     system = [] if body.get("instructions") is None else [{"role": "system", "content": body["instructions"]}]
-    chat["messages"] = [*system, *_messages(body.get("input"))]
+    given = body.get("input")
+    asked = [{"role": "user", "content": given}] if isinstance(given, str) else _messages(given)
+    chat["messages"] = [*system, *asked]
     text, reasoning = _object(body, "text"), _object(body, "reasoning")
-    if isinstance(form := text.get("format"), dict) and form.get("type") == "json_schema":
+    form = text.get("format")
+    if isinstance(form, dict) and form.get("type") == "json_schema":
         form = {"type": "json_schema", "json_schema": _without_type(form)}
-    if form is not None:
-        chat["response_format"] = form
-    if text.get("verbosity") is not None:
-        chat["verbosity"] = text["verbosity"]
-    if reasoning.get("effort") is not None:
-        chat["reasoning_effort"] = reasoning["effort"]
-    if tools := [_tool(place, tool) for place, tool in enumerate(_array(body, "tools"))]:
-        chat["tools"] = tools
-    if body.get("tool_choice") is not None:
-        chat["tool_choice"] = _tool_choice(body["tool_choice"])
+    tools = [_tool(tool, f"/tools/{place}/type") for place, tool in enumerate(_array(body, "tools"))]
+    choice = body.get("tool_choice")
+    if isinstance(choice, dict):
+        named = cast("dict[str, Any]", choice)
+        if named.get("type") != "function":
+            raise wrong("/tool_choice/type", "only `function` can be chosen by name")
+        choice = {"type": "function", "function": {"name": named.get("name")}}
     include = _array(body, "include")
     if unknown := [str(each)[:60] for each in include if each not in INCLUDED]:
         raise wrong("/include", f"only {', '.join(INCLUDED)} can be included, not {', '.join(unknown)}")
-    if LOGPROBS in include or body.get("top_logprobs"):
-        chat |= {"logprobs": True} | ({"top_logprobs": body["top_logprobs"]} if body.get("top_logprobs") else {})
     if body.get("truncation") not in (None, "disabled"):
         raise wrong("/truncation", "takes only `disabled`: the MLLM is sent the whole input")
-    return chat
+    alternatives = body.get("top_logprobs") or None
+    changed = {
+        "response_format": form,
+        "verbosity": text.get("verbosity"),
+        "reasoning_effort": reasoning.get("effort"),
+        "tools": tools or None,
+        "tool_choice": choice,
+        "logprobs": True if LOGPROBS in include or alternatives else None,
+        "top_logprobs": alternatives,
+    }
+    return chat | {name: value for name, value in changed.items() if value is not None}
 
 
-def _messages(given: Any) -> list[dict[str, Any]]:
-    if isinstance(given, str):
-        return [{"role": "user", "content": given}]
+def _messages(given: Any) -> Iterator[dict[str, Any]]:
+    """The messages of the input; none of what the MLLM thought before."""
     if not isinstance(given, list):
         raise wrong("/input", "is missing: give a text, or a list of items")
-    messages: list[dict[str, Any]] = []
-    for place, item in enumerate(cast("list[Any]", given)):
-        message = _message(item, f"/input/{place}")
-        before = messages[-1] if messages else {}
-        if message is None:
-            continue
-        if "tool_calls" in message and before.get("role") == "assistant":
-            before["tool_calls"] = [*before.get("tool_calls", ()), *message["tool_calls"]]  # one turn, several items
-        else:
-            messages.append(message)
-    return messages
-
-
-def _message(item: Any, pointer: str) -> dict[str, Any] | None:
-    """The message of an item; none of what the MLLM thought before."""
-    if not isinstance(item, dict):
-        raise wrong(pointer, "is no object")
-    given = cast("dict[str, Any]", item)
-    kind = given.get("type", "message")
-    if kind == "message":
-        content = given.get("content")
-        if not isinstance(content, str):
-            content = _parts(_array(given, "content", pointer), f"{pointer}/content")
-        return {"role": given.get("role", "user"), "content": content}
-    if kind == "function_call":
-        function = {"name": given.get("name"), "arguments": given.get("arguments")}
-        call = {"id": given.get("call_id"), "type": "function", "function": function}
-        return {"role": "assistant", "content": None, "tool_calls": [call]}
-    if kind == "function_call_output":
-        output = given.get("output")
-        if isinstance(output, list):
-            output = _parts(cast("list[Any]", output), f"{pointer}/output")
-        return {"role": "tool", "tool_call_id": given.get("call_id"), "content": output}
-    if kind == "reasoning":
-        return None
-    if kind == "item_reference":
-        raise wrong(f"{pointer}/type", f"{STATELESS}: send the item itself")
-    raise wrong(f"{pointer}/type", f"items of the type {str(kind)[:40]!r} cannot be sent on as a chat")
+    before: dict[str, Any] = {}
+    for place, each in enumerate(cast("list[Any]", given)):
+        pointer = f"/input/{place}"
+        item = _as_object(each, pointer)
+        match item.get("type", "message"):
+            case "message":
+                content = item.get("content")
+                if not isinstance(content, str):
+                    content = _parts(_array(item, "content", pointer), f"{pointer}/content")
+                message = {"role": item.get("role", "user"), "content": content}
+            case "function_call":
+                function = {"name": item.get("name"), "arguments": item.get("arguments")}
+                call = {"id": item.get("call_id"), "type": "function", "function": function}
+                if before.get("role") == "assistant":  # one turn, several items
+                    before.setdefault("tool_calls", []).append(call)
+                    continue
+                message = {"role": "assistant", "content": None, "tool_calls": [call]}
+            case "function_call_output":
+                output = item.get("output")
+                if isinstance(output, list):
+                    output = _parts(cast("list[Any]", output), f"{pointer}/output")
+                message = {"role": "tool", "tool_call_id": item.get("call_id"), "content": output}
+            case "reasoning":
+                continue
+            case "item_reference":
+                raise wrong(f"{pointer}/type", f"{STATELESS}: send the item itself")
+            case kind:
+                raise wrong(f"{pointer}/type", f"items of the type {str(kind)[:40]!r} cannot be sent on as a chat")
+        yield message
+        before = message
 
 
 def _parts(parts: list[Any], pointer: str) -> list[dict[str, Any]]:
-    return [_part(part, f"{pointer}/{place}") for place, part in enumerate(parts)]
+    return [_part(_as_object(part, f"{pointer}/{place}"), f"{pointer}/{place}") for place, part in enumerate(parts)]
 
 
-def _part(part: Any, pointer: str) -> dict[str, Any]:
-    if not isinstance(part, dict):
-        raise wrong(pointer, "is no object")
-    given = cast("dict[str, Any]", part)
-    kind = given.get("type")
-    if kind in ("input_text", "output_text", "text"):
-        return {"type": "text", "text": given.get("text", "")}
-    if kind == "refusal":
-        return {"type": "refusal", "refusal": given.get("refusal", "")}
-    if kind == "input_image" and isinstance(given.get("image_url"), str):
-        detail = {} if given.get("detail") is None else {"detail": given["detail"]}
-        return {"type": "image_url", "image_url": {"url": given["image_url"], **detail}}
-    if kind in ("input_image", "input_file") and given.get("file_id") is not None:
-        raise wrong(f"{pointer}/file_id", f"{STATELESS}, and so no files: send the image itself as `image_url`")
-    raise wrong(f"{pointer}/type", f"parts of the type {str(kind)[:40]!r} cannot be sent on as a chat")
+def _part(part: dict[str, Any], pointer: str) -> dict[str, Any]:
+    match part:
+        case {"type": "input_text" | "output_text" | "text"}:
+            return {"type": "text", "text": part.get("text", "")}
+        case {"type": "refusal"}:
+            return {"type": "refusal", "refusal": part.get("refusal", "")}
+        case {"type": "input_image", "image_url": str(url)}:
+            detail = {} if part.get("detail") is None else {"detail": part["detail"]}
+            return {"type": "image_url", "image_url": {"url": url, **detail}}
+        case {"type": "input_image" | "input_file", "file_id": file} if file is not None:
+            raise wrong(f"{pointer}/file_id", f"{STATELESS}, and so no files: send the image itself as `image_url`")
+        case _:
+            kind = str(part.get("type"))[:40]
+            raise wrong(f"{pointer}/type", f"parts of the type {kind!r} cannot be sent on as a chat")
 
 
-def _tool(place: int, tool: Any) -> dict[str, Any]:
-    if not isinstance(tool, dict) or tool.get("type") != "function":
-        kind = str(tool.get("type"))[:40] if isinstance(tool, dict) else "none"
-        detail = f"{kind!r} is a tool of OpenAI's own servers: only `function` can be sent on"
-        raise wrong(f"/tools/{place}/type", detail)
+def _tool(tool: Any, pointer: str) -> dict[str, Any]:
+    kind = tool.get("type") if isinstance(tool, dict) else "none"
+    if kind != "function":
+        shown = str(kind)[:40]
+        raise wrong(pointer, f"{shown!r} is a tool of OpenAI's own servers: only `function` can be sent on")
     return {"type": "function", "function": _without_type(tool)}
-
-
-def _tool_choice(choice: Any) -> Any:
-    if not isinstance(choice, dict):
-        return choice
-    if choice.get("type") != "function":
-        raise wrong("/tool_choice/type", "only `function` can be chosen by name")
-    return {"type": "function", "function": {"name": choice.get("name")}}
 
 
 def _without_type(value: Any) -> dict[str, Any]:
     return {name: held for name, held in cast("dict[str, Any]", value).items() if name != "type"}
 
 
+def _as_object(value: Any, pointer: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise wrong(pointer, "is no object")
+    return cast("dict[str, Any]", value)
+
+
 def _object(body: dict[str, Any], name: str) -> dict[str, Any]:
-    value = body.get(name)
-    if value is not None and not isinstance(value, dict):
-        raise wrong(f"/{name}", "is no object")
-    return value or {}
+    return {} if body.get(name) is None else _as_object(body[name], f"/{name}")
 
 
 def _array(body: dict[str, Any], name: str, above: str = "") -> list[Any]:
@@ -183,26 +176,27 @@ def response_of(completion: dict[str, Any], request: dict[str, Any]) -> dict[str
 
 def as_response(streamed: Streamed, request: dict[str, Any], model: str) -> Streamed:
     """A chat's stream as that of a response."""
-    return replace(streamed, events=_response_events(streamed, ResponseEvents(request, model)))
+    response = ResponseEvents(request, model)
 
+    async def events() -> AsyncGenerator[bytes]:
+        for event in response.begin():
+            yield event
+        try:
+            async with aclosing(streamed.events) as chunks:
+                async for received in chunks:
+                    chunk = data_of(received)
+                    if isinstance(chunk.get("error"), dict):
+                        yield response.fail(chunk["error"])
+                        return
+                    for event in response.add(chunk):
+                        yield event
+        except CowError as error:
+            yield response.fail(openai_error(streamed.locate(error)))
+            return
+        for event in response.end():
+            yield event
 
-async def _response_events(streamed: Streamed, response: ResponseEvents) -> AsyncGenerator[bytes]:
-    for event in response.begin():
-        yield event
-    try:
-        async with aclosing(streamed.events) as chunks:
-            async for received in chunks:
-                chunk = data_of(received)
-                if isinstance(chunk.get("error"), dict):
-                    yield response.fail(chunk["error"])
-                    return
-                for event in response.add(chunk):
-                    yield event
-    except CowError as error:
-        yield response.fail(openai_error(streamed.locate(error)))
-        return
-    for event in response.end():
-        yield event
+    return replace(streamed, events=events())
 
 
 class ResponseEvents:

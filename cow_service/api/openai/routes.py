@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
-from functools import partial
 from typing import Annotated, Any
 
 from anyio import to_thread
@@ -12,20 +10,17 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel
 
 from cow_service import errors
-from cow_service.api.body import read_object
 from cow_service.api.openai import records
-from cow_service.api.openai.answering import FIELDS_OF_CHAT, answer_events, completion_of, parse_chat
-from cow_service.api.openai.chats import EXTENSION, Chat, ChatRequest, ResponsesRequest, as_json, locate_in_chat
+from cow_service.api.openai.answering import FIELDS_OF_CHAT
+from cow_service.api.openai.chats import EXTENSION, Chat, ChatRequest, ResponsesRequest, as_json
+from cow_service.api.openai.completer import Completer
 from cow_service.api.openai.forwarding import Whole
-from cow_service.api.openai.proxy import Proxy, preferences_without_key
 from cow_service.api.openai.responses import as_response, chat_fields, response_of
 from cow_service.api.openai.stream import EventsResponse, Streamed
 from cow_service.api.problems import MEDIA_TYPE, OPENAI_ROOT, ChatProblem, documented
 from cow_service.api.routes.simulate import ACCEPTED, FAILURES, PREFERENCES
-from cow_service.api.submission import Submitter, from_app, json_response
-from cow_service.errors import BodyTypeUnsupported, shortened
+from cow_service.api.submission import from_app, json_response
 from cow_service.requests import AnswerRequest
-from cow_service.requests.values import SHOWN_CHARACTERS
 
 ANSWER_FIELDS = "ChatExtension"  # the schema of `cow` in a request
 REFERENCE = "#/components/schemas/{model}"
@@ -44,59 +39,6 @@ REPLIES = (
     records.UpstreamError,
     ChatProblem,
 )
-
-
-class Completer:
-    """Completes chats on an engine."""
-
-    def __init__(self, submitter: Submitter) -> None:
-        self._submitter = submitter
-        self.service = submitter.engine.service
-        self.settings = self.service.settings
-        self._proxy = Proxy(submitter)
-        self.started = int(time.time())
-
-    async def close(self) -> None:
-        """Closes connections."""
-        await self._proxy.close()
-
-    async def read_body(self, request: Request) -> dict[str, Any]:
-        """The JSON object that a request holds. Raises `BodyTypeUnsupported`, `MalformedBody`."""
-        media_type = request.headers.get("content-type", "none").partition(";")[0].strip().lower()
-        if media_type != "application/json" and not media_type.endswith("+json"):
-            raise BodyTypeUnsupported(
-                f"The body has the media type '{shortened(media_type, SHOWN_CHARACTERS)}'. Send application/json."
-            )
-        return await self._submitter.in_thread(partial(read_object, await request.body(), "The body"))
-
-    async def complete(self, request: Request, chat: Chat, *, stored: bool = True) -> Whole | Streamed | Response:
-        """The reply; a response where the caller takes the job instead, which needs `stored`.
-
-        Raises `ModelNotFound`, `InvalidRequest`, and what the MLLM or the job fails with.
-        """
-        answerer = records.find_answerer(self.service, chat.model)
-        reader = await to_thread.run_sync(self.service.chat_reader, answerer.reader)
-        if reader is not None:
-            return await self._proxy.complete(request, chat, answerer, reader)
-        submitter = self._submitter
-        submission = submitter.submission(request, "answer")
-        if not stored:
-            submission = replace(submission, prefer=preferences_without_key(request))
-        parsed = await submitter.in_thread(partial(parse_chat, chat, answerer))
-        try:
-            if chat.stream:
-                created_at = await submitter.submit(submission, parsed.request, None)
-                return Streamed(
-                    answer_events(submitter, submission, parsed, created_at),
-                    locate=lambda error: locate_in_chat(error, parsed.pointers),
-                    leave=partial(submitter.leave, submission, created_at),
-                )
-            result = await submitter.result(request, submission, parsed.request, None)
-            if result is None:
-                return await submitter.accepted(submission)
-            return Whole(await to_thread.run_sync(completion_of, parsed, result))
-        except errors.CowError as error:
-            raise locate_in_chat(error, parsed.pointers) from error
 
 
 ChatCompleter = Annotated[Completer, from_app("completer")]
@@ -126,7 +68,6 @@ router = APIRouter(prefix=OPENAI_ROOT.rstrip("/"), tags=["OpenAI-compatible"])
 
 @router.post(
     "/chat/completions",
-    operation_id="chat",
     summary="The MLLM behind a model, seeing more",
     responses={
         200: _reply([records.ChatCompletion, records.MllmCompletion], "A `ChatChunk`, or a `ChatProblem` at the end"),
@@ -144,15 +85,11 @@ async def chat(request: Request, completer: ChatCompleter) -> Response:
     such as `cow/embedded`, answers as `POST /answer`.
     """
     asked = Chat.parse(await completer.read_body(request))
-    reply = await completer.complete(request, asked)
-    if isinstance(reply, Streamed):
-        return EventsResponse(reply, completer.settings)
-    return await _whole(reply) if isinstance(reply, Whole) else reply
+    return await _respond(await completer.complete(request, asked), completer)
 
 
 @router.post(
     "/responses",
-    operation_id="responses",
     summary="The same, as OpenAI's responses",
     responses={
         200: _reply([records.ResponseReply], "An event of OpenAI's responses"),
@@ -170,10 +107,10 @@ async def responses(request: Request, completer: ChatCompleter) -> Response:
     asked = Chat.parse(chat_fields(body))
     reply = await completer.complete(request, asked, stored=False)
     if isinstance(reply, Streamed):
-        return EventsResponse(as_response(reply, body, asked.model), completer.settings)
-    if isinstance(reply, Whole):
-        return await _whole(replace(reply, body=response_of(reply.body, body)) if reply.succeeded else reply)
-    return reply
+        reply = as_response(reply, body, asked.model)
+    elif isinstance(reply, Whole) and reply.succeeded:
+        reply = replace(reply, body=response_of(reply.body, body))
+    return await _respond(reply, completer)
 
 
 @router.get("/models", operation_id="chatModels", summary="Models to chat with")
@@ -197,8 +134,12 @@ def model(
     return records.ChatModel(id=model, created=completer.started)
 
 
-async def _whole(reply: Whole) -> Response:
-    return json_response(await to_thread.run_sync(as_json, reply.body), reply.status, reply.headers)
+async def _respond(reply: Whole | Streamed | Response, completer: Completer) -> Response:
+    if isinstance(reply, Streamed):
+        return EventsResponse(reply, completer.service.settings)
+    if isinstance(reply, Whole):
+        return json_response(await to_thread.run_sync(as_json, reply.body), reply.status, reply.headers)
+    return reply
 
 
 def document_chat(document: dict[str, Any]) -> None:

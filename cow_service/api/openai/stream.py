@@ -18,9 +18,8 @@ from cow_service.api.openai.chats import EXTENSION, as_json
 from cow_service.api.openai.records import ChatProgress
 from cow_service.api.problems import chat_problem
 from cow_service.api.routes.jobs import PING_SECONDS
-from cow_service.api.submission import Submission, Submitter
+from cow_service.api.submission import Submission, Submitter, do_nothing
 from cow_service.errors import CowError
-from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.subscriptions import QUEUED, follow
 from cow_service.records import TERMINAL, Job
 from cow_service.settings import Settings
@@ -103,10 +102,6 @@ def progress_chunk(job: Job, head: dict[str, Any], delta: dict[str, Any] | None 
     return event_of(chunk_of(head, delta or {}, cow=progress_of(job)))
 
 
-async def do_nothing() -> None:
-    """Does nothing."""
-
-
 @dataclass(frozen=True)
 class Streamed:
     """A reply as it is streamed: server-sent events, each whole, with the blank line at its end."""
@@ -162,15 +157,21 @@ async def follow_job(submitter: Submitter, submission: Submission, created_at: s
     yield job
     updates: asyncio.Queue[Job | None] = asyncio.Queue()  # None: the job has ended
 
+    async def listen() -> None:
+        with suppress(CowError):
+            async with aclosing(follow(engine, submission.job_id, QUEUED)) as events:
+                async for event in events:
+                    if event.job is not None and event.job.status not in TERMINAL:
+                        updates.put_nowait(event.job)
+
     def end(task: asyncio.Future[str | None]) -> None:
         if not task.cancelled():
             task.exception()  # else asyncio logs it as never retrieved where the caller has disconnected
         updates.put_nowait(None)
 
     with engine.active.waiting(submission.job_id) as waiter:
-        listening = asyncio.ensure_future(_listen(engine, submission, updates))
-        gone = asyncio.Event()  # never set: the response itself notices that the caller has disconnected
-        ending = asyncio.ensure_future(submitter.outcome(submission, waiter, created_at, gone, may_have_ended=True))
+        listening = asyncio.ensure_future(listen())
+        ending = asyncio.ensure_future(submitter.outcome(submission, waiter, created_at, may_have_ended=True))
         ending.add_done_callback(end)
         try:
             while not ending.done():
@@ -187,12 +188,3 @@ async def follow_job(submitter: Submitter, submission: Submission, created_at: s
             ending.cancel()
     assert result is not None, "it waits as long as it takes"
     yield result
-
-
-async def _listen(engine: JobEngine, submission: Submission, updates: asyncio.Queue[Job | None]) -> None:
-    """Puts progress into the queue, until the end of the job."""
-    with suppress(CowError):
-        async with aclosing(follow(engine, submission.job_id, QUEUED)) as events:
-            async for event in events:
-                if event.job is not None and event.job.status not in TERMINAL:
-                    updates.put_nowait(event.job)

@@ -92,7 +92,6 @@ MAX_CONCURRENT_DOWNLOADS = 4  # made at the same time; pictures are encoded by `
 
 @router.get(
     "/jobs/{id}/download",
-    operation_id="download",
     tags=["jobs"],
     summary="A job as a file",
     response_class=Response,
@@ -185,7 +184,6 @@ def _find_succeeded(engine: JobEngine, job_id: str, owner: str | None) -> tuple[
 @router.head("/artifacts/{sha256}", include_in_schema=False)
 @router.get(
     "/artifacts/{sha256}",
-    operation_id="artifact",
     tags=["artifacts"],
     summary="Bytes by their SHA-256",
     response_class=Response,

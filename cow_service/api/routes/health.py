@@ -25,7 +25,7 @@ class Health(BaseModel):
 router = APIRouter()
 
 
-@router.get("/livez", operation_id="livez", tags=["health"], summary="The process answers")
+@router.get("/livez", tags=["health"], summary="The process answers")
 async def livez() -> Health:
     """For restarts: says nothing about whether work can be done."""
     return Health()
@@ -33,7 +33,6 @@ async def livez() -> Health:
 
 @router.get(
     "/readyz",
-    operation_id="readyz",
     tags=["health"],
     summary="The default request can be served",
     responses=documented(
@@ -54,7 +53,7 @@ def readyz(engine: Engine, readiness: Annotated[Readiness, from_app("readiness")
     return Health()
 
 
-@router.get("/models", operation_id="models", tags=["models"], summary="Readers and generators")
+@router.get("/models", tags=["models"], summary="Readers and generators")
 def models(engine: Engine) -> Models:
     """What each is, what it needs, and whether it is ready."""
     return engine.service.models()
@@ -62,7 +61,6 @@ def models(engine: Engine) -> Models:
 
 @router.get(
     "/workers",
-    operation_id="workers",
     tags=["health"],
     summary="Processes, their workers, and the queues",
     responses=documented(errors.StorageUnavailable),
@@ -74,13 +72,7 @@ def workers(engine: Engine) -> Workers:
     return engine.processes.overview.workers()
 
 
-@router.get(
-    "/metrics",
-    operation_id="metrics",
-    tags=["health"],
-    summary="Counters for Prometheus",
-    response_class=PlainTextResponse,
-)
+@router.get("/metrics", tags=["health"], summary="Counters for Prometheus", response_class=PlainTextResponse)
 def metrics(engine: Engine) -> Response:
     """Requests, stages, jobs, queues, workers, memory of the process and of GPUs, in Prometheus' text format."""
     return Response(engine.service.metrics.exposition(), headers={"Content-Type": MEDIA_TYPE})

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Query, Request, Response
-from pydantic import AwareDatetime
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from cow_service import errors
@@ -16,7 +15,7 @@ from cow_service.api.routes.simulate import RETURN
 from cow_service.api.submission import MINIMAL_APPLIED, Engine, Owner, json_response, minimize, preferences_of
 from cow_service.jobs.job_table import JobFilters
 from cow_service.jobs.subscriptions import END, follow
-from cow_service.records import TERMINAL, AcceptedRequest, Job, JobKind, JobPage, JobStatus
+from cow_service.records import TERMINAL, AcceptedRequest, Job, JobPage
 
 JobId = Annotated[str, Path(max_length=64, pattern=r"^[A-Za-z0-9-]+$", description="As the job says.")]
 GONE = (errors.JobNotFound, errors.InvalidRequest, errors.StorageUnavailable)
@@ -37,30 +36,16 @@ router = APIRouter(tags=["jobs"])
 
 @router.get(
     "/jobs",
-    operation_id="jobs",
     summary="Jobs, newest first",
     responses=documented(errors.InvalidRequest, errors.StorageUnavailable),
 )
-def jobs(
-    engine: Engine,
-    owner: Owner,
-    status: Annotated[list[JobStatus] | None, Query(description="May be repeated.")] = None,
-    kind: Annotated[JobKind | None, Query()] = None,
-    created_after: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
-    created_before: Annotated[AwareDatetime | None, Query(description="RFC 3339; included.")] = None,
-    limit: Annotated[int, Query(ge=1, le=500)] = 50,
-    cursor: Annotated[
-        str | None, Query(max_length=40_000, pattern=r"^[A-Za-z0-9_-]*$", description="`next` of the page before.")
-    ] = None,
-) -> JobPage:
+def jobs(engine: Engine, owner: Owner, filters: Annotated[JobFilters, Query()]) -> JobPage:
     """Without their results. Jobs that come or go between two pages are neither shown twice nor hide others."""
-    filters = JobFilters(tuple(status or ()), kind, created_after, created_before, limit, cursor)
     return engine.page(owner, filters)
 
 
 @router.get(
     "/jobs/{id}",
-    operation_id="job",
     summary="A job",
     response_model=Job,
     responses=documented(*GONE),
@@ -74,24 +59,13 @@ def job(request: Request, engine: Engine, owner: Owner, id: JobId) -> Response:
     return json_response(minimize(found), headers=MINIMAL_APPLIED)
 
 
-@router.get(
-    "/jobs/{id}/request",
-    operation_id="request_of",
-    summary="The request that became a job",
-    responses=documented(*GONE),
-)
+@router.get("/jobs/{id}/request", summary="The request that became a job", responses=documented(*GONE))
 def request_of(engine: Engine, owner: Owner, id: JobId) -> AcceptedRequest:
     """As it was accepted, to be sent again or changed: its image need not be sent with it."""
     return engine.request_of(id, owner)
 
 
-@router.post(
-    "/jobs/{id}/cancel",
-    operation_id="cancel",
-    summary="End a job",
-    response_model=Job,
-    responses=documented(*GONE),
-)
+@router.post("/jobs/{id}/cancel", summary="End a job", response_model=Job, responses=documented(*GONE))
 def cancel(engine: Engine, owner: Owner, id: JobId) -> Response:
     """Whoever works on it stops at the next step. A job that has ended stays as it is."""
     return json_response(engine.cancel(id, owner).as_json())
@@ -99,7 +73,6 @@ def cancel(engine: Engine, owner: Owner, id: JobId) -> Response:
 
 @router.delete(
     "/jobs/{id}",
-    operation_id="delete",
     summary="Delete a job and what only it holds",
     status_code=204,
     responses=documented(*GONE),
@@ -111,7 +84,6 @@ def delete(engine: Engine, owner: Owner, id: JobId) -> None:
 
 @router.get(
     "/jobs/{id}/events",
-    operation_id="events",
     summary="Follow a job",
     response_class=Response,
     responses={

@@ -8,7 +8,7 @@ import io
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.resources import files
-from importlib.resources.abc import Traversable
+from pathlib import Path
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Request, Response
@@ -20,6 +20,7 @@ from cow_service.jobs.engine import JobEngine
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.weights.manifests import EXAMPLES
 
+WEB = Path(__file__).parents[2] / "web"
 MEDIA_TYPES = {
     ".css": "text/css; charset=utf-8",
     ".html": "text/html; charset=utf-8",
@@ -103,53 +104,36 @@ class StaticFile:
 @cache
 def static_files() -> dict[str, StaticFile]:
     """The page's files by their paths below `/web/`; the page itself is `index.html`."""
-    found = _files_in(files("cow_service").joinpath("web"))
+    found = _files_in(WEB)
     modules = [path for path in sorted(found) if path.endswith(".js") and not path.startswith("docs/")]
     links = "\n".join(f'    <link rel="modulepreload" href="web/{path}">' for path in modules)
     page = found["index.html"]
     found["index.html"] = StaticFile(page.body.replace(PRELOADS.encode(), links.encode()), page.media_type)
     for name, example in EXAMPLES.items():
-        image = example.file("image").read_bytes()
+        image, small = example.file("image").read_bytes(), io.BytesIO()
+        with Image.open(io.BytesIO(image)) as opened:
+            opened.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
+            opened.save(small, "JPEG", quality=75, optimize=True)
         found[f"examples/{name}.jpg"] = StaticFile(image, MEDIA_TYPES[".jpg"])
-        found[f"examples/{name}-small.jpg"] = StaticFile(_shrink(image), MEDIA_TYPES[".jpg"])
+        found[f"examples/{name}-small.jpg"] = StaticFile(small.getvalue(), MEDIA_TYPES[".jpg"])
     return found
 
 
 @cache
 def docs_files() -> dict[str, StaticFile]:
     """The page of `/docs` and what it loads, 1.7 MB, by name; read when first asked for."""
-    swagger_ui = files("fastapi_offline").joinpath("static")
-    found = _files_in(files("cow_service").joinpath("web/docs"))
+    found, swagger_ui = _files_in(WEB / "docs"), files("fastapi_offline").joinpath("static")
     for name in ("swagger-ui-bundle.js", "swagger-ui.css"):
-        found[name] = _static_file(swagger_ui.joinpath(name))
+        found[name] = StaticFile(swagger_ui.joinpath(name).read_bytes(), MEDIA_TYPES[Path(name).suffix])
     return found
 
 
-def _files_in(folder: Traversable, prefix: str = "") -> dict[str, StaticFile]:
-    found: dict[str, StaticFile] = {}
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            found |= _files_in(entry, f"{prefix}{entry.name}/")
-        elif _suffix_of(entry) in MEDIA_TYPES:
-            found[prefix + entry.name] = _static_file(entry)
-    return found
-
-
-def _static_file(entry: Traversable) -> StaticFile:
-    return StaticFile(entry.read_bytes(), MEDIA_TYPES[_suffix_of(entry)])
-
-
-def _suffix_of(entry: Traversable) -> str:
-    return "." + entry.name.rpartition(".")[2]
-
-
-def _shrink(image: bytes) -> bytes:
-    """A JPEG of at most `THUMBNAIL_SIDE` px."""
-    with Image.open(io.BytesIO(image)) as opened:
-        opened.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
-        out = io.BytesIO()
-        opened.save(out, "JPEG", quality=75, optimize=True)
-    return out.getvalue()
+def _files_in(folder: Path) -> dict[str, StaticFile]:
+    return {
+        path.relative_to(folder).as_posix(): StaticFile(path.read_bytes(), MEDIA_TYPES[path.suffix])
+        for path in folder.rglob("*")
+        if path.suffix in MEDIA_TYPES
+    }
 
 
 @cache

@@ -58,7 +58,6 @@ router = APIRouter()
 
 @router.post(
     "/simulate",
-    operation_id="simulate",
     response_model=Simulation,
     tags=["simulation"],
     summary="Imagine the future of an image",
@@ -76,7 +75,6 @@ async def simulate(request: Request, submitter: JobSubmitter) -> Response:
 
 @router.post(
     "/answer",
-    operation_id="answer",
     response_model=Answer,
     tags=["answering"],
     summary="Look, then answer",

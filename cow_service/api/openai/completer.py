@@ -1,27 +1,32 @@
-"""Chats with an MLLM: what can be imagined is added, the MLLM is asked once, and its reply comes back as it is."""
+"""Completes chats, on the job engine and with the MLLM behind a model.
+
+With an MLLM, what can be imagined is added to the chat, the MLLM is asked once, and its reply comes back as it is.
+Without one, the chat is a job as of `POST /answer`, and its result becomes the reply.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import base64
-from collections.abc import AsyncGenerator, Awaitable
-from contextlib import AsyncExitStack, aclosing, suppress
+import time
+from collections.abc import AsyncGenerator
+from contextlib import AsyncExitStack, aclosing
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 from anyio import to_thread
-from fastapi import Request
+from fastapi import Request, Response
 from pydantic import ValidationError
 
 from cow_service import errors
-from cow_service.api.openai import stream
+from cow_service.api import submission as jobs
+from cow_service.api.body import read_object
+from cow_service.api.openai import records, stream
+from cow_service.api.openai.answering import answer_events, completion_of, parse_chat
 from cow_service.api.openai.chats import EXTENSION, Chat, ImagePart, images_of, locate_in_chat, other_parts, wrong
-from cow_service.api.openai.forwarding import Events, Forwarder, Whole
-from cow_service.api.openai.records import WITHOUT, Answerer, ChatImagination
+from cow_service.api.openai.forwarding import Forwarder, Whole
+from cow_service.api.openai.records import Answerer, ChatImagination
 from cow_service.api.problems import invalid
-from cow_service.api.submission import Preferences, Submission, Submitter, disconnected, owner_of, preferences_of
-from cow_service.errors import Canceled, CowError, InvalidRequest, MllmBadReply
 from cow_service.jobs.engine import new_job_id
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode_own, encode_png
@@ -31,8 +36,8 @@ from cow_service.readers.mllm.hypothesis import hypothesis, pictures
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Job, Simulation, Usage
 from cow_service.requests import SimulateRequest
+from cow_service.requests.values import SHOWN_CHARACTERS
 
-Made = TypeVar("Made")
 NOTE = "imagined-frames"  # name in prompts/
 FIELDS_OF_CHAT = ("image", "question")  # of a `SimulateRequest`: from messages
 OF_ANSWERS = {  # fields of an `AnswerRequest`, and what does the same for a chat
@@ -49,47 +54,86 @@ PASSED_OVER = (
 )  # fmt: skip
 
 
-class Proxy:
-    """Stands in for the MLLM behind a model."""
+class Completer:
+    """Completes chats."""
 
-    def __init__(self, submitter: Submitter) -> None:
+    def __init__(self, submitter: jobs.Submitter) -> None:
         self._submitter = submitter
-        self._artifacts = submitter.engine.service.artifacts
-        self._forwarder = Forwarder(submitter.engine.service.settings)
+        self.service = submitter.engine.service
+        self._forwarder = Forwarder(self.service.settings)
+        self.started = int(time.time())
 
     async def close(self) -> None:
-        """Closes its connections."""
+        """Closes connections."""
         await self._forwarder.close()
 
-    async def complete(
-        self, request: Request, chat: Chat, answerer: Answerer, reader: ChatReader
-    ) -> Whole | stream.Streamed:
-        """The reply to a chat, streamed where it says so.
+    async def read_body(self, request: Request) -> dict[str, Any]:
+        """The JSON object that a request holds. Raises `BodyTypeUnsupported`, `MalformedBody`."""
+        media_type = request.headers.get("content-type", "none").partition(";")[0].strip().lower()
+        if media_type != "application/json" and not media_type.endswith("+json"):
+            shown = errors.shortened(media_type, SHOWN_CHARACTERS)
+            raise errors.BodyTypeUnsupported(f"The body has the media type '{shown}'. Send application/json.")
+        return await self._submitter.in_thread(partial(read_object, await request.body(), "The body"))
 
-        Raises `InvalidRequest` for what COW itself is told, the errors of a simulation that are not those of the chat,
-        and `MllmUnavailable` and `MllmBadReply` for the MLLM's server. What that server refuses comes back as a reply.
+    async def complete(
+        self, request: Request, chat: Chat, *, stored: bool = True
+    ) -> Whole | stream.Streamed | Response:
+        """The reply, streamed where the chat says so; a response where the caller takes the job instead, which needs
+        `stored`.
+
+        Raises `ModelNotFound`, `InvalidRequest` for what COW itself is told, what a job fails with, unless the chat
+        goes on without imagination, and `MllmUnavailable` and `MllmBadReply` for the MLLM's server. What that server
+        refuses comes back as a reply.
         """
-        prefer = preferences_without_key(request)
+        answerer = records.find_answerer(self.service, chat.model)
+        reader = await to_thread.run_sync(self.service.chat_reader, answerer.reader)
+        if reader is None:
+            return await self._answer(request, chat, answerer, stored=stored)
+        prefer, submitter = preferences_without_key(request), self._submitter
         what_if = find_what_if(chat, answerer)
         if isinstance(what_if, ChatImagination):
             return await self._forward(request, EnrichedChat(chat, chat.messages, what_if), reader)
-        owner = owner_of(request)
-        self._submitter.engine.check_capacity(owner)
-        submission = Submission("simulate", owner, prefer, new_job_id(owner, None))
+        owner = jobs.owner_of(request)
+        submitter.engine.check_capacity(owner)
+        submission = jobs.Submission("simulate", owner, prefer, new_job_id(owner, None))
         try:
             if chat.stream:
-                created_at = await self._submitter.submit(submission, what_if.request, None)
+                created_at = await submitter.submit(submission, what_if.request, None)
                 return self._stream(submission, created_at, chat, what_if, reader)
-            result = await self._submitter.result(request, submission, what_if.request, None)
-        except CowError as error:
+            result = await submitter.result(request, submission, what_if.request)
+        except errors.CowError as error:
             enriched = EnrichedChat(chat, chat.messages, what_if.explain(error))
         else:
             assert result is not None, "it waits as long as it takes"
-            enriched = await to_thread.run_sync(add_frames, chat, what_if, result, self._artifacts)
+            enriched = await to_thread.run_sync(add_frames, chat, what_if, result, self.service.artifacts)
         return await self._forward(request, enriched, reader)
 
+    async def _answer(
+        self, request: Request, chat: Chat, answerer: Answerer, *, stored: bool
+    ) -> Whole | stream.Streamed | Response:
+        """The reply of a model without an MLLM."""
+        submitter = self._submitter
+        submission = submitter.submission(request, "answer")
+        if not stored:
+            submission = replace(submission, prefer=preferences_without_key(request))
+        parsed = await submitter.in_thread(partial(parse_chat, chat, answerer))
+        try:
+            if chat.stream:
+                created_at = await submitter.submit(submission, parsed.request, None)
+                return stream.Streamed(
+                    answer_events(submitter, submission, parsed, created_at),
+                    locate=lambda error: locate_in_chat(error, parsed.pointers),
+                    leave=partial(submitter.leave, submission, created_at),
+                )
+            result = await submitter.result(request, submission, parsed.request)
+            if result is None:
+                return await submitter.accepted(submission)
+            return Whole(await to_thread.run_sync(completion_of, parsed, result))
+        except errors.CowError as error:
+            raise locate_in_chat(error, parsed.pointers) from error
+
     def _stream(
-        self, submission: Submission, created_at: str | None, chat: Chat, what_if: WhatIf, reader: ChatReader
+        self, submission: jobs.Submission, created_at: str | None, chat: Chat, what_if: WhatIf, reader: ChatReader
     ) -> stream.Streamed:
         """Progress while the simulation runs, then the reply's own events."""
         stack = AsyncExitStack()
@@ -100,38 +144,34 @@ class Proxy:
                 async with aclosing(stream.follow_job(self._submitter, submission, created_at)) as updates:
                     async for update in updates:
                         if isinstance(update, Job):
-                            yield stream.progress_chunk(
-                                update, stream.job_head(update.id, update.created_at, chat.model)
-                            )
+                            head = stream.job_head(update.id, update.created_at, chat.model)
+                            yield stream.progress_chunk(update, head)
                         else:
                             result = update
-                enriched = await to_thread.run_sync(add_frames, chat, what_if, result, self._artifacts)
-            except CowError as error:
+                enriched = await to_thread.run_sync(add_frames, chat, what_if, result, self.service.artifacts)
+            except errors.CowError as error:
                 enriched = EnrichedChat(chat, chat.messages, what_if.explain(error))
             async for event in _events_of(await self._ask(enriched, reader, stack), enriched):
                 yield event
 
-        return stream.Streamed(
-            events(), leave=partial(self._submitter.leave, submission, created_at), close=stack.aclose
-        )
+        leave = partial(self._submitter.leave, submission, created_at)
+        return stream.Streamed(events(), leave=leave, close=stack.aclose)
 
     async def _forward(self, request: Request, enriched: EnrichedChat, reader: ChatReader) -> Whole | stream.Streamed:
         """The reply of the MLLM. It is given up where the caller goes away before it has begun."""
-        stack = AsyncExitStack()
-        try:
-            async with disconnected(request) as gone:
-                reply = await _unless(gone, self._ask(enriched, reader, stack))
-        except BaseException:
-            await stack.aclose()
-            raise
-        if enriched.chat.stream and (isinstance(reply, Events) or reply.succeeded):
-            return stream.Streamed(_events_of(reply, enriched), close=stack.aclose)
-        await stack.aclose()
-        if isinstance(reply, Events):
-            raise MllmBadReply("The server of the multimodal LLM streamed its reply, which the chat did not ask for.")
-        return reply
+        async with AsyncExitStack() as stack:
+            reply = await jobs.unless_disconnected(request, self._ask(enriched, reader, stack))
+            refused = isinstance(reply, Whole) and not reply.succeeded
+            if enriched.chat.stream and not refused:
+                return stream.Streamed(_events_of(reply, enriched), close=stack.pop_all().aclose)
+        if isinstance(reply, Whole):
+            return reply
+        detail = "The server of the multimodal LLM streamed its reply, which the chat did not ask for."
+        raise errors.MllmBadReply(detail)
 
-    async def _ask(self, enriched: EnrichedChat, reader: ChatReader, stack: AsyncExitStack) -> Whole | Events:
+    async def _ask(
+        self, enriched: EnrichedChat, reader: ChatReader, stack: AsyncExitStack
+    ) -> Whole | AsyncGenerator[bytes]:
         """What the MLLM replies, with `cow` in a whole reply. A stream stays open until the stack is closed."""
         body = {name: value for name, value in enriched.chat.fields.items() if name != EXTENSION}
         if isinstance(body.get("messages"), list):
@@ -142,20 +182,20 @@ class Proxy:
         else:
             body["model"] = reader.upstream.model
             reply, warnings = await stack.enter_async_context(self._forwarder.send(reader.upstream, body)), ()
-        if isinstance(reply, Events) or not reply.succeeded:
+        if not isinstance(reply, Whole) or not reply.succeeded:
             return reply
         return replace(reply, body=reply.body | {EXTENSION: enriched.extension(*warnings)})
 
 
-def preferences_without_key(request: Request) -> Preferences:
+def preferences_without_key(request: Request) -> jobs.Preferences:
     """What counts of the caller's preferences. Raises `InvalidRequest` for an idempotency key."""
-    prefer = preferences_of(request.headers)
+    prefer = jobs.preferences_of(request.headers)
     if prefer.key is not None:
-        raise InvalidRequest(
+        raise errors.InvalidRequest(
             "The header `Idempotency-Key` cannot be kept here: a chat with an MLLM is not a stored job, and the same "
             "key would not bring the same reply. Leave it out; with /simulate and /answer it counts."
         )
-    return Preferences(fresh=prefer.fresh)
+    return jobs.Preferences(fresh=prefer.fresh)
 
 
 @dataclass(frozen=True)
@@ -167,7 +207,7 @@ class WhatIf:
     image: ImagePart
     given: frozenset[str]  # fields of `cow` in the request
 
-    def explain(self, error: CowError) -> ChatImagination:
+    def explain(self, error: errors.CowError) -> ChatImagination:
         """Why nothing was imagined, where the chat goes on without. Raises what the caller is to hear instead."""
         own = {"/image": self.image.url_pointer, "/question": f"/messages/{self.message}/content"}
         located = locate_in_chat(error, own)
@@ -182,12 +222,20 @@ def find_what_if(chat: Chat, answerer: Answerer) -> WhatIf | ChatImagination:
     """What the chat asks to be imagined, or why nothing is. Raises `InvalidRequest` for unusable fields of `cow`."""
     if answerer.imagine == "never":
         unused = f"`{EXTENSION}` was not used: the model's name says that nothing is imagined."
-        reason = f"The model's name ends with {WITHOUT}."
+        reason = f"The model's name ends with {records.WITHOUT}."
         return _nothing_imagined("no-imagination", reason, warnings=(unused,) if chat.cow else ())
     asked, question = chat.question()
     images = list({image.url: image for image in reversed(list(images_of(chat.messages)))}.values())
     others = sorted({kind for _, kind in other_parts(chat.messages)})
-    _check_extension(chat)
+    for name in chat.cow:
+        if name in FIELDS_OF_CHAT:
+            raise wrong(f"/{EXTENSION}/{name}", "is said by `messages`; leave it out")
+        if name in OF_ANSWERS:
+            raise wrong(f"/{EXTENSION}/{name}", f"leave it out: {OF_ANSWERS[name]}")
+    try:  # what COW itself is told, whatever the messages hold
+        SimulateRequest.model_validate({**chat.cow, "question": "?", "image": "data:"})
+    except ValidationError as error:
+        raise invalid(error, lambda pointer: f"/{EXTENSION}{pointer}") from error
     for applies, reason, detail in (
         (others, "other-parts", f"The messages hold parts that COW does not read: {', '.join(others)}."),
         (len(images) > 1, "several-images", f"A what-if question is about one image; there are {len(images)}."),
@@ -202,19 +250,6 @@ def find_what_if(chat: Chat, answerer: Answerer) -> WhatIf | ChatImagination:
     except ValidationError as error:
         refused = invalid(error)
         return _nothing_imagined(refused.code, refused.detail)
-
-
-def _check_extension(chat: Chat) -> None:
-    """Raises `InvalidRequest` for what COW itself is told and cannot do."""
-    for name in chat.cow:
-        if name in FIELDS_OF_CHAT:
-            raise wrong(f"/{EXTENSION}/{name}", "is said by `messages`; leave it out")
-        if name in OF_ANSWERS:
-            raise wrong(f"/{EXTENSION}/{name}", f"leave it out: {OF_ANSWERS[name]}")
-    try:
-        SimulateRequest.model_validate({**chat.cow, "question": "?", "image": "data:"})
-    except ValidationError as error:
-        raise invalid(error, lambda pointer: f"/{EXTENSION}{pointer}") from error
 
 
 def _nothing_imagined(
@@ -240,14 +275,27 @@ class EnrichedChat:
 
 
 def add_frames(chat: Chat, what_if: WhatIf, result: str, artifacts: ArtifactStore) -> EnrichedChat:
-    """The chat with the frames of a simulation behind its question. CPU work. Raises `ArtifactNotFound`."""
+    """The chat with a note and the frames of a simulation behind its question; of two worlds, a named strip of each.
+
+    All images are seen in the `detail` of the caller's own. CPU work. Raises `ArtifactNotFound`.
+    """
     simulation = Simulation.model_validate_json(result)
-    parts, prompts = frame_parts(simulation, artifacts, what_if.image.detail)
+    pngs = [artifacts.read(frame.sha256) for frame in simulation.frames]
+    factual = tuple(decode_own(artifacts.read(frame.sha256)) for frame in simulation.factual_frames)
+    imagined = Imagined(simulation, tuple(decode_own(png) for png in pngs) if factual else (), factual)
+    if factual:
+        pngs = [encode_png(picture) for picture in pictures(imagined)]
+    prompt, told = load_prompt(NOTE), hypothesis(imagined)
+    detail = {} if what_if.image.detail is None else {"detail": what_if.image.detail}
+    parts: list[Any] = [{"type": "text", "text": prompt.render(**{name: told[name] for name in prompt.inputs})}]
+    for png in pngs:
+        url = "data:image/png;base64," + base64.b64encode(png).decode()
+        parts.append({"type": "image_url", "image_url": {"url": url, **detail}})
     cow = ChatImagination(
         imagined=True,
         simulation=simulation.id,
         frames=simulation.factual_frames + simulation.frames,
-        prompts=prompts,
+        prompts={prompt.name: prompt.version},
         usage=simulation.usage,
         usage_total=simulation.usage_total,
         reused=simulation.reused,
@@ -260,28 +308,7 @@ def add_frames(chat: Chat, what_if: WhatIf, result: str, artifacts: ArtifactStor
     return EnrichedChat(chat, messages, cow)
 
 
-def frame_parts(
-    simulation: Simulation, artifacts: ArtifactStore, detail: str | None
-) -> tuple[list[dict[str, Any]], dict[str, int]]:
-    """The note and the frames of a simulation as parts of a message (of two worlds, a named strip of each), and the
-    version of the prompt.
-
-    `detail` is that of the caller's own image, so that all images are seen alike.
-    """
-    pngs = [artifacts.read(frame.sha256) for frame in simulation.frames]
-    factual = tuple(decode_own(artifacts.read(frame.sha256)) for frame in simulation.factual_frames)
-    imagined = Imagined(simulation, tuple(decode_own(png) for png in pngs) if factual else (), factual)
-    if factual:
-        pngs = [encode_png(picture) for picture in pictures(imagined)]
-    prompt, told = load_prompt(NOTE), hypothesis(imagined)
-    note = prompt.render(**{name: told[name] for name in prompt.inputs})
-    shown = {} if detail is None else {"detail": detail}
-    urls = ["data:image/png;base64," + base64.b64encode(png).decode() for png in pngs]
-    images = [{"type": "image_url", "image_url": {"url": url, **shown}} for url in urls]
-    return [{"type": "text", "text": note}, *images], {prompt.name: prompt.version}
-
-
-async def _events_of(reply: Whole | Events, enriched: EnrichedChat) -> AsyncGenerator[bytes]:
+async def _events_of(reply: Whole | AsyncGenerator[bytes], enriched: EnrichedChat) -> AsyncGenerator[bytes]:
     """A reply as events: its own, behind one that carries `cow`; of a whole reply, chunks made of it."""
     if isinstance(reply, Whole):
         for chunk in stream.chunks_of(reply.body, with_usage=enriched.chat.with_usage):
@@ -290,25 +317,9 @@ async def _events_of(reply: Whole | Events, enriched: EnrichedChat) -> AsyncGene
             yield stream.DONE
         return
     is_first = True
-    async with aclosing(reply.events) as events:
+    async with aclosing(reply) as events:
         async for event in events:
             if is_first and "choices" in (chunk := stream.data_of(event)):
                 is_first = False
                 yield stream.event_of(stream.chunk_of(stream.head_of(chunk), {}, cow=enriched.extension()))
             yield event
-
-
-async def _unless(gone: asyncio.Event, work: Awaitable[Made]) -> Made:
-    """The result of the work, which is canceled where the caller goes away. Raises `Canceled` then."""
-    task, left = asyncio.ensure_future(work), asyncio.ensure_future(gone.wait())
-    try:
-        await asyncio.wait({task, left}, return_when=asyncio.FIRST_COMPLETED)
-        if not task.done():
-            raise Canceled("The caller went away before the reply was there.")
-        return task.result()
-    finally:
-        left.cancel()
-        if not task.done():
-            task.cancel()
-            with suppress(asyncio.CancelledError, CowError):
-                await task
