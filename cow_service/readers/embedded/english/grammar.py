@@ -8,20 +8,52 @@ where they may begin with the next word. No rule may begin with itself.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterator, Sequence, Set
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from itertools import islice
 
-from lark import Lark, Token, Tree
+from lark import Lark
 from lark.grammar import Symbol, Terminal
 
-from cow_service.readers.embedded.english.lexicon import Item, Word, words_at
+from cow_service.readers.embedded.english.lexicon import NUMERALS, Item, Word, words_of
 
-STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial", "place", "opening", "premise"]
+STARTS = ["intervention", "fitting", "trail", "quantity", "asked", "adverbial", "place", "opening", "premise", "list"]
 MAX_WORDS = 48  # of one parse: its work may grow with the cube of their number
+_NUMBER = re.compile(r"[0-9]+(\.[0-9]+)?")
 
-_Nodes = tuple[Tree[Token] | Token, ...]
+
+@dataclass(frozen=True)
+class Node:
+    """What a rule makes of some words: the nodes of the rules in it, and the words that it keeps."""
+
+    name: str
+    children: tuple[Node | Word, ...]
+
+    def find(self, *names: str) -> Iterator[Node]:
+        """The nodes of some names, itself among them, those above first; all without a name."""
+        if not names or self.name in names:
+            yield self
+        for child in self.children:
+            if isinstance(child, Node):
+                yield from child.find(*names)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    @property
+    def names(self) -> list[str]:
+        """The names of its nodes, its own first."""
+        return [node.name for node in self.find()]
+
+    @property
+    def words(self) -> list[Word]:
+        """The words that it keeps, in order."""
+        return [word for each in self.children for word in ([each] if isinstance(each, Word) else each.words)]
+
+
+_Nodes = tuple[Node | Word, ...]
 
 
 class _Grammar:
@@ -37,42 +69,37 @@ class _Grammar:
         self.rules: dict[str, list[Sequence[Symbol]]] = {}
         for rule in lark.rules:
             self.rules.setdefault(rule.origin.name, []).append(rule.expansion)
-        self.firsts = self._firsts()
+        # The terminals that each rule may begin with, and "" where it may be nothing.
+        self.firsts, grown = {name: frozenset[str]() for name in self.rules}, True
+        while grown:
+            found = {name: frozenset[str]().union(*map(self.first, ways)) for name, ways in self.rules.items()}
+            self.firsts, grown = found, found != self.firsts
         self.kept: dict[tuple[str, frozenset[str]], list[Sequence[Symbol]]] = {}
 
-    def _firsts(self) -> dict[str, frozenset[str]]:
-        """The terminals that each rule may begin with, and "" where it may be nothing."""
-        firsts: dict[str, frozenset[str]] = dict.fromkeys(self.rules, frozenset())
-        grown = True
-        while grown:
-            grown = False
-            for name, expansions in self.rules.items():
-                found = firsts[name].union(*(_first(expansion, firsts) for expansion in expansions))
-                grown = grown or found != firsts[name]
-                firsts[name] = found
-        return firsts
+    def first(self, expansion: Sequence[Symbol]) -> frozenset[str]:
+        """The terminals that one way to write a rule may begin with."""
+        found = frozenset[str]()
+        for symbol in expansion:
+            first = frozenset([symbol.name]) if symbol.is_term else self.firsts[symbol.name]
+            if "" not in first:
+                return found | first
+            found |= first - {""}
+        return found | {""}
 
     def names(self, word: Word) -> frozenset[str]:
         """The terminals that a word may be."""
-        return frozenset([word.kind] if word.kind else self.terminals.get(word.text, ()))
+        if word.kind:
+            return frozenset([word.kind])
+        number = word.text in NUMERALS or _NUMBER.fullmatch(word.text)
+        return frozenset(self.terminals.get(word.text, ())) | ({"NUMBER"} if number else set())
 
     def expansions(self, name: str, ahead: frozenset[str]) -> list[Sequence[Symbol]]:
         """The ways to go on with a rule where the next word may be one of some terminals."""
         key = name, ahead
         if key not in self.kept:
             wanted = ahead | {""}
-            self.kept[key] = [each for each in self.rules[name] if not wanted.isdisjoint(_first(each, self.firsts))]
+            self.kept[key] = [each for each in self.rules[name] if not wanted.isdisjoint(self.first(each))]
         return self.kept[key]
-
-
-def _first(expansion: Sequence[Symbol], firsts: Mapping[str, frozenset[str]]) -> frozenset[str]:
-    found: set[str] = set()
-    for symbol in expansion:
-        first = frozenset([symbol.name]) if symbol.is_term else firsts[symbol.name]
-        found |= first - {""}
-        if "" not in first:
-            return frozenset(found)
-    return frozenset(found | {""})
 
 
 @cache
@@ -85,13 +112,22 @@ def listed_words() -> Set[str]:
     return _grammar().terminals.keys()
 
 
+def terminals(word: str) -> Set[str]:
+    """The terminals of the grammar that a word may be."""
+    return _grammar().terminals.get(word, frozenset())
+
+
+def may_begin(start: str, word: Word) -> bool:
+    """Whether a word may be the first one of a rule."""
+    return not _grammar().firsts[start].isdisjoint(_grammar().names(word))
+
+
 class _Parse:
     """What the rules make of some words, by rule and place: where each may end, with the first tree that ends there."""
 
     def __init__(self, words: Sequence[Word]) -> None:
-        self.grammar = _grammar()
-        self.tokens = [Token(word.kind, word.text, start_pos=at, line=word.at) for at, word in enumerate(words)]
-        self.names = [*(self.grammar.names(word) for word in words), frozenset[str]()]
+        self.grammar, self.words = _grammar(), words
+        self.names = [*map(self.grammar.names, words), frozenset[str]()]
         self.known: dict[tuple[str, int], dict[int, _Nodes]] = {}
 
     def ends(self, name: str, start: int) -> dict[int, _Nodes]:
@@ -101,7 +137,7 @@ class _Parse:
                 for end, nodes in self._follow(expansion, start).items():
                     found.setdefault(end, nodes)
             if not name.startswith("_"):
-                found = {end: (Tree(name, list(nodes)),) for end, nodes in found.items()}
+                found = {end: (Node(name, nodes),) for end, nodes in found.items()}
             self.known[name, start] = found
         return self.known[name, start]
 
@@ -114,50 +150,34 @@ class _Parse:
                     for end, more in self.ends(symbol.name, at).items():
                         behind.setdefault(end, nodes + more)
                 elif symbol.name in self.names[at]:
-                    behind.setdefault(at + 1, nodes if symbol.filter_out else (*nodes, self.tokens[at]))
+                    behind.setdefault(at + 1, nodes if symbol.filter_out else (*nodes, self.words[at]))
             reached = behind
         return reached
 
 
-def _trees(start: str, words: Sequence[Word]) -> dict[int, Tree[Token]]:
+def parse_ends(start: str, words: Sequence[Word]) -> dict[int, Node]:
     """The trees of a rule over the first words, by their number."""
     if not words or not may_begin(start, words[0]):
         return {}
-    ends = _Parse(words).ends(start, 0)
-    return {end: tree for end, (tree, *_) in ends.items() if isinstance(tree, Tree)}
+    ends = _Parse(words[:MAX_WORDS]).ends(start, 0)
+    return {end: node for end, (node, *_) in ends.items() if isinstance(node, Node)}
 
 
-def parse_all(start: str, words: Sequence[Word]) -> Tree[Token] | None:
+def parse_all(start: str, words: Sequence[Word]) -> Node | None:
     """The tree of a rule over all of some words; None where they are no such thing."""
-    return _trees(start, words).get(len(words)) if len(words) <= MAX_WORDS else None
+    return parse_ends(start, words).get(len(words))
 
 
-def parse_from(start: str, words: Sequence[Word]) -> tuple[Tree[Token], int] | None:
-    """The tree of a rule over as many words as can be, from the first on, and their number."""
-    found = _trees(start, words[:MAX_WORDS])
-    # "the ball is going" is not "the ball is gone"
-    whole = [end for end in found if end and (end == len(words) or words[end].text != "-ing")]
-    return (found[max(whole)], max(whole)) if whole else None
+def read_from(start: str, found: Sequence[Item], at: int, window: int) -> tuple[Node, int] | None:
+    """The tree of a rule over as many items as can be, from a place on, and the place of the item behind them.
 
-
-def read_from(start: str, found: Sequence[Item], at: int, window: int) -> tuple[Tree[Token], int] | None:
-    """The tree of a rule over the items from a place on, `window` words at most, and the place of the item behind it.
-
-    The `line` of a token is the place of its item.
+    `window` words are looked at.
     """
-    words = list(islice((word for place in range(at, len(found)) for word in words_at(found, place)), window))
-    parsed = parse_from(start, words)
-    if parsed is None:
+    words = list(islice(words_of(found, at), min(window, MAX_WORDS)))
+    trees = parse_ends(start, words)
+    # "the ball is going" is not "the ball is gone"
+    whole = [end for end in trees if end and (end == len(words) or words[end].text != "-ing")]
+    if not whole:
         return None
-    tree, length = parsed
-    return tree, words[length].at if length < len(words) else words[-1].at + 1
-
-
-def may_begin(start: str, word: Word) -> bool:
-    """Whether a word may be the first one of a rule."""
-    return not _grammar().firsts[start].isdisjoint(_grammar().names(word))
-
-
-def terminals(word: str) -> Set[str]:
-    """The terminals of the grammar that a word may be."""
-    return _grammar().terminals.get(word, frozenset())
+    end = max(whole)
+    return trees[end], words[end].at if end < len(words) else words[-1].at + 1

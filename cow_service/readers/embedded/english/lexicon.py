@@ -1,10 +1,10 @@
-"""The closed word lists of `lexicon.toml`: colours, verbs with their inflections, function words."""
+"""The closed word lists of `lexicon.toml`, and what a text is made of: items, noun phrases and words."""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Literal
@@ -12,21 +12,10 @@ from typing import Literal
 from cow_service.readers.base import Quantity, SpeedWord
 from cow_service.records import MotionKind, Until, Vector
 
-Form = Literal["base", "s", "past", "ing"]
-
 
 def words(*lists: str) -> frozenset[str]:
     """The words of some space-separated lists."""
     return frozenset(word for text in lists for word in text.split())
-
-
-@dataclass(frozen=True)
-class Verb:
-    """One inflected form of a verb. `kind` is None for a verb that is not a way to move."""
-
-    lemma: str
-    form: Form
-    kind: MotionKind | None
 
 
 TABLES: dict[str, dict[str, str]] = tomllib.loads(
@@ -38,50 +27,54 @@ COLOURS: dict[str, str] = {word: name for name, text in TABLES["colours"].items(
 _VECTORS: dict[str, Vector] = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "up": (0.0, -1.0), "down": (0.0, 1.0)}
 DIRECTIONS = {word: _VECTORS[way] for way, text in TABLES["directions"].items() for word in text.split()}
 NUMBER_WORDS = {word: value for value, word in enumerate(TABLES["sets"]["numerals"].split(), 1)}
-ADJECTIVES, NOUN_MODIFIERS, MARKED = SETS["adjectives"], SETS["noun_modifiers"], SETS["marked"]
-UNCHANGED_PLURALS = SETS["unchanged_plurals"]
-_UNITS = [[unit, *text.split()] for unit, text in TABLES["metres"].items()]
-METRES = {word: float(size) for unit, size, *others in _UNITS for word in (unit, *others)}  # of a unit of length
+NUMERALS = NUMBER_WORDS | {"twenty": 20, "thirty": 30, "forty": 40, "fifty": 50, "sixty": 60, "hundred": 100}
+METRES = {  # of a unit of length
+    word: float(text.split()[0])
+    for unit, text in TABLES["metres"].items()
+    for word in (unit, *text.split()[1:])
+}  # fmt: skip
 PLACES = DIRECTIONS.keys() | SETS["places"]
 DETERMINERS, VAGUE_DETERMINERS = SETS["determiners"], SETS["vague_determiners"]
 CONDITIONALS, AUXILIARIES, BE, NEGATIONS = (SETS[n] for n in ("conditionals", "auxiliaries", "be", "negations"))
 CAUSATIVES, MOVER_PRONOUNS = SETS["causatives"], SETS["mover_pronouns"]
 FUNCTION_WORDS = AUXILIARIES | BE | NEGATIONS | CONDITIONALS | CAUSATIVES | MOVER_PRONOUNS | SETS["function_words"]
+CLOSED = FUNCTION_WORDS | DETERMINERS
 AGENTS, GENERIC, SCENERY = SETS["agents"], SETS["generic"], SETS["scenery"]
 ABSTRACT = PLACES | SETS["viewers"] | SETS["abstract"]
 NO_THINGS = ABSTRACT | SCENERY
-MEASURES, MARK_NOUNS = SETS["measures"], SETS["mark_nouns"]
 TOUCH, OCCLUDE, LAND = SETS["touch"], SETS["occlude"], SETS["land"]
-TRANSITIVE, WEAK = SETS["transitive"], SETS["weak"]
-_KINDS: tuple[MotionKind, ...] = ("linear", "projectile", "fall", "static")
+ARROWS = frozenset(["arrow", "arrowhead"])
+PUNCTUATION = frozenset(".,;:?!()—–")
+ENDS = frozenset(".?!;")  # of a sentence
 
 
-def _third_person(lemma: str) -> str:
-    if lemma.endswith(("s", "x", "ch", "sh", "o")):
-        return lemma + "es"
-    return lemma[:-1] + "ies" if lemma.endswith("y") and lemma[-2] not in "aeo" else lemma + "s"
+@dataclass(frozen=True)
+class Verb:
+    """One inflected form of a verb. `kind` is None for a verb that is not a way to move."""
+
+    lemma: str
+    form: Literal["base", "s", "past", "ing"]
+    kind: MotionKind | None
 
 
-def _forms(lemma: str) -> dict[str, Form]:
+def _inflect(lemma: str, kind: MotionKind | None) -> dict[str, Verb]:
+    """The forms of a verb."""
     stem = lemma + lemma[-1] if lemma in SETS["doubled"] else lemma.removesuffix("e")
-    past = lemma[:-1] + "ied" if lemma.endswith("y") and lemma[-2] not in "aeo" else stem + "ed"
-    forms: dict[str, Form] = {_third_person(lemma): "s", stem + "ing": "ing"}
-    forms |= dict.fromkeys(TABLES["irregular_verbs"].get(lemma, past).split(), "past")
-    forms[lemma] = "base"
-    return forms
+    third, past = f"{lemma}s", f"{stem}ed"
+    if lemma.endswith("y") and lemma[-2] not in "aeo":
+        third, past = f"{lemma[:-1]}ies", f"{lemma[:-1]}ied"
+    elif lemma.endswith(("s", "x", "ch", "sh", "o")):
+        third = f"{lemma}es"
+    forms = {third: Verb(lemma, "s", kind), f"{stem}ing": Verb(lemma, "ing", kind)}
+    forms |= dict.fromkeys(TABLES["irregular_verbs"].get(lemma, past).split(), Verb(lemma, "past", kind))
+    return forms | {lemma: Verb(lemma, "base", kind)}
 
 
-def _verbs() -> dict[str, Verb]:
-    kinds: dict[str, MotionKind | None] = dict.fromkeys(TOUCH | OCCLUDE | LAND | SETS["other"])
-    for kind in _KINDS:
-        kinds |= dict.fromkeys(SETS[kind], kind)
-    table = {word: Verb(word, "past", None) for word in SETS["participles"]}
-    for lemma, kind in kinds.items():
-        table |= {word: Verb(lemma, form, kind) for word, form in _forms(lemma).items()}
-    return table
-
-
-VERBS: dict[str, Verb] = _verbs()
+_KINDS: dict[str, MotionKind | None] = dict.fromkeys(TOUCH | OCCLUDE | LAND | SETS["other"])
+_MOTIONS: tuple[MotionKind, ...] = ("linear", "projectile", "fall", "static")
+_KINDS.update((lemma, kind) for kind in _MOTIONS for lemma in SETS[kind])
+VERBS = {word: Verb(word, "past", None) for word in SETS["participles"]}
+VERBS.update(form for lemma, kind in _KINDS.items() for form in _inflect(lemma, kind).items())
 
 
 def lemma(word: str) -> str:
@@ -89,35 +82,39 @@ def lemma(word: str) -> str:
     return VERBS[word].lemma if word in VERBS else ""
 
 
+def is_form(word: str, *forms: str) -> bool:
+    """Whether a lower case word is one of some forms of a verb."""
+    return word in VERBS and VERBS[word].form in forms
+
+
+def moves(verb: Verb | None) -> bool:
+    """Whether what does so changes its place."""
+    return verb is not None and verb.kind not in {None, "static"}
+
+
 def is_modifier(word: str) -> bool:
     """Whether a lower case word describes a noun and is none: a colour, an adjective, a participle, a place."""
     if word in SETS["not_adjectives"]:
         return False
-    participle = word in VERBS and VERBS[word].form in {"past", "ing"}
-    known = any(word in listed for listed in (COLOURS, ADJECTIVES, PLACES, NUMBER_WORDS, MARKED))
+    known = any(word in listed for listed in (COLOURS, SETS["adjectives"], PLACES, NUMBER_WORDS, SETS["marked"]))
     ending = len(word) > 4 and word.endswith(("ed", "ing", "ish", "ful", "less", "ous"))
-    return participle or known or word.isdecimal() or ending
-
-
-def is_adverb(word: str) -> bool:
-    """Whether a lower case word is an adverb by its ending, such as "freely"."""
-    return len(word) > 4 and word.endswith("ly") and word not in SETS["not_adverbs"]
+    return is_form(word, "past", "ing") or known or word.isdecimal() or ending
 
 
 def singular(noun: str) -> str:
     """A plural noun made singular, by its ending."""
     if noun in TABLES["irregular_plurals"]:
         return TABLES["irregular_plurals"][noun]
-    if noun in UNCHANGED_PLURALS or len(noun) < 4 or not noun.endswith("s") or noun.endswith(("ss", "us", "is")):
+    if (
+        noun in SETS["unchanged_plurals"]
+        or len(noun) < 4
+        or not noun.endswith("s")
+        or noun.endswith(("ss", "us", "is"))
+    ):
         return noun
     if noun.endswith(("sses", "xes", "ches", "shes", "toes")):
         return noun[:-2]
     return noun[:-3] + "y" if noun.endswith("ies") else noun[:-1]
-
-
-QUANTITY = "~"
-PUNCTUATION = frozenset(".,;:?!()—–")
-_TOKEN = re.compile(r"\d+\.\d+|no\.(?=\s{0,3}\d)|n't\b|'s\b|#\d+|\w+?(?=n't\b)|\w+|[.,;:?!()—–]", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -153,6 +150,11 @@ class ObjectPhrase:
         """Whether it names a thing: not a place, the arrow or the image, and not the floor."""
         return self.head is not None and (self.as_thing or self.head not in NO_THINGS)
 
+    @property
+    def words(self) -> set[str]:
+        """The lower case words of the text."""
+        return set(self.text.lower().split())
+
 
 @dataclass(frozen=True)
 class QuantityWords:
@@ -170,9 +172,9 @@ class QuantityWords:
 
 @dataclass(frozen=True)
 class Item:
-    """A word (`key`, lower case), a noun phrase (`phrase`; then `words` are its words, determiner first) or a quantity.
+    """A word (`key`, lower case), a noun phrase (`phrase`) or a quantity, which has the key "~".
 
-    The key of a quantity is `QUANTITY`, and `words` are its words.
+    `words` are those of a noun phrase, determiner first, or of a quantity.
     """
 
     key: str
@@ -181,6 +183,14 @@ class Item:
     phrase: ObjectPhrase | None = None
     words: tuple[str, ...] = ()
     quantity: QuantityWords | None = None
+
+    @property
+    def thing(self) -> ObjectPhrase | None:
+        """The noun phrase, where it names a thing."""
+        return self.phrase if self.phrase is not None and self.phrase.is_thing else None
+
+
+_TOKEN = re.compile(r"\d+\.\d+|no\.(?=\s{0,3}\d)|n't\b|'s\b|#\d+|\w+?(?=n't\b)|\w+|[.,;:?!()—–]", re.IGNORECASE)
 
 
 def tokens(text: str) -> list[Item]:
@@ -200,24 +210,6 @@ def phrase_at(found: Sequence[Item], at: int) -> ObjectPhrase | None:
     return found[at].phrase if 0 <= at < len(found) else None
 
 
-def flatten(found: Iterable[Item]) -> list[str]:
-    """The words of some items, those of their noun phrases too."""
-    return [word for item in found for word in (item.words or (item.key,))]
-
-
-def _number(keys: Sequence[str], head: str) -> int | None:
-    plural = head.endswith("s") and not head.endswith("ss") and head not in UNCHANGED_PLURALS
-    for at, key in enumerate(keys):
-        digits = key.lstrip("#")
-        named = at > 0 and keys[at - 1] in {"number", "no", "no."}
-        counts = plural and at < len(keys) - 1 and not named and key == digits
-        if digits.isdecimal() and len(digits) <= 6 and not counts:
-            return int(digits)
-        if key in NUMBER_WORDS and not counts and (named or key != "one"):
-            return NUMBER_WORDS[key]
-    return None
-
-
 def is_count(key: str) -> bool:
     """Whether a word numbers an object, or says that a number follows."""
     numeral = key.lstrip("#").isdecimal() or (key in NUMBER_WORDS and key != "one")
@@ -230,16 +222,36 @@ def object_phrase(text: str, keys: tuple[str, ...]) -> ObjectPhrase:
     content = [key for key in content if len(key) > 1] or content  # "ball A" is a ball
     nouns = [key for key in content[:-1] if not is_modifier(key)]
     head = content[-1] if content else ""
-    modifiers = content[:-1] or content
-    colour = next((COLOURS[key] for key in modifiers if key in COLOURS), None)
-    noun = " ".join([*nouns, singular(head)]) if content and head not in {"one", "ones"} else None
+    numbered = nouns[-1] if head.isdecimal() and nouns else head
+    plural = numbered.endswith("s") and not numbered.endswith("ss") and numbered not in SETS["unchanged_plurals"]
+    number = None
+    for at, key in enumerate(keys):
+        digits, named = key.lstrip("#"), at > 0 and keys[at - 1] in {"number", "no", "no."}
+        if plural and at < len(keys) - 1 and not named and not key.startswith("#"):
+            continue  # it counts them
+        if digits.isdecimal() and len(digits) <= 6:
+            number = int(digits)
+        elif key in NUMBER_WORDS and (named or key != "one"):
+            number = NUMBER_WORDS[key]
+        if number is not None:
+            break
     return ObjectPhrase(
         text=" ".join(text.split()),
-        colour=colour,
-        noun=noun,
-        inside_box=any(key in MARKED for key in content[:-1]),
-        number=_number(keys, nouns[-1] if head.isdecimal() and nouns else head),
+        colour=next((COLOURS[key] for key in content[:-1] or content if key in COLOURS), None),
+        noun=" ".join([*nouns, singular(head)]) if content and head not in {"one", "ones"} else None,
+        inside_box=any(key in SETS["marked"] for key in content[:-1]),
+        number=number,
     )
+
+
+@dataclass(frozen=True)
+class Word:
+    """What rules are made of. `kind` is the terminal of a noun phrase or a pronoun; `at`, its place in the items."""
+
+    kind: str
+    text: str
+    at: int
+    phrase: ObjectPhrase | None = None
 
 
 _SAME: dict[str, tuple[str, ...]] = {
@@ -250,51 +262,30 @@ _SAME: dict[str, tuple[str, ...]] = {
     "makes": ("make",), "made": ("make",), "elapses": ("elapse",), "longer": ("long", "-er"),
     "n't": ("not",), "cannot": ("can", "not"), "wo": ("will",), "ca": ("can",),
 }  # fmt: skip
-ARROWS = frozenset(["arrow", "arrowhead"])
-PRONOUNS = frozenset(["it", "itself", "they", "them", "he", "she"])
+_BASE = {word: (verb.lemma, "-ing") if verb.form == "ing" else (verb.lemma,) for word, verb in VERBS.items()} | _SAME
+_PRONOUNS = words("it itself they them he she")
+_WITH_UNIT = re.compile(r"([0-9]+(?:\.[0-9]+)?)([a-z]+)")
 
 
-@dataclass(frozen=True)
-class Word:
-    """A token: `kind` is the terminal of a noun phrase or a pronoun, empty for a word; `at`, its place in the items."""
-
-    kind: str
-    text: str
-    at: int
-
-
-def words_of(found: Sequence[Item]) -> list[Word]:
-    """The tokens of some items."""
-    return [word for at in range(len(found)) for word in words_at(found, at)]
+def plain_words(keys: Sequence[str], at: int) -> Iterator[Word]:
+    """Lower case words at a place for the rules: verbs in their base form, an ending "-ing" and a unit apart."""
+    for key in keys:
+        with_unit = _WITH_UNIT.fullmatch(key) if key[0].isdigit() else None
+        for text in with_unit.groups() if with_unit else _BASE.get(key, (key,)):
+            yield Word("PRONOUN" if key in _PRONOUNS else "", text, at)
 
 
-def words_at(found: Sequence[Item], at: int) -> list[Word]:
-    """The tokens of one item."""
-    item = found[at]
-    if item.phrase is None:
-        return plain_words([item.key], at)
-    if _is_words(item, item.phrase):
-        return plain_words(item.words, at)
-    return [Word("AGENT" if item.phrase.head in AGENTS else "NP", item.phrase.text, at)]
-
-
-def plain_words(keys: Sequence[str], at: int) -> list[Word]:
-    """Lower case words at a place as tokens: the base form of a verb, its ending "-ing" apart."""
-    return [Word("PRONOUN" if key in PRONOUNS else "", text, at) for key in keys for text in _base_forms(key)]
-
-
-def _is_words(item: Item, phrase: ObjectPhrase) -> bool:
-    """Whether a noun phrase names no object: a place, the trail, or an adjective alone as in "the last of which"."""
-    if phrase.head in ARROWS:
-        return True
-    if phrase.as_thing or phrase.colour is not None or phrase.number is not None or phrase.inside_box:
-        return False
-    content = [word for word in item.words if word not in DETERMINERS]
-    return phrase.head in NO_THINGS or all(word == "one" or is_modifier(word) for word in content)
-
-
-def _base_forms(word: str) -> tuple[str, ...]:
-    verb = VERBS.get(word)
-    if verb is None or word in _SAME:
-        return _SAME.get(word, (word,))
-    return (verb.lemma, "-ing") if verb.form == "ing" else (verb.lemma,)
+def words_of(found: Sequence[Item], start: int = 0) -> Iterator[Word]:
+    """The items from a place on as words: noun phrases that name no object, such as "the left", in their words."""
+    for at in range(start, len(found)):
+        item, phrase = found[at], found[at].phrase
+        if phrase is None:
+            yield from plain_words([item.key], at)
+            continue
+        singled_out = phrase.as_thing or phrase.colour or phrase.number is not None or phrase.inside_box
+        content = (word for word in item.words if word not in DETERMINERS)
+        nameless = phrase.head in NO_THINGS or all(word == "one" or is_modifier(word) for word in content)
+        if phrase.head in ARROWS or (nameless and not singled_out):
+            yield from plain_words(item.words, at)
+        else:
+            yield Word("AGENT" if phrase.head in AGENTS else "NP", phrase.text, at, phrase)

@@ -11,96 +11,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from cow_service.readers.base import Quantity
+from cow_service.readers.embedded.english import interventions, motion, noun_phrases, wording
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.grammar import read_from
-from cow_service.readers.embedded.english.interventions import (
-    InterventionWords,
-    TrailWords,
-    implied_placing,
-    split_interventions,
-    split_trail,
-)
-from cow_service.readers.embedded.english.lexicon import (
-    SETS,
-    Item,
-    ObjectPhrase,
-    key_at,
-    phrase_at,
-    tokens,
-    words,
-)
-from cow_service.readers.embedded.english.motion import (
-    Clauses,
-    MotionCandidate,
-    MotionWords,
-    OtherWords,
-    arrow_statement,
-    clause_end,
-    is_passive,
-    is_vague,
-    read_clauses,
-    read_motion,
-    with_front,
-)
-from cow_service.readers.embedded.english.noun_phrases import items, with_nouns, with_places, with_tables
-from cow_service.readers.embedded.english.spelling import without_typing_errors
-from cow_service.readers.options import split_options
-from cow_service.records import MotionKind
-
-_ENDS = frozenset(".?!;")
-_WINDOW = 24  # words of the openings of one sentence
-_MAX_TRIES = 12  # of one question
-_LONGEST_FIRST = sorted(map(re.escape, lex.TABLES["said_as"]), key=len, reverse=True)
-_SAID_AS = re.compile(rf"\b(?:{'|'.join(_LONGEST_FIRST)})\b", re.I)
-_TAG = re.compile(rf",\s*(?:{'|'.join(lex.SETS['tags'])})\s*\?(?=\s+\S)", re.I)  # and something else is asked
-
-
-def without_openings(text: str) -> str:
-    """The text without openings; what asks by a statement ("I wonder whether it ...") begins with "tell me" then.
-
-    Words of informal English are put as the grammar has them ("gonna" as "going to").
-    """
-    text = _TAG.sub(".", text)
-    text = _SAID_AS.sub(lambda found: lex.TABLES["said_as"][found[0].lower()], text.replace("’", "'"))
-    found, kept, end, tries = tokens(text), list[str](), 0, 0
-    for at in range(len(found)):
-        if not (at == 0 or key_at(found, at - 1) in _ENDS) or tries >= _MAX_TRIES:
-            continue
-        tries += 1
-        parsed = read_from("opening", found, at, _WINDOW)
-        if parsed is None:
-            continue
-        tree, behind = parsed
-        asks = next(tree.find_data("asks_if"), None)
-        kept += [text[end : found[at].start], "" if asks is None else f"tell me {found[behind - 1].key} "]
-        end = found[behind].start if behind < len(found) else len(text)
-    return "".join([*kept, text[end:]])
-
-
-# Sentences of the text, and what those are about that say how to reply.
-_BETWEEN_SENTENCES = re.compile(r"((?<=[.?!])\s+|\n+)")
-_BETWEEN_PARTS = re.compile(r"((?<=[.?!;:])\s+)")
-_PICTURES = words("image images frame frames picture pictures photo photos")
-_ABOUT_REPLY = re.compile(
-    r"\byour (?:\w+ ){0,2}(?:response|answer|reply|output)s?\b|\bjson\b|answer\s*:\s*\$|\$\s?letter\b", re.IGNORECASE
-)
-_CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
-_YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)  # what may be replied
-_HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)
-
-
-def without_reply_form(prompt: str) -> str:
-    """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
-    sentences = _BETWEEN_SENTENCES.split(_YES_NO.sub("", _HEADING.sub("", prompt)))
-    kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
-    parts: list[str] = []
-    for part in _BETWEEN_PARTS.split(kept):
-        said = re.findall(r"\w+", part.lower())
-        first = next((word for word in said[:2] if word != "please"), "")
-        if not (first in SETS["instructions"] or (first == "note" and not _PICTURES.isdisjoint(said))):
-            parts.append(part)  # the others say what to do, or what the images are
-    return "".join(parts)
-
+from cow_service.readers.embedded.english.interventions import InterventionWords, TrailWords
+from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, key_at, phrase_at
+from cow_service.readers.embedded.english.motion import Clauses, MotionCandidate, MotionWords, OtherWords
+from cow_service.readers.options import plain, split_options
 
 MAX_WORDS = 240  # of a question that are read
 _EACH_OF_TWO = lex.words("both each together")
@@ -143,44 +59,49 @@ class Question:
         """Whether the item at a place tells the motion and was understood."""
         return self.items[at].start in self.read
 
+    def means_mover(self, phrase: ObjectPhrase) -> bool:
+        """Whether a phrase speaks of the mover again: no word in it that the mover's own lacks."""
+        words = set(plain(phrase.text).split())
+        return self.mover is not None and bool(words) and words <= set(plain(self.mover.text).split())
+
 
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str) -> Question:
     """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    text = without_reply_form(split_options(question).rest)
-    found = tokens(text)
+    text = wording.without_reply_form(split_options(question).rest)
+    found = lex.tokens(text)
     beyond = ""
     if len(found) > MAX_WORDS:
         text, rest = text[: found[MAX_WORDS].start], found[MAX_WORDS : MAX_WORDS + 7]
         beyond = " ".join(each.key for each in rest)
-    text, errors = without_typing_errors(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
-    text = without_openings(text)
-    changes, found = split_interventions(with_places(with_nouns(with_tables(items(text)))))
-    trail, found = split_trail(found)
-    clauses = read_clauses(found)
-    best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)  # the first of the highest
-    best = _before_while(found, clauses, best)
-    at = best.at if best else len(found)
-    mover = (best.subject if best else None) or _antecedent(found, clauses, at)
-    mover = _in_full(mover, found[:at], changes) if mover else None
-    arrow = any(token.key.startswith("arrow") for token in tokens(text))
-    clause, motion = _motion(found, clauses, best, mover, arrow, changes)
+    text, errors = wording.without_typing_errors(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
+    text = wording.without_openings(text)
+    arrow = any(token.key.startswith("arrow") for token in lex.tokens(text))
+    found = noun_phrases.with_nouns(noun_phrases.with_tables(noun_phrases.items(text)))
+    changes, found = interventions.split_interventions(noun_phrases.with_places(found))
+    trail, found = interventions.split_trail(found)
+    clauses = motion.read_clauses(found)
+    best = _best(found, clauses)
+    mover = _mover(found, clauses, best, changes)
+    clause, told = _motion(found, clauses, best, mover, arrow, changes)
     if trail is not None and trail.near is None and trail.side is None:
-        trail = replace(trail, side=motion.direction)  # "on along its trail to the right": its last end is there
-    motion, fitted = replace(motion, trail=trail), frozenset[int]()
-    if not changes and (best is None or (best.asked and not _says_way(motion))):
-        changes, fitted = implied_placing(found)
-    read = motion.read.union(fitted, *(other.motion.read for other in motion.others))
+        trail = replace(trail, side=told.direction)  # "on along its trail to the right": its last end is there
+    told, fitted = replace(told, trail=trail), frozenset[int]()
+    if not changes and (best is None or (best.asked and not told.says_way)):
+        changes, fitted = interventions.implied_placing(found)
+    read = told.read.union(fitted, *(other.motion.read for other in told.others))
     put = next((change for change in changes if change.kind == "place"), None)
     # "If you lift the ball and put it into the mug": the lifting is a part of it.
     lifted = best.subject if best is not None and best.verb in {"lift", "raise", "carry", "bring"} else None
     carried = put is not None and lifted == put.object
-    way = best is None and motion.arrow is not None and bool(clauses.question_subjects)  # "on its way along the arrow"
+    if carried:
+        read = read.union(item.start for item in found[clause.start : clause.stop])
+    way = best is None and told.arrow is not None and bool(clauses.question_subjects)  # "on its way along the arrow"
     if put is not None and not way and (best is None or best.asked or best.kind == "static" or carried):
-        mover, motion = put.object, replace(motion, kind="place", verb="put")
+        mover, told = put.object, replace(told, kind="place", verb="put")
     return Question(
         mover=mover,
-        motion=motion,
+        motion=told,
         others=_others(found, mover, clause, changes, trail),
         items=tuple(found),
         interventions=changes,
@@ -189,9 +110,61 @@ def parse(question: str) -> Question:
         names_direction=_DIRECTION_WORDS.search(text) is not None,
         beyond=beyond,
         pronoun=_open_pronoun(found, best, mover),
-        read=read.union(item.start for item in found[clause.start : clause.stop]) if carried else read,
+        read=read,
         errors=errors,
     )
+
+
+def parse_noun_phrase(text: str) -> ObjectPhrase | None:
+    """The first noun phrase of a text such as "the red toy car"; None where there is none."""
+    found = noun_phrases.items("the " + text.removeprefix("the "))
+    phrase = next((item.phrase for item in found if item.phrase is not None), None)
+    if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
+        return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
+    return phrase
+
+
+def _best(found: Sequence[Item], clauses: Clauses) -> MotionCandidate | None:
+    """The verb that tells the motion: the first of the highest rank."""
+    best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)
+    if best is None or best.asked or not best.moves or found[best.start].key != "while":
+        return best
+    # In front of "while", where both are told: "the mug slides left by 20 px while the ball drops".
+    told = [
+        each
+        for each in clauses.candidates
+        if each.at < best.start and not each.asked and each.moves and motion.clause_end(found, each.at) == best.start
+        and each.subject is not None and each.subject.is_thing and each.subject.head not in lex.AGENTS
+    ]  # fmt: skip
+    return told[-1] if told else best
+
+
+def _mover(
+    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, changes: Sequence[InterventionWords]
+) -> ObjectPhrase | None:
+    """What moves, as it is worded most fully."""
+    at = best.at if best else len(found)
+    mover = best.subject if best else None
+    certain = [(place, item.phrase) for place, item in enumerate(found) if item.phrase and not motion.is_vague(item)]
+    if mover is None:
+        # A pronoun, or a clause without a subject, stands for who acts in a passive question, else for its subject.
+        acting = [
+            phrase
+            for place, phrase in certain
+            if place > 1 and found[place - 1].key == "by" and motion.is_passive(found, place - 2)
+            and phrase.head not in lex.ABSTRACT | lex.AGENTS
+        ]  # fmt: skip
+        asked = [each for each in clauses.question_subjects if each[1].head not in lex.ABSTRACT]
+        named = [(place, phrase) for place, phrase in certain if phrase.is_thing]
+        before = [phrase for each in (asked, named) for place, phrase in each if place < at]
+        mover = next(iter([*acting, *before, *(phrase for _, phrase in asked + named)]), None)
+    if mover is None:
+        return None
+    # "The white pawn ... if the pawn moves".
+    told = [item.phrase for item in found[:at] if item.phrase]
+    told += [phrase for change in changes for phrase in (change.object, *change.targets) if change.kind == "place"]
+    fuller = {phrase for phrase in told if phrase != mover and _repeats(mover, phrase)}
+    return fuller.pop() if len(fuller) == 1 else mover
 
 
 def _motion(
@@ -203,77 +176,38 @@ def _motion(
     changes: Sequence[InterventionWords],
 ) -> tuple[range, MotionWords]:
     """The places of the clause that tells the motion, and what it tells."""
-    at = best.at if best else len(found)
+    at, start = (best.at, best.start) if best else (len(found), 0)
+    verb, kind = (best.verb, best.kind) if best else ("", None)
+    if best is None:
+        # "What does it touch on its way down?", "the falling ball", and "where would it land?" without its support.
+        ways = (place for place, item in enumerate(found) if item.words[-1:] == ("way",))
+        down = any(key_at(found, way - 1) == "on" and key_at(found, way + 1) == "down" for way in ways)
+        removed = any(change.kind == "remove" for change in changes)
+        lands = removed and any(lex.lemma(item.key) in {"land", "happen"} for item in found)
+        if down or lands or (mover is not None and "falling" in mover.text.lower().split()[:-1]):
+            verb, kind = "fall", "fall"
     beside = _movers_beside(found, clauses, best)
-    end = min([clause_end(found, at) if best else at, *(other.start for other in beside)])
-    shared = _sharing(found, at, end)
-    verb, kind = (best.verb, best.kind) if best else _falling(found, changes, mover)
-    motion = read_motion(
+    end = min([motion.clause_end(found, at) if best else at, *(other.start for other in beside)])
+    shared: int | None = None  # "the ball moves left and the car to the right"
+    for place in range(at + 1, end - 2):
+        if found[place].key in {"and", "while"} and found[place + 1].thing:
+            way = motion.read_motion(found[place + 1 : end], "", None, None)
+            if way.direction is not None or way.depth:
+                shared = place
+                break
+    told = motion.read_motion(
         found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
     )
-    start = best.start if best else 0
-    motion = with_front(motion, found[start:at] if best else found, arrow_statement(found))
-    speeds = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
-    speeds = [(place, said) for place, said in speeds if isinstance(said.speed, Quantity)]
-    motion = replace(
-        motion,
-        quantities=(*motion.quantities, *(said for _, said in speeds)),
-        read=motion.read.union(place for place, _ in speeds),
-        others=_other_motions(found, clauses, best, shared, end),
+    told = motion.with_front(told, found[start:at] if best else found, found)
+    elsewhere = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
+    speeds = {place: said for place, said in elsewhere if isinstance(said.speed, Quantity)}
+    told = replace(
+        told,
+        quantities=(*told.quantities, *speeds.values()),
+        read=told.read.union(speeds),
+        others=_other_motions(found, best, beside, shared, end),
     )
-    return range(start if best else at, end), motion
-
-
-def parse_noun_phrase(text: str) -> ObjectPhrase | None:
-    """The first noun phrase of a text such as "the red toy car"; None where there is none."""
-    found = items("the " + text.removeprefix("the "))
-    phrase = next((item.phrase for item in found if item.phrase is not None), None)
-    if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
-        return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
-    return phrase
-
-
-def _falling(
-    found: Sequence[Item], changes: Sequence[InterventionWords], mover: ObjectPhrase | None
-) -> tuple[str, MotionKind | None]:
-    """ "What does it touch on its way down?", "the falling ball", and "where would it land?" without its support."""
-    removed = any(change.kind == "remove" for change in changes)
-    falls = any(removed and lex.lemma(item.key) in {"land", "happen"} for item in found) or any(
-        item.words[-1:] == ("way",) and key_at(found, at - 1) == "on" and key_at(found, at + 1) == "down"
-        for at, item in enumerate(found)
-    )
-    falls = falls or (mover is not None and "falling" in mover.text.lower().split()[:-1])
-    return ("fall", "fall") if falls else ("", None)
-
-
-def _says_way(motion: MotionWords) -> bool:
-    """Whether a motion has a direction of any sort."""
-    said = (motion.direction, motion.arrow, motion.forward, motion.trail)
-    return bool(motion.depth) or motion.kind in {"fall", "projectile"} or any(each is not None for each in said)
-
-
-def _antecedent(found: Sequence[Item], clauses: Clauses, at: int) -> ObjectPhrase | None:
-    """What a pronoun, or a clause without a subject, stands for: who acts in a passive question, else its subject."""
-    for place, item in enumerate(found):
-        acting = key_at(found, place - 1) == "by" and is_passive(found, place - 2) if place > 1 else False
-        if acting and item.phrase and item.phrase.head not in lex.ABSTRACT | lex.AGENTS and not is_vague(item):
-            return item.phrase
-    things = [(place, item.phrase) for place, item in enumerate(found) if item.phrase and not is_vague(item)]
-    named = [(place, phrase) for place, phrase in things if phrase.is_thing]
-    asked = [(place, phrase) for place, phrase in clauses.question_subjects if phrase.head not in lex.ABSTRACT]
-    before = [phrase for place, phrase in asked if place < at] + [phrase for place, phrase in named if place < at]
-    return next(iter(before + [phrase for _, phrase in asked + named]), None)
-
-
-def _open_pronoun(found: Sequence[Item], best: MotionCandidate | None, mover: ObjectPhrase | None) -> str:
-    """The pronoun that moves where two things were named alike before it: "the ball and the mug ... if it rolls"."""
-    if best is None or best.subject is not None:
-        return ""
-    for at in range(best.at - 2):
-        two = found[at].phrase, found[at + 2].phrase
-        if found[at + 1].key == "and" and mover in two and all(each is not None and each.is_thing for each in two):
-            return next((item.key for item in found[at + 3 : best.at] if item.key in lex.MOVER_PRONOUNS), "")
-    return ""
+    return range(start if best else at, end), told
 
 
 def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
@@ -285,115 +219,88 @@ def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidat
         each
         for each in clauses.candidates
         if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
-        and each.at > best.at and each.kind not in {None, "static"}
-        and each.start > best.at and each.subject is not None and (each.subject.noun or each.subject.colour)
+        and each.at > best.at and each.start > best.at and each.moves
+        and each.subject is not None and (each.subject.noun or each.subject.colour)
         and all(item.key != "whether" for item in found[best.at : each.at])  # it is asked, not told
         and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 
 
-def _before_while(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> MotionCandidate | None:
-    """The motion in front of "while", where both are told: "the mug slides left by 20 px while the ball drops"."""
-    if best is None or best.asked or found[best.start].key != "while":
-        return best
-    told = [
-        each
-        for each in clauses.candidates
-        if each.at < best.start and not each.asked and each.kind not in {None, "static"}
-        and each.subject is not None and each.subject.is_thing and each.subject.head not in lex.AGENTS
-        and clause_end(found, each.at) == best.start
-    ]  # fmt: skip
-    return told[-1] if told and best.kind not in {None, "static"} else best
-
-
 def _other_motions(
-    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, shared: int | None, end: int
+    found: Sequence[Item],
+    best: MotionCandidate | None,
+    beside: Sequence[MotionCandidate],
+    shared: int | None,
+    end: int,
 ) -> tuple[OtherWords, ...]:
-    """What else moves at the same time, and how."""
+    """What else moves at the same time, and how.
+
+    How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
+    """
     others: list[OtherWords] = []
     if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
         others.append(_other_motion(thing, best, found[shared + 1 : end]))
-    others += _joint_motion(found, best, end)
-    for each in _movers_beside(found, clauses, best):
+    # "The ball and the mug both move to the right"; but "the ball between the cube and the mug rolls": one thing moves.
+    if best is not None and best.subject is not None and best.moves and not best.asked:
+        at = best.at - (key_at(found, best.at - 1) in _EACH_OF_TWO)
+        pair = key_at(found, at - 2) == "and" and phrase_at(found, at - 3) == best.subject
+        thing = found[at - 1].thing if pair and not lex.is_form(found[best.at].key, "s") else None
+        other = None if thing is None else _other_motion(thing, best, found[best.at : end])
+        long = any(item.quantity is not None and item.quantity.speed is None for item in found[best.at : end])
+        if other is not None and not other.motion.steps and not long:
+            read = other.motion.read.union(item.start for item in found[at : best.at])
+            others.append(replace(other, motion=replace(other.motion, read=read)))
+    for each in beside:
         if each.subject is not None and all(each.subject != other.object for other in others):
-            others.append(_other_motion(each.subject, each, found[each.at : clause_end(found, each.at)]))
+            others.append(_other_motion(each.subject, each, found[each.at : motion.clause_end(found, each.at)]))
     return tuple(others)
 
 
-def _sharing(found: Sequence[Item], at: int, end: int) -> int | None:
-    """Where a second mover shares the verb: "the ball moves left and the car to the right"."""
-    for place in range(at + 1, end - 2):
-        phrase = found[place + 1].phrase
-        if found[place].key in {"and", "while"} and phrase is not None and phrase.is_thing:
-            way = read_motion(found[place + 1 : end], "", None, None)
-            if way.direction is not None or way.depth:
-                return place
-    return None
-
-
 def _other_motion(thing: ObjectPhrase, verb: MotionCandidate, words: Sequence[Item]) -> OtherWords:
-    motion = read_motion(words, verb.verb, verb.kind, thing)
-    # How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
+    told = motion.read_motion(words, verb.verb, verb.kind, thing)
     lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
-    return OtherWords(thing, replace(motion, read=frozenset[int]() if motion.steps else motion.read - lengths))
+    return OtherWords(thing, replace(told, read=frozenset() if told.steps else told.read - lengths))
 
 
-def _joint_motion(found: Sequence[Item], best: MotionCandidate | None, end: int) -> list[OtherWords]:
-    """The second of two subjects of one verb: "the ball and the mug both move to the right"."""
-    if best is None or best.asked or best.kind in {None, "static"} or best.subject is None:
-        return []
-    if found[best.at].key in lex.VERBS and lex.VERBS[found[best.at].key].form == "s":
-        return []  # "the ball between the cube and the mug rolls": one thing moves
-    at = best.at - (key_at(found, best.at - 1) in _EACH_OF_TWO)
-    thing, joined = phrase_at(found, at - 1), key_at(found, at - 2) == "and"
-    if thing is None or not thing.is_thing or not joined or phrase_at(found, at - 3) != best.subject:
-        return []
-    words = found[best.at : end]
-    motion = read_motion(words, best.verb, best.kind, thing)
-    if motion.steps or any(item.quantity is not None and item.quantity.speed is None for item in words):
-        return []  # of the first mover alone the reader tells how far it goes
-    both = {found[each].start for each in range(at, best.at)}
-    return [OtherWords(thing, replace(motion, read=motion.read | both))]
-
-
-def _in_full(mover: ObjectPhrase, before: Sequence[Item], changes: Sequence[InterventionWords]) -> ObjectPhrase:
-    """The first mention of the mover where it is worded more fully: "the white pawn ... if the pawn moves"."""
-    named = [item.phrase for item in before if item.phrase]
-    named += [phrase for change in changes for phrase in (change.object, *change.targets) if change.kind == "place"]
-    fuller = {phrase for phrase in named if phrase != mover and _repeats(mover, phrase)}
-    return fuller.pop() if len(fuller) == 1 else mover
+def _open_pronoun(found: Sequence[Item], best: MotionCandidate | None, mover: ObjectPhrase | None) -> str:
+    """The pronoun that moves where two things were named alike before it: "the ball and the mug ... if it rolls"."""
+    if best is None or best.subject is not None:
+        return ""
+    for at in range(best.at - 2):
+        two = found[at].thing, found[at + 2].thing
+        if found[at + 1].key == "and" and mover in two and None not in two:
+            return next((item.key for item in found[at + 3 : best.at] if item.key in lex.MOVER_PRONOUNS), "")
+    return ""
 
 
 def _others(
     found: Sequence[Item],
     mover: ObjectPhrase | None,
     clause: range,
-    interventions: Sequence[InterventionWords],
+    changes: Sequence[InterventionWords],
     trail: TrailWords | None,
 ) -> tuple[ObjectPhrase, ...]:
-    changed = [change.object for change in interventions]
-    named = [phrase for change in interventions for phrase in change.targets]
+    """The further things that are named, each once."""
+    known = [phrase for phrase in (mover, *(change.object for change in changes)) if phrase is not None]
+    named = [phrase for change in changes for phrase in change.targets]
     named += [] if trail is None or trail.near is None else [trail.near]
-    things = [(at, item, item.phrase) for at, item in enumerate(found)]
-    things += [(at, item, item.phrase.place.of) for at, item, _ in things if item.phrase and item.phrase.place]
-    for at, item, phrase in sorted(things, key=lambda each: each[0]):
-        if phrase is None or is_vague(item) or _HOW_MANY.issuperset(item.words):
-            continue
-        bare = phrase.head in lex.GENERIC or phrase.noun is None
-        singled_out = phrase.colour is not None or phrase.inside_box or phrase.number is not None
-        if not (singled_out if bare else phrase.is_thing) or (at in clause and phrase.head in lex.AGENTS):
-            continue
-        if phrase.noun in lex.ADJECTIVES and item.words[0] not in lex.DETERMINERS:
-            continue  # "which ball will it hit first?"
-        again = item.words[0] != "another" and any(
-            _repeats(phrase, known) for known in (mover, *named, *changed) if known
-        )
-        if not again:
-            named.append(phrase)
+    for at, item in enumerate(found):
+        place = item.phrase.place if item.phrase is not None else None
+        for phrase in (item.phrase, None if place is None else place.of):
+            if phrase is None or motion.is_vague(item) or _HOW_MANY.issuperset(item.words):
+                continue
+            bare = phrase.head in lex.GENERIC or phrase.noun is None
+            singled_out = phrase.colour is not None or phrase.inside_box or phrase.number is not None
+            acts = at in clause and phrase.head in lex.AGENTS
+            # "Which ball will it hit first?"
+            adjective = phrase.noun in lex.SETS["adjectives"] and item.words[0] not in lex.DETERMINERS
+            if not (singled_out if bare else phrase.is_thing) or acts or adjective:
+                continue
+            if item.words[0] == "another" or not any(_repeats(phrase, earlier) for earlier in (*known, *named)):
+                named.append(phrase)
     return tuple(named)
 
 
 def _repeats(phrase: ObjectPhrase, known: ObjectPhrase) -> bool:
     """Whether a later phrase means an earlier object: no word in it that the earlier one lacks."""
-    words, earlier = set(phrase.text.lower().split()), set(known.text.lower().split())
-    return phrase.head in {known.head, None} and words - {"one"} <= earlier
+    return phrase.head in {known.head, None} and phrase.words - {"one"} <= known.words
