@@ -8,18 +8,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the command line prints its help without records
-    from cow_service.records import (
-        Encounter,
-        EncounterKind,
-        Intervention,
-        Path,
-        PlacedBefore,
-        Placement,
-        PlacementResult,
-        PlaceRelation,
-        Trajectory,
-        Vector,
-    )
+    from cow_service import records
+    from cow_service.records import Encounter, Intervention, Path, PlacedBefore, PlaceRelation, Trajectory, Vector
 
 MAX_OBJECT = 200  # characters
 ALONG_AXIS = 0.95  # sine of the angle out of the image plane from which only the depth is worth a word
@@ -78,16 +68,16 @@ RELATION_WORDS: dict[str, PlaceRelation] = {
 SURE = 0.9  # share of the worlds: where something is as it was meant in fewer, a warning says so
 HARDLY_SEEN = 0.25  # share of a thing that is seen
 _WHERE: dict[PlaceRelation, str] = {"into": "in", "onto": "on"}  # of what is there; else as it is put
-_DOES_NOT_STAY: dict[PlacementResult, str] = {
+_DOES_NOT_STAY: dict[records.PlacementResult, str] = {
     "overlaps": "there is no room for it, and it overlaps",
     "falls-off": "it does not stay there, but falls off",
     "tips": "it does not stay there: it tips over, or tips over what it is put to",
 }
-_NOT_AS_MEANT: dict[PlacementResult, str] = {
+_NOT_AS_MEANT: dict[records.PlacementResult, str] = {
     "sticks-out": "goes in but sticks out",
     "on-the-rim": "does not go in, but lies on the rim",
 }
-_ENDS: dict[PlacementResult, str] = {
+_ENDS: dict[records.PlacementResult, str] = {
     "inside": "goes in and stays inside",
     "sticks-out": "goes in but sticks out",
     "on-the-rim": "does not go in and stays on the rim",
@@ -97,14 +87,6 @@ _ENDS: dict[PlacementResult, str] = {
     "falls-off": "falls off",
     "tips": "tips over, or tips over what it was put to",
 }
-
-
-def _placement_parts(placement: Placement) -> list[str]:
-    """The parts of a sentence about it, after its name."""
-    end = _ENDS[placement.result]
-    if placement.result in ("inside", "sticks-out") and placement.above_rim:
-        end = f"{end} with {round(100 * placement.above_rim)}% of its height above the rim"
-    return ["is carried over", "is let go", end]
 
 
 def place_words(placed: Intervention) -> str:
@@ -122,7 +104,7 @@ def state_words(placed: Intervention) -> str:
 
 def cannot_stay(placed: PlacedBefore) -> str:
     """Why something cannot be put somewhere, in a sentence."""
-    faults: list[PlacementResult] = [result for result in _DOES_NOT_STAY if result in placed.probabilities]
+    faults: list[records.PlacementResult] = [result for result in _DOES_NOT_STAY if result in placed.probabilities]
     result = placed.result
     if result not in _DOES_NOT_STAY:
         result = max(faults, key=lambda fault: placed.probabilities[fault])
@@ -151,7 +133,7 @@ AT_REST = 1e-3  # m from where it starts, within which a body has not set out
 COVERED = 0.3  # share of what is hidden, from which it counts as hidden
 MAX_MET = 2  # encounters that are told one by one
 SIDEWAYS = 0.7  # of the speed in depth: from that on something moves to the side
-_KINDS: dict[str, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
+_KINDS: dict[str, records.EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
 _NOT_MET = {"touches": "does not touch {}", "covers": "does not hide {}", "covered": "is not hidden by {}"}
 _NOTHING_MET = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
 _BECOMES = {
@@ -240,7 +222,11 @@ class _Facts:
         self._outcome = trajectory.outcome
         self._names = [mover, *(body.object for body in trajectory.bodies[1:])]
         self._paths = {path.body: path for path in reversed(trajectory.paths)}
-        self._subject = self._asked_body()
+        # Which body it is whose encounter is asked about; None where nothing is asked or that body is not there.
+        self._subject = None if self._outcome is None else 0
+        if self._outcome is not None and self._outcome.subject is not None:
+            others = enumerate(self._names[1:], 1)
+            self._subject = next((index for index, name in others if name == self._outcome.subject), None)
         self._asked = self._asked_about()
 
     def sentence(self) -> str:
@@ -264,21 +250,16 @@ class _Facts:
         if asked.relation not in _KINDS or asked.within is not None or asked.partly or asked.every:
             return None
         met = None if first is None else first.object
+        kind = _KINDS[asked.relation]
+        own = [e for e in self._trajectory.encounters if e.subject == self._subject and e.kind == kind]
+        meant = {(each.body, each.object) for each in own if _has_happened(each) and self._is_meant(each.object)}
         agreeing = {
             "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,
-            "how-many": outcome.probability if self._count() == outcome.count else None,
+            "how-many": outcome.probability if len(meant) == outcome.count else None,
             "which-first": outcome.probability if outcome.first == met else None,
             "when": (outcome.probability if outcome.time is None else None) if first is None else first.probability,
         }
         return agreeing.get(asked.form)
-
-    def _asked_body(self) -> int | None:
-        """Which body it is whose encounter is asked about; None where nothing is asked or that body is not there."""
-        if self._outcome is None:
-            return None
-        if self._outcome.subject is None:
-            return 0
-        return next((i for i, name in enumerate(self._names) if i and name == self._outcome.subject), None)
 
     def _asked_about(self) -> Encounter | None:
         """The first encounter that the question asks for."""
@@ -300,12 +281,6 @@ class _Facts:
         among = () if self._outcome is None else self._outcome.asked.among
         return not among or name in among
 
-    def _count(self) -> int:
-        """How many things the body asked about meets in the way asked about."""
-        kind = None if self._outcome is None else _KINDS[self._outcome.asked.relation]
-        own = [e for e in self._trajectory.encounters if e.subject == self._subject and e.kind == kind]
-        return len({(each.body, each.object) for each in own if _has_happened(each) and self._is_meant(each.object)})
-
     def _told(self, body: int) -> list[Encounter]:
         """The encounters of a body that are told, in their order: what is asked about, then the first ones."""
         own = [each for each in self._trajectory.encounters if each.subject == body]
@@ -320,7 +295,10 @@ class _Facts:
         """How one body goes, what it meets, and how it ends."""
         placement = self._trajectory.placement
         if body == 0 and placement is not None:
-            parts = _placement_parts(placement)
+            end = _ENDS[placement.result]
+            if placement.result in ("inside", "sticks-out") and placement.above_rim:
+                end = f"{end} with {round(100 * placement.above_rim)}% of its height above the rim"
+            parts = ["is carried over", "is let go", end]
         else:
             met, path = self._told(body), self._paths.get(body)
             going = ["stays where it is"]
@@ -412,12 +390,12 @@ class _Facts:
         if outcome is None or outcome.asked.relation not in _BECOMES or (outcome.asked.target and not outcome.object):
             return ""
         does, does_not = _BECOMES[outcome.asked.relation]
-        found: list[tuple[float, str]] = []
-        for path in self._trajectory.paths[1:]:
-            name = self._names[path.body]
-            time = path.tipped_at if outcome.asked.relation == "tips" else path.moved_at
-            if time is not None and outcome.object in (None, name) and self._is_meant(name):
-                found.append((time, name))
+        tips = outcome.asked.relation == "tips"
+        times = (
+            (path.tipped_at if tips else path.moved_at, self._names[path.body]) for path in self._trajectory.paths[1:]
+        )
+        found = [(time, name) for time, name in times if time is not None and outcome.object in (None, name)]
+        found = [(time, name) for time, name in found if self._is_meant(name)]
         if found:
             time, name = min(found, key=lambda each: each[0])
             return f"{named(name, 'the')} {does} after {time:.1f} s"

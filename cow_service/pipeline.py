@@ -36,11 +36,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
         grounding=grounding,
         motion=motion,
         trajectory=trajectory,
-        frames=clip.frames,
-        factual_frames=clip.factual_frames,
-        video=clip.video,
-        overlay=clip.overlay,
-        generator=clip.generator,
+        **dict(clip),
         reader=run.reader_info("grounding", "motion"),
         **run.accounts(*SIMULATION_STAGES),
         warnings=run.warnings("grounding", "motion", "trajectory"),
@@ -59,6 +55,9 @@ def answer(run: Run[AnswerRequest]) -> Answer:
     wanted = request.imagine == "always" if gate is None else gate.imagined
     simulation, failure = _imagine(run) if wanted else (None, None)
     verdicts, warnings = _verdicts(run, first, simulation)
+    if failure is not None:
+        why = f"{failure.code}: {failure.detail}"
+        warnings = (f"Nothing was imagined, the answer is from the image alone. {why}", *warnings)
     return Answer(
         **dict(verdicts.verdict),
         id=run.id,
@@ -73,7 +72,7 @@ def answer(run: Run[AnswerRequest]) -> Answer:
         baseline=verdicts.baseline,
         reader=run.reader_info("gating", "grounding", "motion", "answering"),
         **run.accounts("gating", *SIMULATION_STAGES, "answering"),
-        warnings=(*_not_imagined(failure), *warnings),
+        warnings=warnings,
     )
 
 
@@ -96,9 +95,3 @@ def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, CowError | Non
         raise  # the last: another process may be able to imagine
     except CowError as error:
         return None, error
-
-
-def _not_imagined(failure: CowError | None) -> tuple[str, ...]:
-    if failure is None:
-        return ()
-    return (f"Nothing was imagined, the answer is from the image alone. {failure.code}: {failure.detail}",)

@@ -9,28 +9,8 @@ from typing import Literal, Protocol
 
 from pydantic import Field
 
-from cow_service.records import (
-    AnswerOption,
-    Asked,
-    BBox,
-    Cue,
-    Grounding,
-    Intervention,
-    InterventionKind,
-    LocatedObject,
-    MetresPerPixel,
-    MotionKind,
-    ObjectPrior,
-    PlaceRelation,
-    Point,
-    ReaderInfo,
-    Record,
-    Simulation,
-    Source,
-    Until,
-    Usage,
-    Vector,
-)
+from cow_service import records
+from cow_service.records import BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Point, Record, Source, Vector
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
 
@@ -71,16 +51,12 @@ class OtherMotionReading:
 class CallLog:
     """What one stage sent to a multimodal LLM. Readers add to it, so that failed calls count, too."""
 
-    usage: Usage = field(default_factory=Usage)
+    usage: records.Usage = field(default_factory=records.Usage)
     prompts: dict[str, int] = field(default_factory=dict[str, int])  # version by name
 
-    def add(self, usage: Usage) -> None:
+    def add(self, usage: records.Usage) -> None:
         """Counts a call."""
         self.usage += usage
-
-
-def _never_canceled() -> None:
-    """Does nothing."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +70,7 @@ class ReaderInput:
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: nobody need look for them
     sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, beside the question's
     calls: CallLog = field(default_factory=CallLog)
-    check_canceled: Callable[[], None] = _never_canceled  # to be called while waiting; raises `Canceled`
+    check_canceled: Callable[[], None] = lambda: None  # to be called while waiting; raises `Canceled`
     cpu: Callable[[], AbstractContextManager[None]] = nullcontext  # to be held around work on the CPU; not reentrant
 
 
@@ -118,12 +94,12 @@ class MotionHints(Record):
     speed: SpeedWord | Quantity | None = None
     distance: Quantity | None = None
     duration: float | None = Field(default=None, gt=0)  # s
-    until: Until | None = None
+    until: records.Until | None = None
     then: tuple[StepReading, ...] = ()  # further legs
     also: tuple[OtherMotionHint, ...] = ()
-    cue: Cue | None = None
+    cue: records.Cue | None = None
     along_arrow: bool | None = None
-    metres_per_pixel: MetresPerPixel | None = None
+    metres_per_pixel: records.MetresPerPixel | None = None
     down: Vector = (0.0, 1.0)
     scale_error: str | None = None  # code of the error for which the scale could not be read
 
@@ -132,9 +108,9 @@ class MotionHints(Record):
 class NamedChange:
     """An intervention whose objects are names that are still to be located."""
 
-    kind: InterventionKind
+    kind: records.InterventionKind
     object: str
-    relation: PlaceRelation | None = None
+    relation: records.PlaceRelation | None = None
     targets: tuple[str, ...] = ()
 
 
@@ -142,7 +118,7 @@ class NamedChange:
 class QuestionReading:
     """What the words of a question say, without a look at the image and without a model."""
 
-    asked: Asked | None = None  # null where the reader cannot tell from the words alone
+    asked: records.Asked | None = None  # null where the reader cannot tell from the words alone
     changes: tuple[NamedChange, ...] = ()  # what is taken away or put somewhere
     trail_named: bool = False  # the question speaks of a trail
     drawings_named: frozenset[str] = frozenset()  # "arrow" and "box", where the question speaks of one
@@ -157,11 +133,11 @@ class GroundingReading:
     point: Point | None = None  # where the reader pointed, if it gave no box; by default the centre of the box
     others: tuple[LocatedObject, ...] = ()
     warnings: tuple[str, ...] = ()
-    interventions: tuple[Intervention, ...] = ()
+    interventions: tuple[records.Intervention, ...] = ()
     hints: MotionHints | None = None
     prior: ObjectPrior | None = None  # of the mover
     mask: Mask | None = None  # [H, W] of the mover, where it does not follow from the box
-    asked: Asked | None = None  # what the question wants to know; null where the reader cannot say
+    asked: records.Asked | None = None  # what the question wants to know; null where the reader cannot say
     changes: tuple[NamedChange, ...] = ()  # as `interventions`, of things that the request locates
 
 
@@ -171,19 +147,19 @@ class MotionReading:
 
     kind: MotionKind
     direction: Vector | None  # any length; px of the upright image
-    cue: Cue
+    cue: records.Cue
     along_arrow: bool | None = None
     depth: float = 0.0  # see `Motion.depth`
     depth_deviation: float | None = None  # degrees; null where the reader says nothing of the depth
     speed: SpeedWord | Quantity | None = None  # a word: as for such a thing
     distance: Quantity | None = None  # after which it is stopped
     duration: float | None = None  # s, after which it is stopped
-    until: Until | None = None
+    until: records.Until | None = None
     steps: tuple[StepReading, ...] = ()
     trail: tuple[Point, ...] = ()  # earlier positions that are shown, oldest first, px
     others: tuple[OtherMotionReading, ...] = ()
     speed_deviation: float | None = None  # of ln speed; null where the reader says nothing of the speed
-    metres_per_pixel: MetresPerPixel | None = None  # null where the reader cannot tell
+    metres_per_pixel: records.MetresPerPixel | None = None  # null where the reader cannot tell
     down: Vector = (0.0, 1.0)  # unit vector: which way things fall in the image
     sentence: str | None = None
     warnings: tuple[str, ...] = ()
@@ -193,7 +169,7 @@ class MotionReading:
 class Imagined:
     """What an answer may be drawn from besides the image: the simulation and its frames."""
 
-    simulation: Simulation
+    simulation: records.Simulation
     frames: tuple[Image, ...]  # RGB [h, w, 3] of `simulation.frames`, in their order
     factual_frames: tuple[Image, ...] = ()  # of `simulation.factual_frames`
 
@@ -228,7 +204,7 @@ class Reader(Protocol):
     """Reads images for questions. Holds connections or weights, never a request; safe to use from several threads."""
 
     source: Source
-    info: ReaderInfo
+    info: records.ReaderInfo
     """Name, model and revision. The run adds prompts and stages."""
     fingerprint: str
     """All that decides what it reads, besides what it is given: model, revision, prompts, options."""
@@ -257,7 +233,7 @@ class Reader(Protocol):
     def answer(
         self,
         given: ReaderInput,
-        options: Sequence[AnswerOption],
+        options: Sequence[records.AnswerOption],
         grounding: Grounding | None,
         imagined: Imagined | None,
         votes: int,

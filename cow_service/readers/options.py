@@ -145,23 +145,19 @@ def split_options(question: str) -> Listed:
     Letters that follow one another from A may also name things ("car (A) hits car (B)"): a list has texts that differ
     and none that asks; of several such lists the longest counts, and of those the last.
     """
-    lists = [listed for chain in _letter_chains(question)[-MAX_LISTS:] for listed in _read_lettered(question, chain)]
-    longest = max((len(listed.options) for listed in lists), default=0)
-    if longest:
-        return [listed for listed in lists if len(listed.options) == longest][-1]
-    return next(_read_announced(question), Listed((), question))
-
-
-def _letter_chains(question: str) -> list[list[re.Match[str]]]:
-    """Runs of markers A, B, C..., two or more."""
-    chains: list[list[re.Match[str]]] = []
+    chains: list[list[re.Match[str]]] = []  # runs of markers A, B, C...
     for marker in _MARKER.finditer(question):
         letter = _letter(marker)
         if letter == "A":
             chains.append([marker])
         elif chains and len(chains[-1]) < len(_LETTERS) and letter == _LETTERS[len(chains[-1])]:
             chains[-1].append(marker)
-    return [chain for chain in chains if len(chain) > 1]
+    chains = [chain for chain in chains if len(chain) > 1][-MAX_LISTS:]
+    lists = [listed for chain in chains for listed in _read_lettered(question, chain)]
+    longest = max((len(listed.options) for listed in lists), default=0)
+    if longest:
+        return [listed for listed in lists if len(listed.options) == longest][-1]
+    return next(_read_announced(question), Listed((), question))
 
 
 def _letter(marker: re.Match[str]) -> str:
@@ -173,7 +169,9 @@ def _read_lettered(question: str, chain: Sequence[re.Match[str]]) -> Iterator[Li
     closing = _LIST_END.search(question, min(chain[-1].end() + 1, len(question)))
     ends = [*(marker.start() for marker in chain[1:]), closing.start() if closing else len(question)]
     spans = [question[marker.end() : end] for marker, end in zip(chain, ends, strict=True)]
-    texts = [_strip_joint(" ".join(span.split()).strip(_EDGES)) for span in spans]
+    texts = [" ".join(span.split()).strip(_EDGES) for span in spans]
+    for joint in (" or", " and"):
+        texts = [text.removesuffix(joint).rstrip(_EDGES) for text in texts]
     differ = len({text.lower() for text in texts}) == len(texts)
     say_something = all(re.search(r"[\w+−±-]", text) for text in texts)
     ask = any("?" in span or _MARKER.search(text) or _ASKS.match(text) for span, text in zip(spans, texts, strict=True))
@@ -181,12 +179,6 @@ def _read_lettered(question: str, chain: Sequence[re.Match[str]]) -> Iterator[Li
         options = tuple((_letter(marker), text) for marker, text in zip(chain, texts, strict=True))
         places = _places(question, [marker.end() for marker in chain], texts)
         yield Listed(options, question[: chain[0].start()] + " . " + question[ends[-1] :], places=places)
-
-
-def _strip_joint(text: str) -> str:
-    for joint in (" or", " and"):
-        text = text.removesuffix(joint).rstrip(_EDGES)
-    return text
 
 
 def _read_announced(question: str) -> Iterator[Listed]:

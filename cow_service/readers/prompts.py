@@ -5,8 +5,9 @@ What a prompt is given is data: it is put in as it stands, and never read as a t
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import yaml
@@ -17,7 +18,6 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from cow_service.weights.manifests import PROMPTS
 
 FIELDS = {"version": int, "inputs": list}
-_FENCE = "---"
 
 # No autoescape: prompts are plain text for a model, and HTML entities would change the words it reads.
 _ENVIRONMENT = ImmutableSandboxedEnvironment(autoescape=False, undefined=StrictUndefined, trim_blocks=True)
@@ -40,12 +40,12 @@ class Prompt:
             faults = {"missing": missing, "not declared": unknown}
             problems = [f"{what}: {', '.join(names)}" for what, names in faults.items() if names]
             raise TypeError(f"Prompt {self.name!r}, inputs {'; '.join(problems)}.")
-        return _compiled(self.body).render(**inputs).strip()
+        return self.template.render(**inputs).strip()
 
-
-@cache
-def _compiled(body: str) -> Template:
-    return _ENVIRONMENT.from_string(body)  # which takes milliseconds
+    @cached_property
+    def template(self) -> Template:
+        """Its body, compiled, which takes milliseconds."""
+        return _ENVIRONMENT.from_string(self.body)
 
 
 @cache
@@ -56,23 +56,18 @@ def load_prompt(name: str) -> Prompt:
 
 def parse_prompt(name: str, text: str) -> Prompt:
     """A prompt from its file's text. Raises `ValueError`, naming the prompt and what is wrong with it."""
-    lines = text.splitlines()
-    if not lines or lines[0].strip() != _FENCE or _FENCE not in (line.strip() for line in lines[1:]):
-        raise ValueError(f"Prompt {name!r} does not begin with front matter between two lines of {_FENCE!r}.")
-    end = next(at for at, line in enumerate(lines[1:], 1) if line.strip() == _FENCE)
-    head: Any = yaml.safe_load("\n".join(lines[1:end]))
-    _check(name, head)
-    body = "\n".join(lines[end + 1 :]).strip()
-    inputs = tuple(str(item) for item in head["inputs"])
-    undeclared = find_undeclared_variables(_ENVIRONMENT.parse(body)) - set(inputs)
-    if undeclared:
-        raise ValueError(f"Prompt {name!r} uses inputs that it does not declare: {', '.join(sorted(undeclared))}.")
-    return Prompt(name, head["version"], inputs, body)
-
-
-def _check(name: str, head: Any) -> None:
+    parts = re.split(r"^[ \t]*---[ \t]*$", text, maxsplit=2, flags=re.MULTILINE)
+    if len(parts) < 3 or parts[0]:
+        raise ValueError(f"Prompt {name!r} does not begin with front matter between two lines of '---'.")
+    head: Any = yaml.safe_load(parts[1])
     if not isinstance(head, dict) or set(head) != set(FIELDS):
         raise ValueError(f"Prompt {name!r} needs exactly these fields in its front matter: {', '.join(FIELDS)}.")
     for field, kind in FIELDS.items():
         if not isinstance(head[field], kind) or isinstance(head[field], bool):
             raise ValueError(f"Prompt {name!r}: {field} must be of type {kind.__name__}, not {head[field]!r}.")
+    body = parts[2].strip()
+    inputs = tuple(str(item) for item in head["inputs"])
+    undeclared = find_undeclared_variables(_ENVIRONMENT.parse(body)) - set(inputs)
+    if undeclared:
+        raise ValueError(f"Prompt {name!r} uses inputs that it does not declare: {', '.join(sorted(undeclared))}.")
+    return Prompt(name, head["version"], inputs, body)

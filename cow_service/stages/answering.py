@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from functools import partial
 
 from cow_service.errors import MllmBadReply
-from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode_own
 from cow_service.readers.base import AnswerReading, Imagined, Reader, ReaderInput
 from cow_service.readers.options import read_choices
@@ -33,7 +32,11 @@ def answer_question(
     imagined = None
     if simulation is not None:
         with run.cpu():
-            imagined = _with_frames(simulation, run.backends.artifacts)
+            frames, factual = (
+                tuple(decode_own(run.backends.artifacts.read(frame.sha256)) for frame in chosen)
+                for chosen in (simulation.frames, simulation.factual_frames)
+            )
+            imagined = Imagined(simulation, frames, factual)
     answer = partial(ask, run.reader, given, options, grounding, votes=request.votes)
     verdict, warnings = answer(imagined)
     baseline = None if first is None or not request.baseline else first.verdict
@@ -67,29 +70,13 @@ def ask(
         reasoning=winner.reasoning,
         votes=dict(counted),
     )
-    return verdict, (*winner.notes, *_split(verdict, votes))
-
-
-def _with_frames(simulation: Simulation, artifacts: ArtifactStore) -> Imagined:
-    """A simulation with the pixels of its chosen frames."""
-    frames, factual = (
-        tuple(decode_own(artifacts.read(frame.sha256)) for frame in chosen)
-        for chosen in (simulation.frames, simulation.factual_frames)
-    )
-    return Imagined(simulation, frames, factual)
-
-
-def _split(verdict: Verdict, votes: int) -> tuple[str, ...]:
-    """What a caller should know of the votes, in whole sentences; empty where there is nothing to say."""
-    found: list[str] = []
-    lost = votes - sum(verdict.votes.values())
+    warnings, lost = list(winner.notes), votes - len(readings)
     if lost:
-        found.append(f"{lost} of {votes} votes could not be read and do not count.")
-    most = max(verdict.votes.values())
-    tied = [name for name, count in verdict.votes.items() if count == most]
+        warnings.append(f"{lost} of {votes} votes could not be read and do not count.")
+    tied = [name for name, count in counted.items() if count == most]
     if len(tied) > 1:
-        found.append(f"The votes are tied between {' and '.join(tied)}; the first one given was taken.")
-    return tuple(found)
+        warnings.append(f"The votes are tied between {' and '.join(tied)}; the first one given was taken.")
+    return verdict, tuple(warnings)
 
 
 def _named(reading: AnswerReading) -> str:
@@ -114,19 +101,18 @@ def ask_first(run: Run[AnswerRequest]) -> StageResult[FirstAnswers]:
 def gate_of(first: FirstAnswers, threshold: float) -> Gate:
     """Whether to imagine. Votes that could not be read count as asked for: they agree with nothing."""
     verdict = first.verdict
-    counts = Counter({} if verdict is None else verdict.votes).most_common(2)
-    most = counts[0][1] if counts else 0
-    tied = len(counts) > 1 and counts[1][1] == most
+    votes = {} if verdict is None else verdict.votes
+    second, most = sorted([0, 0, *votes.values()])[-2:]
     reason: GateReason = "agreed"
     if verdict is None:
         reason = "unreadable"
-    elif tied or most / first.asked < threshold:
+    elif most == second or most / first.asked < threshold:
         reason = "disagreed"
     elif verdict.not_sure:
         reason = "not-sure"
     return Gate(
         answer=None if verdict is None else verdict.answer,
-        votes={} if verdict is None else verdict.votes,
+        votes=votes,
         asked=first.asked,
         agreement=most / first.asked,
         threshold=threshold,

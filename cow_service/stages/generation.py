@@ -14,12 +14,12 @@ from cow_service.generators.interventions import with_put, without_removed
 from cow_service.media.artifacts import ArtifactWriter
 from cow_service.media.images import encode_jpeg, encode_png, fit_within
 from cow_service.media.overlay import Replaced, draw_overlay
-from cow_service.records import BBox, Clip, Frame, Grounding, Motion, PlacedBefore, Trajectory, Video
+from cow_service.records import Clip, Frame, Grounding, Motion, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.reconstruction import obstacles_of
 from cow_service.stages.run import Run
-from cow_service.vision.types import Image, Mask
+from cow_service.vision.types import Image
 
 
 @dataclass(frozen=True)
@@ -78,15 +78,15 @@ def choose_frames(wanted: FramesRequest, trajectory: Trajectory) -> tuple[int, .
         return tuple(sorted(set(spread))) if len(set(spread)) == count else tuple(range(last + 1))[:count]
     if wanted.policy == "uniform":
         return tuple(int(i) for i in np.linspace(0, last, count).round()) if count > 1 else (last,)
-    return _at_events(trajectory, count)
-
-
-def _at_events(trajectory: Trajectory, count: int) -> tuple[int, ...]:
-    last, visible = trajectory.num_frames - 1, trajectory.path.visible
+    # The first frames of encounters, then those after contacts, of which those between bodies come first.
+    visible = trajectory.path.visible
     chosen = list(dict.fromkeys(encounter.first_frame for encounter in trajectory.encounters))[:count]
-    for frame in _contact_frames(trajectory):
-        if len(chosen) < count and all(abs(frame - other) >= MIN_GAP * trajectory.fps for other in (0, *chosen)):
+    for contact in sorted(trajectory.contacts, key=lambda contact: (contact.b is None, contact.time)):
+        frame, taken = math.ceil(contact.time * trajectory.fps - 1e-6), (0, *chosen)
+        is_apart = all(abs(frame - other) >= MIN_GAP * trajectory.fps for other in taken)
+        if frame <= last and len(chosen) < count and is_apart:
             chosen.append(frame)
+    # The rest where something is seen to move, else anywhere, far from one another.
     moving = last if trajectory.moving_until is None else max(1, math.ceil(trajectory.moving_until * trajectory.fps))
     seen = [i for i in range(1, min(last, moving) + 1) if visible[i]] or list(range(1, last + 1))
     if not chosen:
@@ -97,13 +97,6 @@ def _at_events(trajectory: Trajectory, count: int) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def _contact_frames(trajectory: Trajectory) -> list[int]:
-    """The first frame after each contact of the clip, those between bodies before those with the floor."""
-    contacts = sorted(trajectory.contacts, key=lambda contact: (contact.b is None, contact.time))
-    frames = [math.ceil(contact.time * trajectory.fps - 1e-6) for contact in contacts]
-    return [frame for frame in frames if frame < trajectory.num_frames]
-
-
 def generate(
     run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory
 ) -> StageResult[Clip]:
@@ -111,43 +104,32 @@ def generate(
 
     Raises `InvalidRequest`, `GeneratorOutOfMemory`, `Canceled`.
     """
-    with run.backends.artifacts.batch(run.retry_policy) as artifacts:
-        clip = _clip(run, grounding, motion, trajectory, artifacts)
-    frames = (*clip.frames, *clip.factual_frames)
-    pictures = (*(frame.sha256 for frame in frames), *([] if clip.video is None else [clip.video.sha256]))
-    return StageResult(value=clip, artifacts=(*pictures, clip.overlay.sha256))
-
-
-def _clip(
-    run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory, artifacts: ArtifactWriter
-) -> Clip:
-    with run.cpu():
-        given, as_it_is = _inputs(run, grounding, motion, trajectory)
-    with ThreadPoolExecutor(1) as encoder:
+    with run.backends.artifacts.batch(run.retry_policy) as artifacts, ThreadPoolExecutor(1) as encoder:
+        with run.cpu():
+            given, as_it_is = _inputs(run, grounding, motion, trajectory)
         with run.device():
             frames, video = _render(run, given, artifacts, encoder)
-            factual = _factual_frames(run, as_it_is, [frame.index for frame in frames], encoder)
+            factual: list[EncodedFrame] = []
+            # On a device of its own they are made only where they are asked for: they cost as much as the clip.
+            wanted, is_cheap = run.request.frames, run.generator.concurrency is None
+            if as_it_is is not None and (is_cheap if wanted.factual is None else wanted.factual):
+                indices = [frame.index for frame in frames]
+                pictures = run.generator.render(as_it_is, indices, run.report_share)
+                factual = [
+                    EncodedFrame.of(pixels, index, trajectory.fps, wanted.max_side, encoder)
+                    for index, pixels in zip(indices, pictures, strict=True)
+                ]
         with run.cpu():
-            overlay = _overlay(run.image.pixels, given, as_it_is or given, motion, trajectory)
-        return Clip(
+            overlay = _draw_overlay(run.image.pixels, given, as_it_is or given)
+        clip = Clip(
             frames=stored(frames, artifacts),
             factual_frames=stored(factual, artifacts),
             video=video,
             overlay=artifacts.put(overlay, "image/jpeg"),
             generator=run.generator.describe(given),
         )
-
-
-def _overlay(
-    image: Image, given: GeneratorInput, as_it_is: GeneratorInput, motion: Motion, trajectory: Trajectory
-) -> bytes:
-    """The overlay over the input image [H, W, 3], as JPEG."""
-    mover = (as_it_is if given.before is None else given).scene.silhouette(given.grounding.bbox)
-    gone = as_it_is.obstacles[len(given.obstacles) :]
-    removed = [(each.name, each.bbox, each.mask.full()) for each in gone]
-    placed = [_replaced(given, as_it_is, each) for each in trajectory.placed]
-    drawn = draw_overlay(image, given.grounding, motion, trajectory, mover, removed, placed)
-    return encode_jpeg(fit_within(drawn, OVERLAY_SIDE))
+    named = (*clip.frames, *clip.factual_frames, *([] if video is None else [video]), clip.overlay)
+    return StageResult(value=clip, artifacts=tuple(each.sha256 for each in named))
 
 
 def _inputs(
@@ -166,31 +148,23 @@ def _inputs(
     return with_put(given, trajectory.factual), as_it_is
 
 
-def _replaced(given: GeneratorInput, as_it_is: GeneratorInput, placed: PlacedBefore) -> Replaced:
-    """Where something was, and where it is put."""
-    (old_bbox, old), (bbox, mask) = (_seen_in(each, placed.body) for each in (as_it_is, given))
-    return Replaced(placed.object, placed.place, old_bbox, old, bbox, mask)
-
-
-def _seen_in(given: GeneratorInput, body: int) -> tuple[BBox, Mask]:
-    """Box and mask [H, W] of a body."""
-    if body == 0:
-        return given.grounding.bbox, given.scene.silhouette(given.grounding.bbox)
-    return given.obstacles[body - 1].bbox, given.obstacles[body - 1].mask.full()
-
-
-def _factual_frames(
-    run: Run[SimulateRequest], given: GeneratorInput | None, indices: Sequence[int], encoder: Executor
-) -> list[EncodedFrame]:
-    """The chosen frames of the scene as it is; a generator on a device of its own makes them only where they are
-    asked for, because they cost as much as the clip."""
-    wanted = run.request.frames
-    if given is None or not (run.generator.concurrency is None if wanted.factual is None else wanted.factual):
-        return []
-    return [
-        EncodedFrame.of(pixels, index, given.trajectory.fps, wanted.max_side, encoder)
-        for index, pixels in zip(indices, run.generator.render(given, indices, run.report_share), strict=True)
-    ]
+def _draw_overlay(image: Image, given: GeneratorInput, as_it_is: GeneratorInput) -> bytes:
+    """The overlay over the input image [H, W, 3], as JPEG."""
+    grounding, trajectory = given.grounding, given.trajectory
+    mover = (as_it_is if given.before is None else given).scene.silhouette(grounding.bbox)
+    gone = as_it_is.obstacles[len(given.obstacles) :]
+    placed: list[Replaced] = []
+    for each in trajectory.placed:
+        (old_bbox, old), (bbox, mask) = (
+            (there.obstacles[each.body - 1].bbox, there.obstacles[each.body - 1].mask.full())
+            if each.body
+            else (there.grounding.bbox, there.scene.silhouette(there.grounding.bbox))
+            for there in (as_it_is, given)
+        )
+        placed.append(Replaced(each.object, each.place, old_bbox, old, bbox, mask))
+    removed = [(each.name, each.bbox, each.mask.full()) for each in gone]
+    drawn = draw_overlay(image, grounding, given.motion, trajectory, mover, removed, placed)
+    return encode_jpeg(fit_within(drawn, OVERLAY_SIDE))
 
 
 def _render(
@@ -199,7 +173,6 @@ def _render(
     """The chosen frames, and the video of all of them. Only those that are needed are rendered."""
     generator, request, trajectory = run.generator, run.request, given.trajectory
     chosen = choose_frames(request.frames, trajectory)
-    size = generator.size(given.scene.width, given.scene.height)
     indices = tuple(range(trajectory.num_frames)) if request.video else chosen
     frames: list[EncodedFrame] = []
 
@@ -209,18 +182,22 @@ def _render(
                 frames.append(EncodedFrame.of(pixels, index, trajectory.fps, request.frames.max_side, encoder))
             yield pixels
 
-    video = _store_video(rendered(), trajectory.fps, size, artifacts) if request.video else None
-    if video is None:
+    if not request.video:
         for _ in rendered():
             pass
-    return frames, video
+        return frames, None
 
-
-def _store_video(frames: Iterator[Image], fps: float, size: tuple[int, int], artifacts: ArtifactWriter) -> Video:
     from cow_service.media.video import write_mp4  # noqa: PLC0415 # FFmpeg's bindings take long to import
 
+    width, height = generator.size(given.scene.width, given.scene.height)
     with artifacts.scratch() as path:
-        count = write_mp4(frames, path, fps=fps, width=size[0], height=size[1])
+        count = write_mp4(rendered(), path, fps=trajectory.fps, width=width, height=height)
         artifact = artifacts.put_file(path, "video/mp4")
-    even = (size[0] + size[0] % 2, size[1] + size[1] % 2)
-    return Video(url=artifact.url, sha256=artifact.sha256, fps=fps, num_frames=count, width=even[0], height=even[1])
+    return frames, Video(
+        url=artifact.url,
+        sha256=artifact.sha256,
+        fps=trajectory.fps,
+        num_frames=count,
+        width=width + width % 2,
+        height=height + height % 2,
+    )

@@ -24,6 +24,7 @@ from cow_service.vision.types import Mask
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 WHITE = 128  # grey level from which a pixel of a mask is the object's
+UNREADABLE = (errors.ArtifactNotFound, errors.ImageTooLarge, errors.ImageTypeUnsupported, errors.ImageUnreadable)
 MAX_MASK_SHARE = 0.95  # of the image: more is no object, but an image without a mask
 
 
@@ -204,12 +205,7 @@ def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Mask:
     try:
         data = run.backends.artifacts.read(given.artifact)
         picture = decode(data, max_megapixels=image.width * image.height / 1e6)
-    except (
-        errors.ArtifactNotFound,
-        errors.ImageTooLarge,
-        errors.ImageTypeUnsupported,
-        errors.ImageUnreadable,
-    ) as error:
+    except UNREADABLE as error:
         raise refused(f"cannot be read: {error.detail}") from error
     mask = picture.pixels.min(axis=2) >= WHITE
     share = float(mask.mean())
@@ -326,8 +322,14 @@ def removed_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
 def understood(grounding: Grounding, words: WordReader) -> Grounding:
     """The grounding with what the names of its things say of their shapes, and with the things that a kind means."""
 
+    def prior_of(thing: LocatedObject | Grounding) -> ObjectPrior | None:
+        """Its prior, completed by what its name says; None where neither says anything."""
+        said = {field: value for field, value in thing.prior or () if value}
+        completed = words.read_name(thing.object).model_copy(update=said)
+        return None if completed == ObjectPrior() else completed
+
     def described(thing: LocatedObject) -> LocatedObject:
-        return thing.model_copy(update={"prior": _with_name(thing.prior, thing.object, words)})
+        return thing.model_copy(update={"prior": prior_of(thing)})
 
     asked = grounding.asked
     if asked is not None and asked.among:
@@ -336,23 +338,14 @@ def understood(grounding: Grounding, words: WordReader) -> Grounding:
         among = dict.fromkeys(name for said in asked.among for name in words.names_meant(said, names))
         asked = asked.model_copy(update={"among": tuple(among)})
     interventions = (
-        each.model_copy(
-            update={"object": described(each.object), "targets": tuple(described(target) for target in each.targets)}
-        )
+        each.model_copy(update={"object": described(each.object), "targets": tuple(map(described, each.targets))})
         for each in grounding.interventions
     )
     return grounding.model_copy(
         update={
-            "others": tuple(described(other) for other in grounding.others),
+            "others": tuple(map(described, grounding.others)),
             "interventions": tuple(interventions),
-            "prior": _with_name(grounding.prior, grounding.object, words),
+            "prior": prior_of(grounding),
             "asked": asked,
         }
     )
-
-
-def _with_name(prior: ObjectPrior | None, name: str, words: WordReader) -> ObjectPrior | None:
-    """A prior, completed by what the object's name says; None where neither says anything."""
-    said = {field: value for field, value in prior or () if value}
-    completed = words.read_name(name).model_copy(update=said)
-    return None if completed == ObjectPrior() else completed

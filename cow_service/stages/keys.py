@@ -15,21 +15,10 @@ from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel
 
-from cow_service import __version__
+from cow_service import __version__, records
 from cow_service.readers.base import MotionHints
 from cow_service.readers.prompts import load_prompt
-from cow_service.records import (
-    Clip,
-    Grounding,
-    Motion,
-    ReaderInfo,
-    Record,
-    Sha256,
-    Simulation,
-    Trajectory,
-    Usage,
-    Verdict,
-)
+from cow_service.records import Clip, Grounding, Motion, ReaderInfo, Record, Simulation, Trajectory, Usage, Verdict
 from cow_service.requests import SimulateRequest, Stage
 
 Value = TypeVar("Value")
@@ -42,7 +31,7 @@ class StageResult(Record, Generic[Value]):
     warnings: tuple[str, ...] = ()
     reader: ReaderInfo | None = None  # null where the stage asked none
     usage: Usage = Usage()
-    artifacts: tuple[Sha256, ...] = ()  # those that the value names
+    artifacts: tuple[records.Sha256, ...] = ()  # those that the value names
     hints: MotionHints | None = None  # of stage 1 for stage 2
 
 
@@ -164,15 +153,13 @@ def key_of(
         del parts["request"]["seed"]
     sampled = decided.votes is not None and not repeats_answers(getattr(request, decided.votes))
     parts["backend"] = identity
-    return StageKey(digest_of(parts), identity is not None and not sampled, _read_with_more(parts, decided.read_with))
-
-
-def _read_with_more(parts: Mapping[str, Any], stage: str | None) -> tuple[str, ...]:
-    """The digest of the same stage where one more is left to the reader; none where the request leaves it that, too."""
+    # The same stage where one more is left to the reader, unless the request leaves it that, too.
     left: list[str] = parts["request"].get("left_to_reader", [])
-    if stage is None or stage in left:
-        return ()
-    return (digest_of({**parts, "request": parts["request"] | {"left_to_reader": sorted([*left, stage])}}),)
+    also: tuple[str, ...] = ()
+    if decided.read_with is not None and decided.read_with not in left:
+        more = parts["request"] | {"left_to_reader": sorted([*left, decided.read_with])}
+        also = (digest_of(parts | {"request": more}),)
+    return StageKey(digest_of(parts), identity is not None and not sampled, also)
 
 
 def _digest(value: Record | None) -> str | None:

@@ -5,29 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import pairwise
+from typing import Literal
 
-from cow_service.errors import FieldError, InvalidRequest
+from cow_service import records
+from cow_service.errors import FieldError, InvalidRequest, field_of
 from cow_service.narration import bare_name, direction_words, place_words, same_name
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.physics.trail_fit import fit_throw, straight_direction
 from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.prompts import load_prompt
-from cow_service.records import (
-    DIRECTED_KINDS,
-    FALLING_KINDS,
-    AlsoMoving,
-    BBox,
-    Grounding,
-    Law,
-    MetresPerPixel,
-    Motion,
-    MotionKind,
-    MotionStep,
-    Source,
-    Vector,
-)
-from cow_service.requests import CameraRequest, MotionRequest, OtherMotionRequest, SimulateRequest, TrajectoryRequest
+from cow_service.records import BBox, Grounding, Law, Motion, MotionKind, Source, Vector
+from cow_service.requests import CameraRequest, MotionRequest, SimulateRequest
 from cow_service.stages.grounding import placed_mover
 from cow_service.stages.keys import StageResult
 from cow_service.stages.reconstruction import camera_of
@@ -56,21 +45,47 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         with run.cpu():
             given = run.reader_input("motion", run.scene_of(grounding, None if hints is None else hints.cue))
         reading, source = run.reader.read_motion(given, grounding, hints), run.reader.source
-    reading, unused = _fitting(_with_request(reading, request.motion, grounding))
+    if request.motion is not None:
+        reading = _with_request(reading, request.motion, grounding)
+    placed = placed_mover(grounding)
+    if placed is not None and reading.kind == "place" and not reading.sentence:
+        sentence = f"The {bare_name(grounding.object)} is lifted, carried over and put {place_words(placed)}"
+        reading = replace(reading, sentence=sentence)
+    warnings = list(reading.warnings)
+    unused = [name for name in _OF_A_LINE if getattr(reading, name) not in (None, ())]
+    if reading.kind != "linear" and unused:
+        reading = replace(reading, distance=None, duration=None, until=None, steps=())
+        ends = f"a {reading.kind} ends by what it meets"
+        warnings.append(f"The {' and '.join(unused)} of the motion was not used: {ends}.")
     motion = _complete(run.image.info.width, grounding, reading, source, request.law)
     if motion.cue == "trail":
         with run.cpu():
             scene = run.scene_of(grounding, motion.cue)
             motion = along_trail(scene, grounding, motion, request.camera, reading.speed is not None)
-    return StageResult(value=motion, warnings=(*reading.warnings, *unused, *_assumed(motion, reading)))
+    # What nobody said: how fast a throw is, and the scale of lengths in metres.
+    if motion.kind == "projectile" and not isinstance(reading.speed, Quantity) and not motion.trail:
+        warnings.append(
+            f"How far a throw reaches depends on its speed: {motion.speed:.0f} px/s was assumed; "
+            "`motion.speed` sets it."
+        )
+    lengths = [each for each in (reading.speed, reading.distance) if isinstance(each, Quantity)]
+    if motion.metres_per_pixel.source == "default" and any(each.unit in ("m", "m/s") for each in lengths):
+        warnings.append(
+            f"Lengths in metres were taken at {motion.metres_per_pixel.value:.4f} m per pixel, which was assumed; "
+            "`motion.metres_per_pixel` sets it."
+        )
+    return StageResult(value=motion, warnings=tuple(warnings))
 
 
-# --- what the request and the reader say
+# --- what the request says
 
 
 def _given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReading | None:
-    """What the request says of the motion; None where it leaves that to the reader."""
-    given = request.stated_motion
+    """What the request says of the motion; None where it leaves that to the reader.
+
+    A given path amounts to a motion from its first point towards its last, at its mean speed (px/s).
+    """
+    given, path = request.stated_motion, request.trajectory
     if given is not None:
         return MotionReading(
             given.stated_kind or "linear",
@@ -79,75 +94,57 @@ def _given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReadi
             depth=given.depth,
             depth_deviation=given.depth_deviation or 0.0,
         )
-    if request.trajectory is not None:
-        return _along(request.trajectory)
+    if path is not None:
+        (x0, y0), last = path.points[0], path.points[-1]
+        way = sum(math.dist(a, b) for a, b in pairwise(path.points))
+        if way < 1e-6:
+            return MotionReading("static", None, "request")
+        # The first move of a path that ends where it began.
+        x, y = next(point for point in (last, *path.points) if math.dist(point, (x0, y0)) > 1e-6)
+        speed = Quantity(way * path.fps / (len(path.points) - 1), "px/s")
+        return MotionReading("linear", (x - x0, y - y0), "request", speed=speed)
     if grounding.source == "request" and placed_mover(grounding) is not None:
         return MotionReading("place", None, "request")
     return None
 
 
-def _along(path: TrajectoryRequest) -> MotionReading:
-    """The motion that a given path amounts to: from its first point towards its last, at its mean speed (px/s)."""
-    (x0, y0), last = path.points[0], path.points[-1]
-    way = sum(math.dist(a, b) for a, b in zip(path.points, path.points[1:], strict=False))
-    if way < 1e-6:
-        return MotionReading("static", None, "request")
-    # The first move of a path that ends where it began.
-    x, y = next(point for point in (last, *path.points) if math.dist(point, (x0, y0)) > 1e-6)
-    speed = Quantity(way * path.fps / (len(path.points) - 1), "px/s")
-    return MotionReading("linear", (x - x0, y - y0), "request", speed=speed)
+def _with_request(reading: MotionReading, given: MotionRequest, grounding: Grounding) -> MotionReading:
+    """The reading with what a request says of speed, length, scale and other movers.
 
-
-def _with_request(reading: MotionReading, given: MotionRequest | None, grounding: Grounding) -> MotionReading:
-    """The reading with what a request says of speed, length, scale and other movers."""
-    said: dict[str, Any] = {}
-    if given is not None:
-        scale = given.metres_per_pixel
-        said = {
-            "speed": None if given.speed is None else Quantity(given.speed, "px/s"),
-            "speed_deviation": given.speed_deviation,
-            "distance": None if given.distance is None else Quantity(given.distance, "px"),
-            "duration": given.duration,
-            "until": given.until,
-            "steps": tuple(
-                StepReading(
-                    step.direction,
-                    step.depth,
-                    None if step.distance is None else Quantity(step.distance, "px"),
-                    step.duration,
-                )
-                for step in given.steps
-            ),
-            "metres_per_pixel": None if scale is None else MetresPerPixel(value=scale, source="request"),
-            "others": tuple(_given_other(index, each, grounding) for index, each in enumerate(given.others)),
-        }
-    placed = placed_mover(grounding)
-    if placed is not None and reading.kind == "place" and not reading.sentence:
-        said["sentence"] = f"The {bare_name(grounding.object)} is lifted, carried over and put {place_words(placed)}"
+    Raises `InvalidRequest` for another mover that was not located.
+    """
+    others: list[OtherMotionReading] = []
+    for index, each in enumerate(given.others):
+        found = [other for other in grounding.others if same_name(other.object, each.object)]
+        if len(found) != 1:
+            seen = ", ".join(f"'{other.object}'" for other in grounding.others) or "none"
+            pointer = f"/motion/others/{index}/object"
+            detail = f"'{each.object}' names {len(found)} of the located objects ({seen})"
+            raise InvalidRequest(
+                f"`{field_of(pointer)}`: {detail}: give it in `objects` under this name.",
+                errors=(FieldError(pointer, detail),),
+            )
+        speed = _quantity(each.speed, "px/s")
+        others.append(OtherMotionReading(found[0], each.stated_kind, each.direction, each.depth, speed))
+    scale = given.metres_per_pixel
+    said = {
+        "speed": _quantity(given.speed, "px/s"),
+        "speed_deviation": given.speed_deviation,
+        "distance": _quantity(given.distance, "px"),
+        "duration": given.duration,
+        "until": given.until,
+        "steps": tuple(
+            StepReading(step.direction, step.depth, _quantity(step.distance, "px"), step.duration)
+            for step in given.steps
+        ),
+        "metres_per_pixel": None if scale is None else records.MetresPerPixel(value=scale, source="request"),
+        "others": tuple(others),
+    }
     return replace(reading, **{name: value for name, value in said.items() if value not in (None, ())})
 
 
-def _given_other(index: int, given: OtherMotionRequest, grounding: Grounding) -> OtherMotionReading:
-    """Raises `InvalidRequest` for another mover that was not located."""
-    found = [other for other in grounding.others if same_name(other.object, given.object)]
-    if len(found) != 1:
-        seen = ", ".join(f"'{other.object}'" for other in grounding.others) or "none"
-        detail = f"'{given.object}' names {len(found)} of the located objects ({seen})"
-        raise InvalidRequest(
-            f"`motion.others.{index}.object`: {detail}: give it in `objects` under this name.",
-            errors=(FieldError(f"/motion/others/{index}/object", detail),),
-        )
-    speed = None if given.speed is None else Quantity(given.speed, "px/s")
-    return OtherMotionReading(found[0], given.stated_kind, given.direction, given.depth, speed)
-
-
-def _fitting(reading: MotionReading) -> tuple[MotionReading, tuple[str, ...]]:
-    """The reading without lengths that its kind of motion cannot have, and a warning for them."""
-    unused = [name for name in _OF_A_LINE if getattr(reading, name) not in (None, ())]
-    if reading.kind == "linear" or not unused:
-        return reading, ()
-    cleared = replace(reading, distance=None, duration=None, until=None, steps=())
-    return cleared, (f"The {' and '.join(unused)} of the motion was not used: a {reading.kind} ends by what it meets.",)
+def _quantity(value: float | None, unit: Literal["px", "px/s"]) -> Quantity | None:
+    return None if value is None else Quantity(value, unit)
 
 
 # --- in pixels and seconds
@@ -158,7 +155,7 @@ class Measures:
     """What turns numbers with units into pixels."""
 
     image_width: int  # px
-    scale: MetresPerPixel
+    scale: records.MetresPerPixel
     law: Law
 
     def pixels(self, quantity: Quantity) -> float:
@@ -173,7 +170,7 @@ class Measures:
 
     def speed(self, kind: MotionKind, bbox: BBox, said: SpeedWord | Quantity | None) -> float:
         """px/s of an object in a box; 0 for kinds of motion that have no speed."""
-        if kind not in DIRECTED_KINDS:
+        if kind not in records.DIRECTED_KINDS:
             return 0.0
         if isinstance(said, Quantity):
             return self.pixels(said)
@@ -188,7 +185,7 @@ class Measures:
         return SCALE_DEVIATION if said.unit == "m/s" and self.scale.source == "default" else 0.0
 
 
-def throw_speed(bbox: BBox, scale: MetresPerPixel) -> float:
+def throw_speed(bbox: BBox, scale: records.MetresPerPixel) -> float:
     """px/s of a throw whose speed nobody gave: v^2 / (g R) as of a toy of radius 0.15 m thrown at 1.8 m/s.
 
     How far it gets in the image, in its own radii, does then not depend on the scale, which is uncertain.
@@ -208,13 +205,13 @@ def _unit(vector: Vector) -> Vector:
 
 def _complete(image_width: int, grounding: Grounding, reading: MotionReading, source: Source, law: Law) -> Motion:
     """Adds what a reading leaves open: scale, speed, deviations, gravity and the sentence."""
-    scale = reading.metres_per_pixel or MetresPerPixel(
+    scale = reading.metres_per_pixel or records.MetresPerPixel(
         value=DEFAULT_SCENE_WIDTH / image_width,
         source="default",
         note=f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object",
     )
     measures = Measures(image_width, scale, law)
-    moves, falls = reading.kind in DIRECTED_KINDS, reading.kind in FALLING_KINDS
+    moves, falls = reading.kind in records.DIRECTED_KINDS, reading.kind in records.FALLING_KINDS
     direction = _unit(reading.direction) if moves and reading.direction is not None else None
     depth = reading.depth if moves else 0.0
     depth_deviation = THROW_DEPTH_DEVIATION if reading.kind == "projectile" else 0.0
@@ -224,7 +221,7 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
     if moves and reading.speed_deviation is not None:
         speed_deviation = reading.speed_deviation
     steps = tuple(
-        MotionStep(
+        records.MotionStep(
             direction=_unit(step.direction),
             depth=step.depth,
             distance=None if step.distance is None else measures.pixels(step.distance),
@@ -232,6 +229,23 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         )
         for step in reading.steps
     )
+    others: list[records.AlsoMoving] = []
+    also: list[str] = []
+    for other in reading.others:
+        is_directed = other.kind in records.DIRECTED_KINDS
+        others.append(
+            records.AlsoMoving(
+                object=other.object,
+                kind=other.kind,
+                direction=_unit(other.direction) if is_directed and other.direction is not None else None,
+                depth=other.depth if is_directed else 0.0,
+                speed=measures.speed(other.kind, other.object.bbox, other.speed),
+                speed_deviation=measures.speed_deviation(other.kind, other.speed),
+            )
+        )
+        verb = {"projectile": "is thrown", "fall": "falls", "static": "stays where it is"}.get(other.kind, "moves")
+        way = "" if other.kind in ("fall", "static") else direction_words(other.direction, other.depth)
+        also.append(f"{bare_name(other.object.object)} {verb} {way}".rstrip())
     gravity = GRAVITY / scale.value  # px/s^2
     return Motion(
         kind=reading.kind,
@@ -248,7 +262,7 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         until=reading.until,
         steps=steps,
         trail=reading.trail,
-        others=tuple(_also_moving(other, measures) for other in reading.others),
+        others=tuple(others),
         gravity=(reading.down[0] * gravity, reading.down[1] * gravity) if falls else (0.0, 0.0),
         down=reading.down,
         metres_per_pixel=scale,
@@ -260,21 +274,9 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
             reading.sentence,
             further=[direction_words(step.direction, step.depth) for step in reading.steps],
             stops=any(value is not None for value in (reading.distance, reading.duration, reading.until)),
-            also=[_other_words(other) for other in reading.others],
+            also=also,
         ),
         source=source,
-    )
-
-
-def _also_moving(other: OtherMotionReading, measures: Measures) -> AlsoMoving:
-    moves = other.kind in DIRECTED_KINDS
-    return AlsoMoving(
-        object=other.object,
-        kind=other.kind,
-        direction=_unit(other.direction) if moves and other.direction is not None else None,
-        depth=other.depth if moves else 0.0,
-        speed=measures.speed(other.kind, other.object.bbox, other.speed),
-        speed_deviation=measures.speed_deviation(other.kind, other.speed),
     )
 
 
@@ -302,9 +304,6 @@ def along_trail(
     return motion.model_copy(update=measured)
 
 
-# --- in words
-
-
 def motion_sentence(
     object: str,
     kind: MotionKind,
@@ -329,27 +328,3 @@ def motion_sentence(
         also=also,
     )
     return " ".join(text.split())
-
-
-def _other_words(other: OtherMotionReading) -> str:
-    """What another mover does, such as "car moves to the left"."""
-    verb = {"projectile": "is thrown", "fall": "falls", "static": "stays where it is"}.get(other.kind, "moves")
-    way = "" if other.kind in ("fall", "static") else direction_words(other.direction, other.depth)
-    return " ".join([bare_name(other.object.object), verb, way]).rstrip()
-
-
-def _assumed(motion: Motion, reading: MotionReading) -> tuple[str, ...]:
-    """Warnings for what nobody said: how fast a throw is, and the scale of lengths in metres."""
-    told: list[str] = []
-    if motion.kind == "projectile" and not isinstance(reading.speed, Quantity) and not motion.trail:
-        told.append(
-            f"How far a throw reaches depends on its speed: {motion.speed:.0f} px/s was assumed; "
-            "`motion.speed` sets it."
-        )
-    lengths = [each for each in (reading.speed, reading.distance) if isinstance(each, Quantity)]
-    if motion.metres_per_pixel.source == "default" and any(each.unit in ("m", "m/s") for each in lengths):
-        told.append(
-            f"Lengths in metres were taken at {motion.metres_per_pixel.value:.4f} m per pixel, which was assumed; "
-            "`motion.metres_per_pixel` sets it."
-        )
-    return tuple(told)

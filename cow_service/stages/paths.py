@@ -46,12 +46,12 @@ def record_trajectory(
     """
     shown, request, given = _Shown(situation, result), situation.request, situation.request.trajectory
     worlds, light = shown.worlds, shown.worlds.layout.light
-    placed = shown.record_placed()
+    camera = shown.record_camera()
     placement = None
     if worlds.placements is not None:
         others = None if shown.ensemble is None else shown.ensemble.placements
         placement = _placement(situation.grounding.object, worlds.placements, others)
-    camera = shown.record_camera()
+    placed = shown.record_placed()
     paths = shown.record_paths() if path is None else (shown.record_free_path(path),)
     until = moving_until(paths, request.fps)
     contacts = shown.record_contacts(FloorCamera.of(camera, *situation.size))

@@ -47,11 +47,6 @@ class Situation:
     obstacles: Sequence[Obstacle]
     removed: Sequence[Obstacle] = ()
 
-    @staticmethod
-    def of(scene: Scene, grounding: Grounding, motion: Motion, request: SimulateRequest) -> Situation:
-        """With the obstacles that the scene shows."""
-        return Situation(scene, grounding, motion, request, *obstacles_of(scene, grounding))
-
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the image, px."""
@@ -106,9 +101,14 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     bodies = seen_bodies(situation)
     present = bodies[: 1 + len(situation.obstacles)]
     query = query_of(situation, bodies)
-    flying = bodies[0].bbox if flies(bodies[0], motion) and bodies[0].shape == "sphere" else None
-    fit = camera_of(situation.scene, motion, request.camera, flying, fixed_focal=situation.follows_path)
     carried, before = placement_goals(situation, present)
+    fit = camera_of(
+        situation.scene,
+        motion,
+        request.camera,
+        bodies[0].bbox if bodies[0].shape == "sphere" and flies(bodies[0], motion) else None,
+        fixed_focal=situation.follows_path,
+    )
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}

@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 import uuid
 from collections import abc
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -33,7 +33,17 @@ def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
     Raises `InvalidRequest` with a JSON Pointer for each option that the generator does not take, for a clip that it
     cannot make, and for frames that the clip does not have.
     """
-    options = _read_options(generator, request.generator_options)
+    try:
+        options = generator.options_model.model_validate(request.generator_options)
+    except ValidationError as error:
+        known = ", ".join(sorted(generator.options_model.model_fields)) or "none"
+        fields = tuple(
+            FieldError("/generator_options/" + "/".join(pointer_part(part) for part in item["loc"]), item["msg"])
+            for item in error.errors()
+        )
+        raise InvalidRequest(
+            f"`generator_options` are not valid for this generator. It takes: {known}.", errors=fields
+        ) from error
     if request.num_frames not in (legal := generator.nearest_lengths(request.num_frames)):
         detail = f"this generator makes no clip of {request.num_frames} frames; take {' or '.join(map(str, legal))}"
         raise InvalidRequest(f"`num_frames`: {detail}.", errors=(FieldError("/num_frames", detail),))
@@ -50,20 +60,6 @@ def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
     return options
 
 
-def _read_options(generator: Limits, given: dict[str, Any]) -> BaseModel:
-    try:
-        return generator.options_model.model_validate(given)
-    except ValidationError as error:
-        known = ", ".join(sorted(generator.options_model.model_fields)) or "none"
-        fields = tuple(
-            FieldError("/generator_options/" + "/".join(pointer_part(part) for part in item["loc"]), item["msg"])
-            for item in error.errors()
-        )
-        raise InvalidRequest(
-            f"`generator_options` are not valid for this generator. It takes: {known}.", errors=fields
-        ) from error
-
-
 ALMOST_DONE = 0.999  # of a stage whose end has not been reported
 
 Request_co = TypeVar("Request_co", bound=SimulateRequest, covariant=True)
@@ -71,23 +67,17 @@ Progress = Callable[[Stage | None, float], None]
 """Hears how far a stage is, 0 to 1; the stage is None while the run waits to begin. What it raises ends the run."""
 
 
-class Step(Protocol):
-    """Runs a stage: directly, or as a step whose result is stored and found again."""
-
-    def __call__(
-        self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
-    ) -> tuple[StageResult[Any], bool]:
-        """The stage's result, and whether another request had computed it."""
-        ...
+Compute = Callable[[], StageResult[Any]]
+Step = Callable[[Stage, StageKey, Compute], tuple[StageResult[Any], bool]]
+"""Runs a stage, directly or as a step whose result is stored and found again: the result, and whether another request
+had computed it."""
 
 
 def ignore_progress(stage: Stage | None, done: float) -> None:
     """Does nothing."""
 
 
-def compute_directly(
-    stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
-) -> tuple[StageResult[Any], bool]:
+def compute_directly(stage: Stage, key: StageKey, compute: Compute) -> tuple[StageResult[Any], bool]:
     """Computes every time: for runs that are not resumed."""
     return compute(), False
 
@@ -209,6 +199,15 @@ class Run(Generic[Request_co]):
 
     def stage(self, name: Stage, function: Callable[..., StageResult[Value]], *inputs: Record | None) -> Value:
         """Runs one stage, `function(run, *inputs)`, through `step`, with its time, warnings and usage noted."""
+
+        def compute() -> StageResult[Value]:
+            result = function(self, *inputs)
+            if name not in self._calls:
+                return result
+            calls = self._calls[name]
+            info = self.reader.info.model_copy(update={"prompts": dict(sorted(calls.prompts.items()))})
+            return result.model_copy(update={"reader": info, "usage": calls.usage})
+
         started = time.perf_counter()
         self.report(name, 0.0)
         key = key_of(
@@ -221,9 +220,9 @@ class Run(Generic[Request_co]):
             lambda: bool(getattr(self.reader, "heeds_seed", True)),
         )
         try:
-            result, reused = self.step(name, key, lambda: self._compute(name, function, inputs))
+            result, reused = self.step(name, key, compute)
         except CowError as error:
-            spent = self.usage(*self.results, name)
+            spent = self.usage(stage for stage in (*self.results, name) if stage not in self.reused)
             error.usage = spent.model_dump() if spent.calls else None
             raise
         self.results[name] = result
@@ -291,19 +290,19 @@ class Run(Generic[Request_co]):
         repeats = getattr(self.reader, "repeats_answers", None)
         return repeats is not None and repeats(votes)
 
-    def usage(self, *stages: Stage) -> Usage:
-        """What some stages of this request asked of a multimodal LLM, failed ones of this process included."""
-        return sum((self._usage_of(stage) for stage in stages if stage not in self.reused), Usage())
-
-    def usage_total(self, *stages: Stage) -> Usage:
-        """The same without reuse: results of other requests count as if they had been computed for this one."""
-        return sum((self._usage_of(stage) for stage in stages), Usage())
+    def usage(self, stages: Iterable[Stage]) -> Usage:
+        """What some stages asked of a multimodal LLM, failed ones of this process included."""
+        asked = (self._calls.get(stage) or self.results.get(stage) for stage in stages)
+        return sum((each.usage for each in asked if each is not None), Usage())
 
     def accounts(self, *stages: Stage) -> dict[str, Any]:
-        """What some stages cost and took, and which of them were reused: fields of a result."""
+        """What some stages cost and took, and which of them were reused: fields of a result.
+
+        In total, results of other requests count as if they had been computed for this one.
+        """
         return {
-            "usage": self.usage(*stages),
-            "usage_total": self.usage_total(*stages),
+            "usage": self.usage(stage for stage in stages if stage not in self.reused),
+            "usage_total": self.usage(stages),
             "timings": {stage: seconds for stage, seconds in self.timings.items() if stage in stages},
             "reused": tuple(stage for stage in self.reused if stage in stages),
         }
@@ -321,22 +320,9 @@ class Run(Generic[Request_co]):
         """The warnings of some stages."""
         return tuple(warning for stage in stages for warning in self.results[stage].warnings)
 
-    def _usage_of(self, stage: Stage) -> Usage:
-        if stage in self._calls:
-            return self._calls[stage].usage
-        return self.results[stage].usage if stage in self.results else Usage()
-
     def _identity(self, backend: BackendRole) -> dict[str, Any] | None:
         """All that decides the work of a backend; None where one of another package does not say."""
         fingerprint = getattr(self.reader if backend == "reader" else self.generator, "fingerprint", None)
         if fingerprint is None or backend == "reader":
             return None if fingerprint is None else {"reader": fingerprint}
         return {"generator": fingerprint, "options": self.generator_options.model_dump(mode="json")}
-
-    def _compute(self, name: Stage, function: Callable[..., StageResult[Any]], inputs: tuple[Any, ...]) -> Any:
-        result = function(self, *inputs)
-        if name not in self._calls:
-            return result
-        calls = self._calls[name]
-        info = self.reader.info.model_copy(update={"prompts": dict(sorted(calls.prompts.items()))})
-        return result.model_copy(update={"reader": info, "usage": calls.usage})

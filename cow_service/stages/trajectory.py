@@ -13,7 +13,7 @@ from cow_service.records import Asked, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.paths import record_trajectory
-from cow_service.stages.reconstruction import Situation, reconstruct
+from cow_service.stages.reconstruction import Situation, obstacles_of, reconstruct
 from cow_service.stages.run import Run
 
 BY_ENCOUNTERS = (*KIND_OF, "tips", "moves", "leaves", "lands")  # relations that encounters and paths decide
@@ -24,7 +24,8 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
         scene = run.scene_of(grounding, motion.cue)
-        trajectory = simulate_world(Situation.of(scene, grounding, motion, run.request))
+        situation = Situation(scene, grounding, motion, run.request, *obstacles_of(scene, grounding))
+        trajectory = simulate_world(situation)
     return StageResult(value=trajectory, warnings=_warnings(run.request, grounding, trajectory))
 
 

@@ -51,33 +51,27 @@ _SEVERAL = re.compile(r"\b(?:both|all|several|more than one|at the same time|sim
 
 
 def says_it_happens(text: str, asked: Asked) -> bool | None:
-    """Whether an option says that what is asked happens; None where it does not say so plainly."""
-    bare = text.strip().rstrip(".!")
+    """Whether an option says that what is asked happens; None where it does not say so plainly.
+
+    It may say that the mover touches, hides or is hidden by the thing asked about, in words of that alone.
+    """
+    bare, said = text.strip().rstrip(".!"), _unfolded(text)
     if _YES.fullmatch(bare) or _NO.fullmatch(bare):
         return _YES.fullmatch(bare) is not None
-    said = _unfolded(text)
     if said in _BARE:
         return _BARE[said]
-    event = _says_event(said.split(), asked)
-    return None if event is None else event != asked.negated
-
-
-def _says_event(words: list[str], asked: Asked) -> bool | None:
-    """Whether it says that the mover touches, hides or is hidden by the thing asked about, in words of that alone."""
-    yes, no = (_TOUCHING, _MISSING) if asked.relation == "touches" else (_COVERING, _SEEN)
+    words, (yes, no) = said.split(), (_TOUCHING, _MISSING) if asked.relation == "touches" else (_COVERING, _SEEN)
     about = [at for at, word in enumerate(words) if word in yes | no]
     if len(about) != 1:
         return None
     known = yes | no | _NEGATIONS | _FILLERS
-    known |= _ANY_WORDS if asked.target is None else set(plain(asked.target).split())
-    if asked.target is not None:
-        known -= {"nothing"}
+    known = known | _ANY_WORDS if asked.target is None else (known | set(plain(asked.target).split())) - {"nothing"}
     before, after = words[: about[0]], words[about[0] + 1 :]
     acting = asked.relation != "covered" and _PASSIVE.isdisjoint(before)  # then the mover is spoken of, by any name
-    if not set(after if acting else words) <= known:
-        return None
     turned = sum(word in _NEGATIONS for word in words)
-    return None if turned > 1 else (words[about[0]] in yes) != (turned == 1)
+    if turned > 1 or not set(after if acting else words) <= known:
+        return None
+    return ((words[about[0]] in yes) != (turned == 1)) != asked.negated
 
 
 def names_none(text: str) -> bool:
@@ -144,15 +138,17 @@ def spans(said: Sequence[Span]) -> list[Span]:
     """The span that each time stands for: a value, for all that is nearer to it than to another value named."""
     values = sorted({low for low, high in said if low == high})
     gaps = [high - low for low, high in pairwise(values)]
-    return [_around(low, values, gaps) if low == high else (low, high) for low, high in said]
-
-
-def _around(value: float, values: Sequence[float], gaps: Sequence[float]) -> Span:
-    if not gaps:
-        return value * (1 - ALONE), value * (1 + ALONE)
-    at = values.index(value)
-    before, after = gaps[max(at - 1, 0)], gaps[min(at, len(gaps) - 1)]
-    return max(value - before / 2, 0.0), value + after / 2
+    found: list[Span] = []
+    for low, high in said:
+        if low != high:
+            found.append((low, high))
+        elif gaps:
+            at = values.index(low)
+            before, after = gaps[max(at - 1, 0)], gaps[min(at, len(gaps) - 1)]
+            found.append((max(low - before / 2, 0.0), low + after / 2))
+        else:
+            found.append((low * (1 - ALONE), low * (1 + ALONE)))
+    return found
 
 
 def count_of(text: str) -> range | None:
@@ -287,35 +283,22 @@ def _in_words(outcome: Outcome) -> str:
 
 def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
     """The options that say what the world says."""
-    match outcome.asked.form:
-        case "whether" | "changes":
-            happens = _happens(outcome)
-            return [option for option in options if says_it_happens(option.text, outcome.asked) is happens]
-        case "which-first":
-            return _naming(options, outcome.first)
-        case "when":
-            return _at_time(options, outcome)
-        case "how-many":
-            return [option for option in options if outcome.count in (count_of(option.text) or range(0))]
-        case "where" | "what-happens":
-            return []
-
-
-def _naming(options: Sequence[AnswerOption], first: str | None) -> list[AnswerOption]:
-    if first is None:
+    form, first = outcome.asked.form, outcome.first
+    if form in ("whether", "changes"):
+        happens = _happens(outcome)
+        return [option for option in options if says_it_happens(option.text, outcome.asked) is happens]
+    if form == "how-many":
+        return [option for option in options if outcome.count in (count_of(option.text) or range(0))]
+    if (form == "which-first" and first is None) or (form == "when" and outcome.time is None):
         return [option for option in options if names_none(option.text)]
-    if any(names_several(option.text) for option in options):
-        return []
-    said = [(option, parse_noun_phrase(option.text)) for option in options if not names_none(option.text)]
-    return [option for option, phrase in said if phrase is not None and may_name(phrase, first)]
-
-
-def _at_time(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
-    """The one option in whose span the time lies, where no other option's meets the band of times."""
-    if outcome.time is None:
-        return [option for option in options if names_none(option.text)]
-    said = [(option, span) for option in options if (span := seconds_of(option.text)) is not None]
-    low, high = outcome.time_band or (outcome.time, outcome.time)
-    placed = list(zip([option for option, _ in said], spans([span for _, span in said]), strict=True))
-    met = [(option, span) for option, span in placed if span[0] <= high and span[1] >= low]
-    return [option for option, (start, end) in met if len(met) == 1 and start <= outcome.time <= end]
+    if form == "which-first" and first is not None and not any(names_several(option.text) for option in options):
+        named = [(option, parse_noun_phrase(option.text)) for option in options if not names_none(option.text)]
+        return [option for option, phrase in named if phrase is not None and may_name(phrase, first)]
+    if form == "when" and outcome.time is not None:
+        # The one option in whose span the time lies, where no other option's meets the band of times.
+        said = [(option, span) for option in options if (span := seconds_of(option.text)) is not None]
+        low, high = outcome.time_band or (outcome.time, outcome.time)
+        placed = zip([option for option, _ in said], spans([span for _, span in said]), strict=True)
+        met = [(option, span) for option, span in placed if span[0] <= high and span[1] >= low]
+        return [option for option, (start, end) in met if len(met) == 1 and start <= outcome.time <= end]
+    return []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cow_service.physics.camera import FOCAL_WIDTHS, FloorCamera
 from cow_service.records import BBox, Vector
-from cow_service.vision.masks import bbox_of, resized_mask, scaled, without_holes
+from cow_service.vision.masks import bbox_of, lab_of, resized_mask, scaled, without_holes
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 PAINT, DARK, OTHER = 1, 2, 3  # labels of pixels, 0 beside it: the body's colour, tyres, and glass and lamps
@@ -67,10 +67,10 @@ class VehicleModel:
         model = VehicleModel(camera, foot, yaw, size, np.zeros(2))
         for _ in range(_FITS):
             low, high = model._extent()
-            size *= math.sqrt((x1 - x0) * (y1 - y0) / max(1e-6, float(np.prod(high - low))))
-            model = VehicleModel(camera, foot, yaw, size, np.zeros(2))
+            factor = math.sqrt((x1 - x0) * (y1 - y0) / max(1e-6, float(np.prod(high - low))))
+            model = replace(model, scale=model.scale * factor)
         low, high = model._extent()
-        return VehicleModel(camera, foot, yaw, model.scale, np.array([x0 + x1, y0 + y1]) / 2 - (low + high) / 2)
+        return replace(model, shift=np.array([x0 + x1, y0 + y1]) / 2 - (low + high) / 2)
 
     @property
     def ahead(self) -> Floats:
@@ -81,7 +81,9 @@ class VehicleModel:
     def drawn(self, corner: tuple[int, int], scale: float, shape: tuple[int, int]) -> Labels:
         """Labels [h, w] of a window of the image from a corner [x, y] (px) on, resized by a scale."""
         labels = np.zeros(shape, np.uint8)
-        ahead, left = self._eye()
+        # Where the camera is in the car's frame: ahead of and to the left of its middle.
+        (right, _, depth), cosine, sine = -self.foot, math.cos(self.yaw), math.sin(self.yaw)
+        ahead, left = (cosine * right + sine * depth) / self.scale, (cosine * depth - sine * right) / self.scale
         near = 1 if left > 0 else -1
         parts = [(part, DARK) for part in _WHEELS[-near]] + [(_BODY, PAINT)]
         parts += [(part, OTHER) for part in _LAMPS if ahead > _BODY[:, 0].max()]
@@ -106,12 +108,6 @@ class VehicleModel:
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         floor = np.column_stack([cosine * ahead - sine * left, up, sine * ahead + cosine * left])
         return self.camera.project(self.camera.from_floor(floor + self.foot)) + self.shift
-
-    def _eye(self) -> tuple[float, float]:
-        """Where the camera is in the car's frame: ahead of and to the left of its middle."""
-        right, ahead = -self.foot[0], -self.foot[2]
-        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
-        return (cosine * right + sine * ahead) / self.scale, (cosine * ahead - sine * right) / self.scale
 
 
 WORKING_SIDE = 80  # px: the vehicle is compared at this size
@@ -170,22 +166,18 @@ def facing(image: Image, mask: Mask, bbox: BBox) -> Vector | None:
 
 def _fits(image: Image, seen: _Seen, pitches: Iterable[float], turns: Floats) -> Iterable[tuple[float, VehicleModel]]:
     """The models of these cameras and turns with their scores."""
-    height, width = image.shape[:2]
+    (height, width), inside = image.shape[:2], seen.labels > 0
+    least = SMOOTHING * float(inside.sum())
     for pitch in pitches:
         camera = FloorCamera(width, height, FOCAL_WIDTHS * width, pitch, 0.0, 1.0)
         for yaw in turns.tolist():
             model = VehicleModel.fitted(camera, seen.bbox, yaw)
             if model is not None:
-                yield _score(seen.labels, model.drawn(seen.corner, seen.scale, seen.labels.shape[:2])), model
-
-
-def _score(seen: Labels, model: Labels) -> float:
-    """Intersection over union of the outlines, and the weighted agreement of the parts."""
-    inside, drawn = seen > 0, model > 0
-    whole = float((inside & drawn).sum()) / max(1, int((inside | drawn).sum()))
-    least = SMOOTHING * float(inside.sum())
-    tyres, glass = (_dice(seen == label, model == label, least) for label in (DARK, OTHER))
-    return whole + TYRES * tyres + GLASS * glass
+                # Intersection over union of the outlines, and the weighted agreement of the parts.
+                drawn = model.drawn(seen.corner, seen.scale, seen.labels.shape[:2])
+                whole = float((inside & (drawn > 0)).sum()) / max(1, int((inside | (drawn > 0)).sum()))
+                tyres, glass = (_dice(seen.labels == label, drawn == label, least) for label in (DARK, OTHER))
+                yield whole + TYRES * tyres + GLASS * glass, model
 
 
 def _dice(a: Mask, b: Mask, least: float) -> float:
@@ -204,7 +196,7 @@ def _seen(image: Image, mask: Mask, bbox: BBox) -> _Seen | None:
     if not own.any():
         return None
     near = (x0 - left) * scale, (y0 - top) * scale, (x1 - left) * scale, (y1 - top) * scale
-    labels = _labels(np.asarray(cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32), own, near)
+    labels = _labels(lab_of(small), own, near)
     x0, y0, x1, y1 = (side / scale for side in bbox_of(labels > 0))
     return _Seen(labels, (left + x0, top + y0, left + x1, top + y1), (left, top), scale)
 
@@ -216,36 +208,28 @@ def _labels(lab: Floats32, own: Mask, near: BBox) -> Labels:
     paint, colour = float(np.median(lightness[inner])), np.median(lab[..., 1:][inner], axis=0)
     floor = float(np.median(lightness[~own])) if not own.all() else 100.0
     dark = (lightness < min(TYRE_SHARE * floor, TYRE_LIGHTNESS)) & (chroma < TYRE_CHROMA) & (paint > BLACK)
-    whole = _with_tyres(own, dark, near)
-    filled = without_holes(_closed(whole))
+    # Tyres are what is dark, touches it and lies in the lower half of the box or below.
+    x0, y0, x1, y1 = near
+    beside = 0.05 * (x1 - x0)
+    columns, rows = np.arange(own.shape[1])[None], np.arange(own.shape[0])[:, None]
+    tyres = dark & (rows > (y0 + y1) / 2) & (columns > x0 - beside) & (columns < x1 + beside)
+    count, parts = cv2.connectedComponents((own | tyres).astype(np.uint8))
+    whole = parts == int(np.argmax(np.bincount(parts[own], minlength=count)))
+    slits = np.ones((SLIT, SLIT), np.uint8)  # narrow ones are closed
+    filled = without_holes(cv2.morphologyEx(whole.astype(np.uint8), cv2.MORPH_CLOSE, slits) > 0)
     away = np.hypot(*(lab[..., 1:] - colour).transpose(2, 0, 1))
     tint = float(np.hypot(*colour))
     other = away > max(OTHER_STEP, OTHER_SHARE * tint)
     if tint < NEUTRAL:
         other |= away > TINTED if paint < BLACK else lightness < DARKER * paint
     _, top, _, bottom = bbox_of(filled)
-    down = (np.arange(len(own))[:, None] - top) / max(1.0, bottom - 1 - top)
+    down = (rows - top) / max(1.0, bottom - 1 - top)
     other &= (down <= LOW_PART) | (lightness > paint)
     labels = np.where(filled, np.uint8(PAINT), np.uint8(0))
     labels[_eroded(filled) & other | filled & ~whole] = OTHER
     labels[filled & dark & (down > HIGH_PART)] = DARK
     labels[filled & dark & (down <= HIGH_PART)] = OTHER
     return labels
-
-
-def _with_tyres(own: Mask, dark: Mask, near: BBox) -> Mask:
-    """The mask with what is dark, touches it and lies in the lower half of a box [x0, y0, x1, y1] or below."""
-    x0, y0, x1, y1 = near
-    beside = 0.05 * (x1 - x0)
-    columns, rows = np.arange(own.shape[1])[None], np.arange(own.shape[0])[:, None]
-    tyres = dark & (rows > (y0 + y1) / 2) & (columns > x0 - beside) & (columns < x1 + beside)
-    count, parts = cv2.connectedComponents((own | tyres).astype(np.uint8))
-    return parts == int(np.argmax(np.bincount(parts[own], minlength=count)))
-
-
-def _closed(mask: Mask) -> Mask:
-    """The mask without narrow slits."""
-    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((SLIT, SLIT), np.uint8)) > 0
 
 
 def _eroded(mask: Mask) -> Mask:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,22 +13,12 @@ from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, words
 from cow_service.readers.embedded.english.noun_phrases import TABLES
-from cow_service.readers.embedded.english.nouns import (
-    Kind,
-    container_form,
-    is_cube,
-    is_vehicle,
-    kind_of,
-    may_name,
-    shape_of,
-)
+from cow_service.readers.embedded.english.nouns import Kind, kind_of, may_name
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.outlines import contradicts, form_of, is_cut, log_ratio
-from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT
-from cow_service.records import BBox, LocatedObject, ObjectPrior
-from cow_service.vision.masks import iou
-from cow_service.vision.regions import SAME_OBJECT_IOU, Region
+from cow_service.records import BBox, LocatedObject
+from cow_service.vision.regions import Region, is_same_object
 from cow_service.vision.scene import Scene
 
 LEAD = 0.25  # of the mean size of the regions: so far ahead of the next one in place
@@ -73,8 +63,18 @@ def at_place(regions: Sequence[Region], relation: str, beside: Region | None) ->
     lead = LEAD * _size(regions)
     if beside is None:
         return _first(regions, (2, -1 if relation == "far" else 1), lead)
-    x, y = beside.centre
-    possible = [region for region in regions if _is_there(region, relation, beside)]
+    (x, y), (x0, _, x1, y1) = beside.centre, beside.bbox
+    # On the side that the relation names; near and far are on every side.
+    sides: dict[str, Callable[[Region], bool]] = {
+        "behind": lambda region: region.bbox[0] < x1 and region.bbox[2] > x0 and region.bbox[3] < y1,
+        "front_of": lambda region: region.bbox[0] < x1 and region.bbox[2] > x0 and region.bbox[3] > y1,
+        "left_of": lambda region: region.centre[0] < x,
+        "right_of": lambda region: region.centre[0] > x,
+        "above": lambda region: region.centre[1] < y and x0 < region.centre[0] < x1,
+        "on": lambda region: region.centre[1] < y and x0 < region.centre[0] < x1,
+        "below": lambda region: region.centre[1] > y and x0 < region.centre[0] < x1,
+    }
+    possible = [region for region in regions if relation not in sides or sides[relation](region)]
     if len(possible) < 2:
         return possible
     sign = -1 if relation == "far" else 1
@@ -83,29 +83,12 @@ def at_place(regions: Sequence[Region], relation: str, beside: Region | None) ->
     return ranked[:1] if gap >= lead else possible
 
 
-def _is_there(region: Region, relation: str, beside: Region) -> bool:
-    """Whether a region is on the side of another one that a relation names; near and far are on every side."""
-    (x, y), (x0, _, x1, y1) = beside.centre, beside.bbox
-    own_x, own_y = region.centre
-    overlaps = region.bbox[0] < x1 and region.bbox[2] > x0
-    sides = {
-        "behind": overlaps and region.bbox[3] < y1, "front_of": overlaps and region.bbox[3] > y1,
-        "left_of": own_x < x, "right_of": own_x > x,
-        "above": own_y < y and x0 < own_x < x1, "on": own_y < y and x0 < own_x < x1,
-        "below": own_y > y and x0 < own_x < x1,
-    }  # fmt: skip
-    return sides.get(relation, True)
-
-
 def _first(regions: Sequence[Region], measure: tuple[int, int], lead: float) -> list[Region]:
+    """The region that is first by one of `_MEASURES`; all of them where it has no clear lead."""
     which, sign = measure
-    ranked = sorted(regions, key=lambda region: -sign * _places(region)[which])
-    ahead = abs(_places(ranked[0])[which] - _places(ranked[1])[which])
-    return [ranked[0]] if ahead >= lead else list(regions)
-
-
-def _places(region: Region) -> tuple[float, float, float]:
-    return *region.centre, region.bbox[3]
+    ranked = sorted(((*region.centre, region.bbox[3])[which] * -sign, i) for i, region in enumerate(regions))
+    ahead = ranked[1][0] - ranked[0][0]
+    return [regions[ranked[0][1]]] if ahead >= lead else list(regions)
 
 
 def _size(regions: Sequence[Region]) -> float:
@@ -158,55 +141,40 @@ def _best(names: Sequence[ObjectPhrase], rows: Sequence[Row], taken: tuple[tuple
     ahead = sum(max(0.0, max(row, default=0.0)) for row in rows[at + 1 :])
     # Of more regions than there are names, the worse ones are never needed.
     for region in [*sorted(range(len(rows[at])), key=lambda region: -rows[at][region])[: len(names)], NOWHERE]:
-        sharing = [_shared(names[at], names[name]) for name, other in taken if other == region != NOWHERE]
-        ratio = UNSEEN if region == NOWHERE else rows[at][region] + sum(sharing)
+        ratio = UNSEEN if region == NOWHERE else rows[at][region]
+        for other in (names[name] for name, other in taken if other == region != NOWHERE):
+            # One region under two names.
+            colours = {names[at].colour, other.colour} - {None}
+            forms = {form_of(names[at].head), form_of(other.head)} - {None}
+            ratio += SHARED if len(colours) < 2 and len(forms) < 2 else IMPOSSIBLE
         if ratio + ahead > best:
             best = max(best, ratio + _best(names, rows, (*taken, (at, region))))
     return best
 
 
-def _shared(one: ObjectPhrase, other: ObjectPhrase) -> float:
-    """The log ratio of one region under two names."""
-    colours, forms = {one.colour, other.colour} - {None}, {form_of(one.head), form_of(other.head)} - {None}
-    return SHARED if len(colours) < 2 and len(forms) < 2 else IMPOSSIBLE
-
-
-def is_poor(region: Region, phrase: ObjectPhrase) -> bool:
-    """Whether no colour says for certain that a region is meant, and its outline speaks against that."""
-    return region.colour != phrase.colour and _shape_ratio(region, phrase) < POOR
-
-
-def is_clear(region: Region, phrase: ObjectPhrase) -> bool:
-    """Whether a region is what a noun names, whatever else is there."""
-    return _shape_ratio(region, phrase) > CLEAR
-
-
 def _row(regions: Sequence[Region], phrase: ObjectPhrase) -> Row:
-    return [_shape_ratio(region, phrase) + _colour_ratio(region, phrase) for region in regions]
-
-
-def _colour_ratio(region: Region, phrase: ObjectPhrase) -> float:
-    if phrase.colour is None:
-        return 0.0
-    if region.colour == phrase.colour:
-        return EXACT
-    return NEAR if phrase.colour in region.colours else IMPOSSIBLE
+    row: Row = []
+    for region in regions:
+        if phrase.colour is None:
+            colour = 0.0
+        elif region.colour == phrase.colour:
+            colour = EXACT
+        else:
+            colour = NEAR if phrase.colour in region.colours else IMPOSSIBLE
+        row.append(_shape_ratio(region, phrase) + colour)
+    return row
 
 
 def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
     """By outline; one that the border cuts says less."""
     form = form_of(phrase.head)
-    if form is None or not _can_be(region, phrase):
-        return 0.0 if _can_be(region, phrase) else IMPOSSIBLE
-    return (CUT if is_cut(region) else 1.0) * min(SURE, max(LEAST, log_ratio(region, form)))
-
-
-def _can_be(region: Region, phrase: ObjectPhrase) -> bool:
-    """Whether a region is round where the noun names something round, and not where it does not."""
-    form = form_of(phrase.head)
+    # A region is round where the noun names something round, and not where it does not.
+    can_be = not region.is_disc or (form is None and phrase.head not in _SOLID)
     if form == "ball":
-        return region.roundness >= (ROUND if phrase.colour is None else NOT_ROUND)
-    return not region.is_disc or (form is None and phrase.head not in _SOLID)
+        can_be = region.roundness >= (ROUND if phrase.colour is None else NOT_ROUND)
+    if form is None or not can_be:
+        return 0.0 if can_be else IMPOSSIBLE
+    return (CUT if is_cut(region) else 1.0) * min(SURE, max(LEAST, log_ratio(region, form)))
 
 
 WHOLE = 0.7  # share of a region that must lie inside a drawn box to be the thing in it
@@ -231,14 +199,11 @@ def best_matches(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequen
 
 def _fitting(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[Region]:
     """Regions that fit a phrase about as well as the best does, where the other phrases have theirs."""
-    tables = _tables(regions) if phrase.head in TABLES else []
+    tables: list[Region] = []
+    if phrase.head in TABLES:  # what others stand on
+        bodies = [SeenBody(region.colour, region.bbox, region.mask, "box") for region in regions]
+        tables = [regions[i] for i in dict.fromkeys(supports_of(bodies)) if i is not None]
     return singled_out(_foremost(tables or regions, phrase, others), phrase)
-
-
-def _tables(regions: Sequence[Region]) -> list[Region]:
-    """Regions that others stand on."""
-    bodies = [SeenBody(region.colour, region.bbox, region.mask, "box") for region in regions]
-    return [regions[i] for i in dict.fromkeys(supports_of(bodies)) if i is not None]
 
 
 def _foremost(
@@ -249,7 +214,9 @@ def _foremost(
     ranked = sorted((ratio for ratio in ratios if ratio > IMPOSSIBLE), reverse=True)
     least = ranked[min(count, len(ranked)) - 1] - CLEARLY_WORSE if ranked else 0.0
     fitting = [region for region, ratio in zip(regions, ratios, strict=True) if ratio > max(IMPOSSIBLE, least)]
-    return [] if all(is_poor(region, phrase) for region in fitting) else fitting
+    # Where no colour says for certain that one is meant, and the outlines speak against it, none is.
+    is_sure = any(each.colour == phrase.colour or _shape_ratio(each, phrase) >= POOR for each in fitting)
+    return fitting if is_sure else []
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase] = ()) -> Region | None:
@@ -258,23 +225,15 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[
     return fitting[0] if len(fitting) == 1 else None
 
 
-def match_both(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[Region]:
-    """The two regions that fit a phrase such as "both mugs"; empty where it is not clear which two."""
-    return match_some(regions, phrase, others, 2)
-
-
-def match_some(
-    regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase], count: int
+def match_several(
+    regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase], count: int | None
 ) -> list[Region]:
-    """The so many regions that fit a phrase; empty where it is not clear which."""
-    fitting = _foremost(regions, phrase, others, count)
-    return fitting if len(fitting) == count else []
-
-
-def match_all(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[Region]:
-    """All regions that fit a phrase such as "mugs"; empty where it is not clear of each whether it is one."""
-    fitting = _foremost(regions, phrase, others)
-    return fitting if all(is_clear(region, phrase) for region in fitting) else []
+    """The so many regions that fit a phrase such as "both mugs", or all; empty where it is not clear which."""
+    fitting = _foremost(regions, phrase, others, count or 1)
+    is_clear = len(fitting) == count
+    if count is None:
+        is_clear = all(_shape_ratio(region, phrase) > CLEAR for region in fitting)
+    return fitting if is_clear else []
 
 
 def inside_drawn_box(scene: Scene, phrase: ObjectPhrase, remedy: str) -> BBox:
@@ -308,45 +267,32 @@ def things_of_kinds(
     Raises `CannotGround`.
     """
     asked, found = read_asked(question), list[LocatedObject]()
-    left = [region for region in regions if iou(region.bbox, mover) < SAME_OBJECT_IOU]
-    for name in () if asked is None else asked.among:
+    among = () if asked is None else asked.among
+    left = [region for region in regions if not is_same_object(region.bbox, mover)]
+    for name in among:
         kind = kind_of(name)
         if kind is None or any(may_name(kind.phrase, each.object) for each in given):
             continue
-        fitting = _of_kind(left, kind, [other for other in question.others if not is_kind_asked(other, question)])
+        others = [other for other in question.others if not is_kind_asked(other, question)]
+        fitting = match_several(left, kind.phrase, others, kind.count)
         if not fitting:
             raise CannotGround(
                 f"The question asks about '{name}', and which things those are the image does not tell for certain. "
                 f"Seen: {describe(regions)}. {GIVE_OBJECT}"
             )
         found += _named(fitting, kind)
-    return (*found, *_alternatives(left, question, given))
-
-
-def _alternatives(regions: Sequence[Region], question: Question, given: Sequence[LocatedObject]) -> list[LocatedObject]:
-    """Those of the kind in "which mug does it hit first"; none where the image does not tell which those are."""
-    asked, found = read_asked(question), list[LocatedObject]()
+    # Those of the kind in "which mug does it hit first"; none where the image does not tell which those are.
     for phrase in read_alternatives(question):
         kind = kind_of(phrase.text) or Kind(phrase, None)
-        listed = asked is None or phrase.text in asked.among or phrase.colour is not None or kind.phrase.head is None
+        listed = asked is None or phrase.text in among or phrase.colour is not None or kind.phrase.head is None
         if not listed and not any(may_name(kind.phrase, each.object) for each in given):
-            found += _named(_of_kind(regions, kind, ()), kind)
-    return found
+            found += _named(match_several(left, kind.phrase, (), kind.count), kind)
+    return tuple(found)
 
 
 def _named(regions: Sequence[Region], kind: Kind) -> list[LocatedObject]:
-    names = [f"{region.colour} {kind.phrase.head}" for region in regions]
-    return [
-        LocatedObject(object=name, bbox=region.bbox, source="embedded")
-        for name, region in zip(names, regions, strict=True)
-    ]
-
-
-def _of_kind(regions: Sequence[Region], kind: Kind, others: Sequence[ObjectPhrase]) -> list[Region]:
-    """The regions of a kind; none where others may be of it, too, or where they are not as many as is said."""
-    if kind.count is not None:
-        return match_some(regions, kind.phrase, others, kind.count)
-    return match_all(regions, kind.phrase, others)
+    head = kind.phrase.head
+    return [LocatedObject(object=f"{each.colour} {head}", bbox=each.bbox, source="embedded") for each in regions]
 
 
 def is_kind_asked(phrase: ObjectPhrase, question: Question) -> bool:
@@ -359,7 +305,7 @@ def noun_warnings(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> l
     """A warning for each thing whose noun is not known, or whose outline is not that of the noun."""
     warnings: list[str] = []
     for phrase, bbox in found:
-        region = next((each for each in scene.regions if iou(each.bbox, bbox) >= SAME_OBJECT_IOU), None)
+        region = next((each for each in scene.regions if is_same_object(each.bbox, bbox)), None)
         if region is None or phrase.inside_box:
             continue
         place = f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})"
@@ -371,23 +317,3 @@ def noun_warnings(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> l
         elif contradicts(region, phrase.head):
             warnings.append(f"'{phrase.text}' was taken for what is {place}, which does not look like '{phrase.head}'.")
     return warnings
-
-
-def read_name(name: str) -> ObjectPrior:
-    """What a noun says of a thing's shape."""
-    opening = container_form(name)
-    return ObjectPrior(
-        shape=shape_of(name),
-        elongated=is_vehicle(name),
-        equal_sided=is_cube(name),
-        opening=None if opening == "unknown" else opening,
-    )
-
-
-def names_meant(words: str, names: Sequence[str]) -> tuple[str, ...]:
-    """Those of a kind such as "both mugs", where there are as many as is said; else the words themselves."""
-    kind = kind_of(words)
-    if kind is None or any(plain(name) == plain(words) for name in names):
-        return (words,)
-    found = tuple(name for name in names if may_name(kind.phrase, name))
-    return found if found and kind.count in (None, len(found)) else (words,)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TypedDict, TypeVar
 
@@ -10,7 +9,6 @@ from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
-from cow_service.readers.embedded.english.interventions import TrailWords
 from cow_service.readers.embedded.english.lexicon import QuantityWords
 from cow_service.readers.embedded.english.motion import MotionWords, OtherWords, StepWords
 from cow_service.readers.embedded.english.questions import Question
@@ -18,7 +16,7 @@ from cow_service.readers.embedded.matching import best_matches, describe, match_
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, Until, Vector
 from cow_service.vision.scene import Scene
-from cow_service.vision.trails import Trail, TrailEnd, trail_of
+from cow_service.vision.trails import TrailEnd, trail_of
 
 _T = TypeVar("_T")
 
@@ -79,27 +77,23 @@ def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[
     """What else is set moving. Raises `CannotReadDirection` where it was not found, or which way is not said."""
     readings: list[OtherMotionReading] = []
     for other in others:
-        found = next((each for each in grounding.others if each.object == other.object.text), None)
-        kind, motion = other.motion.kind or "linear", other.motion
+        name, motion, kind = other.object.text, other.motion, other.motion.kind or "linear"
+        found = next((each for each in grounding.others if each.object == name), None)
         if found is None:
-            raise CannotReadDirection(f"'{other.object.text}' moves, too, and was not found. {GIVE_DIRECTION}")
-        way = (None, 0.0) if kind not in DIRECTED_KINDS else _way(_aimed(other, grounding), motion.depth)
-        if way[0] is None and kind in DIRECTED_KINDS:
-            raise CannotReadDirection(f"Which way '{other.object.text}' moves was not understood. {GIVE_DIRECTION}")
+            raise CannotReadDirection(f"'{name}' moves, too, and was not found. {GIVE_DIRECTION}")
+        way = None, 0.0
+        if kind in DIRECTED_KINDS:
+            direction = motion.direction
+            if direction is None and motion.towards is not None:
+                things = [(each.object, each.bbox) for each in grounding.others] + [(grounding.object, grounding.bbox)]
+                goal = next((bbox for thing, bbox in things if thing == motion.towards.text), None)
+                if goal is not None:  # from centre to centre
+                    (x0, y0, x1, y1), start = goal, found.bbox
+                    direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
+            way = _way(direction, motion.depth)
         speed = quantities(motion.quantities, None)["speed"]
         readings.append(OtherMotionReading(found, kind, way[0], way[1], speed))
     return tuple(readings)
-
-
-def _aimed(other: OtherWords, grounding: Grounding) -> Vector | None:
-    """The direction of a second mover: as said, or towards a thing that was found."""
-    if other.motion.direction is not None or other.motion.towards is None:
-        return other.motion.direction
-    goal = other.motion.towards.text
-    things = [(each.object, each.bbox) for each in grounding.others] + [(grounding.object, grounding.bbox)]
-    boxes = [bbox for name, bbox in things if name == goal]
-    own = next(bbox for name, bbox in things if name == other.object.text)
-    return None if not boxes else difference(own, boxes[0])
 
 
 def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
@@ -108,16 +102,6 @@ def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
     if direction is None:
         raise CannotReadDirection(f"Which way a part of the motion goes was not understood. {GIVE_DIRECTION}")
     return direction, depth
-
-
-def difference(start: Sequence[float], end: Sequence[float]) -> Vector:
-    """From the centre of one box to that of another, px."""
-    return ((end[0] + end[2] - start[0] - start[2]) / 2, (end[1] + end[3] - start[1] - start[3]) / 2)
-
-
-def length(vector: Vector) -> float:
-    """px."""
-    return math.hypot(*vector)
 
 
 def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, ...]]:
@@ -134,10 +118,21 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     if len(trails) != 1:
         return scene, ()
     trail, warnings = trails[0], ()
+    beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
     if words is not None:
-        trail = trail.ending(TrailEnd(_near(scene, words, trail), words.side, is_oldest=not words.last))
+        near = None if words.near is None else match_one(beside, words.near)
+        if words.near is not None and near is None:
+            raise CannotGround(
+                f"The question tells the end of the trail by '{words.near.text}', which was not found, or not for "
+                f"certain. Seen: {describe(scene.regions)}. {GIVE_PLACE}"
+            )
+        trail = trail.ending(TrailEnd(None if near is None else near.bbox, words.side, is_oldest=not words.last))
     if not trail.end_known:
-        name, bbox = _ahead(scene, question, trail)
+        # What may lie ahead: the first thing that is asked about, else the middle of the image.
+        asked = ((each.text, match_one(beside, each)) for each in question.others)
+        x, y = scene.width / 2, scene.height / 2
+        ahead = ((name, region.bbox) for name, region in asked if region is not None)
+        name, bbox = next(ahead, ("middle of the image", (x, y, x, y)))
         trail = trail.ending(TrailEnd(bbox))
         warnings = (
             f"The image shows the {phrase.text} in {len(trail.positions)} places one after another, and neither they "
@@ -145,30 +140,6 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
             f'like "on along its trail, the last of which is the leftmost". {GIVE_PLACE}',
         )
     return scene.with_mover(trail.present.bbox), warnings
-
-
-def _ahead(scene: Scene, question: Question, trail: Trail) -> tuple[str, BBox]:
-    """What may lie ahead of a trail: the first thing that is asked about, else the middle of the image."""
-    beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
-    for phrase in question.others:
-        found = match_one(beside, phrase)
-        if found is not None:
-            return phrase.text, found.bbox
-    x, y = scene.width / 2, scene.height / 2
-    return "middle of the image", (x, y, x, y)
-
-
-def _near(scene: Scene, words: TrailWords, trail: Trail) -> BBox | None:
-    """The box of the thing that the words name an end of the trail by. Raises `CannotGround` where it is not found."""
-    if words.near is None:
-        return None
-    found = match_one([r for r in scene.regions if trail_of((trail,), r.bbox) is None], words.near)
-    if found is None:
-        raise CannotGround(
-            f"The question tells the end of the trail by '{words.near.text}', which was not found, or not for certain. "
-            f"Seen: {describe(scene.regions)}. {GIVE_PLACE}"
-        )
-    return found.bbox
 
 
 def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> MotionReading | None:

@@ -88,7 +88,11 @@ def log_ratio(region: Region, form: str) -> float:
 
 
 def _density(measured: Sequence[float], form: str) -> float:
-    return (1 - ODD) * math.exp(-_misfit(measured, form)) / _spread(form) + ODD
+    """exp(-misfit), over its integral over all outlines; or an outline that is nobody's."""
+    (low, high), *shares = OUTLINES[form]
+    sides = [math.log(high / low), *(end - start for start, end in shares)]
+    integral = math.prod(side + 2 * step for side, step in zip(sides, _STEPS, strict=True))
+    return (1 - ODD) * math.exp(-_misfit(measured, form)) / integral + ODD
 
 
 def is_cut(region: Region) -> bool:
@@ -96,13 +100,6 @@ def is_cut(region: Region) -> bool:
     height, width = region.mask.shape
     x0, y0, x1, y1 = region.bbox
     return x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
-
-
-def _spread(form: str) -> float:
-    """The integral of exp(-misfit) over all outlines: makes a density of it."""
-    (low, high), *shares = OUTLINES[form]
-    sides = [math.log(high / low), *(end - start for start, end in shares)]
-    return math.prod(side + 2 * step for side, step in zip(sides, _STEPS, strict=True))
 
 
 def _misfit(measured: Sequence[float], form: str) -> float:
@@ -120,7 +117,11 @@ def _measures(region: Region) -> list[float]:
     sides = mask & ~(np.roll(mask, 1, axis=1) & np.roll(mask, -1, axis=1))  # their hull is that of the mask
     sides[:, [0, -1]] = mask[:, [0, -1]]
     filled = np.count_nonzero(mask) / np.count_nonzero(hull(sides))
-    return [math.log(height / width), filled, *_widths(mask)]
+    # The median width in each of the bands, over the largest of them.
+    rows = mask.sum(axis=1)
+    cuts = [(int(low * height), math.ceil(high * height)) for low, high in BANDS]
+    widths = [float(np.median(rows[start : max(start + 1, end)])) for start, end in cuts]
+    return [math.log(height / width), filled, *(each / max(1.0, *widths) for each in widths)]
 
 
 def _has_handle(mask: Mask) -> bool:
@@ -147,11 +148,3 @@ def _has_handle(mask: Mask) -> bool:
         between = (line - side)[(down > _BETWEEN[0]) & (down < _BETWEEN[1])]
         out.append(float(between.max(initial=0.0)) / body)
     return max(out) > _REACHES and min(out) < _BARE
-
-
-def _widths(mask: Mask) -> list[float]:
-    """The median width in each of the `BANDS` of a mask [h, w], over the largest of them."""
-    rows = mask.sum(axis=1)
-    cuts = [(int(low * len(rows)), math.ceil(high * len(rows))) for low, high in BANDS]
-    widths = [float(np.median(rows[start : max(start + 1, end)])) for start, end in cuts]
-    return [width / max(1.0, *widths) for width in widths]

@@ -6,65 +6,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from cow_service import __version__
+from cow_service import __version__, records
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.narration import same_name
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import (
-    AnswerReading,
-    GroundingReading,
-    Imagined,
-    MotionHints,
-    MotionReading,
-    NamedChange,
-    QuestionReading,
-    ReaderInput,
-)
+from cow_service.readers import base
+from cow_service.readers.base import MotionReading, ReaderInput
+from cow_service.readers.embedded import changes, matching, motions
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
-from cow_service.readers.embedded.changes import check_changes, find_placed, find_removed, given_as, without
+from cow_service.readers.embedded.english import nouns
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked, unread
 from cow_service.readers.embedded.english.lexicon import ARROWS, ObjectPhrase
 from cow_service.readers.embedded.english.motion import MotionWords
-from cow_service.readers.embedded.english.nouns import is_vehicle
 from cow_service.readers.embedded.english.questions import Question, parse, parse_noun_phrase
 from cow_service.readers.embedded.facing import facing
-from cow_service.readers.embedded.matching import (
-    best_matches,
-    describe,
-    inside_drawn_box,
-    is_kind_asked,
-    is_known,
-    match_one,
-    names_meant,
-    noun_warnings,
-    read_name,
-    things_of_kinds,
-)
-from cow_service.readers.embedded.motions import (
-    along_trail,
-    length,
-    other_readings,
-    quantities,
-    scene_of_mover,
-    step_readings,
-)
+from cow_service.readers.embedded.matching import describe
+from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import (
-    DIRECTED_KINDS,
-    AnswerOption,
-    BBox,
-    Grounding,
-    LocatedObject,
-    MotionKind,
-    ObjectPrior,
-    ReaderInfo,
-    Source,
-    Vector,
-)
+from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Source, Vector
 from cow_service.settings import Settings
 from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
-from cow_service.vision.masks import iou
-from cow_service.vision.regions import SAME_OBJECT_IOU, Region
+from cow_service.vision.regions import Region, is_same_object
 from cow_service.vision.scene import Scene
 
 
@@ -72,7 +34,7 @@ class EmbeddedReader:
     """Colour and noun of the mover, words and arrows for its direction, encounters for the answer."""
 
     source: Source = "embedded"
-    info = ReaderInfo(name="embedded", revision=__version__)  # rules change with the version alone
+    info = records.ReaderInfo(name="embedded", revision=__version__)  # rules change with the version alone
     fingerprint = f"embedded {__version__}"
 
     heeds_seed = False
@@ -81,11 +43,11 @@ class EmbeddedReader:
         """Always: rules draw no random numbers."""
         return True
 
-    def read_question(self, question: str) -> QuestionReading:
+    def read_question(self, question: str) -> base.QuestionReading:
         """What the grammar reads."""
-        read = parse(question)
-        changes = (
-            NamedChange(
+        read, words = parse(question), question.lower()
+        named = (
+            base.NamedChange(
                 kind=change.kind,
                 object=change.object.text,
                 relation=change.relation,
@@ -93,72 +55,109 @@ class EmbeddedReader:
             )
             for change in read.interventions
         )
-        words = question.lower()
         drawings = frozenset(each for each in ("arrow", "box") if each in words)
-        return QuestionReading(read_asked(read), tuple(changes), read.motion.trail is not None, drawings)
+        return base.QuestionReading(read_asked(read), tuple(named), read.motion.trail is not None, drawings)
 
     def read_name(self, name: str) -> ObjectPrior:
         """By its noun."""
-        return read_name(name)
+        opening = nouns.container_form(name)
+        return ObjectPrior(
+            shape=nouns.shape_of(name),
+            elongated=nouns.is_vehicle(name),
+            equal_sided=nouns.is_cube(name),
+            opening=None if opening == "unknown" else opening,
+        )
 
     def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:
-        """Those of the kind, where they are as many as the words say."""
-        return names_meant(words, names)
+        """Those of a kind such as "both mugs", where there are as many as is said; else the words themselves."""
+        kind = nouns.kind_of(words)
+        if kind is None or any(plain(name) == plain(words) for name in names):
+            return (words,)
+        found = tuple(name for name in names if nouns.may_name(kind.phrase, name))
+        return found if found and kind.count in (None, len(found)) else (words,)
 
-    def ground(self, given: ReaderInput) -> GroundingReading:
+    def ground(self, given: ReaderInput) -> base.GroundingReading:
         """The region that fits the mover's words. Raises `CannotGround` where none or several do."""
-        scene, question = given.scene, parse(given.question)
-        if question.mover is None or not _names_motion(question.motion):
-            words = unread(question)
-            named = ("', '".join((*words.turning, *words.beside)) or given.question)[:MAX_UNREAD]
+        question = parse(given.question)
+        mover, motion, left = question.mover, question.motion, unread(question)
+        parts = (motion.kind, motion.arrow, motion.direction, motion.forward, motion.towards, motion.trail)
+        says_motion = bool(motion.verb or motion.depth) or any(part is not None for part in parts)
+        if mover is None or not says_motion:
+            named = ("', '".join((*left.turning, *left.beside)) or given.question)[:MAX_UNREAD]
             raise CannotGround(
                 "The question does not say in words what moves, as far as the embedded reader understands it; it reads "
                 f"English. It did not understand '{named}'. "
                 f'Ask like "If the red ball moves to the left, will it hit the vase?". {GIVE_PLACE}'
             )
         with given.cpu():
-            check_changes(question)
-            scene, assumed = scene_of_mover(scene, question)
-            removed = find_removed(scene, question, given.known)
-            regions = without(scene.regions, removed)
-            bbox = _mover(scene, regions, question, question.mover)
-            placed = find_placed(scene, regions, question, (question.mover, bbox), given.known)
-            others = _others(regions, [*question.others, *_sought(given, question)], bbox)
-            others += things_of_kinds(regions, question, bbox, given.known)
-            found = {other.object for other in others}
-            unseen = (each for each in question.others if each.text not in found and not is_kind_asked(each, question))
-            missing = [_not_found(scene, each.text) for each in unseen if given_as(each, given.known) is None]
-            boxes = {other.object: other.bbox for other in others} | {question.mover.text: bbox}
-            things = [(each, boxes[each.text]) for each in (question.mover, *question.others) if each.text in boxes]
-            doubts = [*noun_warnings(scene, things), *_unread_warnings(question)]
-        return GroundingReading(
-            question.mover.text,
+            changes.check_changes(question)
+            scene, assumed = motions.scene_of_mover(given.scene, question)
+            removed = changes.find_removed(scene, question, given.known)
+            regions = changes.without(scene.regions, [change.object.bbox for change in removed])
+            bbox = _mover(scene, regions, question, mover)
+            placed = changes.find_placed(scene, regions, question, (mover, bbox), given.known)
+            # The other things of the question, and those that the caller wants located under other words.
+            words = [phrase.text for phrase in (mover, *question.others)]
+            sought = [name for name in given.sought if not any(same_name(name, each) for each in words)]
+            phrases = [(name, parse_noun_phrase(name)) for name in sought]
+            wanted = [*question.others, *(replace(phrase, text=name) for name, phrase in phrases if phrase is not None)]
+            others: dict[BBox, LocatedObject] = {}
+            for phrase in wanted:
+                place = _bbox_of(regions, phrase, bbox, wanted)
+                if place is not None:
+                    others.setdefault(place, LocatedObject(object=phrase.text, bbox=place))
+            located = (*others.values(), *matching.things_of_kinds(regions, question, bbox, given.known))
+            boxes = {other.object: other.bbox for other in located}
+            missing = [
+                f"The question names '{each.text}', which was not found, or not for certain, so no encounter is told "
+                f"of it by that name. Seen: {describe(scene.regions)}."
+                for each in question.others
+                if each.text not in boxes
+                and not matching.is_kind_asked(each, question)
+                and changes.given_as(each, given.known) is None
+            ]
+            boxes |= {mover.text: bbox}
+            things = [(each, boxes[each.text]) for each in (mover, *question.others) if each.text in boxes]
+            doubts = matching.noun_warnings(scene, things)
+        doubts += [f"Read '{error}' as '{meant}'." for error, meant in question.errors]
+        doubts += [f"The words '{each}' were not understood, so no outcome is told." for each in left.turning]
+        doubts += [f"The words '{each}' were not understood and changed nothing." for each in left.beside]
+        return base.GroundingReading(
+            mover.text,
             bbox,
-            others=others,
+            others=located,
             warnings=(*assumed, *missing, *doubts),
             interventions=(*removed, *placed),
             asked=read_asked(question),
         )
 
-    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
+    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: base.MotionHints | None) -> MotionReading:
         """Kind and direction from the words, and from the arrow where the words speak of one.
 
         Raises `CannotReadDirection`.
         """
         with given.cpu():
-            question = parse(given.question)
-            on = along_trail(given.scene, grounding, question.motion) if question.motion.trail is not None else None
-            reading = on or _read_motion(given.scene, question, grounding)
-            return _with_quantities(given.scene, question, grounding, reading)
+            scene, question = given.scene, parse(given.question)
+            words = question.motion
+            on = motions.along_trail(scene, grounding, words) if words.trail is not None else None
+            reading = on or _read_motion(scene, question, grounding)
+            parted = any(each.share is not None for each in words.quantities)
+            way = _towards(scene, words.towards, grounding) if parted and words.towards is not None else None
+            return replace(
+                reading,
+                steps=motions.step_readings(words.steps, grounding.bbox),
+                others=motions.other_readings(words.others, grounding),
+                **motions.quantities(words.quantities, None if way is None else math.hypot(*way), grounding.bbox),
+            )
 
     def answer(
         self,
         given: ReaderInput,
-        options: Sequence[AnswerOption],
+        options: Sequence[records.AnswerOption],
         grounding: Grounding | None,
-        imagined: Imagined | None,
+        imagined: base.Imagined | None,
         votes: int,
-    ) -> tuple[AnswerReading, ...]:
+    ) -> tuple[base.AnswerReading, ...]:
         """What the world tells of the question, the same for every vote; not sure where it does not."""
         question = parse(given.question)
         outcome = None if imagined is None else imagined.simulation.trajectory.outcome
@@ -181,30 +180,17 @@ def create(settings: Settings) -> EmbeddedReader:
     return EmbeddedReader()
 
 
-def _unread_warnings(question: Question) -> list[str]:
-    words = unread(question)
-    said = [f"Read '{error}' as '{meant}'." for error, meant in question.errors]
-    said += [f"The words '{each}' were not understood, so no outcome is told." for each in words.turning]
-    return said + [f"The words '{each}' were not understood and changed nothing." for each in words.beside]
-
-
-def _names_motion(words: MotionWords) -> bool:
-    """Whether the question says at all that something moves."""
-    parts = (words.kind, words.arrow, words.direction, words.forward, words.towards, words.trail)
-    return bool(words.verb or words.depth) or any(part is not None for part in parts)
-
-
 def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: ObjectPhrase) -> BBox:
     if phrase.text.lower().split()[0] in _SEVERAL:
         raise CannotGround(f"The question moves '{phrase.text}' at once: ask of one thing, or name each. {GIVE_PLACE}")
     if phrase.inside_box:
-        return inside_drawn_box(scene, phrase, GIVE_PLACE)
+        return matching.inside_drawn_box(scene, phrase, GIVE_PLACE)
     if not scene.regions:
         raise CannotGround(
             f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to "
             f"tell its objects apart. {GIVE_PLACE}"
         )
-    fitting = best_matches(regions, phrase, question.others)
+    fitting = matching.best_matches(regions, phrase, question.others)
     if len(fitting) > 1 and question.mentions_arrow:
         fitting = at_arrow(scene, fitting) or fitting
     seen = describe(scene.regions)
@@ -215,7 +201,7 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
             f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. "
             f"Seen in all: {seen}. {GIVE_PLACE}"
         )
-    if phrase.colour is None and not is_known(phrase) and len(scene.regions) > 1:
+    if phrase.colour is None and not matching.is_known(phrase) and len(scene.regions) > 1:
         raise CannotGround(
             f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
             f"Seen: {seen}. {GIVE_PLACE}"
@@ -223,54 +209,45 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
     return fitting[0].bbox
 
 
-def _sought(given: ReaderInput, question: Question) -> list[ObjectPhrase]:
-    """What the caller wants located, but for what the question names in the same words."""
-    named = [phrase.text for phrase in (question.mover, *question.others) if phrase is not None]
-    phrases = ((name, parse_noun_phrase(name)) for name in given.sought if not any(same_name(name, n) for n in named))
-    return [replace(phrase, text=name) for name, phrase in phrases if phrase is not None]
-
-
-def _others(regions: Sequence[Region], phrases: Sequence[ObjectPhrase], mover: BBox) -> tuple[LocatedObject, ...]:
-    """The other things of these words, where exactly one region fits; the rest stay unnamed."""
-    found: dict[BBox, LocatedObject] = {}
-    for phrase in phrases:
-        bbox = _bbox_of(regions, phrase, mover, phrases)
-        if bbox is not None:
-            found.setdefault(bbox, LocatedObject(object=phrase.text, bbox=bbox))
-    return tuple(found.values())
-
-
 def _bbox_of(
     regions: Sequence[Region], phrase: ObjectPhrase, mover: BBox, others: Sequence[ObjectPhrase]
 ) -> BBox | None:
-    """The box of the one region, besides the mover, that fits a phrase."""
-    region = match_one([region for region in regions if iou(region.bbox, mover) < SAME_OBJECT_IOU], phrase, others)
+    """The box of the one region, besides the mover, that fits a phrase; what several fit stays unnamed."""
+    beside = [region for region in regions if not is_same_object(region.bbox, mover)]
+    region = matching.match_one(beside, phrase, others)
     return None if region is None else region.bbox
 
 
-def _not_found(scene: Scene, text: str) -> str:
-    return (
-        f"The question names '{text}', which was not found, or not for certain, so no encounter is told of it by that "
-        f"name. Seen: {describe(scene.regions)}."
-    )
-
-
 def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> MotionReading:
-    words = question.motion
+    words, name = question.motion, grounding.object
     kind = words.kind or "linear"
     if kind == "static" and question.names_direction:
         raise CannotReadDirection(
-            f"The question says that the {grounding.object} does not move, and speaks of a direction all the same: "
+            f"The question says that the {name} does not move, and speaks of a direction all the same: "
             f"which is meant was not understood. {GIVE_DIRECTION}"
         )
     if words.contradictory:
         raise CannotReadDirection(
-            f"The verb '{words.verb}' and the direction that the question gives for the {grounding.object} contradict "
+            f"The verb '{words.verb}' and the direction that the question gives for the {name} contradict "
             f"each other: which is meant was not understood. {GIVE_DIRECTION}"
         )
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
-    return _as_said(scene, words, kind, grounding) or _as_shown(scene, question, kind, grounding)
+    said = _as_said(scene, words, kind, grounding)
+    if said is not None:
+        return said
+    if words.forward is None:
+        return motions.along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
+    # Forward or backward, by the way that a vehicle is seen to face.
+    told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
+    if not nouns.is_vehicle(name):
+        raise CannotReadDirection(
+            f"{told} The embedded reader sees only of vehicles with wheels which way they face. {GIVE_DIRECTION}"
+        )
+    way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
+    if way is None:
+        raise CannotReadDirection(f"{told} Which way it faces could not be seen for certain. {GIVE_DIRECTION}")
+    return MotionReading(kind, way if words.forward else (-way[0], -way[1]), "orientation")
 
 
 def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grounding) -> MotionReading | None:
@@ -299,27 +276,6 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
     return None
 
 
-def _as_shown(scene: Scene, question: Question, kind: MotionKind, grounding: Grounding) -> MotionReading:
-    """The motion whose direction the image shows, by a trail or an arrow. Raises `CannotReadDirection`."""
-    words = question.motion
-    if words.forward is not None:
-        return _as_it_faces(scene, words.forward, kind, grounding)
-    return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
-
-
-def _as_it_faces(scene: Scene, forward: bool, kind: MotionKind, grounding: Grounding) -> MotionReading:
-    """Forward or backward, by the way that a vehicle is seen to face."""
-    said = f"The question says that the {grounding.object} moves {'forward' if forward else 'backward'}."
-    if not is_vehicle(grounding.object):
-        raise CannotReadDirection(
-            f"{said} The embedded reader sees only of vehicles with wheels which way they face. {GIVE_DIRECTION}"
-        )
-    way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
-    if way is None:
-        raise CannotReadDirection(f"{said} Which way it faces could not be seen for certain. {GIVE_DIRECTION}")
-    return MotionReading(kind, way if forward else (-way[0], -way[1]), "orientation")
-
-
 def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
     """Along the only arrow drawn at the mover, where the question names no direction at all."""
     near = arrows_near(scene, grounding.bbox)
@@ -342,15 +298,6 @@ def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: M
         )
     note = "The question names no direction; the arrow drawn at the object was followed."
     return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
-
-
-def _with_quantities(scene: Scene, question: Question, grounding: Grounding, reading: MotionReading) -> MotionReading:
-    """How fast, how far and how long, the further legs, and what else moves."""
-    words = question.motion
-    parted = any(each.share is not None for each in words.quantities)
-    way = length(_towards(scene, words.towards, grounding)) if parted and words.towards is not None else None
-    steps, others = step_readings(words.steps, grounding.bbox), other_readings(words.others, grounding)
-    return replace(reading, **quantities(words.quantities, way, grounding.bbox), steps=steps, others=others)
 
 
 def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:
