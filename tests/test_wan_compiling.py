@@ -13,7 +13,7 @@ from torch._dynamo.testing import CompileCounter
 
 from cow_service.generators.wan import acceleration, conditioning, generator, loading
 from cow_service.generators.wan.capabilities import detect_capabilities
-from cow_service.generators.wan.generator import ClipSize, WanGenerator, compile_for
+from cow_service.generators.wan.generator import WanGenerator, compile_for
 from cow_service.generators.wan.profiles import Acceleration, profile_of
 from cow_service.settings import Settings
 from cow_service.weights.device import cpu_threads
@@ -47,7 +47,7 @@ def test_no_clip_waits_for_the_compiler(
     graphs: CompileCounter, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.INFO, logger="cow_service"):
-        model = loaded(tmp_path, warmup=True)._model
+        model = loaded(tmp_path, warmup=True)
     told = [message.partition(" in ")[0] for message in caplog.messages if "compiled" in message]
     assert told == [
         "compiled for 112 x 64 px and 81 frames",
@@ -56,7 +56,7 @@ def test_no_clip_waits_for_the_compiler(
     assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(tmp_path / "compiled")
     compiled = graphs.frame_count
     assert compiled == 2, "for one size, then for any"
-    sizes = ClipSize(64, 112, 9), ClipSize(128, 64, 81), ClipSize(112, 64, 81), ClipSize(96, 80, 33)
+    sizes = (64, 112, 9), (128, 64, 81), (112, 64, 81), (96, 80, 33)
     with cpu_threads(model.threads):  # as for a clip: compiled code holds for a number of threads
         compile_for(model.pipeline, model.denoise, model.profile.sampling, sizes)
     assert graphs.frame_count == compiled
@@ -84,9 +84,9 @@ def test_the_usual_size_runs_its_own_code(monkeypatch: pytest.MonkeyPatch, tmp_p
     monkeypatch.setattr(acceleration, "detect_capabilities", lambda device: able)
     monkeypatch.setattr(loading, "profile_of", lambda manifest, name: COMPILED)
     torch._dynamo.reset()
-    model = loaded(tmp_path, warmup=True)._model
+    model = loaded(tmp_path, warmup=True)
     assert compiled == [0, 1]
-    for size, number in ((ClipSize(112, 64, 81), 0), (ClipSize(112, 64, 9), 1), (ClipSize(112, 64, 81), 0)):
+    for size, number in (((112, 64, 81), 0), ((112, 64, 9), 1), ((112, 64, 81), 0)):
         ran.clear()
         with cpu_threads(model.threads):
             compile_for(model.pipeline, model.denoise, model.profile.sampling, [size])

@@ -54,7 +54,7 @@ def simulate(service: Service, progress: Callable[[str, float], None] | None = N
 def pipeline_of(service: Service, name: str = "tiny-ati") -> WanTrackPipeline:
     generator = service.generators.get(name)
     assert isinstance(generator, WanGenerator)
-    return generator._model.pipeline
+    return generator.pipeline
 
 
 def pictures(simulation: Simulation) -> list[str]:
@@ -345,9 +345,9 @@ def test_parts_that_are_moved_one_by_one_leave_before_the_steps(toys: Service, m
     made = toys.generators.get("tiny-ati")
     assert isinstance(made, WanGenerator)
     pipeline, heard = pipeline_of(toys), list[str]()
-    acceleration = made._model.profile.acceleration.model_copy(update={"offload": "model"})
-    profile = made._model.profile.model_copy(update={"acceleration": acceleration})
-    monkeypatch.setattr(made, "_model", replace(made._model, profile=profile))
+    acceleration = made.profile.acceleration.model_copy(update={"offload": "model"})
+    profile = made.profile.model_copy(update={"acceleration": acceleration})
+    monkeypatch.setattr(made, "profile", profile)
     denoise, encode = pipeline.denoise, pipeline.encode_prompt
     monkeypatch.setattr(pipeline, "maybe_free_model_hooks", lambda: heard.append("freed"))
     monkeypatch.setattr(pipeline, "denoise", lambda *args: (heard.append("steps"), denoise(*args))[1])
@@ -409,11 +409,10 @@ def test_without_weights_it_says_how_to_get_them(tmp_path: Path, name: str) -> N
     ],
 )
 def test_the_size_of_a_clip(toys: Service, size: tuple[int, int], wanted: tuple[int, int]) -> None:
-    from dataclasses import replace
 
     generator = toys.generators.get("tiny-ati")
     assert isinstance(generator, WanGenerator)
-    full = WanGenerator(replace(generator._model, max_area=480 * 832))
+    full = replace(generator, max_area=480 * 832)
     assert full.size(*size) == wanted
 
 

@@ -77,7 +77,7 @@ def test_a_caller_who_goes_away_ends_the_work(tmp_path: Path) -> None:
             passes.append(1)
             loop.call_soon_threadsafe(gone.set)
 
-        generator._model.pipeline.transformer.register_forward_hook(after)
+        generator.pipeline.transformer.register_forward_hook(after)
         messages = [{"type": "http.request", "body": sent, "more_body": False}]
 
         async def receive() -> dict[str, Any]:

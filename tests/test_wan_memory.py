@@ -56,7 +56,8 @@ def test_it_is_what_the_loaded_parts_take(checkpoint: Path) -> None:
 
 def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """There is no GPU here: its size, and what it can do, are fakes."""
-    monkeypatch.setattr(memory, "check_device", lambda wanted, device: None)
+    monkeypatch.setattr(memory, "detect_capabilities", lambda device: None)
+    monkeypatch.setattr(memory, "refusals", lambda wanted, machine: ())
     found = memory._read_headers(checkpoint, checkpoint)
     assert found is not None
     need = {name: need_of(profile_of(ATI, name), found[0], ATI.architecture["num_layers"]) for name in ATI.profiles}
@@ -80,7 +81,8 @@ def test_float8_is_kept_only_where_there_is_some(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Told before anything is read, and no such profile is recommended."""
-    monkeypatch.setattr(memory, "check_device", lambda wanted, device: None)
+    monkeypatch.setattr(memory, "detect_capabilities", lambda device: None)
+    monkeypatch.setattr(memory, "refusals", lambda wanted, machine: ())
     monkeypatch.setattr(memory, "_room", lambda device: 10**12)
     with pytest.raises(GeneratorUnavailable, match=r"'small-float8' keeps the float8 .* has none.*COW_CHECKPOINTS"):
         check_memory(ATI, "small-float8", checkpoint, checkpoint, GPU)

@@ -27,7 +27,7 @@ from cow_service.errors import (
 )
 from cow_service.generators.wan import conditioning, loading
 from cow_service.generators.wan.acceleration import accelerate_transformer
-from cow_service.generators.wan.generator import CONDITION_CHANNELS, LoadedModel
+from cow_service.generators.wan.generator import CONDITION_CHANNELS, WanGenerator
 from cow_service.generators.wan.pipeline import Conditioning, denoise, latent_shape
 from cow_service.generators.wan.profiles import Acceleration, Profile, Sampling, profile_of
 from cow_service.generators.wan.ranks import MODULE, RankGroup, Sharing
@@ -42,22 +42,22 @@ TINY = load_manifests()["tiny-ati"]
 NOISE = torch.randn(latent_shape(96, 64, 9), generator=torch.Generator().manual_seed(1))
 
 
-def model(folder: Path, profile: str) -> LoadedModel:
+def model(folder: Path, profile: str) -> WanGenerator:
     settings = Settings(data_dir=folder, device="cpu", profile=profile, warmup=False)
-    return loading.load("tiny-ati", conditioning.ati, settings)._model
+    return loading.load("tiny-ati", conditioning.ati, settings)
 
 
-def group_of(loaded: LoadedModel) -> RankGroup:
+def group_of(loaded: WanGenerator) -> RankGroup:
     assert loaded.group is not None
     return loaded.group
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> LoadedModel:
+def alone(tmp_path_factory: pytest.TempPathFactory) -> WanGenerator:
     return model(tmp_path_factory.mktemp("alone"), "exact")
 
 
-_shared: list[LoadedModel] = []  # the one of the fixture: a process has one group at a time
+_shared: list[WanGenerator] = []  # the one of the fixture: a process has one group at a time
 
 
 def close_shared() -> None:
@@ -72,7 +72,7 @@ def _closed_afterwards() -> Iterator[None]:
 
 
 @pytest.fixture
-def shared(tmp_path_factory: pytest.TempPathFactory) -> LoadedModel:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> WanGenerator:
     """Made once, and again after a test that had a group of its own."""
     if not _shared:
         _shared.append(model(tmp_path_factory.mktemp("shared"), "exact-2"))
@@ -88,14 +88,14 @@ def given() -> Conditioning:
     return Conditioning(*texts, torch.randn(1, 17, sizes["image_dim"], generator=drawn), *conditions)
 
 
-def latents(loaded: LoadedModel, on_step: Callable[[int, int], None] = lambda done, total: None, **how: Any) -> Tensor:
+def latents(loaded: WanGenerator, on_step: Callable[[int, int], None] = lambda done, total: None, **how: Any) -> Tensor:
     return loaded.denoise(NOISE, given(), loaded.profile.sampling.model_copy(update=how), on_step)
 
 
 @pytest.mark.parametrize(
     "how", [{}, {"guidance_scale": 1.0}, {"guidance_window": (0.25, 0.75)}, {"solver": "euler", "steps": 3}]
 )
-def test_two_processes_make_the_same_clip(alone: LoadedModel, shared: LoadedModel, how: dict[str, Any]) -> None:
+def test_two_processes_make_the_same_clip(alone: WanGenerator, shared: WanGenerator, how: dict[str, Any]) -> None:
     """In steps with guidance and without: also with the solver's state and the rank that has nothing to compute."""
     passes: list[int] = []
     handle = shared.pipeline.transformer.register_forward_hook(lambda *_: passes.append(1))
@@ -107,7 +107,7 @@ def test_two_processes_make_the_same_clip(alone: LoadedModel, shared: LoadedMode
     assert len(passes) == len(heard), "the unconditional passes were computed elsewhere"
 
 
-def test_a_clip_that_is_canceled_leaves_the_others_in_step(alone: LoadedModel, shared: LoadedModel) -> None:
+def test_a_clip_that_is_canceled_leaves_the_others_in_step(alone: WanGenerator, shared: WanGenerator) -> None:
     def stop(done: int, total: int) -> None:
         if done == 2:
             raise Canceled("no more")
@@ -127,7 +127,7 @@ def test_a_rank_that_cannot_load_says_why(tmp_path: Path) -> None:
         group.denoise(NOISE, given(), profile.sampling, lambda done, total: None)
 
 
-def broken(folder: Path, on_step: Callable[[LoadedModel], None]) -> Exception:
+def broken(folder: Path, on_step: Callable[[WanGenerator], None]) -> Exception:
     """What a clip raises in whose second step something happens. The clips after it say that a worker is replaced."""
     close_shared()
     loaded = model(folder, "exact-2")
@@ -139,12 +139,12 @@ def broken(folder: Path, on_step: Callable[[LoadedModel], None]) -> Exception:
     return caught.value
 
 
-def process_of(loaded: LoadedModel) -> subprocess.Popen[bytes]:
+def process_of(loaded: WanGenerator) -> subprocess.Popen[bytes]:
     return group_of(loaded)._ranks[0]._spawned.process
 
 
-def test_a_rank_that_has_no_memory_says_so_once(alone: LoadedModel, tmp_path: Path) -> None:
-    def run_out(loaded: LoadedModel) -> None:
+def test_a_rank_that_has_no_memory_says_so_once(alone: WanGenerator, tmp_path: Path) -> None:
+    def run_out(loaded: WanGenerator) -> None:
         group_of(loaded)._ranks[0].error = GeneratorOutOfMemory("A share of a clip does not fit.")
         process_of(loaded).kill()
 
@@ -159,7 +159,7 @@ def test_a_rank_that_has_no_memory_says_so_once(alone: LoadedModel, tmp_path: Pa
 
 
 def test_an_error_of_rank_0_stays_its_own(tmp_path: Path) -> None:
-    def fail(loaded: LoadedModel) -> None:
+    def fail(loaded: WanGenerator) -> None:
         def forward(*_: object) -> None:
             raise RuntimeError("a fault of the code")
 

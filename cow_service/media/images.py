@@ -14,7 +14,6 @@ import hashlib
 import io
 import re
 import struct
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -69,24 +68,6 @@ _EXIF = b"Exif\0\0"
 _ORIENTATION = 0x0112
 _TIFF_INTEGERS = {3: "H", 4: "I"}  # SHORT, LONG
 
-# What pillow raises on damaged files. Its warnings are raised only where the host made warnings errors.
-_PILLOW_ERRORS = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    EOFError,
-    Image.DecompressionBombError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    Warning,
-    struct.error,
-    zlib.error,
-)
-
 _TRANSPOSE_TO_UPRIGHT = {  # by EXIF orientation
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -122,10 +103,6 @@ _SNIFFED_BYTES = 1024
 _KINDS = {"image/png": "PNG", "image/jpeg": "JPEG", "image/webp": "WebP"}
 
 
-class OverfullError(ValueError):
-    """A file of more parts than any camera or program writes. The message says what it is."""
-
-
 @dataclass(frozen=True)
 class DecodedImage:
     """The input image as pixels, upright, and the record that names it.
@@ -155,11 +132,29 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     if kind is None:
         raise ImageTypeUnsupported(f"The image is {_describe_foreign(data)}: send it as PNG, JPEG or WebP.")
     try:
-        pixels = _decode_as(kind, data, max_megapixels)
-    except OverfullError as error:
-        raise ImageUnreadable(f"The image is {error}: save it anew with another program and send that.") from error
-    except _PILLOW_ERRORS as error:
-        raise _damaged(kind, data) from error
+        if kind == "WebP":
+            # Opening a WebP file allocates its whole canvas, so that its size has to be known before. Its blocks are
+            # never decoded or joined by the decoder: they can stay.
+            _check_size(*_webp_size(data), max_megapixels)
+            stripped, orientation = data, UPRIGHT
+        else:
+            stripped, orientation = _strip_png(data) if kind == "PNG" else _strip_jpeg(data)
+        with _OPENERS[kind](io.BytesIO(stripped)) as image:
+            _check_size(image.width, image.height, max_megapixels)
+            frames = int(getattr(image, "n_frames", 1))
+            if frames > 1:
+                raise ImageTypeUnsupported(f"The image is an animated {kind} of {frames} frames: send one frame of it.")
+            rgb = _to_rgb(image)
+            if kind == "WebP":
+                orientation = _exif_orientation(image.info.get("exif", b""))
+    except (CowError, MemoryError):
+        raise
+    except Exception as error:  # pillow raises a dozen kinds on damaged files
+        raise ImageUnreadable(
+            f"The {kind} file of {len(data)} bytes could not be decoded, it is damaged or incomplete: send it whole."
+        ) from error
+    turn = _TRANSPOSE_TO_UPRIGHT.get(orientation)
+    pixels = np.asarray(rgb if turn is None else rgb.transpose(turn), np.uint8)
     height, width = pixels.shape[:2]
     info = ImageInfo(width=width, height=height, sha256=hashlib.sha256(data).hexdigest())
     return DecodedImage(pixels, info, f"image/{kind.lower()}")
@@ -243,25 +238,6 @@ def _describe_foreign(data: bytes) -> str:
     return f"of no known type (it begins with the bytes {data[:8].hex(' ')})"
 
 
-def _decode_as(kind: str, data: bytes, max_megapixels: float) -> NDArray[np.uint8]:
-    if kind == "WebP":
-        # Opening a WebP file allocates its whole canvas, so that its size has to be known before.
-        _check_size(*_webp_size(data), max_megapixels)
-    strip = {"PNG": _strip_png, "JPEG": _strip_jpeg}.get(kind)
-    # The blocks of a WebP file are never decoded or joined by the decoder: they can stay.
-    stripped, orientation = strip(data) if strip else (data, UPRIGHT)
-    with _OPENERS[kind](io.BytesIO(stripped)) as image:
-        _check_size(image.width, image.height, max_megapixels)
-        frames = int(getattr(image, "n_frames", 1))
-        if frames > 1:
-            raise ImageTypeUnsupported(f"The image is an animated {kind} of {frames} frames: send one frame of it.")
-        rgb = _to_rgb(image)
-        if kind == "WebP":
-            orientation = _exif_orientation(image.info.get("exif", b""))
-        turn = _TRANSPOSE_TO_UPRIGHT.get(orientation)
-        return np.asarray(rgb if turn is None else rgb.transpose(turn), np.uint8)
-
-
 def _webp_size(data: bytes) -> tuple[int, int]:
     """Width and height in px from the first chunk (RFC 9649, sections 2.5 to 2.7)."""
     chunk, head = data[12:16], data[20:30]
@@ -272,7 +248,7 @@ def _webp_size(data: bytes) -> tuple[int, int]:
     if chunk == b"VP8L" and head[:1] == b"\x2f" and len(head) >= 5:
         bits = int.from_bytes(head[1:5], "little")
         return (bits & 0x3FFF) + 1, ((bits >> 14) & 0x3FFF) + 1
-    raise _damaged("WebP", data)
+    raise ValueError("no known first chunk")
 
 
 def _check_size(width: int, height: int, max_megapixels: float) -> None:
@@ -307,17 +283,8 @@ def _to_rgb(image: Image.Image) -> Image.Image:
     return image
 
 
-def _damaged(kind: str, data: bytes) -> ImageUnreadable:
-    return ImageUnreadable(
-        f"The {kind} file of {len(data)} bytes could not be decoded, it is damaged or incomplete: send it whole."
-    )
-
-
 def _strip_png(data: bytes) -> tuple[bytes, int]:
-    """A PNG file without its ancillary chunks, except transparency and animation; and its EXIF orientation.
-
-    Raises `OverfullError`.
-    """
+    """A PNG file without its ancillary chunks, except transparency and animation; and its EXIF orientation."""
     kept = [_PNG_SIGNATURE]
     orientation = UPRIGHT
     at = len(_PNG_SIGNATURE)
@@ -334,14 +301,11 @@ def _strip_png(data: bytes) -> tuple[bytes, int]:
         if name == b"IEND":
             return b"".join(kept), orientation
         at = end
-    raise OverfullError(f"a PNG file of more than {MAX_PNG_CHUNKS} chunks")
+    raise _overfull(f"a PNG file of more than {MAX_PNG_CHUNKS} chunks")
 
 
 def _strip_jpeg(data: bytes) -> tuple[bytes, int]:
-    """A JPEG file without application segments and comments, except Adobe's colour transform; and its EXIF orientation.
-
-    Raises `OverfullError`.
-    """
+    """A JPEG file without application segments and comments, except Adobe's colours; and its EXIF orientation."""
     kept = [data[:2]]
     orientation = UPRIGHT
     at = 2
@@ -355,7 +319,7 @@ def _strip_jpeg(data: bytes) -> tuple[bytes, int]:
         if marker in (_JPEG_SCAN, _JPEG_END):
             rest = data[at - 2 :]
             if (scans := rest.count(_JPEG_SCAN_START)) > MAX_JPEG_SCANS:
-                raise OverfullError(f"a JPEG file of {scans} scans, more than {MAX_JPEG_SCANS}")
+                raise _overfull(f"a JPEG file of {scans} scans, more than {MAX_JPEG_SCANS}")
             return b"".join((*kept, rest)), orientation
         end = at + int.from_bytes(data[at : at + 2])
         if marker == _JPEG_ADOBE or not (0xE0 <= marker <= 0xEF or marker == _JPEG_COMMENT):
@@ -363,7 +327,12 @@ def _strip_jpeg(data: bytes) -> tuple[bytes, int]:
         elif marker == _JPEG_APP1 and orientation == UPRIGHT and data.startswith(_EXIF, at + 2):
             orientation = _exif_orientation(data[at + 2 : end])
         at = end
-    raise OverfullError(f"a JPEG file of more than {MAX_JPEG_SEGMENTS} segments")
+    raise _overfull(f"a JPEG file of more than {MAX_JPEG_SEGMENTS} segments")
+
+
+def _overfull(what: str) -> ImageUnreadable:
+    """For a file of more parts than any camera or program writes."""
+    return ImageUnreadable(f"The image is {what}: save it anew with another program and send that.")
 
 
 def _exif_orientation(exif: bytes) -> int:

@@ -6,11 +6,12 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import TypeAlias, cast
 
 import torch
 
@@ -33,6 +34,7 @@ from cow_service.generators.wan.tracks import tracks_of
 from cow_service.records import GeneratorInfo
 from cow_service.vision.types import Image
 from cow_service.weights.device import cpu_threads
+from cow_service.weights.manifests import Manifest
 
 USUAL_SIDES = 832, 480  # their ratio
 SIDE_MULTIPLE = 16  # px: the sides of a clip are multiples of it
@@ -42,15 +44,9 @@ DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
 COMPILED_FRAMES = (81, 17)
 CONDITION_CHANNELS = 20
 
+ClipSize: TypeAlias = tuple[int, int, int]  # width and height (px), frames
+
 log = logging.getLogger("cow_service")
-
-
-class ClipSize(NamedTuple):
-    """Pixels, and frames."""
-
-    width: int
-    height: int
-    num_frames: int
 
 
 def clip_size(max_area: int, width: int, height: int) -> tuple[int, int]:
@@ -61,12 +57,15 @@ def clip_size(max_area: int, width: int, height: int) -> tuple[int, int]:
     return clip_width, clip_height
 
 
-@dataclass(frozen=True)
-class LoadedModel:
-    """A loaded model, and what would have to be the same to make its clips again."""
+@dataclass(eq=False)
+class WanGenerator(WanLimits):
+    """Wan2.1 image-to-video, conditioned on tracks. One clip at a time on its device; others wait."""
 
-    name: str
-    repository: str | None
+    concurrency = 1
+    fingerprint: str = field(init=False)  # SHA-256 of everything that decides a clip besides its input
+
+    manifest: Manifest
+    repository: str | None  # of the transformer, or the name of the user's own checkpoint
     revision: str | None
     revisions: dict[str, str]  # of the other parts that were pulled
     weights_identity: str  # as `weights_identity`, taken before the weights were loaded
@@ -77,40 +76,30 @@ class LoadedModel:
     profile: Profile
     conditioning: TrackConditioning
     max_area: int  # px per frame
-    negative_prompt: str
-    threads: int | None  # CPU threads; None keeps PyTorch's own number
+
+    def __post_init__(self) -> None:
+        self._embeddings = EmbeddingCache(self.pipeline)
+        self._negative_prompt = str(self.manifest.defaults.get("negative_prompt", ""))
+        threads = self.manifest.defaults.get("threads")
+        self.threads = None if threads is None else int(threads)  # of the CPU; None keeps PyTorch's own number
+        parts = (
+            *(self.manifest.name, self.repository, self.revision, sorted(self.revisions.items())),
+            *(self.weights_identity, self.device.type, self.profile_name, self.profile.model_dump_json()),
+            *(self.max_area, self._negative_prompt),
+        )
+        self.fingerprint = sha256(repr(parts).encode()).hexdigest()
 
     @property
     def denoise(self) -> Denoise:
         """Of this process, or of several."""
         return (self.group or self.pipeline).denoise
 
-    @property
-    def fingerprint(self) -> str:
-        """SHA-256 of everything that decides a clip besides its input."""
-        parts = (
-            *(self.name, self.repository, self.revision, sorted(self.revisions.items()), self.weights_identity),
-            *(self.device.type, self.profile_name, self.profile.model_dump_json(), self.max_area, self.negative_prompt),
-        )
-        return sha256(repr(parts).encode()).hexdigest()
-
-
-class WanGenerator(WanLimits):
-    """Wan2.1 image-to-video, conditioned on tracks. One clip at a time on its device; others wait."""
-
-    concurrency = 1
-
-    def __init__(self, model: LoadedModel) -> None:
-        self.fingerprint = model.fingerprint
-        self._model = model
-        self._embeddings = EmbeddingCache(model.pipeline)
-
     def size(self, width: int, height: int) -> tuple[int, int]:
         """The model's area at the image's aspect ratio, sides rounded down to multiples of 16 px.
 
         Raises `InvalidRequest` for an image so narrow that no clip of that shape can be made.
         """
-        clip_width, clip_height = clip_size(self._model.max_area, width, height)
+        clip_width, clip_height = clip_size(self.max_area, width, height)
         if max(clip_width, clip_height) > MAX_SIDE:
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
             raise InvalidRequest(f"`image`: {detail}.", errors=(FieldError("/image", detail),))
@@ -121,51 +110,53 @@ class WanGenerator(WanLimits):
 
         Else the first clip would wait for it, and the first of a second size once more.
         """
-        model = self._model
-        if model.profile.acceleration.compile == "none":
+        if self.profile.acceleration.compile == "none":
             return
         width, height = self.size(*USUAL_SIDES)
-        sizes = [ClipSize(width, height, frames) for frames in COMPILED_FRAMES]
+        with self._own_device(f"A clip of {width} x {height}", lambda: None):
+            sizes = [(width, height, frames) for frames in COMPILED_FRAMES]
+            compile_for(self.pipeline, self.denoise, self.profile.sampling, sizes)
+
+    @contextmanager
+    def _own_device(self, what: str, check_canceled: Callable[[], None]) -> Generator[None]:
         with (
-            exclusive_use(model.device, lambda: None),
-            cpu_threads(model.threads),
-            within_memory(model.device, self._embeddings.clear, f"A clip of {width} x {height}"),
+            exclusive_use(self.device, check_canceled),
+            cpu_threads(self.threads),
+            within_memory(self.device, self._embeddings.clear, what),
         ):
-            compile_for(model.pipeline, model.denoise, model.profile.sampling, sizes)
+            yield
 
     def close(self) -> None:
         """Ends the processes that share its clips."""
-        if self._model.group is not None:
-            self._model.group.close()
+        if self.group is not None:
+            self.group.close()
 
     def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""
-        model, options, sampling = self._model, _options(given), self._sampling(given)
-        acceleration = model.profile.acceleration.model_dump(exclude_defaults=True, mode="json")
+        options = cast(WanOptions, given.options)  # the generator's own `options_model`
+        sampling, prompt, negative = self._chosen(options, given.motion.sentence)
+        changed = self.profile.acceleration.model_dump(exclude_defaults=True, mode="json").items()
         return GeneratorInfo(
-            name=model.name,
-            model=model.repository,
-            revision=model.revision,
+            name=self.manifest.name,
+            model=self.repository,
+            revision=self.revision,
             seed=given.seed,
             steps=sampling.steps,
             options={
-                "profile": model.profile_name,
+                "profile": self.profile_name,
                 "solver": sampling.solver,
                 "shift": sampling.shift,
                 "guidance_scale": sampling.guidance_scale,
                 "guidance_window": str(list(sampling.guidance_window)),
-                "dtype": model.profile.dtype,
-                "vae_dtype": model.profile.vae_dtype,
-                "device": model.device.type,
-                "prompt": _prompt(given),
-                "negative_prompt": self._negative_prompt(options) if sampling.guided else "",
+                "dtype": self.profile.dtype,
+                "vae_dtype": self.profile.vae_dtype,
+                "device": self.device.type,
+                "prompt": prompt,
+                "negative_prompt": negative or "",
                 "clean_cues": options.clean_cues,
             }
-            | {f"{part}_revision": revision for part, revision in model.revisions.items()}
-            | {
-                name: value if isinstance(value, bool | int | float | str) else str(value)
-                for name, value in acceleration.items()
-            },
+            | {f"{part}_revision": revision for part, revision in self.revisions.items()}
+            | {name: value if isinstance(value, bool | int | float | str) else str(value) for name, value in changed},
         )
 
     def render(
@@ -175,70 +166,54 @@ class WanGenerator(WanLimits):
 
         `progress` is called after every denoising step; once it has raised, nothing more is computed.
         """
-        model, num_frames = self._model, given.trajectory.num_frames
         width, height = self.size(given.scene.width, given.scene.height)
-        with (
-            exclusive_use(model.device, lambda: progress(0.0)),
-            cpu_threads(model.threads),
-            within_memory(model.device, self._embeddings.clear, f"A clip of {num_frames} frames at {width} x {height}"),
-        ):
-            video = self._video(given, width, height, progress)
+        what = f"A clip of {given.trajectory.num_frames} frames at {width} x {height}"
+        with self._own_device(what, lambda: progress(0.0)):
+            video = self._make_clip(given, width, height, progress)
         progress(1.0)
         for index in indices:
             yield video[index]
 
-    def _video(self, given: GeneratorInput, width: int, height: int, progress: Callable[[float], None]) -> Image:
+    def _make_clip(self, given: GeneratorInput, width: int, height: int, progress: Callable[[float], None]) -> Image:
         """All frames [F, height, width, 3]."""
-        model, pipeline, num_frames = self._model, self._model.pipeline, given.trajectory.num_frames
         # Drawn on the CPU: a seed gives the same noise whatever the device.
         random = torch.Generator().manual_seed(given.seed)
-        noise = torch.randn(latent_shape(width, height, num_frames), generator=random)
+        noise = torch.randn(latent_shape(width, height, given.trajectory.num_frames), generator=random)
         progress(0.0)
         try:
-            sampling = self._sampling(given)
-            conditioning = self._conditioning(given, width, height, guided=sampling.guided)
-            if model.profile.acceleration.offload == "model":  # else the last encoder stays beside the transformer
-                pipeline.maybe_free_model_hooks()
+            scene, options = given.scene, cast(WanOptions, given.options)
+            sampling, prompt, negative = self._chosen(options, given.motion.sentence)
+            first_frame = scene.clean if options.clean_cues else scene.image
+            image = self._embeddings.image(first_frame, width, height, given.trajectory.num_frames)
+            tracks = tracks_of(given.trajectory, scene.width, scene.height)
+            # In pixels of the clip: its sides are rounded, so that its aspect ratio is not quite the image's.
+            tracks = tracks.scaled(width / scene.width, height / scene.height)
+            condition, unconditional = self.conditioning(image.condition, tracks, width, height)
+            conditioning = Conditioning(
+                prompt=self._embeddings.text(prompt),
+                negative_prompt=None if negative is None else self._embeddings.text(negative),
+                image=image.embeds,
+                condition=condition,
+                unconditional=unconditional,
+            )
+            if self.profile.acceleration.offload == "model":  # else the last encoder stays beside the transformer
+                self.pipeline.maybe_free_model_hooks()
             progress(0.0)
-            latents = model.denoise(
+            latents = self.denoise(
                 noise, conditioning, sampling, lambda done, total: progress(DENOISING_SHARE * done / total)
             )
-            return pipeline.decode(latents)
+            return self.pipeline.decode(latents)
         finally:
-            pipeline.vae.clear_cache()  # features of a clip that was not decoded to its end
-            pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure
+            self.pipeline.vae.clear_cache()  # features of a clip that was not decoded to its end
+            self.pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure
 
-    def _conditioning(self, given: GeneratorInput, width: int, height: int, *, guided: bool) -> Conditioning:
-        scene, options = given.scene, _options(given)
-        first_frame = scene.clean if options.clean_cues else scene.image
-        image = self._embeddings.image(first_frame, width, height, given.trajectory.num_frames)
-        tracks = tracks_of(given.trajectory, scene.width, scene.height)
-        # In pixels of the clip: its sides are rounded, so that its aspect ratio is not quite the image's.
-        tracks = tracks.scaled(width / scene.width, height / scene.height)
-        condition, unconditional = self._model.conditioning(image.condition, tracks, width, height)
-        return Conditioning(
-            prompt=self._embeddings.text(_prompt(given)),
-            negative_prompt=self._embeddings.text(self._negative_prompt(options)) if guided else None,
-            image=image.embeds,
-            condition=condition,
-            unconditional=unconditional,
-        )
-
-    def _sampling(self, given: GeneratorInput) -> Sampling:
-        update = _options(given).model_dump(include={"steps", "shift", "guidance_scale"}, exclude_none=True)
-        return self._model.profile.sampling.model_copy(update=update)
-
-    def _negative_prompt(self, options: WanOptions) -> str:
-        return self._model.negative_prompt if options.negative_prompt is None else options.negative_prompt
-
-
-def _options(given: GeneratorInput) -> WanOptions:
-    return cast(WanOptions, given.options)  # the generator's own `options_model`
-
-
-def _prompt(given: GeneratorInput) -> str:
-    prompt = _options(given).prompt
-    return given.motion.sentence if prompt is None else prompt
+    def _chosen(self, options: WanOptions, sentence: str) -> tuple[Sampling, str, str | None]:
+        """Sampling, prompt and negative prompt, None where no step is guided: the request's, else the model's."""
+        update = options.model_dump(include={"steps", "shift", "guidance_scale"}, exclude_none=True)
+        sampling = self.profile.sampling.model_copy(update=update)
+        prompt = sentence if options.prompt is None else options.prompt
+        negative = self._negative_prompt if options.negative_prompt is None else options.negative_prompt
+        return sampling, prompt, negative if sampling.guided else None
 
 
 def keep_compiled_code(folder: Path) -> None:

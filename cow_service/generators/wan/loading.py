@@ -33,7 +33,7 @@ from cow_service.generators.wan.checkpoints import (
     counted,
     load_transformer,
 )
-from cow_service.generators.wan.generator import USUAL_SIDES, LoadedModel, WanGenerator, clip_size, keep_compiled_code
+from cow_service.generators.wan.generator import USUAL_SIDES, WanGenerator, clip_size, keep_compiled_code
 from cow_service.generators.wan.memory import check_memory, within_memory
 from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
@@ -73,22 +73,18 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     revisions = _revisions(manifest, profile, settings)
     repository = manifest.sources["transformer"].repository if manifest.sources else None
     generator = WanGenerator(
-        LoadedModel(
-            name=name,
-            repository=repository if own is None else own.name,
-            revision=revisions.pop("transformer", None),
-            revisions=revisions,
-            weights_identity=identity,
-            pipeline=pipeline,
-            group=group,
-            device=device,
-            profile_name=settings.profile,
-            profile=profile,
-            conditioning=track_conditioning,
-            max_area=max_area,
-            negative_prompt=str(manifest.defaults.get("negative_prompt", "")),
-            threads=int(manifest.defaults["threads"]) if "threads" in manifest.defaults else None,
-        )
+        manifest=manifest,
+        repository=repository if own is None else own.name,
+        revision=revisions.pop("transformer", None),
+        revisions=revisions,
+        weights_identity=identity,
+        pipeline=pipeline,
+        group=group,
+        device=device,
+        profile_name=settings.profile,
+        profile=profile,
+        conditioning=track_conditioning,
+        max_area=max_area,
     )
     if settings.warmup:
         try:

@@ -17,7 +17,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from cow_service.errors import CheckpointInvalid, DeviceFailed, GeneratorOutOfMemory, GeneratorUnavailable
-from cow_service.generators.wan.acceleration import check_device
+from cow_service.generators.wan.capabilities import detect_capabilities, refusals
 from cow_service.generators.wan.checkpoints import FLOAT8, checkpoint_files
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
 from cow_service.weights.device import is_out_of_memory
@@ -77,7 +77,6 @@ def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, de
     if found is None:
         return
     parameters, has_float8 = found
-    profiles = {each: profile_of(manifest, each) for each in manifest.profiles}
     if profile_of(manifest, name).acceleration.fp8 == "stored" and not has_float8:
         raise GeneratorUnavailable(
             f"The profile '{name}' keeps the float8 of a checkpoint, and that of '{manifest.name}' has none: give one "
@@ -95,19 +94,18 @@ def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, de
             return f"{need.host / 1e9:.0f} GB of this machine's memory, and it has {room.host / 1e9:.0f} GB"
         return None
 
-    def runs(profile: Profile) -> bool:
-        try:
-            check_device(profile.acceleration, device)
-        except GeneratorUnavailable:
-            return False
-        return has_float8 or profile.acceleration.fp8 != "stored"
-
-    if (short := shortage(profiles[name])) is not None:
-        fitting = [other for other, profile in profiles.items() if shortage(profile) is None and runs(profile)]
-        remedy = (
-            f"Of its profiles fit: {', '.join(fitting)} (COW_PROFILE)." if fitting else "None of its profiles fits."
-        )
-        raise GeneratorUnavailable(f"The weights of '{manifest.name}' with the profile '{name}' take {short}. {remedy}")
+    if (short := shortage(profile_of(manifest, name))) is not None:
+        machine = detect_capabilities(device)
+        profiles = {other: profile_of(manifest, other) for other in manifest.profiles}
+        fitting = [
+            other
+            for other, profile in profiles.items()
+            if (has_float8 or profile.acceleration.fp8 != "stored")
+            and shortage(profile) is None
+            and not refusals(profile.acceleration, machine)
+        ]
+        remedy = f"Of its profiles fit: {', '.join(fitting)} (COW_PROFILE)" if fitting else "None of its profiles fits"
+        raise GeneratorUnavailable(f"The weights of '{manifest.name}' with the profile '{name}' take {short}. {remedy}.")
 
 
 def _room(device: torch.device) -> int:
