@@ -478,7 +478,7 @@ def test_a_checkpoint_for_a_model_that_takes_none(tmp_path: Path) -> None:
 
 def test_parts_of_ones_own_carry_no_pulled_revision(tmp_path: Path) -> None:
     """A whole pipeline of one's own brings its own other parts, whatever was pulled."""
-    from cow_service.generators.wan.loading import _revisions
+    from cow_service.generators.wan.loading import Weights
     from cow_service.generators.wan.profiles import profile_of
     from cow_service.weights.manifests import load_manifests
     from cow_service.weights.repositories import Lock, folder_of, write_lock
@@ -493,7 +493,7 @@ def test_parts_of_ones_own_carry_no_pulled_revision(tmp_path: Path) -> None:
     for own, parts in (({}, ["base", "transformer"]), ("one.safetensors", ["base"]), ("whole", [])):
         checkpoints = {"ati": tmp_path / own} if own else {}
         settings = Settings(data_dir=tmp_path, checkpoints=checkpoints)
-        assert sorted(_revisions(manifest, profile, settings)) == parts
+        assert sorted(Weights(manifest, profile, settings).revisions()) == parts
 
 
 def test_what_a_generator_needs_is_told_by_its_manifest() -> None:

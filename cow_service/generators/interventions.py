@@ -3,8 +3,6 @@
 What is taken away leaves its place with its shadow, and what it hid is completed. What is put elsewhere is drawn there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -8,8 +8,6 @@ Bytes that no longer match their name are removed when that is noticed, as if th
 when the same bytes are sent or computed again.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import logging
@@ -80,9 +78,13 @@ class ArtifactWriter(ABC):
         Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
         """
 
-    @abstractmethod
     def put_file(self, path: Path, media_type: str) -> Artifact:
         """Moves in a finished file of `scratch`; afterwards `path` no longer exists. Raises as `put` does."""
+        extension_of(media_type)
+        with disk_errors():
+            data = path.read_bytes()
+            path.unlink()
+        return self.put(data, media_type)
 
     @abstractmethod
     def scratch(self) -> AbstractContextManager[Path]:
@@ -121,9 +123,9 @@ class ArtifactStore(ArtifactWriter):
     def local_file(self, sha256: str) -> AbstractContextManager[Path]:
         """A file with the bytes of an artifact, which is there inside the block. Raises as `get` does."""
 
-    @abstractmethod
     def signed_url(self, sha256: str, seconds: float) -> str | None:
         """A URL under which anybody can get an artifact for so long; None where the store has none."""
+        return None
 
     @abstractmethod
     def delete(self, sha256: str, untouched_since: float) -> bool:
@@ -252,10 +254,6 @@ class DiskArtifacts(ArtifactStore):
         with disk_errors(sha256):
             path = self._get(sha256)
         yield path
-
-    def signed_url(self, sha256: str, seconds: float) -> str | None:
-        """There is none."""
-        return None
 
     def delete(self, sha256: str, untouched_since: float) -> bool:
         """Deletes the file."""

@@ -5,8 +5,6 @@ needs them, and decoders spend on them without bound: compressed text grows a th
 the same bytes thousands of times, blocks are joined in quadratic time. Of EXIF only the orientation is read, here.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import codecs
@@ -14,7 +12,7 @@ import hashlib
 import io
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -214,6 +212,18 @@ def fit_within(pixels: NDArray[np.uint8], max_side: int | None) -> NDArray[np.ui
         return pixels
     size = (max(1, round(width * max_side / longer)), max(1, round(height * max_side / longer)))
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def tiled(frames: Sequence[NDArray[np.uint8]], columns: int, gap: int, grey: int) -> NDArray[np.uint8]:
+    """Frames [h, w, 3] of one size in rows from left to right, at most `columns` in each, `gap` px of grey apart."""
+    height, width = frames[0].shape[:2]
+    columns = min(columns, len(frames))
+    rows = -(-len(frames) // columns)
+    sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), grey, np.uint8)
+    for place, frame in enumerate(frames):
+        y, x = place // columns * (height + gap), place % columns * (width + gap)
+        sheet[y : y + height, x : x + width] = frame
+    return sheet
 
 
 def _describe_foreign(data: bytes) -> str:

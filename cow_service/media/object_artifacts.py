@@ -6,8 +6,6 @@ is sent again where that is longer ago. Bytes are compared with their digest onc
 and process, and whenever they are read. Credentials and endpoints come from the environment, as obstore reads them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import time
@@ -110,11 +108,6 @@ class ObjectArtifacts(ArtifactStore):
                 pass
         self._send(sha256, data, media_type)
         return artifact_of(sha256, media_type, len(data))
-
-    def put_file(self, path: Path, media_type: str) -> Artifact:
-        """Sends the bytes of a file, and deletes it."""
-        extension_of(media_type)
-        return self.put(_take_file(path), media_type)
 
     def get(self, sha256: str) -> Artifact:
         """Finds an object. Its bytes are not compared: whoever gets them from a signed URL can."""
@@ -236,23 +229,11 @@ class _ParallelWriter(ArtifactWriter):
         self.sent.append(self._threads.submit(self._retry, partial(self._store.put, data, media_type)))
         return artifact_of(hashlib.sha256(data).hexdigest(), media_type, len(data))
 
-    def put_file(self, path: Path, media_type: str) -> Artifact:
-        extension_of(media_type)
-        return self.put(_take_file(path), media_type)
-
     def scratch(self) -> AbstractContextManager[Path]:
         return self._store.scratch()
 
 
-def _take_file(path: Path) -> bytes:
-    """The bytes of a file, which is deleted."""
-    with disk_errors():
-        data = path.read_bytes()
-        path.unlink()
-        return data
-
-
-def _object(sha256: str, result: obstore.GetResult) -> _Object:
+def _object(sha256: str, result: "obstore.GetResult") -> _Object:
     meta, media_type = result.meta, result.attributes.get("Content-Type", "")
     if media_type not in MEDIA_TYPES:  # an object that somebody else has put there
         raise not_found(sha256)

@@ -1,7 +1,5 @@
 """Draws the results over the input image: outline, direction, paths with their bands, contacts and encounters."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media.images import tiled
 from cow_service.records import BBox, Grounding, Motion, Path, Trajectory
 from cow_service.records.world import MEETINGS
 
@@ -289,12 +288,7 @@ def named_strip(frames: Sequence[Image], name: str) -> Image:
     """Frames [h, w, 3] of one size in their order, in rows from left to right, below a name."""
     height, width = frames[0].shape[:2]
     unit = max(1.0, max(height, width) / 640)
-    columns, bar = min(PER_ROW, len(frames)), round(BAR * unit)
-    rows = -(-len(frames) // columns)
-    total = columns * (width + GAP) - GAP, bar + rows * (height + GAP) - GAP
-    strip = np.full((total[1], total[0], 3), DARK[0], np.uint8)
-    for place, frame in enumerate(frames):
-        y, x = bar + place // columns * (height + GAP), place % columns * (width + GAP)
-        strip[y : y + height, x : x + width] = frame
-    draw_labels(strip, [Label(name, (0.0, float(bar), float(total[0]), float(bar)), LIGHT, below=False)], unit, DARK)
+    sheet, bar = tiled(frames, PER_ROW, GAP, DARK[0]), round(BAR * unit)
+    strip = np.concatenate([np.full((bar, *sheet.shape[1:]), DARK[0], np.uint8), sheet])
+    draw_labels(strip, [Label(name, (0.0, bar, sheet.shape[1], bar), LIGHT, below=False)], unit, DARK)
     return strip

@@ -3,8 +3,6 @@
 This is the seam to FFmpeg.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 from collections.abc import Callable, Iterable, Sequence
@@ -16,15 +14,15 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
-from av.container import OutputContainer
 from av.error import FFmpegError
 from av.video.reformatter import ColorRange, Colorspace
-from av.video.stream import VideoStream
 from numpy.typing import NDArray
 from PIL import Image
 
 from cow_service.errors import InternalError, StorageUnavailable
-from cow_service.media.images import encode_png, fit_within
+from cow_service.media.images import encode_png, fit_within, tiled
+
+Pixels = NDArray[np.uint8]
 
 _RED, _BLUE = 0.2126, 0.0722
 _LUMA = np.array([_RED, 1 - _RED - _BLUE, _BLUE])
@@ -44,38 +42,28 @@ class YuvFrames:
         self._planes = np.empty((height * 3 // 2, width), np.uint8)
         self._is_first = True
 
-    def converted(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def converted(self, rgb: Pixels) -> Pixels:
         """The planes [H * 3 / 2, W] of a frame [H, W, 3], as `yuv420p` lays them out; valid until the next call."""
-        window = self._changed(rgb)
-        if window is not None:
-            self._convert(rgb[window], *window)
-            self._rgb[window] = rgb[window]
-            self._is_first = False
-        return self._planes
-
-    def _changed(self, rgb: NDArray[np.uint8]) -> tuple[slice, slice] | None:
-        """The rows and columns, even, in which a frame differs from the one before; None where it does not."""
         height, width = rgb.shape[:2]
-        if self._is_first:
-            return slice(0, height), slice(0, width)
-        differs = rgb.reshape(height, -1) != self._rgb.reshape(height, -1)
-        rows = np.nonzero(differs.any(axis=1))[0]
-        if not len(rows):
-            return None
-        top, bottom = int(rows[0]) // 2 * 2, int(rows[-1]) // 2 * 2 + 2
-        columns = np.nonzero(differs[top:bottom].any(axis=0))[0] // 3
-        return slice(top, bottom), slice(int(columns[0]) // 2 * 2, int(columns[-1]) // 2 * 2 + 2)
-
-    def _convert(self, rgb: NDArray[np.uint8], rows: slice, columns: slice) -> None:
-        """Writes a window of a frame into the planes."""
-        height, width = self._rgb.shape[:2]
-        self._planes[rows, columns] = cv2.transform(rgb, _TO_LUMA).reshape(rgb.shape[:2])
-        size = rgb.shape[1] // 2, rgb.shape[0] // 2
-        chroma = cv2.transform(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), _TO_CHROMA)
-        planes = self._planes[height:].reshape(2, height // 2, width // 2)
+        rows, columns = slice(0, height), slice(0, width)
+        if not self._is_first:  # the window, of even sides, in which it differs from the frame before
+            differs = rgb.reshape(height, -1) != self._rgb.reshape(height, -1)
+            found = np.nonzero(differs.any(axis=1))[0]
+            if not len(found):
+                return self._planes
+            rows = slice(int(found[0]) // 2 * 2, int(found[-1]) // 2 * 2 + 2)
+            found = np.nonzero(differs[rows].any(axis=0))[0] // 3
+            columns = slice(int(found[0]) // 2 * 2, int(found[-1]) // 2 * 2 + 2)
+        part = rgb[rows, columns]
+        self._planes[rows, columns] = cv2.transform(part, _TO_LUMA).reshape(part.shape[:2])
+        halved = cv2.resize(part, (part.shape[1] // 2, part.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        chroma = self._planes[height:].reshape(2, height // 2, width // 2)
         window = slice(rows.start // 2, rows.stop // 2), slice(columns.start // 2, columns.stop // 2)
-        for plane, values in zip(planes, cv2.split(chroma), strict=True):
+        for plane, values in zip(chroma, cv2.split(cv2.transform(halved, _TO_CHROMA)), strict=True):
             plane[window] = values
+        self._rgb[rows, columns] = part
+        self._is_first = False
+        return self._planes
 
 
 CRF_DEFAULT = 18  # x264's constant rate factor, 0 (lossless) to 51; 18 looks lossless
@@ -90,7 +78,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def write_mp4(
-    frames: Iterable[NDArray[np.uint8]],
+    frames: Iterable[Pixels],
     path: Path,
     *,
     fps: float,
@@ -116,9 +104,7 @@ def write_mp4(
     with ExitStack() as on_error:
         on_error.callback(path.unlink, missing_ok=True)
         try:
-            with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-                stream = _add_stream(container, rate, width, height, crf)
-                count = _encode(frames, container, stream, (height, width, 3))
+            count = _encode(frames, path, rate, width, height, crf)
         except FFmpegError as error:
             if error.errno in _FULL:
                 raise StorageUnavailable(
@@ -132,51 +118,45 @@ def write_mp4(
     return count
 
 
-def _add_stream(container: OutputContainer, rate: Fraction, width: int, height: int, crf: int) -> VideoStream:
+def _encode(frames: Iterable[Pixels], path: Path, rate: Fraction, width: int, height: int, crf: int) -> int:
     options = {"crf": str(crf), "preset": _PRESET, "profile": "high"}
     if cv2.checkHardwareSupport(_AVX_512):
         options["x264-params"] = _UP_TO_AVX2
-    stream = container.add_stream("libx264", rate=rate, options=options)
-    context = stream.codec_context
-    context.width, context.height = width + width % 2, height + height % 2
-    context.pix_fmt = "yuv420p"
-    context.time_base = 1 / rate
-    # Without these tags players guess the matrix from the height of the video, and colours shift.
-    context.colorspace = context.color_primaries = context.color_trc = _BT709
-    context.color_range = ColorRange.MPEG
-    context.thread_count = _THREADS
-    # Slices, the default, would cost compression.
-    context.thread_type = "FRAME"
-    return stream
-
-
-def _encode(
-    frames: Iterable[NDArray[np.uint8]], container: OutputContainer, stream: VideoStream, shape: tuple[int, int, int]
-) -> int:
-    height, width = shape[0] + shape[0] % 2, shape[1] + shape[1] % 2
-    planes = YuvFrames(height, width)
-    count = 0
-    for pixels in frames:
-        if pixels.shape != shape or pixels.dtype != np.uint8:
-            raise ValueError(f"Frame {count} is {pixels.shape} of {pixels.dtype}: it must be {shape} of uint8.")
-        if (height, width) != shape[:2]:
-            pixels = np.pad(pixels, ((0, height - shape[0]), (0, width - shape[1]), (0, 0)), mode="edge")  # noqa: PLW2901
-        frame = av.VideoFrame.from_ndarray(planes.converted(np.ascontiguousarray(pixels)), format="yuv420p")
-        frame.colorspace, frame.color_range = Colorspace.ITU709, ColorRange.MPEG
-        frame.pts, frame.time_base = count, stream.codec_context.time_base
-        container.mux(stream.encode(frame))
-        count += 1
-    if count:
-        container.mux(stream.encode(None))
-    return count
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("libx264", rate=rate, options=options)
+        context = stream.codec_context
+        context.width, context.height = width + width % 2, height + height % 2
+        context.pix_fmt = "yuv420p"
+        context.time_base = 1 / rate
+        # Without these tags players guess the matrix from the height of the video, and colours shift.
+        context.colorspace = context.color_primaries = context.color_trc = _BT709
+        context.color_range = ColorRange.MPEG
+        context.thread_count = _THREADS
+        # Slices, the default, would cost compression.
+        context.thread_type = "FRAME"
+        planes = YuvFrames(context.height, context.width)
+        count = 0
+        for pixels in frames:
+            if pixels.shape != (height, width, 3) or pixels.dtype != np.uint8:
+                shape = f"{pixels.shape} of {pixels.dtype}"
+                raise ValueError(f"Frame {count} is {shape}: it must be {(height, width, 3)} of uint8.")
+            pixels = np.ascontiguousarray(pixels)  # noqa: PLW2901
+            even = cv2.copyMakeBorder(pixels, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+            frame = av.VideoFrame.from_ndarray(planes.converted(np.asarray(even, np.uint8)), format="yuv420p")
+            frame.colorspace, frame.color_range = Colorspace.ITU709, ColorRange.MPEG
+            frame.pts, frame.time_base = count, context.time_base
+            container.mux(stream.encode(frame))
+            count += 1
+        if count:
+            container.mux(stream.encode(None))
+        return count
 
 
 MAX_SIDE = 480  # px of an animated picture: a GIF has no compression to speak of
 GIF_FPS = 12.5  # that browsers show as they should: times of a GIF are hundredths of a second
 SHEET_COLUMNS, SHEET_ROWS, SHEET_SIDE, SHEET_GAP = 4, 3, 320, 4  # px
+WHITE = 255
 WEBP_QUALITY = 80
-
-Pixels = NDArray[np.uint8]
 
 
 def frames_of(video: bytes, max_side: int | None = None) -> tuple[list[Pixels], float]:
@@ -191,11 +171,11 @@ def frames_of(video: bytes, max_side: int | None = None) -> tuple[list[Pixels], 
 def gif(frames: Sequence[Pixels], fps: float) -> bytes:
     """An animated GIF that goes on for ever, at most `MAX_SIDE` px and `GIF_FPS` frames a second."""
     every = max(1, round(fps / GIF_FPS))
-    shown = [Image.fromarray(fit_within(frame, MAX_SIDE)) for frame in frames[::every]]
+    shown = [fit_within(frame, MAX_SIDE) for frame in frames[::every]]
     # One palette for all frames: with one for each, what stands still would flicker. The octree keeps small things'
     # colours, for which the methods that count pixels have none left.
-    palette = _sheet(shown, columns=8).quantize(256, method=Image.Quantize.FASTOCTREE)
-    drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in shown]
+    palette = Image.fromarray(tiled(shown, 8, SHEET_GAP, WHITE)).quantize(256, method=Image.Quantize.FASTOCTREE)
+    drawn = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in shown]
     times = [10 * round(100 * every * place / fps) for place in range(len(shown) + 1)]  # ms, whole hundredths
     return _saved(drawn, "GIF", duration=[after - time for time, after in pairwise(times)], disposal=1)
 
@@ -210,8 +190,9 @@ def contact_sheet(frames: Sequence[Pixels], fps: float) -> bytes:
     """A PNG with frames from all over the clip, in rows from left to right."""
     wanted = min(len(frames), SHEET_COLUMNS * SHEET_ROWS)
     chosen = np.linspace(0, len(frames) - 1, wanted).round().astype(int)
-    shown = [Image.fromarray(fit_within(frames[index], SHEET_SIDE)) for index in chosen]
-    return encode_png(np.asarray(_sheet(shown, SHEET_COLUMNS)))
+    return encode_png(
+        tiled([fit_within(frames[index], SHEET_SIDE) for index in chosen], SHEET_COLUMNS, SHEET_GAP, WHITE)
+    )
 
 
 FORMATS: dict[str, tuple[str, Callable[[Sequence[Pixels], float], bytes]]] = {
@@ -226,17 +207,6 @@ def animation(video: bytes, format: str) -> bytes:
     """The file of a format of `FORMATS`, made of an mp4. Its frames are held as small as they will be in the file."""
     frames, fps = frames_of(video, SHEET_SIDE if format == "sheet" else MAX_SIDE)
     return FORMATS[format][1](frames, fps)
-
-
-def _sheet(pictures: Sequence[Image.Image], columns: int) -> Image.Image:
-    width, height = pictures[0].size
-    columns = min(columns, len(pictures))
-    rows = -(-len(pictures) // columns)
-    size = columns * (width + SHEET_GAP) - SHEET_GAP, rows * (height + SHEET_GAP) - SHEET_GAP
-    sheet = Image.new("RGB", size, (255, 255, 255))
-    for place, picture in enumerate(pictures):
-        sheet.paste(picture, (place % columns * (width + SHEET_GAP), place // columns * (height + SHEET_GAP)))
-    return sheet
 
 
 def _saved(pictures: Sequence[Image.Image], format: str, **options: int | list[int]) -> bytes:

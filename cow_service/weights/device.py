@@ -1,7 +1,5 @@
 """Where weights run: the device that COW_DEVICE names, its CPU threads, and how PyTorch says that memory ran out."""
 
-from __future__ import annotations
-
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from threading import Lock

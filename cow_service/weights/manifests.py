@@ -1,7 +1,5 @@
 """Reads the manifests in `models/`: what a backend or model is, what it needs, its defaults. No weights, no loading."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files

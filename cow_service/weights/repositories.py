@@ -40,7 +40,6 @@ from cow_service.weights.manifests import Manifest, Source
 if TYPE_CHECKING:
     from filelock import FileLock
     from huggingface_hub import HfApi
-    from huggingface_hub.hf_api import RepoSibling
 
 LOCK_NAME = "cow.lock.json"
 PICKLED = (".bin", ".ckpt", ".pickle", ".pkl", ".pt", ".pth")  # reading one of these can run code that it holds
@@ -345,7 +344,15 @@ def download(
     with ExitStack() as held:
         for each in downloads:
             held.callback(_locked(folder_of(weights_dir, each.lock.repository), each.lock.repository).release)
-        _check_free_space(downloads, weights_dir)
+        needed: Counter[int] = Counter()  # bytes, by disk
+        for each in downloads:
+            with disk_errors(each.lock.repository):
+                folder = folder_of(weights_dir, each.lock.repository)  # which may be a link to another disk
+                disk, free = folder.stat().st_dev, shutil.disk_usage(folder).free
+            needed[disk] += each.pending_size
+            if needed[disk] > free:
+                why = f"its disk has {free / 1e9:.1f} GB free, and {needed[disk] / 1e9:.1f} GB are needed"
+                raise _unavailable(each.lock.repository, why, "Free some space, or set COW_MODELS_DIR to a larger disk")
         for each in downloads:
             lock, old = each.lock, read_lock(weights_dir, each.lock.repository)
             if old is not None and old.revision == lock.revision:  # another download may have ended meanwhile
@@ -404,32 +411,21 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
                 pickled = "only pickled files, which can run code when they are read, match"
                 why = f"{pickled if matching else 'no file matches'} '{pattern}'"
                 raise _unavailable(source.repository, why, "Choose a revision that has such files as safetensors")
-        files = tuple(_record(source.repository, siblings[name]) for name in sorted(names))
-        return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=files)
-
-
-def _record(repository: str, sibling: RepoSibling) -> LockedFile:
-    try:
-        path = inside(sibling.rfilename)
-    except ValueError as error:
-        raise _unavailable(repository, f"in its listing, {error}", "Do not use this repository") from error
-    if sibling.lfs is not None:  # files in large-file storage, xet included
-        return LockedFile(path=path, size=sibling.lfs.size, algorithm="sha256", digest=sibling.lfs.sha256)
-    if sibling.size is None or sibling.blob_id is None:
-        raise _unavailable(repository, f"the hub lists no size or no digest of '{path}'", "Run it again")
-    return LockedFile(path=path, size=sibling.size, algorithm="git-sha1", digest=sibling.blob_id)
-
-
-def _check_free_space(downloads: Sequence[Download], weights_dir: Path) -> None:
-    needed: Counter[int] = Counter()
-    for each in downloads:
-        with disk_errors(each.lock.repository):
-            folder = folder_of(weights_dir, each.lock.repository)  # which may be a link to another disk
-            device, free = folder.stat().st_dev, shutil.disk_usage(folder).free
-        needed[device] += each.pending_size
-        if needed[device] > free:
-            why = f"its disk has {free / 1e9:.1f} GB free, and {needed[device] / 1e9:.1f} GB are needed"
-            raise _unavailable(each.lock.repository, why, "Free some space, or set COW_MODELS_DIR to a larger disk")
+        files: list[LockedFile] = []
+        for name in sorted(names):
+            try:
+                path, listed = inside(name), siblings[name]
+            except ValueError as error:
+                raise _unavailable(
+                    source.repository, f"in its listing, {error}", "Do not use this repository"
+                ) from error
+            if listed.lfs is not None:  # files in large-file storage, xet included
+                files.append(LockedFile(path=path, size=listed.lfs.size, algorithm="sha256", digest=listed.lfs.sha256))
+            elif listed.size is None or listed.blob_id is None:
+                raise _unavailable(source.repository, f"the hub lists no size or no digest of '{path}'", "Run it again")
+            else:
+                files.append(LockedFile(path=path, size=listed.size, algorithm="git-sha1", digest=listed.blob_id))
+        return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=tuple(files))
 
 
 def _locked(folder: Path, repository: str) -> FileLock:
@@ -497,26 +493,28 @@ def _hub_errors(repository: str, revision: str | None) -> Generator[None]:
         # By which the library replaces the network's own error.
         while type(cause).__name__ == "LocalEntryNotFoundError" and cause.__cause__ is not None:
             cause = cause.__cause__
-        reason, remedy = _reason(cause)
-        raise _unavailable(repository, reason.format(revision=revision or "main"), remedy) from error
+        kinds = {kind.__name__ for kind in type(cause).__mro__}
+        known = next(((reason, remedy) for name, reason, remedy in REASONS if name in kinds), None)
+        status = getattr(getattr(cause, "response", None), "status_code", None)
+        number = cause.errno if isinstance(cause, OSError) else None
+        if known is not None:
+            reason, remedy = known[0].format(revision=revision or "main"), known[1]
+        elif status in (401, 403):
+            reason, remedy = f"it is not open to this account (HTTP {status})", _LOG_IN
+        elif status is not None:
+            reason, remedy = f"the hub answered with HTTP {status}", "Wait a little and run it again"
+        elif number in (errno.ENOSPC, errno.EDQUOT):
+            reason = "the disk is full"
+            remedy = "Free some space, or set COW_MODELS_DIR to a folder on a larger disk"
+        elif number:
+            reason, remedy = (
+                f"the folder for weights cannot be used ({errno.errorcode.get(number)})",
+                "Make it writable",
+            )
+        else:
+            reason, remedy = f"the download failed ({type(cause).__name__})", _AGAIN
+        raise _unavailable(repository, reason, remedy) from error
 
 
 def _unavailable(repository: str, reason: str, remedy: str) -> WeightsUnavailable:
     return WeightsUnavailable(f"'{repository}' cannot be downloaded: {reason}. {remedy}.")
-
-
-def _reason(error: BaseException) -> tuple[str, str]:
-    kinds = {kind.__name__ for kind in type(error).__mro__}
-    for name, reason, remedy in REASONS:
-        if name in kinds:
-            return reason, remedy
-    status = getattr(getattr(error, "response", None), "status_code", None)
-    if status in (401, 403):
-        return f"it is not open to this account (HTTP {status})", _LOG_IN
-    if status is not None:
-        return f"the hub answered with HTTP {status}", "Wait a little and run it again"
-    if isinstance(error, OSError) and error.errno:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return "the disk is full", "Free some space, or set COW_MODELS_DIR to a folder on a larger disk"
-        return f"the folder for weights cannot be used ({errno.errorcode.get(error.errno)})", "Make it writable"
-    return f"the download failed ({type(error).__name__})", _AGAIN

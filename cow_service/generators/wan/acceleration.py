@@ -12,8 +12,6 @@ Private parts of libraries, for which there is no public way:
 - cache-dit `_is_cached`, `_context_names` and `_context_manager`: the same for its cache.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -3,14 +3,13 @@
 No rule tells: cuDNN's is the faster one on some GPUs and the slower one on others, and lacks shapes.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os
 import statistics
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -132,7 +131,10 @@ def with_attention(
     machine, shape = detect_capabilities(device), shape_of(architecture, width, height)
     names = backends_for_auto(wanted, machine)
     situation = repr((machine.name, torch.__version__, diffusers.__version__, profile.dtype, tuple(shape), names))
-    before = _read_choices(kept)
+    before: dict[str, str] = {}
+    if kept is not None:
+        with suppress(OSError, ValueError, TypeError):  # there is none yet, or it is damaged
+            before = dict(json.loads(kept.read_text()))
     chosen = before.get(situation)
     if chosen in names and _fetched(chosen) is None:
         log.info("attention: %s, as was chosen before", chosen)
@@ -146,14 +148,6 @@ def with_attention(
             part.write_text(json.dumps(before | {situation: chosen}, indent=2) + "\n")
             part.replace(kept)
     return profile.model_copy(update={"acceleration": wanted.model_copy(update={"attention": chosen})})
-
-
-def _read_choices(kept: Path | None) -> dict[str, str]:
-    try:
-        found: Any = {} if kept is None else json.loads(kept.read_text())
-    except (OSError, ValueError):  # there is none yet, or it is damaged
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def fetch_kernels(wanted: Iterable[Acceleration], device: torch.device) -> dict[str, str | None]:

@@ -1,7 +1,5 @@
 """What a device and the installed packages support, and which options of an `Acceleration` they do not."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

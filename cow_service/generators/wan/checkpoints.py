@@ -11,15 +11,13 @@ layers that the model lacks with a warning only; here either every tensor of the
 Private part of diffusers: `_keep_in_fp32_modules`, the layers of a model that must stay in float32.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from accelerate import init_empty_weights
@@ -44,8 +42,7 @@ TEXT_LENGTH = 512  # tokens, fixed by the model
 Architecture = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class _Entry:
+class Entry(NamedTuple):
     """A tensor as its file's header describes it."""
 
     file: Path
@@ -65,14 +62,37 @@ def load_transformer(
     """
     folder, files = checkpoint_files(path)
     config, original = _configuration(folder, architecture)
-    entries = _headers(files)
+    entries = read_headers(files)
     try:
         with init_empty_weights():
             model = WanTransformer3DModel(**config)
     except (TypeError, ValueError, ZeroDivisionError, RuntimeError) as error:
         raise CheckpointInvalid(f"The configuration does not make a Wan transformer: {error}.") from error
     sources = _match_names(entries, model.state_dict(), original)
-    _load_weights(model, sources, entries, dtype, device, keep_float8)
+    # The weights are read one at a time and file after file, straight to their device.
+    precise = tuple(model._keep_in_fp32_modules or ())  # pyright: ignore[reportPrivateUsage]
+    state: dict[str, Tensor] = {}
+    for file in files:
+        here = [(name, source) for name, source in sources.items() if entries[source].file == file]
+        try:
+            with safe_open(file, framework="pt", device=str(device)) as opened:
+                for name, source in here:
+                    entry, tensor = entries[source], opened.get_tensor(entries[source].key)
+                    key = source.removesuffix(".weight") + SCALE
+                    scale = None
+                    if source.endswith(".weight") and key in entries:  # which may lie in another file
+                        with safe_open(entries[key].file, framework="pt", device=str(device)) as scales:
+                            scale = scales.get_tensor(entries[key].key).float()
+                    if keep_float8 and entry.dtype in FLOAT8 and len(entry.shape) == 2 and name.startswith("blocks."):
+                        state[name] = _keep_in_float8(tensor, scale, dtype)
+                        continue
+                    keep = any(part in precise for part in name.split("."))
+                    exact = tensor if scale is None else tensor.float() * scale
+                    state[name] = exact.to(torch.float32 if keep else dtype)
+        except (SafetensorError, OSError) as error:
+            raise CheckpointInvalid(f"{file.name} is damaged ({_reason(error)}). Download it again.") from error
+    model.load_state_dict(state, strict=True, assign=True)
+    cast(Any, model).to(device)  # for the tables of the rotary embedding, which no checkpoint holds
     return model.eval().requires_grad_(False)
 
 
@@ -118,22 +138,17 @@ def checkpoint_files(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
         pickles = [file.name for file in sorted(folder.iterdir()) if file.suffix in PICKLES]
         found = f"only pickles ({', '.join(pickles)}), which can run code when opened" if pickles else "none"
         raise CheckpointInvalid(f"'{path.name}' has no safetensors files: {found}.")
-    _check_shards(folder, files)
-    return folder, files
-
-
-def _check_shards(folder: Path, files: tuple[Path, ...]) -> None:
-    """Every shard that the index or a name like -00001-of-00007 promises must be there."""
+    # Every shard that the index or a name like -00001-of-00007 promises must be there.
     present = {file.name for file in files}
     promised: set[str] = set()
     for index in folder.glob("*.safetensors.index.json"):
         promised |= set(_json(index).get("weight_map", {}).values())
     for name in present:
         if numbered := re.fullmatch(r"(.*-)\d+-of-(\d+)\.safetensors", name):
-            count = int(numbered[2])
-            promised |= {f"{numbered[1]}{i:05d}-of-{numbered[2]}.safetensors" for i in range(1, count + 1)}
+            promised |= {f"{numbered[1]}{i + 1:05d}-of-{numbered[2]}.safetensors" for i in range(int(numbered[2]))}
     if absent := sorted(promised - present):
         raise CheckpointInvalid(f"Shards are missing: {listed(absent)}. Download the checkpoint again.")
+    return folder, files
 
 
 def _configuration(folder: Path | None, architecture: Architecture) -> tuple[dict[str, Any], bool | None]:
@@ -173,9 +188,9 @@ def _reason(error: Exception) -> str:
     return error.strerror or "unreadable" if isinstance(error, OSError) else str(error)
 
 
-def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
-    """What the files hold, by name without the prefix. Reads headers only."""
-    entries: dict[str, _Entry] = {}
+def read_headers(files: Iterable[Path]) -> dict[str, Entry]:
+    """What the files hold, by name without the prefix. Raises `CheckpointInvalid` for a file that is damaged."""
+    entries: dict[str, Entry] = {}
     for file in files:
         try:
             with safe_open(file, framework="pt") as opened:
@@ -184,7 +199,7 @@ def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
                     name, part = key.removeprefix(prefix), opened.get_slice(key)
                     if name in entries:
                         raise CheckpointInvalid(f"'{name}' is both in {entries[name].file.name} and in {file.name}.")
-                    entries[name] = _Entry(file, key, tuple(part.get_shape()), part.get_dtype())
+                    entries[name] = Entry(file, key, tuple(part.get_shape()), part.get_dtype())
         except (SafetensorError, OSError) as error:
             raise CheckpointInvalid(
                 f"{file.name} is cut short or damaged ({_reason(error)}). Download it again."
@@ -192,7 +207,7 @@ def _headers(files: Iterable[Path]) -> dict[str, _Entry]:
     return entries
 
 
-def _match_names(entries: dict[str, _Entry], wanted: Mapping[str, Tensor], original: bool | None) -> dict[str, str]:
+def _match_names(entries: dict[str, Entry], wanted: Mapping[str, Tensor], original: bool | None) -> dict[str, str]:
     """For each of the model's names, the checkpoint's. Raises `CheckpointInvalid` listing all that does not fit."""
     weights = {name for name in entries if not name.endswith((SCALE, *UNUSED))}
     if original is None:
@@ -221,51 +236,12 @@ def _match_names(entries: dict[str, _Entry], wanted: Mapping[str, Tensor], origi
     return sources
 
 
-def _load_weights(
-    model: WanTransformer3DModel,
-    sources: Mapping[str, str],
-    entries: Mapping[str, _Entry],
-    dtype: torch.dtype,
-    device: torch.device,
-    keep_float8: bool,
-) -> None:
-    """Reads the weights, one at a time and file after file, straight to their device."""
-    precise = tuple(model._keep_in_fp32_modules or ())  # pyright: ignore[reportPrivateUsage]
-    state: dict[str, Tensor] = {}
-    for file in sorted({entry.file for entry in entries.values()}):
-        here = [(name, source) for name, source in sources.items() if entries[source].file == file]
-        try:
-            with safe_open(file, framework="pt", device=str(device)) as opened:
-                for name, source in here:
-                    entry, tensor = entries[source], opened.get_tensor(entries[source].key)
-                    key = source.removesuffix(".weight") + SCALE
-                    scale = None
-                    if source.endswith(".weight") and key in entries:  # which may lie in another file
-                        with safe_open(entries[key].file, framework="pt", device=str(device)) as scales:
-                            scale = scales.get_tensor(entries[key].key).float()
-                    if keep_float8 and entry.dtype in FLOAT8 and len(entry.shape) == 2 and name.startswith("blocks."):
-                        state[name] = _keep_in_float8(tensor, scale, dtype)
-                        continue
-                    keep = any(part in precise for part in name.split("."))
-                    exact = tensor if scale is None else tensor.float() * scale
-                    state[name] = exact.to(torch.float32 if keep else dtype)
-        except (SafetensorError, OSError) as error:
-            raise CheckpointInvalid(f"{file.name} is damaged ({_reason(error)}). Download it again.") from error
-    model.load_state_dict(state, strict=True, assign=True)
-    cast(Any, model).to(device)  # for the tables of the rotary embedding, which no checkpoint holds
-
-
 def _keep_in_float8(weight: Tensor, scale: Tensor | None, dtype: torch.dtype) -> Tensor:
     """A float8 matrix times one number, or as it is, as a weight that computes in `dtype`: no value is rounded anew."""
     from torchao.quantization import Float8Tensor  # noqa: PLC0415
 
     factor = torch.ones((), device=weight.device) if scale is None else scale
-    return Float8Tensor(
-        qdata=weight,
-        scale=factor.float().reshape(1, 1),
-        block_size=list(weight.shape),
-        dtype=dtype,
-    )
+    return Float8Tensor(qdata=weight, scale=factor.float().reshape(1, 1), block_size=list(weight.shape), dtype=dtype)
 
 
 def diffusers_names(originals: Iterable[str]) -> dict[str, str]:
@@ -373,7 +349,11 @@ def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], fi
     found: dict[str, dict[str, Tensor]] = {}
     unknown: list[str] = []
     for key, tensor in tensors.items():
-        target, part = _target(key)
+        bare = key
+        for prefix in LORA_PREFIXES:
+            bare = bare.removeprefix(prefix)
+        ends = ((bare.removesuffix(end) + parameter, part) for end, part, parameter in ENDS if bare.endswith(end))
+        target, part = next(ends, (key, ""))
         layer = found.setdefault(target, {})
         if not part or part in layer:
             unknown.append(key)
@@ -391,17 +371,6 @@ def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], fi
             f"LoRA '{file}' does not fit this model: half of a pair or another shape for {_some(misfits)}."
         )
     return changes
-
-
-def _target(key: str) -> tuple[str, str]:
-    """The parameter that a tensor changes, as the file names it, and which part of the change it is; "" if unknown."""
-    bare = key
-    for prefix in LORA_PREFIXES:
-        bare = bare.removeprefix(prefix)
-    for end, part, parameter in ENDS:
-        if bare.endswith(end):
-            return bare.removesuffix(end) + parameter, part
-    return key, ""
 
 
 def _some(names: list[str]) -> str:

@@ -7,8 +7,6 @@ Shapes: T latent frames of h x w cells, N tracks, and F = 4 (T - 1) + 1 clip fra
 Sources: the public implementations of ATI (arXiv 2505.22944) and Wan-Move (arXiv 2512.08765).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeAlias
 

@@ -1,7 +1,5 @@
 """The generator behind `ati`, `wan-move` and their toy-sized twins: one clip from image, tracks and sentence."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -5,9 +5,8 @@ toy size, with seeded random weights and a toy tokenizer: they make a clip in a 
 nothing; it is for tests, and to try a deployment out.
 """
 
-from __future__ import annotations
-
 import logging
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -16,23 +15,11 @@ import torch
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
 from safetensors import SafetensorError
 from torch import distributed, nn
-from transformers import (
-    AutoTokenizer,
-    CLIPImageProcessor,
-    CLIPVisionModel,
-    UMT5EncoderModel,
-)
+from transformers import AutoTokenizer, CLIPImageProcessor, CLIPVisionModel, UMT5EncoderModel
 
 from cow_service.errors import CheckpointInvalid, GeneratorOutOfMemory, GeneratorUnavailable
-from cow_service.generators.wan import conditioning
-from cow_service.generators.wan.acceleration import accelerate, accelerate_transformer, check_device, naming_option
+from cow_service.generators.wan import acceleration, checkpoints, conditioning
 from cow_service.generators.wan.attention import with_attention
-from cow_service.generators.wan.checkpoints import (
-    add_lora,
-    checkpoint_files,
-    counted,
-    load_transformer,
-)
 from cow_service.generators.wan.generator import USUAL_SIDES, WanGenerator, clip_size, keep_compiled_code
 from cow_service.generators.wan.memory import check_memory, within_memory
 from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
@@ -41,7 +28,7 @@ from cow_service.generators.wan.ranks import RankGroup
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device
-from cow_service.weights.manifests import Manifest, load_manifests
+from cow_service.weights.manifests import Manifest, Source, load_manifests
 from cow_service.weights.repositories import folder_of, read_lock, verify, weights_identity
 
 log = logging.getLogger("cow_service")
@@ -61,16 +48,17 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     others = {each: profile_of(manifest, each).acceleration for each in manifest.profiles}
     if own is None:  # what is pulled is not in float8
         others = {each: other for each, other in others.items() if other.fp8 != "stored"}
-    check_device(profile.acceleration, device, others)
+    acceleration.check_device(profile.acceleration, device, others)
     if own is not None:
-        checkpoint_files(own)
+        checkpoints.checkpoint_files(own)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
     max_area = int(manifest.defaults["max_area"])
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
         kept = settings.data_dir / "attention.json"
         profile = with_attention(profile, manifest.architecture, *clip_size(max_area, *USUAL_SIDES), device, kept)
-        pipeline, group = _loaded(manifest, profile, settings, device)
-    revisions = _revisions(manifest, profile, settings)
+        weights = Weights(manifest, profile, settings)
+        pipeline, group = weights.load_pipeline(device)
+    revisions = weights.revisions()
     repository = manifest.sources["transformer"].repository if manifest.sources else None
     generator = WanGenerator(
         manifest=manifest,
@@ -114,89 +102,87 @@ def load_rank(name: str, profile: Profile, settings: Settings, device: torch.dev
     manifest = load_manifests()[name]
     with within_memory(device, lambda: None, f"'{name}' on {device}"):
         if manifest.sources:
-            transformer = _transformer(manifest, profile, settings, device)
+            transformer = Weights(manifest, profile, settings).load_transformer(device)
         else:
             transformer = make_tiny(manifest.architecture).transformer
-        accelerate_transformer(transformer, profile.acceleration, device)
+        acceleration.accelerate_transformer(transformer, profile.acceleration, device)
         cast(nn.Module, transformer).to(device)
         return transformer
 
 
-def _loaded(
-    manifest: Manifest, profile: Profile, settings: Settings, device: torch.device
-) -> tuple[WanTrackPipeline, RankGroup | None]:
-    """The pipeline on its device, and the processes that share its clips, which load at the same time.
+@dataclass(frozen=True)
+class Weights:
+    """Those of a model in a profile: what was pulled, and the user's own."""
 
-    Weights that cannot fit are refused before any is read, and so are files that are not those that were pulled.
-    """
-    if manifest.sources:
-        transformer, base = (_folder(part, manifest, settings) for part in ("transformer", "base"))
-        check_memory(manifest, settings.profile, transformer, base, device)
-        for part in _pulled_parts(manifest, profile, settings):
-            verify(manifest.sources[part], settings.weights_dir, manifest.name)
-    if profile.acceleration.ranks > 1 and distributed.is_initialized():
-        raise GeneratorUnavailable(
-            f"'{manifest.name}': another model of this process shares the GPUs. Use one of them."
+    manifest: Manifest
+    profile: Profile
+    settings: Settings
+
+    def pulled(self) -> dict[str, Source]:
+        """By part, the sources that the model is made of and that are not the user's own."""
+        used = {"transformer", "base"} | ({self.profile.lora.source} if self.profile.lora is not None else set())
+        used -= set(self.settings.own_parts(self.manifest.name))
+        return {part: source for part, source in sorted(self.manifest.sources.items()) if part in used}
+
+    def revisions(self) -> dict[str, str]:
+        """Of every pulled part."""
+        locks = {part: read_lock(self.settings.weights_dir, each.repository) for part, each in self.pulled().items()}
+        return {part: lock.revision for part, lock in locks.items() if lock is not None}
+
+    def folder(self, part: str) -> Path:
+        """Of a pulled part, or the user's own checkpoint."""
+        if part in self.settings.own_parts(self.manifest.name):
+            return self.settings.checkpoints[self.manifest.name]
+        return folder_of(self.settings.weights_dir, self.manifest.sources[part].repository)
+
+    def load_transformer(self, device: torch.device) -> WanTransformer3DModel:
+        """With its LoRA."""
+        # With offloading or quantisation the device need not hold all unquantised weights at once.
+        fp8, lora = self.profile.acceleration.fp8, self.profile.lora
+        direct = self.profile.acceleration.offload == "none" and fp8 in {"none", "stored"}
+        transformer = checkpoints.load_transformer(
+            self.folder("transformer"),
+            self.manifest.architecture,
+            getattr(torch, self.profile.dtype),
+            device if direct else torch.device("cpu"),
+            keep_float8=fp8 == "stored",
         )
-    group = None if profile.acceleration.ranks == 1 else RankGroup(manifest.name, profile, settings, device)
-    try:
+        if lora is not None:
+            file = self.folder(lora.source) / self.manifest.sources[lora.source].files[0]
+            checkpoints.add_lora(transformer, file, lora.scale)
+        return transformer
+
+    def load_pipeline(self, device: torch.device) -> tuple[WanTrackPipeline, RankGroup | None]:
+        """The pipeline on its device, and the processes that share its clips, which load at the same time.
+
+        Weights that cannot fit are refused before any is read, and so are files that are not those that were pulled.
+        """
+        manifest, profile, settings, ranks = self.manifest, self.profile, self.settings, self.profile.acceleration.ranks
         if manifest.sources:
-            transformer = _transformer(manifest, profile, settings, device)
-            dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
-            pipeline = assemble(transformer, _folder("base", manifest, settings), dtype, vae_dtype)
-        else:
-            pipeline = make_tiny(manifest.architecture)
-        pipeline.set_progress_bar_config(disable=True)
-        accelerate(pipeline, profile.acceleration, device)
-        if group is not None:
-            with naming_option(f"{profile.acceleration.ranks} GPUs"):
-                group.join(pipeline.transformer)
-    except BaseException:
-        if group is not None:
-            group.close()
-        raise
-    return pipeline, group
-
-
-def _pulled_parts(manifest: Manifest, profile: Profile, settings: Settings) -> list[str]:
-    """The parts that the model is made of and that are not the user's own."""
-    lora = {profile.lora.source} if profile.lora is not None else set[str]()
-    used = ({"transformer", "base"} | lora) & manifest.sources.keys()
-    return sorted(used - set(settings.own_parts(manifest.name)))
-
-
-def _revisions(manifest: Manifest, profile: Profile, settings: Settings) -> dict[str, str]:
-    """The revision of every pulled part that the model is made of."""
-    repositories = {part: manifest.sources[part].repository for part in _pulled_parts(manifest, profile, settings)}
-    locks = {part: read_lock(settings.weights_dir, repository) for part, repository in repositories.items()}
-    return {part: lock.revision for part, lock in locks.items() if lock is not None}
-
-
-def _folder(part: str, manifest: Manifest, settings: Settings) -> Path:
-    """Of a pulled part, or the user's own checkpoint."""
-    if part in settings.own_parts(manifest.name):
-        return settings.checkpoints[manifest.name]
-    return folder_of(settings.weights_dir, manifest.sources[part].repository)
-
-
-def _transformer(
-    manifest: Manifest, profile: Profile, settings: Settings, device: torch.device
-) -> WanTransformer3DModel:
-    """With its LoRA."""
-    # With offloading or quantisation the device need not hold all unquantised weights at once.
-    fp8 = profile.acceleration.fp8
-    direct = profile.acceleration.offload == "none" and fp8 in {"none", "stored"}
-    transformer = load_transformer(
-        _folder("transformer", manifest, settings),
-        manifest.architecture,
-        getattr(torch, profile.dtype),
-        device if direct else torch.device("cpu"),
-        keep_float8=fp8 == "stored",
-    )
-    if profile.lora is not None:
-        file = _folder(profile.lora.source, manifest, settings) / manifest.sources[profile.lora.source].files[0]
-        add_lora(transformer, file, profile.lora.scale)
-    return transformer
+            check_memory(manifest, settings.profile, self.folder("transformer"), self.folder("base"), device)
+            for source in self.pulled().values():
+                verify(source, settings.weights_dir, manifest.name)
+        if ranks > 1 and distributed.is_initialized():
+            raise GeneratorUnavailable(
+                f"'{manifest.name}': another model of this process shares the GPUs. Use one of them."
+            )
+        group = None if ranks == 1 else RankGroup(manifest.name, profile, settings, device)
+        try:
+            if manifest.sources:
+                dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
+                pipeline = assemble(self.load_transformer(device), self.folder("base"), dtype, vae_dtype)
+            else:
+                pipeline = make_tiny(manifest.architecture)
+            pipeline.set_progress_bar_config(disable=True)
+            acceleration.accelerate(pipeline, profile.acceleration, device)
+            if group is not None:
+                with acceleration.naming_option(f"{ranks} GPUs"):
+                    group.join(pipeline.transformer)
+        except BaseException:
+            if group is not None:
+                group.close()
+            raise
+        return pipeline, group
 
 
 def assemble(
@@ -230,7 +216,7 @@ def _model(kind: Any, base: Path, part: str, dtype: torch.dtype) -> Any:
     """A model whose checkpoint fits it name by name: the libraries only warn, and initialise the rest at random."""
     model, report = _part(kind, base, part, torch_dtype=dtype, use_safetensors=True, output_loading_info=True)
     kinds = {"unknown": "unexpected_keys", "missing": "missing_keys", "of another shape": "mismatched_keys"}
-    misfits = counted({kind: sorted(map(str, report.get(key) or ())) for kind, key in kinds.items()})
+    misfits = checkpoints.counted({kind: sorted(map(str, report.get(key) or ())) for kind, key in kinds.items()})
     if misfits:
         raise CheckpointInvalid(f"The weights of '{part}' do not fit. {misfits}.")
     return model.eval().requires_grad_(False)

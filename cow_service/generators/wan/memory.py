@@ -1,24 +1,21 @@
 """The memory of a device: whether a model's weights fit, who uses it, and what happens when it runs out."""
 
-from __future__ import annotations
-
 import gc
 import math
 import os
 import traceback
 from collections import defaultdict
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 
 import torch
-from safetensors import SafetensorError, safe_open
 
 from cow_service.errors import CheckpointInvalid, DeviceFailed, GeneratorOutOfMemory, GeneratorUnavailable
 from cow_service.generators.wan.capabilities import detect_capabilities, refusals
-from cow_service.generators.wan.checkpoints import FLOAT8, checkpoint_files
+from cow_service.generators.wan.checkpoints import FLOAT8, checkpoint_files, read_headers
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
 from cow_service.weights.device import is_out_of_memory
 from cow_service.weights.manifests import Manifest
@@ -104,8 +101,8 @@ def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, de
             and shortage(profile) is None
             and not refusals(profile.acceleration, machine)
         ]
-        remedy = f"Of its profiles fit: {', '.join(fitting)} (COW_PROFILE)" if fitting else "None of its profiles fits"
-        raise GeneratorUnavailable(f"The weights of '{manifest.name}' with the profile '{name}' take {short}. {remedy}.")
+        able = f"Of its profiles fit: {', '.join(fitting)} (COW_PROFILE)." if fitting else "None of its profiles fits."
+        raise GeneratorUnavailable(f"The weights of '{manifest.name}' with the profile '{name}' take {short}. {able}")
 
 
 def _room(device: torch.device) -> int:
@@ -122,19 +119,15 @@ def _host() -> int:
 
 def _read_headers(checkpoint: Path, base: Path) -> tuple[dict[str, int], bool] | None:
     """How many numbers each part has, and whether the transformer has some in float8; None where it cannot be read."""
-    counts: dict[str, int] = {}
-    has_float8 = False
     try:
-        files: dict[str, Sequence[Path]] = {"transformer": checkpoint_files(checkpoint)[1]}
-        files |= {part: sorted((base / part).glob("*.safetensors")) for part in BASE_PARTS}
-        for part, file in ((part, file) for part, some in files.items() for file in some):
-            with safe_open(file, framework="pt") as opened:
-                for tensor in map(opened.get_slice, tuple(opened.keys())):
-                    counts[part] = counts.get(part, 0) + math.prod(tensor.get_shape())
-                    has_float8 |= part == "transformer" and tensor.get_dtype() in FLOAT8
-    except (CheckpointInvalid, SafetensorError, OSError):
+        files = {"transformer": checkpoint_files(checkpoint)[1]}
+        files |= {part: tuple((base / part).glob("*.safetensors")) for part in BASE_PARTS}
+        held = {part: [each for file in some for each in read_headers([file]).values()] for part, some in files.items()}
+    except (CheckpointInvalid, OSError):
         return None
-    return (counts, has_float8) if len(counts) == len(files) else None
+    counts = {part: sum(math.prod(each.shape) for each in entries) for part, entries in held.items()}
+    has_float8 = any(each.dtype in FLOAT8 for each in held["transformer"])
+    return (counts, has_float8) if all(held.values()) else None
 
 
 @contextmanager

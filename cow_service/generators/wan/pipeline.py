@@ -5,8 +5,6 @@ between the guided and the unconditional pass, guidance holds for a window of st
 steps of a clip, and a callback is called after every step.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -76,7 +74,7 @@ def image_token_count(image_encoder: Any) -> int:
     return (config.image_size // config.patch_size) ** 2 + 1
 
 
-def compose(**parts: Any) -> WanTrackPipeline:
+def compose(**parts: Any) -> "WanTrackPipeline":
     """A pipeline of `transformer`, `vae`, `text_encoder`, `image_encoder`, `tokenizer` and `image_processor`.
 
     The parent class requires a scheduler, which is not used: every clip is sampled with one of its own.

@@ -3,9 +3,7 @@
 Without the model's libraries: a server that has none checks requests and passes them on.
 """
 
-from __future__ import annotations
-
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -37,7 +35,7 @@ class Sampling(Record):
     )
 
     @model_validator(mode="after")
-    def _window_is_ordered(self) -> Sampling:
+    def _window_is_ordered(self) -> Self:
         if not 0 <= self.guidance_window[0] <= self.guidance_window[1] <= 1:
             raise ValueError(f"`guidance_window` [from, to] lies within 0 to 1 in order, got {self.guidance_window}")
         return self
@@ -154,7 +152,7 @@ class Profile(Record):
     lora: Lora | None = None
 
     @model_validator(mode="after")
-    def _ratios_meet_their_steps(self) -> Profile:
+    def _ratios_meet_their_steps(self) -> Self:
         if self.acceleration.cache == "mag" and self.sampling.guidance_window[0] > 0:
             raise ValueError("`cache: mag` counts the steps of each branch: `guidance_window` must begin at 0")
         if self.acceleration.cache == "dbcache" and self.sampling.guidance_window != (0, 1):

@@ -22,7 +22,7 @@ from cow_service.errors import CowError, unforeseen
 from cow_service.generators.wan.loading import load_rank
 from cow_service.generators.wan.memory import within_memory
 from cow_service.generators.wan.pipeline import denoise
-from cow_service.generators.wan.ranks import HOST, Failed, FromRank, Join, Load, Loaded, Share, Sharing, ToRank
+from cow_service.generators.wan.ranks import HOST, Failed, FromRank, Load, Share, Sharing, ToRank
 from cow_service.observability import logging as logs
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import load_manifests
@@ -55,11 +55,11 @@ def work(pipe: Connection[FromRank, ToRank]) -> None:
     threads = load_manifests()[given.name].defaults.get("threads")
     with cpu_threads(None if threads is None else int(threads)):
         transformer = load_rank(given.name, given.profile, given.settings, device)
-        pipe.send(Loaded())
-        join = messages.get()
-        assert isinstance(join, Join)
+        pipe.send("loaded")
+        port = messages.get()
+        assert isinstance(port, int)
         wanted = given.profile.acceleration
-        store = distributed.TCPStore(HOST, join.port, wanted.ranks, is_master=False)
+        store = distributed.TCPStore(HOST, port, wanted.ranks, is_master=False)
         sharing = Sharing(transformer, wanted, given.rank, device, store)
 
         def on_step(done: int, total: int) -> None:

@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import diffusers
 import numpy as np
@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, distributed
 from torch.distributed import distributed_c10d
-from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
+from torch.distributed.device_mesh import init_device_mesh
 
 from cow_service.concurrency import spawn
 from cow_service.errors import CowError, DeviceFailed, GeneratorOutOfMemory, InternalError, WorkerEnded, kinds
@@ -41,8 +41,6 @@ HOST = "127.0.0.1"
 TIMEOUT = timedelta(minutes=10)  # that a rank waits for another one within a step
 PATCH = 4  # latent cells per token
 
-Array = NDArray[np.float32]
-
 
 @dataclass(frozen=True)
 class Load:
@@ -56,42 +54,25 @@ class Load:
 
 
 @dataclass(frozen=True)
-class Join:
-    """To a rank: all have loaded, meet the others at this port."""
-
-    port: int
-
-
-@dataclass(frozen=True)
 class Share:
     """To a rank: take part in a clip. The arguments of `denoise`, exact in float32: no tensor of a clip has more."""
 
-    noise: Array
-    conditioning: Mapping[str, Array | None]
+    tensors: Mapping[str, NDArray[np.float32] | None]  # the noise, and the conditioning by its fields
     sampling: Sampling
 
     @classmethod
     def pack(cls, noise: Tensor, given: Conditioning, sampling: Sampling) -> Share:
         """The message for tensors of any device."""
-
-        def array(tensor: Tensor) -> Array:
-            return cast(Any, tensor.detach().float().cpu().numpy())
-
-        tensors: dict[str, Tensor | None] = vars(given)
-        parts = {name: None if tensor is None else array(tensor) for name, tensor in tensors.items()}
-        return cls(array(noise), parts, sampling)
+        parts: dict[str, Tensor | None] = {"noise": noise, **vars(given)}
+        arrays = {name: None if part is None else part.detach().float().cpu().numpy() for name, part in parts.items()}
+        return cls(arrays, sampling)
 
     def unpack(self) -> tuple[Tensor, Conditioning]:
         """The noise and the conditioning, on the CPU."""
-        parts: dict[str, Any] = {
-            name: None if array is None else torch.from_numpy(array) for name, array in self.conditioning.items()
+        tensors: dict[str, Any] = {
+            name: None if array is None else torch.from_numpy(array) for name, array in self.tensors.items()
         }
-        return torch.from_numpy(self.noise), Conditioning(**parts)
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """From a rank: it has its weights."""
+        return tensors.pop("noise"), Conditioning(**tensors)
 
 
 @dataclass(frozen=True)
@@ -102,8 +83,9 @@ class Failed:
     detail: str
 
 
-ToRank = Load | Join | Share
-FromRank = Loaded | Failed
+Port = int  # where the ranks meet, once all have loaded
+ToRank = Load | Port | Share
+FromRank = Literal["loaded"] | Failed
 
 
 class RankGroup:
@@ -119,7 +101,12 @@ class RankGroup:
         self._transformer: object = None
         self._is_over = False
         self._first_error: CowError | None = None
-        self._ranks = [_Rank(number, device, self._abort) for number in range(1, self._wanted.ranks)]
+
+        def abort() -> None:  # one of the processes has ended: do not wait for it
+            if not self._is_over and self._sharing is not None:
+                self._sharing.leave()
+
+        self._ranks = [_Rank(number, device, abort) for number in range(1, self._wanted.ranks)]
         for rank in self._ranks:
             rank.send(Load(rank.number, str(rank.device), name, profile, settings))
 
@@ -150,7 +137,7 @@ class RankGroup:
     def _met(self, transformer: object) -> Sharing:
         store = distributed.TCPStore(HOST, 0, self._wanted.ranks, is_master=True, wait_for_workers=False)
         for rank in self._ranks:
-            rank.send(Join(store.port))
+            rank.send(store.port)
         return Sharing(transformer, self._wanted, 0, self._device, store)
 
     def denoise(self, noise: Tensor, given: Conditioning, sampling: Sampling, on_step: StepCallback) -> Tensor:
@@ -195,11 +182,6 @@ class RankGroup:
         for rank in self._ranks:
             rank.end()
         if self._sharing is not None:
-            self._sharing.leave()
-
-    def _abort(self) -> None:
-        """One of the processes has ended: do not wait for it."""
-        if not self._is_over and self._sharing is not None:
             self._sharing.leave()
 
     def _check(self) -> None:
@@ -288,7 +270,15 @@ class Sharing:
             timeout=TIMEOUT,
             device_id=device if device.type == "cuda" else None,
         )
-        self._context = self._split_context() if wanted.context_parallel > 1 else None
+        self._context: Any = None
+        if (parts := wanted.context_parallel) > 1:
+            heads = self._transformer.config.num_attention_heads
+            if heads % parts:
+                raise ValueError(f"{heads} attention heads cannot be split among {parts} GPUs")
+            size = 2 if wanted.guidance_parallel else 1, 1, parts
+            mesh = init_device_mesh(device.type, size, mesh_dim_names=("guidance", "ring", "ulysses"))
+            self._context = cast(Any, diffusers).ContextParallelConfig(ulysses_degree=parts, mesh=mesh)
+            self._transformer.enable_parallelism(config=self._context)
 
     def prepare(self, noise: Tensor) -> None:
         """Before each clip, of which `noise` [1, 16, T, h, w] has the size: any number of tokens can be split."""
@@ -324,14 +314,3 @@ class Sharing:
         """Of this thread: diffusers makes some tensors on the current device."""
         if self._device.type == "cuda":
             torch.cuda.set_device(self._device)
-
-    def _split_context(self) -> Any:
-        halves = 2 if self._wanted.guidance_parallel else 1
-        size = halves, 1, self._wanted.context_parallel
-        heads = self._transformer.config.num_attention_heads
-        if heads % self._wanted.context_parallel:
-            raise ValueError(f"{heads} attention heads cannot be split among {self._wanted.context_parallel} GPUs")
-        mesh: DeviceMesh = init_device_mesh(self._device.type, size, mesh_dim_names=("guidance", "ring", "ulysses"))
-        config = cast(Any, diffusers).ContextParallelConfig(ulysses_degree=self._wanted.context_parallel, mesh=mesh)
-        self._transformer.enable_parallelism(config=config)
-        return config

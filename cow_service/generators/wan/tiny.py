@@ -1,7 +1,5 @@
 """Wan2.1 at toy size: the real classes with seeded random weights and a toy tokenizer; without settings or OpenCV."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -10,8 +10,6 @@ ATI's `.pth` is a saved string of bytes: the `.npz` file, whose array is called 
 Sources: the public implementations of ATI (arXiv 2505.22944) and Wan-Move (arXiv 2512.08765).
 """
 
-from __future__ import annotations
-
 import io
 import warnings
 import zipfile
@@ -51,7 +49,7 @@ class Tracks:
         """F, the frames of the clip."""
         return self.points.shape[0]
 
-    def held(self) -> Tracks:
+    def held(self) -> "Tracks":
         """Without tracks that are never visible; zeros where a track is not, which stand for no place, become its last.
 
         Before a track is first seen they become its first place.
@@ -65,7 +63,7 @@ class Tracks:
             points[:, track] = points[np.where(last < 0, known.argmax(), last), track]
         return Tracks(points, visible)
 
-    def scaled(self, x: float, y: float) -> Tracks:
+    def scaled(self, x: float, y: float) -> "Tracks":
         """The same tracks on the image resized by these factors."""
         return Tracks((self.points * np.array([x, y])).astype(np.float32), self.visible)
 
@@ -155,7 +153,6 @@ def _inside(points: Floats, width: int, height: int) -> Bools:
 ARRAY = "array"  # its name in the .npz file
 VISIBILITY = "-visibility"  # between the name of Wan-Move's file of positions and its suffix
 MOST = 10_000_000  # numbers in a file
-SUFFIXES = (".pth", ".npz", ".npy")
 
 
 def write_tracks(tracks: Tracks, path: Path) -> tuple[Path, ...]:
@@ -163,21 +160,22 @@ def write_tracks(tracks: Tracks, path: Path) -> tuple[Path, ...]:
 
     Raises `InvalidRequest` for another suffix, a clip that is too long for ATI, or `.pth` without PyTorch.
     """
-    if path.suffix in (".pth", ".npz") and tracks.num_frames > MAX_FRAMES:
-        raise InvalidRequest(
-            f"The trajectory has {tracks.num_frames} frames: ATI's files hold {MAX_FRAMES}. Simulate with that many."
-        )
+    _check_suffix(path)
     if path.suffix == ".npy":
         other = path.with_name(path.stem + VISIBILITY + path.suffix)
         np.save(path, tracks.points[None])
         np.save(other, tracks.visible[None])
         return path, other
+    if tracks.num_frames > MAX_FRAMES:
+        raise InvalidRequest(
+            f"The trajectory has {tracks.num_frames} frames: ATI's files hold {MAX_FRAMES}. Simulate with that many."
+        )
+    zipped = io.BytesIO()
+    np.savez_compressed(zipped, **{ARRAY: to_ati_file(tracks)})
     if path.suffix == ".npz":
-        path.write_bytes(_zipped(to_ati_file(tracks)))
-    elif path.suffix == ".pth":
-        _import_torch().save(_zipped(to_ati_file(tracks)), path)
+        path.write_bytes(zipped.getvalue())
     else:
-        raise _unknown(path)
+        _import_torch().save(zipped.getvalue(), path)
     return (path,)
 
 
@@ -187,8 +185,7 @@ def read_tracks(path: Path, visibility: Path | None = None) -> Tracks:
     `visibility` is the other file of Wan-Move; without it the one that `write_tracks` puts beside is taken, and where
     there is none every point counts as visible. Raises `InvalidRequest` saying what is wrong with the file.
     """
-    if path.suffix not in SUFFIXES:
-        raise _unknown(path)
+    _check_suffix(path)
     if visibility is not None and path.suffix != ".npy":
         raise InvalidRequest(f"{path.name} holds its own visibility: a file of it goes with .npy alone.")
     try:
@@ -202,7 +199,24 @@ def read_tracks(path: Path, visibility: Path | None = None) -> Tracks:
 
 
 def _ati_array(path: Path) -> Floats32:
-    data = path.read_bytes() if path.suffix == ".npz" else _saved_bytes(path)
+    data: Any = None
+    if path.suffix == ".npz":
+        data = path.read_bytes()
+    else:
+        torch = _import_torch()
+        try:
+            with warnings.catch_warnings():  # PyTorch remarks on how it was pickled
+                warnings.simplefilter("ignore")
+                data = torch.load(path, map_location="cpu", weights_only=True)
+        except (UnpicklingError, RuntimeError, KeyError, EOFError) as error:
+            raise InvalidRequest(
+                f"{path.name} is damaged, or holds more than plain data, which is not read: it could run code."
+            ) from error
+        if isinstance(data, torch.Tensor):
+            data = data.detach().float().numpy()
+        elif not isinstance(data, bytes):
+            kind = type(data).__name__
+            raise InvalidRequest(f"{path.name} holds a {kind}: ATI's tracks are the bytes of an .npz file.")
     if isinstance(data, bytes):
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             if ARRAY not in arrays:
@@ -216,35 +230,14 @@ def _ati_array(path: Path) -> Floats32:
     return array
 
 
-def _saved_bytes(path: Path) -> bytes | NDArray[np.generic]:
-    torch = _import_torch()
-    try:
-        with warnings.catch_warnings():  # PyTorch remarks on how it was pickled
-            warnings.simplefilter("ignore")
-            saved = torch.load(path, map_location="cpu", weights_only=True)
-    except (UnpicklingError, RuntimeError, KeyError, EOFError) as error:
-        raise InvalidRequest(
-            f"{path.name} is damaged, or holds more than plain data, which is not read: it could run code."
-        ) from error
-    if isinstance(saved, bytes):
-        return saved
-    if isinstance(saved, torch.Tensor):
-        return saved.detach().float().numpy()
-    raise InvalidRequest(f"{path.name} holds a {type(saved).__name__}: ATI's tracks are the bytes of an .npz file.")
-
-
 def _wan_move(path: Path, visibility: Path | None) -> Tracks:
     points = _numbers(path, np.load(path, allow_pickle=False))
     points = points[0] if points.ndim == 4 and points.shape[0] == 1 else points
     if points.ndim != 3 or points.shape[2] != 2 or not points.shape[0]:
         raise InvalidRequest(f"{path.name} holds {list(points.shape)}: Wan-Move's tracks are [F, N, 2].")
     # As `write_tracks` names it, and as Wan-Move's own examples do.
-    names = (
-        path.stem + VISIBILITY,
-        path.stem.replace("tracks", "visibility"),
-        path.stem.replace("track", "visibility"),
-    )
-    beside = [path.with_name(name + path.suffix) for name in names if name != path.stem]
+    names = path.stem + VISIBILITY, *(path.stem.replace(word, "visibility") for word in ("tracks", "track"))
+    beside = [path.with_stem(name) for name in names if name != path.stem]
     file = visibility or next((other for other in beside if other.is_file()), None)
     if file is None:
         return Tracks(points, np.ones(points.shape[:2], bool))
@@ -266,12 +259,6 @@ def _numbers(path: Path, data: NDArray[np.generic]) -> Floats32:
     return array
 
 
-def _zipped(array: Floats32) -> bytes:
-    file = io.BytesIO()
-    np.savez_compressed(file, array=array)
-    return file.getvalue()
-
-
 def _import_torch() -> Any:
     try:
         import torch  # noqa: PLC0415
@@ -280,7 +267,8 @@ def _import_torch() -> Any:
     return torch
 
 
-def _unknown(path: Path) -> InvalidRequest:
-    return InvalidRequest(
-        f"{path.name} has the suffix '{path.suffix}': track files are .pth or .npz (ATI) and .npy (Wan-Move)."
-    )
+def _check_suffix(path: Path) -> None:
+    if path.suffix not in (".pth", ".npz", ".npy"):
+        raise InvalidRequest(
+            f"{path.name} has the suffix '{path.suffix}': track files are .pth or .npz (ATI) and .npy (Wan-Move)."
+        )
