@@ -1,11 +1,9 @@
 """The store of images, frames, masks and clips: bytes that are named by their SHA-256.
 
-`ArtifactStore` says what a store does. `DiskArtifacts`, here, keeps files in a folder; `ObjectArtifacts`, in a module
-of its own because it needs obstore, keeps objects in S3 and the like. (obstore's own store for folders does not sync
-what it writes to the disk, and keeps neither media types nor the time of last use.)
-
-Bytes that no longer match their name are removed when that is noticed, as if they had never been stored. They come back
-when the same bytes are sent or computed again.
+`ArtifactStore` says what a store does. `DiskArtifacts` keeps files in a folder; `ObjectArtifacts`, in a module of its
+own because it needs obstore, keeps objects in S3 and the like. (obstore's own store for folders does not sync what it
+writes, and keeps neither media types nor the time of last use.) Bytes that no longer match their name are removed when
+that is noticed; they come back when the same bytes are sent or computed again.
 """
 
 import errno
@@ -71,6 +69,9 @@ def try_once(work: Callable[[], Value], /) -> Value:
 class ArtifactWriter(ABC):
     """Stores bytes under their digests. Every method raises `StorageUnavailable` where the store cannot be written."""
 
+    def __init__(self, scratch_folder: Path) -> None:
+        self.scratch_folder = scratch_folder  # that of the store, or beside the jobs where the store has no folder
+
     @abstractmethod
     def put(self, data: bytes, media_type: str) -> Artifact:
         """Stores bytes, also where those that are stored under their digest are damaged; marks them as used now.
@@ -86,9 +87,16 @@ class ArtifactWriter(ABC):
             path.unlink()
         return self.put(data, media_type)
 
-    @abstractmethod
-    def scratch(self) -> AbstractContextManager[Path]:
+    @contextmanager
+    def scratch(self) -> Generator[Path]:
         """A path on this machine for a temporary file; deleted afterwards unless `put_file` moved it."""
+        with disk_errors():
+            self.scratch_folder.mkdir(parents=True, exist_ok=True)
+        path = self.scratch_folder / f".{uuid4().hex}{TEMPORARY_SUFFIX}"
+        try:
+            yield path
+        finally:
+            path.unlink(missing_ok=True)
 
 
 class ArtifactStore(ArtifactWriter):
@@ -98,7 +106,7 @@ class ArtifactStore(ArtifactWriter):
     """
 
     def __init__(self, scratch_folder: Path) -> None:
-        self._scratch_folder = scratch_folder
+        super().__init__(scratch_folder)
         self._guard = threading.Lock()
         self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
 
@@ -147,21 +155,10 @@ class ArtifactStore(ArtifactWriter):
     def check(self) -> None:
         """Writes a small thing and removes or replaces it. Raises `StorageUnavailable` if that fails."""
 
-    @contextmanager
-    def scratch(self) -> Generator[Path]:
-        """A path for a temporary file in the folder of the store, or beside the jobs where the store has no folder."""
-        with disk_errors():
-            self._scratch_folder.mkdir(parents=True, exist_ok=True)
-        path = self._scratch_folder / f".{uuid4().hex}{TEMPORARY_SUFFIX}"
-        try:
-            yield path
-        finally:
-            path.unlink(missing_ok=True)
-
     def remove_leftovers(self, untouched_since: float) -> None:
         """Removes temporary files of processes that were killed: those not written to after that time."""
         with disk_errors():
-            for path in self._scratch_folder.rglob(f".*{TEMPORARY_SUFFIX}"):
+            for path in self.scratch_folder.rglob(f".*{TEMPORARY_SUFFIX}"):
                 with suppress(FileNotFoundError):  # its process has just ended its work
                     if path.stat().st_mtime <= untouched_since:
                         path.unlink()
@@ -200,7 +197,7 @@ class DiskArtifacts(ArtifactStore):
         extension = extension_of(media_type)
         sha256 = hashlib.sha256(data).hexdigest()
         with disk_errors():
-            if (known := self._find_intact(sha256)) is not None:
+            if known := self._find_intact(sha256):
                 self._mark_used(known)
                 return _artifact_at(known)
             with self.scratch() as temporary:
@@ -328,6 +325,7 @@ class _RetryingWriter(ArtifactWriter):
     """Waits while the disk is full or away."""
 
     def __init__(self, store: ArtifactStore, retry: RetryPolicy) -> None:
+        super().__init__(store.scratch_folder)
         self._store, self._retry = store, retry
 
     def put(self, data: bytes, media_type: str) -> Artifact:
@@ -335,9 +333,6 @@ class _RetryingWriter(ArtifactWriter):
 
     def put_file(self, path: Path, media_type: str) -> Artifact:
         return self._retry(lambda: self._store.put_file(path, media_type))
-
-    def scratch(self) -> AbstractContextManager[Path]:
-        return self._store.scratch()
 
 
 def _artifact_at(path: Path) -> Artifact:

@@ -18,22 +18,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, JpegImagePlugin, PngImagePlugin, WebPImagePlugin
 from PIL.ImageFile import ImageFile
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile
-from PIL.WebPImagePlugin import WebPImageFile
 
-from cow_service.errors import (
-    CowError,
-    FieldError,
-    ImageTooLarge,
-    ImageTypeUnsupported,
-    ImageUnreadable,
-    InternalError,
-    InvalidRequest,
-    field_of,
-)
+from cow_service import errors
 from cow_service.media.artifacts import media_type_of
 from cow_service.records import ImageInfo
 
@@ -45,9 +33,9 @@ MIN_SIDE = 8  # px; nothing that could move has room in less
 # process, which a library must not change under its host; it also fills its table of formats on first use, from
 # whichever thread comes first. `JpegImageFile` reads the first picture of a multi-picture file (MPO), as phones write.
 _OPENERS: dict[str, Callable[[io.BytesIO], ImageFile]] = {
-    "PNG": PngImageFile,
-    "JPEG": JpegImageFile,
-    "WebP": WebPImageFile,
+    "PNG": PngImagePlugin.PngImageFile,
+    "JPEG": JpegImagePlugin.JpegImageFile,
+    "WebP": WebPImagePlugin.WebPImageFile,
 }
 
 UPRIGHT = 1  # EXIF orientation, EXIF 2.3, section 4.6.4
@@ -125,10 +113,10 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     of pixels), and `ImageUnreadable` for damaged files and for sides under `MIN_SIDE` px.
     """
     if not data:
-        raise ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
+        raise errors.ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
     kind = _KINDS.get(media_type_of(data) or "")
     if kind is None:
-        raise ImageTypeUnsupported(f"The image is {_describe_foreign(data)}: send it as PNG, JPEG or WebP.")
+        raise errors.ImageTypeUnsupported(f"The image is {_describe_foreign(data)}: send it as PNG, JPEG or WebP.")
     try:
         if kind == "WebP":
             # Opening a WebP file allocates its whole canvas, so that its size has to be known before. Its blocks are
@@ -141,14 +129,16 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
             _check_size(image.width, image.height, max_megapixels)
             frames = int(getattr(image, "n_frames", 1))
             if frames > 1:
-                raise ImageTypeUnsupported(f"The image is an animated {kind} of {frames} frames: send one frame of it.")
+                raise errors.ImageTypeUnsupported(
+                    f"The image is an animated {kind} of {frames} frames: send one frame of it."
+                )
             rgb = _to_rgb(image)
             if kind == "WebP":
                 orientation = _exif_orientation(image.info.get("exif", b""))
-    except (CowError, MemoryError):
+    except (errors.CowError, MemoryError):
         raise
     except Exception as error:  # pillow raises a dozen kinds on damaged files
-        raise ImageUnreadable(
+        raise errors.ImageUnreadable(
             f"The {kind} file of {len(data)} bytes could not be decoded, it is damaged or incomplete: send it whole."
         ) from error
     turn = _TRANSPOSE_TO_UPRIGHT.get(orientation)
@@ -162,7 +152,7 @@ def decode_own(data: bytes) -> NDArray[np.uint8]:
     """Upright RGB pixels [H, W, 3] of a PNG that this service wrote. Raises `InternalError` where it is damaged."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if pixels is None:
-        raise InternalError("A picture that was written before can no longer be read.")
+        raise errors.InternalError("A picture that was written before can no longer be read.")
     return np.ascontiguousarray(pixels[..., ::-1], np.uint8)
 
 
@@ -192,7 +182,7 @@ def _encoded(extension: str, pixels: NDArray[np.uint8], options: list[int]) -> b
     ordered = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
     encoded, buffer = cv2.imencode(extension, ordered, options)
     if not encoded:
-        raise InternalError(f"Pixels of shape {pixels.shape} could not be encoded as {extension}.")
+        raise errors.InternalError(f"Pixels of shape {pixels.shape} could not be encoded as {extension}.")
     return buffer.tobytes()
 
 
@@ -264,12 +254,12 @@ def _webp_size(data: bytes) -> tuple[int, int]:
 def _check_size(width: int, height: int, max_megapixels: float) -> None:
     megapixels = width * height / 1e6
     if megapixels > max_megapixels:
-        raise ImageTooLarge(
+        raise errors.ImageTooLarge(
             f"The image is {width} x {height} px, {megapixels:.2f} megapixels, over the limit of {max_megapixels:g}: "
             "scale it down and send it again."
         )
     if min(width, height) < MIN_SIDE:
-        raise ImageUnreadable(
+        raise errors.ImageUnreadable(
             f"The image is {width} x {height} px, too small to hold an object: "
             f"send one with both sides at least {MIN_SIDE} px."
         )
@@ -340,9 +330,9 @@ def _strip_jpeg(data: bytes) -> tuple[bytes, int]:
     raise _overfull(f"a JPEG file of more than {MAX_JPEG_SEGMENTS} segments")
 
 
-def _overfull(what: str) -> ImageUnreadable:
+def _overfull(what: str) -> errors.ImageUnreadable:
     """For a file of more parts than any camera or program writes."""
-    return ImageUnreadable(f"The image is {what}: save it anew with another program and send that.")
+    return errors.ImageUnreadable(f"The image is {what}: save it anew with another program and send that.")
 
 
 def _exif_orientation(exif: bytes) -> int:
@@ -372,14 +362,14 @@ def decode_data_url(url: str, pointer: str = "/image") -> bytes:
     Raises `InvalidRequest` pointing at the field of the request that holds it, and `ImageTypeUnsupported` where it
     declares something else.
     """
-    field = field_of(pointer)
+    field = errors.field_of(pointer)
     head = _DATA_URL.match(url[:256])
     if head is None or head["base64"] is None:
         raise _bad_image(f"`{field}` must be a data URL with base64: data:image/png;base64,...", pointer)
     declared = head["type"].lower()
     if not declared.startswith("image/") and declared not in ("", "application/octet-stream"):
         # Of the image types, what the bytes are counts, and not what they are declared to be.
-        raise ImageTypeUnsupported(
+        raise errors.ImageTypeUnsupported(
             f"The data URL of `{field}` declares {declared[:80]}: send image/png, image/jpeg or image/webp."
         )
     try:
@@ -392,5 +382,5 @@ def decode_data_url(url: str, pointer: str = "/image") -> bytes:
         ) from error
 
 
-def _bad_image(detail: str, pointer: str) -> CowError:
-    return InvalidRequest(detail, errors=(FieldError(pointer, detail),))
+def _bad_image(detail: str, pointer: str) -> errors.CowError:
+    return errors.InvalidRequest(detail, errors=(errors.FieldError(pointer, detail),))

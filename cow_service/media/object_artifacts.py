@@ -11,7 +11,7 @@ import logging
 import time
 from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
@@ -23,20 +23,7 @@ from obstore import exceptions
 from obstore.store import from_url
 
 from cow_service.errors import ArtifactNotFound, StorageUnavailable
-from cow_service.media.artifacts import (
-    MEDIA_TYPES,
-    ArtifactStore,
-    ArtifactWriter,
-    ListedArtifact,
-    RetryPolicy,
-    artifact_of,
-    check_digest,
-    disk_errors,
-    extension_of,
-    is_digest,
-    not_found,
-    try_once,
-)
+from cow_service.media import artifacts
 from cow_service.records import Artifact
 from cow_service.settings import SettingsError
 
@@ -61,7 +48,7 @@ class _Object:
         return time.time() - self.used_at < RENEWED_AFTER_SECONDS
 
 
-class ObjectArtifacts(ArtifactStore):
+class ObjectArtifacts(artifacts.ArtifactStore):
     """An `ArtifactStore` in an object store. Temporary files lie in a folder of this machine."""
 
     def __init__(self, url: str, scratch_folder: Path) -> None:
@@ -97,17 +84,15 @@ class ObjectArtifacts(ArtifactStore):
 
     def put(self, data: bytes, media_type: str) -> Artifact:
         """Sends bytes, unless this process knows that the same bytes are there."""
-        extension_of(media_type)
+        artifacts.extension_of(media_type)
         sha256 = hashlib.sha256(data).hexdigest()
         if sha256 in self._verified:
-            try:
+            with suppress(ArtifactNotFound):
                 found = self._head(sha256)
                 if found.is_fresh and self._is_verified(found):
                     return found.artifact
-            except ArtifactNotFound:
-                pass
         self._send(sha256, data, media_type)
-        return artifact_of(sha256, media_type, len(data))
+        return artifacts.artifact_of(sha256, media_type, len(data))
 
     def get(self, sha256: str) -> Artifact:
         """Finds an object. Its bytes are not compared: whoever gets them from a signed URL can."""
@@ -129,15 +114,14 @@ class ObjectArtifacts(ArtifactStore):
                 self.read(sha256)
 
         with ThreadPoolExecutor(MAX_PARALLEL) as pool:
-            for _ in pool.map(touch_one, sha256):
-                pass  # what one of them raises is raised here
+            list(pool.map(touch_one, sha256))  # what one of them raises is raised here
 
     @contextmanager
     def local_file(self, sha256: str) -> Generator[Path]:
         """A temporary copy."""
         _, data = self._fetch(sha256)
         with self.scratch() as path:
-            with disk_errors():
+            with artifacts.disk_errors():
                 path.write_bytes(data)
             yield path
 
@@ -151,25 +135,22 @@ class ObjectArtifacts(ArtifactStore):
 
     def delete(self, sha256: str, untouched_since: float) -> bool:
         """Deletes the object."""
-        try:
-            with _store_errors(sha256):
-                if obstore.head(self._store, sha256)["last_modified"].timestamp() > untouched_since:
-                    return False
-        except ArtifactNotFound:
-            return False
-        self._remove(sha256)
-        return True
+        with suppress(ArtifactNotFound), _store_errors(sha256):
+            if obstore.head(self._store, sha256)["last_modified"].timestamp() <= untouched_since:
+                self._remove(sha256)
+                return True
+        return False
 
-    def listed(self) -> Iterator[ListedArtifact]:
+    def listed(self) -> Iterator[artifacts.ListedArtifact]:
         """All objects that are named by a digest; a request for each thousand."""
         with _store_errors():
             for chunk in obstore.list(self._store):
                 for one in chunk:
-                    if is_digest(one["path"]):
-                        yield ListedArtifact(one["path"], one["size"], one["last_modified"].timestamp())
+                    if artifacts.is_digest(one["path"]):
+                        yield artifacts.ListedArtifact(one["path"], one["size"], one["last_modified"].timestamp())
 
     @contextmanager
-    def batch(self, retry: RetryPolicy = try_once) -> Generator[ArtifactWriter]:
+    def batch(self, retry: artifacts.RetryPolicy = artifacts.try_once) -> Generator[artifacts.ArtifactWriter]:
         """Sends in threads."""
         with ThreadPoolExecutor(MAX_PARALLEL, thread_name_prefix="cow-artifacts") as pool:
             writer = _ParallelWriter(self, retry, pool)
@@ -184,20 +165,20 @@ class ObjectArtifacts(ArtifactStore):
             obstore.get(self._store, CHECKED).bytes()
 
     def _head(self, sha256: str) -> _Object:
-        check_digest(sha256)
+        artifacts.check_digest(sha256)
         with _store_errors(sha256):
             return _object(sha256, obstore.get(self._store, sha256, options={"head": True}))
 
     def _fetch(self, sha256: str) -> tuple[_Object, bytes]:
         """An object and its bytes, which are those of its digest. Raises `ArtifactNotFound`."""
-        check_digest(sha256)
+        artifacts.check_digest(sha256)
         with _store_errors(sha256):
             result = obstore.get(self._store, sha256)
             found, data = _object(sha256, result), bytes(result.bytes())
         if hashlib.sha256(data).hexdigest() != sha256:
             log.error("artifact %s is damaged and was removed", sha256)
             self._remove(sha256)
-            raise not_found(sha256)
+            raise artifacts.not_found(sha256)
         self._note_verified(sha256, found.e_tag)
         return found, data
 
@@ -217,27 +198,26 @@ class ObjectArtifacts(ArtifactStore):
         return found.e_tag is not None and self._verified.get(found.artifact.sha256) == found.e_tag
 
 
-class _ParallelWriter(ArtifactWriter):
+class _ParallelWriter(artifacts.ArtifactWriter):
     """Hands the bytes to other threads. It belongs to one thread."""
 
-    def __init__(self, store: ObjectArtifacts, retry: RetryPolicy, threads: ThreadPoolExecutor) -> None:
+    def __init__(self, store: ObjectArtifacts, retry: artifacts.RetryPolicy, threads: ThreadPoolExecutor) -> None:
+        super().__init__(store.scratch_folder)
         self._store, self._retry, self._threads = store, retry, threads
         self.sent: list[Future[Artifact]] = []
 
     def put(self, data: bytes, media_type: str) -> Artifact:
-        extension_of(media_type)
+        artifacts.extension_of(media_type)
         self.sent.append(self._threads.submit(self._retry, partial(self._store.put, data, media_type)))
-        return artifact_of(hashlib.sha256(data).hexdigest(), media_type, len(data))
-
-    def scratch(self) -> AbstractContextManager[Path]:
-        return self._store.scratch()
+        return artifacts.artifact_of(hashlib.sha256(data).hexdigest(), media_type, len(data))
 
 
 def _object(sha256: str, result: "obstore.GetResult") -> _Object:
     meta, media_type = result.meta, result.attributes.get("Content-Type", "")
-    if media_type not in MEDIA_TYPES:  # an object that somebody else has put there
-        raise not_found(sha256)
-    return _Object(artifact_of(sha256, media_type, meta["size"]), meta["e_tag"], meta["last_modified"].timestamp())
+    if media_type not in artifacts.MEDIA_TYPES:  # an object that somebody else has put there
+        raise artifacts.not_found(sha256)
+    artifact = artifacts.artifact_of(sha256, media_type, meta["size"])
+    return _Object(artifact, meta["e_tag"], meta["last_modified"].timestamp())
 
 
 @contextmanager
@@ -251,7 +231,7 @@ def _store_errors(sha256: str | None = None) -> Generator[None]:
     except (FileNotFoundError, exceptions.BaseError) as error:
         if isinstance(error, FileNotFoundError):
             if sha256 is not None:
-                raise not_found(sha256) from error
+                raise artifacts.not_found(sha256) from error
             reason = "there is no such bucket"
         elif isinstance(error, exceptions.PermissionDeniedError | exceptions.UnauthenticatedError):
             reason = "it refuses the credentials; see those of its provider, such as AWS_*"

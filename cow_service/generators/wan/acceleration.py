@@ -63,8 +63,22 @@ def accelerate(pipeline: Any, wanted: Acceleration, device: torch.device) -> Non
             pipeline.enable_model_cpu_offload(device=device)
         elif wanted.offload == "sequential":
             pipeline.enable_sequential_cpu_offload(device=device)
-        else:
-            _offload_groups(pipeline, device)
+        else:  # the transformer by block and the encoders by layer; the VAE is small and stays on the device
+            from diffusers.hooks.group_offloading import apply_group_offloading  # noqa: PLC0415
+
+            streams = device.type == "cuda"
+            for name, model in pipeline.components.items():
+                if name == "vae":
+                    model.to(device)
+                elif name == "transformer":
+                    for block in model.blocks if streams else ():
+                        pin(block)
+                    # With `record_stream` the CPU does not wait for the copies of each block.
+                    apply_group_offloading(
+                        model, device, num_blocks_per_group=1, use_stream=streams, record_stream=streams
+                    )
+                elif isinstance(model, nn.Module):
+                    apply_group_offloading(model, device, offload_type="leaf_level")
 
 
 def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch.device) -> None:
@@ -75,7 +89,23 @@ def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch
             if all(type(layer.weight) is nn.Parameter for layer in _linear_layers(transformer)):
                 raise ValueError("the checkpoint holds no weights in float8: give one that does (COW_CHECKPOINTS)")
         elif wanted.fp8 != "none":
-            _quantise(transformer, wanted, device)
+            from torchao import quantization as torchao  # noqa: PLC0415
+
+            # torchao's recommended compiler settings hold for the whole process; they are left alone.
+            own: dict[str, Any] = {"set_inductor_config": False}
+            config: Any = (
+                torchao.Float8WeightOnlyConfig(**own)
+                if wanted.fp8 == "weights"
+                else torchao.Float8DynamicActivationFloat8WeightConfig(granularity=torchao.PerRow(), **own)
+            )
+            for block in transformer.blocks:
+                block.to(device)  # one at a time: the device never holds all unquantised weights
+                torchao.quantize_(block, config)
+                if wanted.offload != "none":
+                    block.to("cpu")
+            # torchao silently skips layers whose shape its kernels do not support.
+            if any(type(layer.weight) is nn.Parameter for layer in _linear_layers(transformer)):
+                raise ValueError("the sides of some weights are not multiples of 16")
     with naming_option(f"attention: {wanted.attention}"):
         transformer.set_attention_backend(wanted.attention)
     if wanted.compile != "none":
@@ -92,25 +122,6 @@ def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch
 
 def _linear_layers(transformer: Any) -> list[nn.Linear]:
     return [layer for layer in transformer.blocks.modules() if isinstance(layer, nn.Linear)]
-
-
-def _quantise(transformer: Any, wanted: Acceleration, device: torch.device) -> None:
-    from torchao import quantization as torchao  # noqa: PLC0415
-
-    # torchao's recommended compiler settings hold for the whole process; they are left alone.
-    config: Any = (
-        torchao.Float8WeightOnlyConfig(set_inductor_config=False)
-        if wanted.fp8 == "weights"
-        else torchao.Float8DynamicActivationFloat8WeightConfig(granularity=torchao.PerRow(), set_inductor_config=False)
-    )
-    for block in transformer.blocks:
-        block.to(device)  # one at a time: the device never holds all unquantised weights
-        torchao.quantize_(block, config)
-        if wanted.offload != "none":
-            block.to("cpu")
-    # torchao silently skips layers whose shape its kernels do not support.
-    if any(type(layer.weight) is nn.Parameter for layer in _linear_layers(transformer)):
-        raise ValueError("the sides of some weights are not multiples of 16")
 
 
 def _enable_cache(transformer: Any, wanted: Acceleration) -> None:
@@ -175,26 +186,6 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2) -
 
 def _has_dbcache(transformer: Any) -> bool:
     return getattr(transformer, "_is_cached", False)
-
-
-def _offload_groups(pipeline: Any, device: torch.device) -> None:
-    """Offloads the transformer by block and the encoders by layer; the VAE is small and stays on the device."""
-    from diffusers.hooks.group_offloading import apply_group_offloading  # noqa: PLC0415
-
-    for name, model in pipeline.components.items():
-        if not isinstance(model, nn.Module):
-            continue
-        if name == "vae":
-            model.to(device)
-        elif name == "transformer":
-            streams = device.type == "cuda"
-            if streams:
-                for block in cast(Any, model).blocks:
-                    pin(block)
-            # With `record_stream` the CPU does not wait for the copies of each block.
-            apply_group_offloading(model, device, num_blocks_per_group=1, use_stream=streams, record_stream=streams)
-        else:
-            apply_group_offloading(model, device, offload_type="leaf_level")
 
 
 def pin(module: nn.Module) -> None:

@@ -171,7 +171,7 @@ def write_tracks(tracks: Tracks, path: Path) -> tuple[Path, ...]:
             f"The trajectory has {tracks.num_frames} frames: ATI's files hold {MAX_FRAMES}. Simulate with that many."
         )
     zipped = io.BytesIO()
-    np.savez_compressed(zipped, **{ARRAY: to_ati_file(tracks)})
+    np.savez_compressed(zipped, array=to_ati_file(tracks))
     if path.suffix == ".npz":
         path.write_bytes(zipped.getvalue())
     else:
