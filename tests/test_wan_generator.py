@@ -202,9 +202,9 @@ def test_a_cancel_takes_effect_within_one_step(toys: Service, monkeypatch: pytes
 
 def test_text_and_image_are_encoded_once(toys: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     simulate(toys, video=False)
-    calls = count(monkeypatch, pipeline_of(toys), "embed_text", "embed_image")
+    calls = count(monkeypatch, pipeline_of(toys), "encode_prompt", "embed_image")
     simulate(toys, video=False, seed=7, motion={"direction": [0.3, 1]}, generator_options={"prompt": "new words"})
-    assert calls == {"embed_text": 1, "embed_image": 0}
+    assert calls == {"encode_prompt": 1, "embed_image": 0}
     simulate(toys, video=False, num_frames=13, frames={})
     assert calls["embed_image"] == 1
 

@@ -18,6 +18,7 @@ from cow_service.media.images import fit_within
 from cow_service.physics.camera import FloorCamera
 from cow_service.records import BBox, Body, Path, Point, Trajectory
 from cow_service.vision.masks import CroppedMask, hull, resized_mask
+from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
 
 AWAY = 1e6  # px: where the path of what is taken away ends
@@ -45,8 +46,7 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
     eye = 0.0 if ground is None else ground.camera.height
     unshaded = take_shadows(leaving, clean, moving, still, ground, size[0] / scene.width)
     erased = without_bodies(unshaded, moving, still, eye, resized_mask(scene.cues, size))
-    image = at_full_size(scene.clean, clean, erased)
-    drawn = np.where(scene.cues[..., None], scene.image, image)
+    changed = _with_changes(scene, erased)
     gone = np.logical_or.reduce([as_it_is.obstacles[index - 1].mask.full() for index in removed])
     behind = {
         each.index
@@ -57,7 +57,6 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
         replace(each, mask=_completed(each.mask, gone)) if index in behind else each
         for index, each in enumerate(as_it_is.obstacles[:kept], start=1)
     )
-    changed = scene.changed(np.asarray(drawn, np.uint8), image)
     if 0 in behind:
         changed = changed.with_mask(mover, _completed(CroppedMask.of(scene.silhouette(mover)), gone).full())
     return replace(as_it_is, scene=changed, trajectory=trajectory, obstacles=obstacles)
@@ -80,16 +79,18 @@ def _completed(mask: CroppedMask, gone: Mask) -> CroppedMask:
     return CroppedMask.of(full | (hull(full) & gone))
 
 
-def at_full_size(full: Image, before: Image, after: Image) -> Image:
-    """An image [H, W, 3] with what was changed in a smaller copy of it."""
-    if full.shape == after.shape:
-        return after
-    changed = (cv2.absdiff(before, after).max(axis=2) > CHANGED).astype(np.uint8)
-    share = cv2.GaussianBlur(cv2.dilate(changed, np.ones((FEATHER, FEATHER), np.uint8)).astype(np.float32), (0, 0), 1.5)
-    size = full.shape[1], full.shape[0]
-    share = cv2.resize(share, size, interpolation=cv2.INTER_LINEAR)[..., None]
-    enlarged = cv2.resize(after, size, interpolation=cv2.INTER_CUBIC)
-    return np.where(share > 0, full + share * (enlarged.astype(np.float32) - full), full).astype(np.uint8)
+def _with_changes(scene: Scene, after: Image) -> Scene:
+    """The scene with what was changed in a smaller copy [h, w, 3] of its clean image."""
+    full = scene.clean
+    if full.shape != after.shape:
+        before = fit_within(full, MAX_SIDE)
+        changed = (cv2.absdiff(before, after).max(axis=2) > CHANGED).astype(np.uint8)
+        grown = cv2.dilate(changed, np.ones((FEATHER, FEATHER), np.uint8)).astype(np.float32)
+        size = full.shape[1], full.shape[0]
+        share = cv2.resize(cv2.GaussianBlur(grown, (0, 0), 1.5), size, interpolation=cv2.INTER_LINEAR)[..., None]
+        enlarged = cv2.resize(after, size, interpolation=cv2.INTER_CUBIC).astype(np.float32)
+        after = np.where(share > 0, full + share * (enlarged - full), full).astype(np.uint8)
+    return scene.changed(np.where(scene.cues[..., None], scene.image, after), after)
 
 
 def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
@@ -104,8 +105,7 @@ def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
         return given
     before, scene = replace(given, trajectory=_with_image_first(given, factual, put)), given.scene
     drawn = compose(take_apart(replace(before, options=CutoutOptions())), 1)
-    image = at_full_size(scene.clean, fit_within(scene.clean, MAX_SIDE), drawn)
-    changed = scene.changed(np.asarray(np.where(scene.cues[..., None], scene.image, image), np.uint8), image)
+    changed = _with_changes(scene, drawn)
     obstacles, grounding = list(given.obstacles), given.grounding
     for path in before.trajectory.paths:
         if path.body not in put:

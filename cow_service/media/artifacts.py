@@ -100,10 +100,7 @@ class ArtifactWriter(ABC):
 
 
 class ArtifactStore(ArtifactWriter):
-    """Keeps bytes under their digests. Safe to share between threads.
-
-    Every method raises `StorageUnavailable` where the store cannot be read or written.
-    """
+    """As a writer; reads, lists and deletes, too, and raises `StorageUnavailable` likewise. Threads may share it."""
 
     def __init__(self, scratch_folder: Path) -> None:
         super().__init__(scratch_folder)

@@ -32,10 +32,10 @@ MIN_SIDE = 8  # px; nothing that could move has room in less
 # The classes rather than `Image.open`: that compares every size with `Image.MAX_IMAGE_PIXELS`, one limit for the whole
 # process, which a library must not change under its host; it also fills its table of formats on first use, from
 # whichever thread comes first. `JpegImageFile` reads the first picture of a multi-picture file (MPO), as phones write.
-_OPENERS: dict[str, Callable[[io.BytesIO], ImageFile]] = {
-    "PNG": PngImagePlugin.PngImageFile,
-    "JPEG": JpegImagePlugin.JpegImageFile,
-    "WebP": WebPImagePlugin.WebPImageFile,
+_OPENERS: dict[str, tuple[str, Callable[[io.BytesIO], ImageFile]]] = {
+    "image/png": ("PNG", PngImagePlugin.PngImageFile),
+    "image/jpeg": ("JPEG", JpegImagePlugin.JpegImageFile),
+    "image/webp": ("WebP", WebPImagePlugin.WebPImageFile),
 }
 
 UPRIGHT = 1  # EXIF orientation, EXIF 2.3, section 4.6.4
@@ -86,7 +86,6 @@ _FOREIGN_SIGNATURES = (
 )
 _ISO_BRANDS = {b"avif": "an AVIF file", b"avis": "an AVIF file", b"heic": "a HEIC file", b"mif1": "a HEIF file"}
 _SNIFFED_BYTES = 1024
-_KINDS = {"image/png": "PNG", "image/jpeg": "JPEG", "image/webp": "WebP"}
 
 
 @dataclass(frozen=True)
@@ -114,9 +113,10 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     """
     if not data:
         raise errors.ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
-    kind = _KINDS.get(media_type_of(data) or "")
-    if kind is None:
+    media_type = media_type_of(data)
+    if media_type is None or media_type not in _OPENERS:
         raise errors.ImageTypeUnsupported(f"The image is {_describe_foreign(data)}: send it as PNG, JPEG or WebP.")
+    kind, opener = _OPENERS[media_type]
     try:
         if kind == "WebP":
             # Opening a WebP file allocates its whole canvas, so that its size has to be known before. Its blocks are
@@ -125,7 +125,7 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
             stripped, orientation = data, UPRIGHT
         else:
             stripped, orientation = _strip_png(data) if kind == "PNG" else _strip_jpeg(data)
-        with _OPENERS[kind](io.BytesIO(stripped)) as image:
+        with opener(io.BytesIO(stripped)) as image:
             _check_size(image.width, image.height, max_megapixels)
             frames = int(getattr(image, "n_frames", 1))
             if frames > 1:
@@ -145,7 +145,7 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     pixels = np.asarray(rgb if turn is None else rgb.transpose(turn), np.uint8)
     height, width = pixels.shape[:2]
     info = ImageInfo(width=width, height=height, sha256=hashlib.sha256(data).hexdigest())
-    return DecodedImage(pixels, info, f"image/{kind.lower()}")
+    return DecodedImage(pixels, info, media_type)
 
 
 def decode_own(data: bytes) -> NDArray[np.uint8]:

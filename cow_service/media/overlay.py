@@ -57,13 +57,7 @@ def draw_labels(
 
 
 def _free_place(
-    label: Label,
-    width: int,
-    height: int,
-    gap: int,
-    size: tuple[int, int],
-    placed: Sequence[Plate],
-    points: Floats,
+    label: Label, width: int, height: int, gap: int, size: tuple[int, int], placed: Sequence[Plate], points: Floats
 ) -> Plate:
     """Where a label of a width and height (px) covers least of the others; then fewest points; then next to its box."""
     x0, y0, x1, y1 = (float(np.clip(v, -20_000, 20_000)) for v in label.bbox)

@@ -1,7 +1,4 @@
-"""Frames to an MP4 file that every browser plays, and from there to a GIF, a WebP and a contact sheet.
-
-This is the seam to FFmpeg.
-"""
+"""The seam to FFmpeg: frames to an MP4 that every browser plays, and from there to a GIF, a WebP or a contact sheet."""
 
 import errno
 import io
@@ -78,13 +75,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def write_mp4(
-    frames: Iterable[Pixels],
-    path: Path,
-    *,
-    fps: float,
-    width: int,
-    height: int,
-    crf: int = CRF_DEFAULT,
+    frames: Iterable[Pixels], path: Path, *, fps: float, width: int, height: int, crf: int = CRF_DEFAULT
 ) -> int:
     """Write frames, each [height, width, 3] RGB, as H.264 (High, 4:2:0, BT.709) and return how many there were.
 

@@ -8,8 +8,8 @@ that an interrupted download continues with the same revision and only the missi
 with its API (HF_ENDPOINT), and changes nothing here; `download` carries it out. Exceptions of the hub's library become
 `WeightsUnavailable` here and nowhere else.
 
-huggingface_hub's `verify_repo_checksums` asks the hub for the digests, so that it cannot check offline, and
-`snapshot_download` lists the repository at each call and reports one bar for all files: both are not used.
+huggingface_hub's `verify_repo_checksums` asks the hub for the digests and so needs a network; `snapshot_download` lists
+the repository at each call and reports one bar for all files: both are not used.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from uuid import uuid4
 
+from filelock import FileLock, Timeout
 from pydantic import AfterValidator, Field, ValidationError
 
 from cow_service import __version__
@@ -38,7 +39,6 @@ from cow_service.settings import Settings
 from cow_service.weights.manifests import Manifest, Source
 
 if TYPE_CHECKING:
-    from filelock import FileLock
     from huggingface_hub import HfApi
 
 LOCK_NAME = "cow.lock.json"
@@ -126,10 +126,7 @@ def folder_of(weights_dir: Path, repository: str) -> Path:
 
 
 def check(source: Source, weights_dir: Path, digests: bool = True) -> tuple[Finding, ...]:
-    """Compares the files of a source with their record; empty when all is right.
-
-    Without `digests` only sizes are compared. Raises `WeightsUnavailable` where something cannot be read.
-    """
+    """What is not as recorded, without `digests` by sizes alone. Raises `WeightsUnavailable` for unreadable files."""
     lock = read_lock(weights_dir, source.repository)
     if lock is None:
         return tuple(Finding(file=pattern, problem="not-pulled") for pattern in source.files)
@@ -150,10 +147,7 @@ def check(source: Source, weights_dir: Path, digests: bool = True) -> tuple[Find
 
 
 def verify(source: Source, weights_dir: Path, name: str) -> Path:
-    """The folder of a source's files, where every one has the digest that was recorded; `name` is the manifest's.
-
-    Raises `WeightsUnavailable`, saying what is wrong and how to mend it.
-    """
+    """The folder of a source's files. Raises `WeightsUnavailable` where they are not as recorded, with the remedy."""
     findings = check(source, weights_dir)
     if findings:
         messages = [finding.message for finding in findings[:_MAX_LISTED]]
@@ -167,10 +161,7 @@ def verify(source: Source, weights_dir: Path, name: str) -> Path:
 
 
 def ready(manifest: Manifest, weights_dir: Path, without: Container[str] = ()) -> bool:
-    """All files that the manifest needs, but those of the parts `without`, are here with the right sizes.
-
-    Quick: nothing is hashed.
-    """
+    """All files of the manifest, but those of the parts `without`, are here with the right sizes; nothing is hashed."""
     sources = [source for part, source in manifest.sources.items() if part not in without]
     try:
         return not any(check(source, weights_dir, digests=False) for source in sources)
@@ -430,8 +421,6 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
 
 def _locked(folder: Path, repository: str) -> FileLock:
     """Locks the folder against other downloads, and deletes what killed downloads have left incomplete."""
-    from filelock import FileLock, Timeout  # noqa: PLC0415
-
     kept = folder / ".cache"
     with disk_errors(repository):
         kept.mkdir(parents=True, exist_ok=True)

@@ -34,10 +34,7 @@ FIRST_LAYERS = 5  # dbcache computes a fifth of the layers in every step, and de
 def check_device(
     acceleration: Acceleration, device: torch.device, others: Mapping[str, Acceleration] | None = None
 ) -> None:
-    """Raises `GeneratorUnavailable` listing everything that the device cannot do. Nothing is loaded.
-
-    `others`: the model's profiles, of which the error names those that the device can run.
-    """
+    """Raises `GeneratorUnavailable` for all that the device cannot do, naming those of `others` that it can run."""
     with naming_option(f"device: {device}"):
         machine = detect_capabilities(device)
     if sentences := refusals(acceleration, machine):

@@ -125,10 +125,10 @@ def refusals(acceleration: Acceleration, available: Capabilities) -> tuple[str, 
 
 
 def _refuse_attention(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
-    name, backend = wanted.attention, ATTENTION_BACKENDS.get(wanted.attention)
+    name, backend, here = wanted.attention, ATTENTION_BACKENDS.get(wanted.attention), available.description
     if name == AUTO:
         if available.device != "cuda":
-            yield f"attention: auto needs a GPU, whose backends it times, and {available.description}; choose native."
+            yield f"attention: auto needs a GPU, whose backends it times, and {here}; choose native."
         return
     if backend is None:
         yield f"attention: there is no '{name}'; choose one of {', '.join((AUTO, *ATTENTION_BACKENDS))}."
@@ -136,8 +136,7 @@ def _refuse_attention(wanted: Acceleration, available: Capabilities) -> Iterator
     low, high, own = backend.at_least, backend.at_most, available.compute_capability
     if low and (own is None or not low <= own <= (high or own)):
         needed = _dotted(low) if low == high else f"{_dotted(low)} or more"
-        remedy = f"and {available.description}; choose native"
-        yield f"attention: '{name}' needs a GPU of compute capability {needed}, {remedy}."
+        yield f"attention: '{name}' needs a GPU of compute capability {needed}, and {here}; choose native."
     if backend.package and backend.package not in available.packages:
         others = f"{HUB[backend.package]} or native" if backend.package in HUB else "native"
         yield f"attention: '{name}' needs {_package(backend.package)}; install it, or choose {others}."
@@ -145,8 +144,9 @@ def _refuse_attention(wanted: Acceleration, available: Capabilities) -> Iterator
 
 def _refuse_computing(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     """What `compile`, `cache` and `fp8` lack."""
+    has, own, here = available.packages, available.compute_capability, available.description
     if wanted.compile != "none":
-        if available.device == "cuda" and "triton" not in available.packages:
+        if available.device == "cuda" and "triton" not in has:
             yield f"compile: regional needs {_package('triton')}; install it, or choose none."
         if not available.compiler:
             yield "compile: regional needs a C++ compiler and Python's headers; install them, or choose none."
@@ -155,39 +155,39 @@ def _refuse_computing(wanted: Acceleration, available: Capabilities) -> Iterator
             yield f"compile: sequential offload moves every layer by itself, {remedy}."
     if wanted.cache == "mag" and not wanted.mag_ratios:
         yield "cache: mag needs `mag_ratios`, measured on these weights; give them, or choose first-block."
-    if wanted.cache == "dbcache" and "cache-dit" not in available.packages:
+    if wanted.cache == "dbcache" and "cache-dit" not in has:
         yield f"cache: dbcache needs {_package('cache-dit')}; install it, or choose first-block."
     if wanted.cache == "dbcache" and wanted.ranks > 1:  # it counts passes, of which each GPU sees its own
         yield "cache: dbcache is for one GPU; choose mag or none."
     if wanted.cache == "first-block" and wanted.context_parallel > 1:
         # Each GPU measures the change of its own shard; if only some skip, the others wait for their tensors forever.
         yield "cache: GPUs that share a video would not skip the same steps with first-block; choose mag or none."
-    if wanted.fp8 != "none" and "torchao" not in available.packages:
+    if wanted.fp8 != "none" and "torchao" not in has:
         yield f"fp8: {wanted.fp8} needs {_package('torchao')}; install it, or choose none."
-    own, needed = available.compute_capability, f"compute capability {_dotted(ADA)} or more"
+    needed = f"compute capability {_dotted(ADA)} or more"
     if wanted.fp8 == "dynamic" and (own is None or own < ADA):
-        yield f"fp8: dynamic needs a GPU of {needed}, and {available.description}; choose none."
+        yield f"fp8: dynamic needs a GPU of {needed}, and {here}; choose none."
     if wanted.fp8 in {"stored", "weights"} and wanted.compile != "none" and own and own < ADA:  # Triton lacks it there
-        remedy = f"and {available.description}; choose `compile: none`"
-        yield f"fp8: {wanted.fp8} can only be compiled for {needed}, {remedy}."
+        yield f"fp8: {wanted.fp8} can only be compiled for {needed}, and {here}; choose `compile: none`."
 
 
 def _refuse_placing(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     """What `offload`, `context_parallel` and `guidance_parallel` lack."""
+    on_gpu, here = available.device == "cuda", available.description
     if wanted.offload != "none":
-        if available.device != "cuda":
-            yield f"offload: {wanted.offload} needs a GPU to move weights to, and {available.description}; choose none."
+        if not on_gpu:
+            yield f"offload: {wanted.offload} needs a GPU to move weights to, and {here}; choose none."
         if "accelerate" not in available.packages:
             yield f"offload: {wanted.offload} needs {_package('accelerate')}; install it, or choose none."
     if wanted.ranks > 1:
-        if available.device == "cuda" and available.gpus < wanted.ranks:
-            needed = f"{wanted.ranks} GPUs are to share a clip, from that of COW_DEVICE on"
-            yield f"{needed}, and there are {available.gpus}."
+        if on_gpu and available.gpus < wanted.ranks:
+            share = f"{wanted.ranks} GPUs are to share a clip, from that of COW_DEVICE on"
+            yield f"{share}, and there are {available.gpus}."
         if wanted.offload != "none":
             yield f"offload: {wanted.offload} is for one GPU, and {wanted.ranks} are to share a clip; choose none."
     if wanted.context_parallel > 1:
-        if available.device != "cuda":
-            yield f"context_parallel: {wanted.context_parallel} needs GPUs, and {available.description}; choose 1."
+        if not on_gpu:
+            yield f"context_parallel: {wanted.context_parallel} needs GPUs, and {here}; choose 1."
         if not ATTENTION_BACKENDS.get(wanted.attention, ATTENTION_BACKENDS["native"]).context_parallel:
             able = ", ".join(name for name, backend in ATTENTION_BACKENDS.items() if backend.context_parallel)
             yield f"context_parallel: attention '{wanted.attention}' cannot be split among GPUs; choose one of {able}."

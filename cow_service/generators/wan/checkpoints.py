@@ -122,10 +122,7 @@ def diffusers_config(architecture: Architecture) -> dict[str, Any]:
 
 
 def checkpoint_files(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
-    """The folder of a configuration, where there is one, and the safetensors files in order.
-
-    Raises `CheckpointInvalid` where there are none, or shards are missing. Opens none of them.
-    """
+    """The folder of a configuration, if any, and the safetensors files. Raises `CheckpointInvalid` where some lack."""
     if path.suffix in PICKLES:
         raise CheckpointInvalid(f"{path.name} is a pickle, which can run code when opened. Use its safetensors form.")
     if path.is_file():

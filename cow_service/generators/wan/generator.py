@@ -93,10 +93,7 @@ class WanGenerator(WanLimits):
         return (self.group or self.pipeline).denoise
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """The model's area at the image's aspect ratio, sides rounded down to multiples of 16 px.
-
-        Raises `InvalidRequest` for an image so narrow that no clip of that shape can be made.
-        """
+        """Of a clip, at the image's aspect ratio, in multiples of 16 px. Raises `InvalidRequest` for a narrow image."""
         clip_width, clip_height = clip_size(self.max_area, width, height)
         if max(clip_width, clip_height) > MAX_SIDE:
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
@@ -104,10 +101,7 @@ class WanGenerator(WanLimits):
         return clip_width, clip_height
 
     def compile(self) -> None:
-        """Compiles for clips of any size, most images' first; does nothing where the profile compiles nothing.
-
-        Else the first clip would wait for it, and the first of a second size once more.
-        """
+        """Compiles for clips of any size, where the profile does: else the first clips would wait for it."""
         if self.profile.acceleration.compile == "none":
             return
         width, height = self.size(*USUAL_SIDES)
@@ -224,8 +218,6 @@ def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling
 
     PyTorch compiles a block for the first size that it meets, and once more, for any size, when it meets a second one.
     The first code stays for its own size, and is the faster one: so the size of most clips comes first.
-
-    `denoise`: the pipeline's, or that of several processes.
     """
     step = sampling.model_copy(update={"steps": 1})
     config, device = pipeline.transformer.config, pipeline.compute_device

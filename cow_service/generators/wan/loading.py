@@ -94,10 +94,7 @@ create_tiny_wan_move = partial(load, "tiny-wan-move", conditioning.wan_move)
 
 
 def load_rank(name: str, profile: Profile, settings: Settings, device: torch.device) -> WanTransformer3DModel:
-    """The transformer alone, for one more process that shares the clips of a model: rank 0 has checked the weights.
-
-    Raises as `load` does.
-    """
+    """The transformer alone, for one more process that shares clips; rank 0 has checked it. Raises as `load` does."""
     keep_compiled_code(settings.data_dir / "compiled")
     manifest = load_manifests()[name]
     with within_memory(device, lambda: None, f"'{name}' on {device}"):

@@ -4,7 +4,6 @@ import gc
 import math
 import os
 import traceback
-from collections import defaultdict
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,8 +28,7 @@ BASE_PARTS = ("text_encoder", "image_encoder", "vae")
 CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes or "max"
 CANCEL_POLL_SECONDS = 0.2  # how often a caller that waits for the device checks whether it was canceled
 
-_locks: defaultdict[str, Lock] = defaultdict(Lock)
-_locks_guard = Lock()
+_locks: dict[str, Lock] = {}
 
 
 @dataclass(frozen=True)
@@ -133,8 +131,7 @@ def _read_headers(checkpoint: Path, base: Path) -> tuple[dict[str, int], bool] |
 @contextmanager
 def exclusive_use(device: torch.device, check_canceled: Callable[[], None]) -> Generator[None]:
     """Holds the device for one clip. While another clip has it, `check_canceled` is called, and may raise."""
-    with _locks_guard:
-        lock = _locks[str(device)]
+    lock = _locks.setdefault(str(device), Lock())
     while not lock.acquire(timeout=CANCEL_POLL_SECONDS):
         check_canceled()
     try:

@@ -95,10 +95,7 @@ class WanTrackPipeline(WanImageToVideoPipeline):
     def embed_text(self, text: str) -> Tensor:
         """Text embeddings [1, 512, C]."""
         embeds, _ = self.encode_prompt(
-            prompt=text,
-            do_classifier_free_guidance=False,
-            max_sequence_length=TEXT_LENGTH,
-            device=self.compute_device,
+            prompt=text, do_classifier_free_guidance=False, max_sequence_length=TEXT_LENGTH, device=self.compute_device
         )
         return embeds
 
@@ -149,12 +146,7 @@ class EmbeddingCache:
     def __init__(self, pipeline: WanTrackPipeline) -> None:
         self._pipeline = pipeline
         self._images: OrderedDict[tuple[object, ...], ImageEmbedding] = OrderedDict()
-
-        @lru_cache(MAX_TEXTS)
-        def embed_text(text: str) -> Tensor:
-            return pipeline.embed_text(text)
-
-        self.text = embed_text
+        self.text = lru_cache(MAX_TEXTS)(pipeline.embed_text)
 
     def image(self, image: NDArray[np.uint8], width: int, height: int, num_frames: int) -> ImageEmbedding:
         """Embedding of the first frame of a clip of this size (px) and length."""
@@ -205,10 +197,7 @@ def denoise(
     on_step: StepCallback,
     share: Share = lambda branch, compute, like: compute(),
 ) -> Tensor:
-    """Latents [1, 16, T, h, w] from noise of that shape.
-
-    `on_step(done, total)` is called when the device has done a step, and may raise to cancel.
-    """
+    """Latents [1, 16, T, h, w] from such noise. `on_step(done, total)` follows each step, and may raise to cancel."""
     dtype = cast(torch.dtype, transformer.dtype)  # found by a walk over all weights: once per clip
     schedule = make_schedule(sampling, device)
     latents = noise.to(device, torch.float32)

@@ -4,16 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+import transformers
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
-from transformers import (
-    CLIPImageProcessor,
-    CLIPVisionConfig,
-    CLIPVisionModel,
-    PreTrainedTokenizerFast,
-    UMT5Config,
-    UMT5EncoderModel,
-)
 
 from cow_service.generators.wan.checkpoints import diffusers_config
 from cow_service.generators.wan.pipeline import LATENT_CHANNELS, WanTrackPipeline, compose
@@ -31,10 +24,10 @@ def make_tiny(architecture: Mapping[str, Any]) -> WanTrackPipeline:
     tokenizer.decoder = decoders.ByteLevel()
     tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
     text_width, image_width = architecture["text_dim"], architecture["image_dim"]
-    text_config = UMT5Config(
+    text_config = transformers.UMT5Config(
         vocab_size=len(vocabulary), d_model=text_width, d_kv=8, d_ff=2 * text_width, num_layers=1, num_heads=2
     )
-    image_config = CLIPVisionConfig(
+    image_config = transformers.CLIPVisionConfig(
         hidden_size=image_width, intermediate_size=2 * image_width, num_hidden_layers=2, num_attention_heads=2,
         image_size=32, patch_size=8,
     )  # fmt: skip
@@ -49,13 +42,15 @@ def make_tiny(architecture: Mapping[str, Any]) -> WanTrackPipeline:
                 num_res_blocks=1,
                 temperal_downsample=[False, True, True],
             ),
-            "text_encoder": UMT5EncoderModel(text_config),
-            "image_encoder": CLIPVisionModel(image_config),
+            "text_encoder": transformers.UMT5EncoderModel(text_config),
+            "image_encoder": transformers.CLIPVisionModel(image_config),
         }
     for part in parts.values():
         part.eval().requires_grad_(False)
     return compose(
-        tokenizer=PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", eos_token="</s>"),
-        image_processor=CLIPImageProcessor(size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}),
+        tokenizer=transformers.PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", eos_token="</s>"),
+        image_processor=transformers.CLIPImageProcessor(
+            size={"shortest_edge": 32}, crop_size={"height": 32, "width": 32}
+        ),
         **parts,
     )
