@@ -232,9 +232,17 @@ def examine(lock: Lock, files: Iterable[LockedFile], weights_dir: Path, digests:
             return Finding(file=file.path, problem="missing")
         if size != file.size:
             return Finding(file=file.path, problem="wrong-size", wanted=f"{file.size} bytes", found=f"{size} bytes")
-        if digests and (found := _digest(path, file, stop)) != file.digest:
-            wanted, found = f"{file.algorithm} {file.digest}", f"{file.algorithm} {found}"
-            return Finding(file=file.path, problem="wrong-digest", wanted=wanted, found=found)
+        if digests:
+            state = hashlib.sha256() if file.algorithm == "sha256" else hashlib.sha1(usedforsecurity=False)
+            if file.algorithm == "git-sha1":
+                state.update(b"blob %d\0" % file.size)
+            buffer = memoryview(bytearray(min(_CHUNK_BYTES, max(file.size, 1))))
+            with path.open("rb", buffering=0) as data:
+                while (count := data.readinto(buffer)) and not stop.is_set():
+                    state.update(buffer[:count])
+            if (found := state.hexdigest()) != file.digest:
+                wanted, found = f"{file.algorithm} {file.digest}", f"{file.algorithm} {found}"
+                return Finding(file=file.path, problem="wrong-digest", wanted=wanted, found=found)
         return None
 
     # Hashing releases the GIL, so threads are enough; beyond a few, the disk is the limit.
@@ -245,17 +253,6 @@ def examine(lock: Lock, files: Iterable[LockedFile], weights_dir: Path, digests:
             stop.set()  # else an interrupted check would first finish the files in progress
             raise
     return tuple(finding for finding in findings if finding is not None)
-
-
-def _digest(path: Path, file: LockedFile, stop: Event) -> str:
-    state = hashlib.sha256() if file.algorithm == "sha256" else hashlib.sha1(usedforsecurity=False)
-    if file.algorithm == "git-sha1":
-        state.update(b"blob %d\0" % file.size)
-    buffer = memoryview(bytearray(min(_CHUNK_BYTES, max(file.size, 1))))
-    with path.open("rb", buffering=0) as data:
-        while (count := data.readinto(buffer)) and not stop.is_set():
-            state.update(buffer[:count])
-    return state.hexdigest()
 
 
 @contextmanager

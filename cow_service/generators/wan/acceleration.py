@@ -64,17 +64,17 @@ def accelerate(pipeline: Any, wanted: Acceleration, device: torch.device) -> Non
             from diffusers.hooks.group_offloading import apply_group_offloading  # noqa: PLC0415
 
             streams = device.type == "cuda"
-            for name, model in pipeline.components.items():
+            models: dict[str, Any] = {n: part for n, part in pipeline.components.items() if isinstance(part, nn.Module)}
+            for name, model in models.items():
                 if name == "vae":
                     model.to(device)
                 elif name == "transformer":
                     for block in model.blocks if streams else ():
                         pin(block)
                     # With `record_stream` the CPU does not wait for the copies of each block.
-                    apply_group_offloading(
-                        model, device, num_blocks_per_group=1, use_stream=streams, record_stream=streams
-                    )
-                elif isinstance(model, nn.Module):
+                    moving = {"num_blocks_per_group": 1, "use_stream": streams, "record_stream": streams}
+                    apply_group_offloading(model, device, **moving)
+                else:
                     apply_group_offloading(model, device, offload_type="leaf_level")
 
 

@@ -219,8 +219,23 @@ class _Rank:
         self.has_ended = threading.Event()
         self.error: CowError | None = None
         self._spawned = spawn(MODULE)
-        self._on_end = on_end
-        threading.Thread(target=self._listen, name=f"cow-rank-{number}", daemon=True).start()
+
+        def listen() -> None:
+            try:
+                while True:
+                    message: FromRank = self._spawned.pipe.recv()
+                    if isinstance(message, Failed):
+                        self.error = kinds().get(message.code, InternalError)(message.detail)
+                    else:
+                        self.loaded.set()
+            except (EOFError, OSError):
+                pass
+            self._spawned.process.wait()
+            self.has_ended.set()
+            self.loaded.set()
+            on_end()
+
+        threading.Thread(target=listen, name=f"cow-rank-{number}", daemon=True).start()
 
     def send(self, message: ToRank) -> None:
         """Does nothing once the process has ended."""
@@ -233,21 +248,6 @@ class _Rank:
         """Ends the process at once."""
         self._spawned.process.kill()
         self._spawned.process.wait()
-
-    def _listen(self) -> None:
-        try:
-            while True:
-                message: FromRank = self._spawned.pipe.recv()
-                if isinstance(message, Failed):
-                    self.error = kinds().get(message.code, InternalError)(message.detail)
-                else:
-                    self.loaded.set()
-        except (EOFError, OSError):
-            pass
-        self._spawned.process.wait()
-        self.has_ended.set()
-        self.loaded.set()
-        self._on_end()
 
 
 class Sharing:

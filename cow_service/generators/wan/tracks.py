@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import InvalidRequest
-from cow_service.records import Path as BodyPath
 from cow_service.records import Trajectory
 from cow_service.vision.types import Floats, Floats32
 
@@ -82,7 +81,16 @@ def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
     Points outside the image are not visible. The bodies after the mover share `MAX_OTHER_TRACKS`.
     """
     frames = trajectory.num_frames
-    parts = [_tracks_of_path(path, width, height) for path in trajectory.paths]
+    parts: list[Tracks] = []
+    for path in trajectory.paths:
+        points = np.array(path.tracks, np.float64).reshape(-1, frames, 2).transpose(1, 0, 2)
+        # Inside the image and yet not visible: behind the camera or hidden, and so are the body's other points. Outside
+        # it the centre says nothing of them.
+        hidden = _inside(np.array(path.points, np.float64), width, height) & ~np.array(path.visible, bool)
+        visible = _inside(points, width, height) & ~hidden[:, None]
+        if path.tracks_visible is not None:
+            visible &= np.array(path.tracks_visible, bool).reshape(-1, frames).T
+        parts.append(Tracks(points.astype(np.float32), visible))
     least = max(1, MAX_OTHER_TRACKS // max(1, len(parts) - 1))
     parts[1:] = [Tracks(part.points[:, :least], part.visible[:, :least]) for part in parts[1 : MAX_OTHER_TRACKS + 1]]
     anchors = np.array(trajectory.anchors, np.float32).reshape(1, -1, 2).repeat(frames, axis=0)
@@ -91,19 +99,6 @@ def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
         np.concatenate([part.points for part in parts], axis=1),
         np.concatenate([part.visible for part in parts], axis=1),
     )
-
-
-def _tracks_of_path(path: BodyPath, width: int, height: int) -> Tracks:
-    """Several points of one body."""
-    frames = len(path.points)
-    points = np.array(path.tracks, np.float64).reshape(-1, frames, 2).transpose(1, 0, 2)
-    # Inside the image and yet not visible: behind the camera or hidden, and so are the body's other points. Outside
-    # it the centre says nothing of them.
-    hidden = _inside(np.array(path.points, np.float64), width, height) & ~np.array(path.visible, bool)
-    visible = _inside(points, width, height) & ~hidden[:, None]
-    if path.tracks_visible is not None:
-        visible &= np.array(path.tracks_visible, bool).reshape(-1, frames).T
-    return Tracks(points.astype(np.float32), visible)
 
 
 def to_ati_file(tracks: Tracks) -> Floats32:
