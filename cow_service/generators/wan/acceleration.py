@@ -72,8 +72,9 @@ def accelerate(pipeline: Any, wanted: Acceleration, device: torch.device) -> Non
                     for block in model.blocks if streams else ():
                         pin(block)
                     # With `record_stream` the CPU does not wait for the copies of each block.
-                    moving = {"num_blocks_per_group": 1, "use_stream": streams, "record_stream": streams}
-                    apply_group_offloading(model, device, **moving)
+                    apply_group_offloading(
+                        model, device, num_blocks_per_group=1, use_stream=streams, record_stream=streams
+                    )
                 else:
                     apply_group_offloading(model, device, offload_type="leaf_level")
 
