@@ -16,7 +16,7 @@ from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, take_a
 from cow_service.generators.cutout.shadows import take_shadows
 from cow_service.media.images import fit_within
 from cow_service.physics.camera import FloorCamera
-from cow_service.records import BBox, Body, Path, Point, Trajectory
+from cow_service.records import BBox, Path, Point, Trajectory
 from cow_service.vision.masks import CroppedMask, hull, resized_mask
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
@@ -129,54 +129,37 @@ def _with_image_first(given: GeneratorInput, factual: Trajectory, put: Sequence[
     told = given.trajectory
     assert told.camera is not None  # every world has one
     camera = FloorCamera.of(told.camera, given.scene.width, given.scene.height)
-    paths: list[Path] = []
-    for path in told.paths:
-        start, state, begun = path.points[0], path.states[0], path
-        if path.body in put:
-            seen, body = factual.bodies[path.body], told.bodies[path.body]
-            start = given.grounding.point if path.body == 0 else _middle(seen.bbox)
-            state, begun = (*seen.position, 0.0, 0.0, 0.0), _put_elsewhere(path, seen, body)
-        paths.append(_with_first_frame(begun, state, start))
+    paths = list(told.paths)
     for index in set(put) - {path.body for path in told.paths}:  # what stays at its new place
         seen, body, count = factual.bodies[index], told.bodies[index], told.num_frames
         old, new = camera.project(np.array([seen.position, body.position]))
-        middle = _middle(seen.bbox)
-        x, y = (new + (np.array(middle) - old) * seen.position[2] / body.position[2]).tolist()
-        resting = Path(
-            body=index,
-            states=((*body.position, 0.0, 0.0, 0.0),) * count,
-            points=((x, y),) * count,
-            visible=(True,) * count,
-            scale=(1.0,) * count,
-            tracks=(),
-        )
-        paths.append(_with_first_frame(_put_elsewhere(resting, seen, body), (*seen.position, 0.0, 0.0, 0.0), middle))
-    bodies = tuple(factual.bodies[i] if i in put else body for i, body in enumerate(told.bodies))
-    return told.model_copy(update={"bodies": bodies, "paths": tuple(paths)})
-
-
-def _put_elsewhere(path: Path, seen: Body, body: Body) -> Path:
-    """A path that begins at the new place of a body, as large and turned against how the image shows it."""
-    factor, rotation = seen.position[2] / body.position[2], path.rotation or (0.0,) * len(path.points)
-    scale = tuple(factor * each for each in path.scale)
-    return path.model_copy(update={"scale": scale, "rotation": tuple(body.rotation + each for each in rotation)})
-
-
-def _with_first_frame(path: Path, state: tuple[float, float, float, float, float, float], start: Point) -> Path:
-    """A path with a first frame in which its body is as the image shows it."""
-    return path.model_copy(
-        update={
+        x, y = (new + (np.array(_middle(seen.bbox)) - old) * seen.position[2] / body.position[2]).tolist()
+        states, points = ((*body.position, 0.0, 0.0, 0.0),) * count, ((x, y),) * count
+        still = Path(body=index, states=states, points=points, visible=(True,) * count, scale=(1.0,) * count, tracks=())
+        paths.append(still)
+    for place, path in enumerate(paths):
+        state, start, scale, rotation = path.states[0], path.points[0], path.scale, path.rotation
+        if path.body in put:  # it begins as large and turned against how the image shows it
+            seen, body = factual.bodies[path.body], told.bodies[path.body]
+            state = (*seen.position, 0.0, 0.0, 0.0)
+            start = given.grounding.point if path.body == 0 else _middle(seen.bbox)
+            factor = seen.position[2] / body.position[2]
+            scale = tuple(factor * each for each in scale)
+            rotation = tuple(body.rotation + each for each in rotation or (0.0,) * len(path.points))
+        update = {
             "states": (state, *path.states),
             "points": (start, *path.points),
             "visible": (True, *path.visible),
-            "scale": (1.0, *path.scale),
-            "rotation": (0.0, *path.rotation) if path.rotation else (),
+            "scale": (1.0, *scale),
+            "rotation": (0.0, *rotation) if rotation else (),
             "band": (),
             "futures": (),
             "tracks": (),
             "tracks_visible": None,
         }
-    )
+        paths[place] = path.model_copy(update=update)
+    bodies = tuple(factual.bodies[i] if i in put else body for i, body in enumerate(told.bodies))
+    return told.model_copy(update={"bodies": bodies, "paths": tuple(paths)})
 
 
 def _middle(bbox: BBox) -> Point:

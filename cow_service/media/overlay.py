@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 
 import cv2
 import numpy as np
@@ -216,13 +218,8 @@ def _draw_band(canvas: Image, path: Path, colour: Colour, thin: int) -> None:
 
 def _draw_path(canvas: Image, path: Path, fps: float, colour: Colour, thin: int) -> None:
     """The path as far as it is visible, with a dot every half second."""
-    runs: list[list[tuple[int, int]]] = [[]]
-    for point, visible in zip(path.points, path.visible, strict=True):
-        if visible:
-            runs[-1].append(_fixed(point))
-        elif runs[-1]:
-            runs.append([])
-    lines = [np.array(run, np.int32).reshape(-1, 1, 2) for run in runs if run]
+    runs = groupby(zip(path.points, path.visible, strict=True), key=itemgetter(1))
+    lines = [np.array([[_fixed(point)] for point, _ in run], np.int32) for visible, run in runs if visible]
     for shade, width in ((DARK, 3 * thin), (colour, thin)):
         cv2.polylines(canvas, lines, False, shade, width, cv2.LINE_AA, SUBPIXEL)
     step = max(1, round(fps / 2))

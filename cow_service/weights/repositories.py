@@ -344,11 +344,9 @@ def download(
         for each in downloads:
             lock, old = each.lock, read_lock(weights_dir, each.lock.repository)
             if old is not None and old.revision == lock.revision:  # another download may have ended meanwhile
+                patterns = tuple(dict.fromkeys((*old.patterns, *lock.patterns)))
                 files = {file.path: file for file in (*old.files, *lock.files)}
-                both = {
-                    "patterns": tuple(dict.fromkeys((*old.patterns, *lock.patterns))),
-                    "files": tuple(files[path] for path in sorted(files)),
-                }
+                both = {"patterns": patterns, "files": tuple(files[path] for path in sorted(files))}
                 lock = lock.model_copy(update=both)
             with disk_errors(lock.repository):
                 write_lock(weights_dir, lock)
@@ -404,9 +402,8 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
             try:
                 path, listed = inside(name), siblings[name]
             except ValueError as error:
-                raise _unavailable(
-                    source.repository, f"in its listing, {error}", "Do not use this repository"
-                ) from error
+                why = f"in its listing, {error}"
+                raise _unavailable(source.repository, why, "Do not use this repository") from error
             if listed.lfs is not None:  # files in large-file storage, xet included
                 files.append(LockedFile(path=path, size=listed.lfs.size, algorithm="sha256", digest=listed.lfs.sha256))
             elif listed.size is None or listed.blob_id is None:
@@ -493,10 +490,8 @@ def _hub_errors(repository: str, revision: str | None) -> Generator[None]:
             reason = "the disk is full"
             remedy = "Free some space, or set COW_MODELS_DIR to a folder on a larger disk"
         elif number:
-            reason, remedy = (
-                f"the folder for weights cannot be used ({errno.errorcode.get(number)})",
-                "Make it writable",
-            )
+            reason = f"the folder for weights cannot be used ({errno.errorcode.get(number)})"
+            remedy = "Make it writable"
         else:
             reason, remedy = f"the download failed ({type(cause).__name__})", _AGAIN
         raise _unavailable(repository, reason, remedy) from error
