@@ -35,7 +35,13 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
     scene, kept = as_it_is.scene, len(as_it_is.obstacles) - len(removed)
     clean = fit_within(scene.clean, MAX_SIDE)
     size = clean.shape[1], clean.shape[0]
-    leaving = _leaving(as_it_is, removed)
+    paths: list[Path] = []  # nothing moves but what is taken away
+    for index in removed:
+        (x, y), bodies = _middle(as_it_is.obstacles[index - 1].bbox), as_it_is.trajectory.bodies
+        states = ((*(bodies[index].position if bodies else (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0),) * 2
+        points, visible = ((x, y), (AWAY, y)), (True, False)
+        paths.append(Path(body=index, states=states, points=points, visible=visible, scale=(1.0, 1.0), tracks=()))
+    leaving = replace(as_it_is, trajectory=as_it_is.trajectory.model_copy(update={"paths": tuple(paths)}))
     ground = Ground.of(leaving, size[0] / scene.width)
     moving = moving_bodies(leaving, size, ground)
     mover = as_it_is.grounding.bbox
@@ -60,17 +66,6 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
     if 0 in behind:
         changed = changed.with_mask(mover, _completed(CroppedMask.of(scene.silhouette(mover)), gone).full())
     return replace(as_it_is, scene=changed, trajectory=trajectory, obstacles=obstacles)
-
-
-def _leaving(given: GeneratorInput, removed: Sequence[int]) -> GeneratorInput:
-    """The input with a trajectory in which nothing moves but what is taken away."""
-    paths: list[Path] = []
-    for index in removed:
-        (x, y), bodies = _middle(given.obstacles[index - 1].bbox), given.trajectory.bodies
-        states = ((*(bodies[index].position if bodies else (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0),) * 2
-        points, visible = ((x, y), (AWAY, y)), (True, False)
-        paths.append(Path(body=index, states=states, points=points, visible=visible, scale=(1.0, 1.0), tracks=()))
-    return replace(given, trajectory=given.trajectory.model_copy(update={"paths": tuple(paths)}))
 
 
 def _completed(mask: CroppedMask, gone: Mask) -> CroppedMask:

@@ -331,7 +331,17 @@ def download(
     hub = _hub(endpoint)
     with ExitStack() as held:
         for each in downloads:
-            held.callback(_locked(folder_of(weights_dir, each.lock.repository), each.lock.repository).release)
+            kept = folder_of(weights_dir, each.lock.repository) / ".cache"
+            with disk_errors(each.lock.repository):
+                kept.mkdir(parents=True, exist_ok=True)
+                try:
+                    held.enter_context(FileLock(kept / "cow.lock").acquire(timeout=0))
+                except Timeout as error:
+                    why = "another pull is downloading it"
+                    raise _unavailable(each.lock.repository, why, "Wait for that to end") from error
+                # What killed downloads have left. Their names are unique to one: the library never resumes them.
+                for left in kept.rglob("*.*.*.incomplete"):
+                    left.unlink(missing_ok=True)
         needed: Counter[int] = Counter()  # bytes, by disk
         for each in downloads:
             with disk_errors(each.lock.repository):
@@ -411,22 +421,6 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
             else:
                 files.append(LockedFile(path=path, size=listed.size, algorithm="git-sha1", digest=listed.blob_id))
         return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=tuple(files))
-
-
-def _locked(folder: Path, repository: str) -> FileLock:
-    """Locks the folder against other downloads, and deletes what killed downloads have left incomplete."""
-    kept = folder / ".cache"
-    with disk_errors(repository):
-        kept.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(kept / "cow.lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout as error:
-            raise _unavailable(repository, "another pull is downloading it", "Wait for that to end") from error
-        # Their names are unique to one download: the library never resumes them.
-        for left in kept.rglob("*.*.*.incomplete"):
-            left.unlink(missing_ok=True)
-        return lock
 
 
 def _hub(endpoint: str | None) -> HfApi:

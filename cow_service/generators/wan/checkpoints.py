@@ -313,13 +313,6 @@ def add_lora(transformer: nn.Module, file: Path, scale: float) -> None:
     parameters = dict(transformer.named_parameters())
     if any(type(parameter) is not nn.Parameter or parameter.is_meta for parameter in parameters.values()):
         raise GeneratorUnavailable("A LoRA must be added before the weights are made float8 or offloaded.")
-    changes = _changes(_read(file), parameters, file.name)
-    for name, change in changes.items():
-        parameter = parameters[name]
-        parameter.copy_(parameter.float() + scale * change.on(parameter.device))
-
-
-def _read(file: Path) -> dict[str, Tensor]:
     if not file.is_file():
         raise WeightsUnavailable(f"There is no LoRA '{file.name}'. Pull it with `cow models pull`.")
     try:
@@ -338,7 +331,9 @@ def _read(file: Path) -> dict[str, Tensor]:
             )
     if broken := [key for key, tensor in tensors.items() if not tensor.isfinite().all()]:
         raise CheckpointInvalid(f"LoRA '{file.name}' holds infinite or undefined values: {_some(broken)}.")
-    return tensors
+    for name, change in _changes(tensors, parameters, file.name).items():
+        parameter = parameters[name]
+        parameter.copy_(parameter.float() + scale * change.on(parameter.device))
 
 
 def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], file: str) -> dict[str, _Change]:

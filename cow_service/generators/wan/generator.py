@@ -93,7 +93,7 @@ class WanGenerator(WanLimits):
         return (self.group or self.pipeline).denoise
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Of a clip, at the image's aspect ratio, in multiples of 16 px. Raises `InvalidRequest` for a narrow image."""
+        """Of a clip, at the image's aspect ratio, in multiples of 16 px. Raises `InvalidRequest` if too narrow."""
         clip_width, clip_height = clip_size(self.max_area, width, height)
         if max(clip_width, clip_height) > MAX_SIDE:
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
