@@ -172,9 +172,9 @@ def count(monkeypatch: pytest.MonkeyPatch, pipeline: WanTrackPipeline, *names: s
     for name in names:
         method = getattr(pipeline, name)
 
-        def counted(*args: object, _name: str = name, _method: Callable[..., object] = method) -> object:
+        def counted(*args: object, _name: str = name, _method: Callable[..., object] = method, **given: Any) -> object:
             calls[_name] += 1
-            return _method(*args)
+            return _method(*args, **given)
 
         monkeypatch.setattr(pipeline, name, counted)
     return calls
