@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -172,7 +173,7 @@ def count(monkeypatch: pytest.MonkeyPatch, pipeline: WanTrackPipeline, *names: s
     for name in names:
         method = getattr(pipeline, name)
 
-        def counted(*args: object, _name: str = name, _method: Callable[..., object] = method, **given: Any) -> object:
+        def counted(*args: object, _name: str = name, _method: Any = method, **given: object) -> object:
             calls[_name] += 1
             return _method(*args, **given)
 
