@@ -27,7 +27,7 @@ from pydantic_ai.models import ModelRequestParameters
 from pydantic_ai.output import OutputObjectDefinition
 from pydantic_ai.settings import ModelSettings
 
-from cow_service.readers.local.loading import load_local
+from cow_service.readers.local.reader import load_local
 from cow_service.settings import Settings
 
 app = FastAPI()

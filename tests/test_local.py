@@ -46,10 +46,10 @@ from cow_service.errors import (
     ReaderUnavailable,
     WeightsUnavailable,
 )
-from cow_service.readers.local import loading
+from cow_service.readers.local import reader
 from cow_service.readers.local.generation import BatchGenerator, BatchRow, PendingGeneration, Sampling, conversation_of
-from cow_service.readers.local.loading import device_map, load_local
 from cow_service.readers.local.model import LocalModel
+from cow_service.readers.local.reader import device_map, load_local
 from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny
 from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.locate import locate_schema
@@ -688,7 +688,7 @@ def test_what_is_no_model_of_this_process(tmp_path: Path, name: str | None) -> N
 def with_manifest(monkeypatch: pytest.MonkeyPatch, **rest: Any) -> None:
     toy = load_manifests()[NAME]
     changed = Manifest.model_validate(toy.model_dump() | {"name": "other"} | rest)
-    monkeypatch.setattr(loading, "mllm_manifests", lambda: {NAME: toy, "other": changed})
+    monkeypatch.setattr(reader, "mllm_manifests", lambda: {NAME: toy, "other": changed})
 
 
 def test_a_model_that_only_others_serve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, saved: Path) -> None:

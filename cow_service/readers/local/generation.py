@@ -5,46 +5,25 @@ choice is made in a logits processor, row by row, and `generate` is left with th
 any settings and schemas share a batch, and a seed gives the same reply in whatever company it is written.
 """
 
-from __future__ import annotations
-
+import itertools
 import json
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
+import transformers
 from llguidance import LLMatcher, LLTokenizer
 from llguidance.hf import from_tokenizer
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic_ai import messages as ai
 from pydantic_ai.exceptions import UserError
-from pydantic_ai.messages import (
-    BinaryContent,
-    CachePoint,
-    ModelMessage,
-    ModelResponse,
-    SystemPromptPart,
-    TextContent,
-    TextPart,
-    ThinkingPart,
-    UserPromptPart,
-)
 from torch import Tensor
-from transformers import (
-    GenerationConfig,
-    LogitsProcessor,
-    LogitsProcessorList,
-    PreTrainedModel,
-    PreTrainedTokenizerFast,
-    ProcessorMixin,
-    StoppingCriteria,
-    StoppingCriteriaList,
-)
 
 from cow_service.errors import ImageUnreadable
 from cow_service.media.images import decode
@@ -56,7 +35,6 @@ _BY_NAME = ("properties", "$defs", "definitions")  # what they hold is schemas b
 _AS_IT_IS = ("allOf", "enum", "const", "default", "examples")  # parts of one object, and values
 # With the one, the chat templates of models that think open a reply; the other is the token that ends the thought.
 _THOUGHT_START, _THOUGHT_END = "<think>", "</think>"
-Role = Literal["system", "user", "assistant"]
 Finish = Literal["stop", "length"]
 Turn = dict[str, Any]  # as chat templates take it: {"role": ..., "content": [{"type": "text", "text": ...}, ...]}
 
@@ -70,77 +48,56 @@ class Conversation:
 
 
 def conversation_of(
-    messages: Iterable[ModelMessage], instructions: Sequence[str], special_tokens: Sequence[str]
+    messages: Iterable[ai.ModelMessage], instructions: Sequence[str], special_tokens: Sequence[str]
 ) -> Conversation:
     """The conversation of prepared messages. Text that spells one of the special tokens is not taken for it.
 
-    Raises `UserError` for what such a model cannot be given (tools, files other than images), and the errors of
-    `images.decode`.
+    What one role says in a row is one turn, and texts that meet are one text. Raises `UserError` for what such a model
+    cannot be given (tools, files other than images), and the errors of `images.decode`.
     """
-    builder = _Builder(_token_breaker(special_tokens))
-    for text in instructions:
-        builder.add_text("system", text)
+    said: list[tuple[str, object]] = [("system", text) for text in instructions]
     for message in messages:
-        role: Role = "assistant" if isinstance(message, ModelResponse) else "user"
+        role = "assistant" if isinstance(message, ai.ModelResponse) else "user"
         for part in message.parts:
-            if isinstance(part, SystemPromptPart):
+            if isinstance(part, ai.SystemPromptPart):
                 # Templates take a system turn at the start only.
-                opening = all(turn["role"] == "system" for turn in builder.turns)
-                builder.add_text("system" if opening else "user", part.content)
-            elif isinstance(part, UserPromptPart):
-                for item in [part.content] if isinstance(part.content, str) else part.content:
-                    builder.add(role, item)
-            elif not isinstance(part, ThinkingPart):
-                builder.add(role, part)
-    return Conversation(tuple(builder.turns), tuple(builder.images))
+                opening = all(before == "system" for before, _ in said)
+                said.append(("system" if opening else "user", part.content))
+            elif isinstance(part, ai.UserPromptPart):
+                items = [part.content] if isinstance(part.content, str) else part.content
+                said.extend((role, item) for item in items if not isinstance(item, ai.CachePoint))
+            elif not isinstance(part, ai.ThinkingPart):
+                said.append((role, part))
 
-
-class _Builder:
-    """Turns as they grow: what one role says in a row is one turn, and texts that meet are one text."""
-
-    def __init__(self, break_tokens: Callable[[str], str]) -> None:
-        self.turns: list[Turn] = []
-        self.images: list[Image.Image] = []
-        self._break_tokens = break_tokens
-
-    def add(self, role: Role, item: object) -> None:
-        """Text or an image. Raises `UserError` for anything else."""
-        if isinstance(item, str):
-            self.add_text(role, item)
-        elif isinstance(item, TextContent | TextPart):
-            self.add_text(role, item.content)
-        elif isinstance(item, BinaryContent) and item.is_image:
-            self._content(role).append({"type": "image"})
-            self.images.append(Image.fromarray(decode(item.data).pixels))
-        elif not isinstance(item, CachePoint):
-            raise UserError(f"A model in this process takes text and images (as bytes), not a {type(item).__name__}.")
-
-    def add_text(self, role: Role, text: str) -> None:
-        content = self._content(role)
-        if content and content[-1]["type"] == "text":
-            text = content.pop()["text"] + "\n" + text
-        # Joined first: a special token could otherwise come about where two texts meet.
-        content.append({"type": "text", "text": self._break_tokens(text)})
-
-    def _content(self, role: Role) -> list[dict[str, str]]:
-        if not self.turns or self.turns[-1]["role"] != role:
-            self.turns.append({"role": role, "content": []})
-        return self.turns[-1]["content"]
-
-
-def _token_breaker(special_tokens: Sequence[str]) -> Callable[[str], str]:
-    """Puts a space into every special token that a text spells, or a question could end its turn or claim an image."""
-    longest_first = sorted((token for token in special_tokens if len(token) > 1), key=len, reverse=True)
-    if not longest_first:
-        return lambda text: text
-    found = re.compile("|".join(map(re.escape, longest_first)))
-    return lambda text: found.sub(lambda match: f"{match[0][0]} {match[0][1:]}", text)
+    # A space goes into every special token that a text spells, or a question could end its turn or claim an image.
+    tokens = sorted((token for token in special_tokens if len(token) > 1), key=len, reverse=True)
+    special = re.compile("|".join(map(re.escape, tokens)) or r"(?!)")
+    turns: list[Turn] = []
+    images: list[Image.Image] = []
+    for role, items in itertools.groupby(said, key=lambda each: each[0]):
+        content: list[dict[str, str]] = []
+        for _, item in items:
+            if isinstance(item, ai.BinaryContent) and item.is_image:
+                content.append({"type": "image"})
+                images.append(Image.fromarray(decode(item.data).pixels))
+                continue
+            text = item.content if isinstance(item, ai.TextContent | ai.TextPart) else item
+            if not isinstance(text, str):
+                kind = type(item).__name__
+                raise UserError(f"A model in this process takes text and images (as bytes), not a {kind}.")
+            if content and content[-1]["type"] == "text":
+                # Joined first: a special token could otherwise come about where two texts meet.
+                text = content.pop()["text"] + "\n" + text
+            text = special.sub(lambda match: f"{match[0][0]} {match[0][1:]}", text)
+            content.append({"type": "text", "text": text})
+        turns.append({"role": role, "content": content})
+    return Conversation(tuple(turns), tuple(images))
 
 
 class Grammars:
     """Grammars of JSON schemas over one tokenizer, for a model with `vocabulary` logits."""
 
-    def __init__(self, tokenizer: PreTrainedTokenizerFast, vocabulary: int, ends: Sequence[int]) -> None:
+    def __init__(self, tokenizer: transformers.PreTrainedTokenizerFast, vocabulary: int, ends: Sequence[int]) -> None:
         self._tokens: LLTokenizer = from_tokenizer(tokenizer, n_vocab=vocabulary, eos_token=list(ends))
 
     def grammar(self, schema: Mapping[str, Any]) -> str:
@@ -196,7 +153,7 @@ class BatchRow:
     limit: int
     ends: Collection[int]
     matcher: LLMatcher | None
-    on_end: Callable[[BatchRow, Finish], None]
+    on_end: Callable[["BatchRow", Finish], None]
     is_canceled: Callable[[], bool]
     thought_end: int | None = None  # None once the thought is over
     thought: list[int] = field(default_factory=list[int])
@@ -268,7 +225,7 @@ class BatchRow:
         self.on_end(self, finish)
 
 
-class RowSampler(LogitsProcessor):
+class RowSampler(transformers.LogitsProcessor):
     """Leaves to each row of a batch the one token that it has chosen; to rows that are over, the padding."""
 
     def __init__(self, rows: Sequence[BatchRow], padding: int) -> None:
@@ -296,7 +253,7 @@ class RowSampler(LogitsProcessor):
         return torch.full_like(scores, -torch.inf).scatter_(1, only, 0.0)
 
 
-class RowsDone(StoppingCriteria):
+class RowsDone(transformers.StoppingCriteria):
     """Ends the rows that are complete, and those that nobody waits for any more."""
 
     def __init__(self, rows: Sequence[BatchRow]) -> None:
@@ -355,12 +312,12 @@ class PendingGeneration:
 class BatchGenerator:
     """A model of images and text with its processor, as transformers has them."""
 
-    def __init__(self, model: PreTrainedModel, processor: ProcessorMixin) -> None:
+    def __init__(self, model: transformers.PreTrainedModel, processor: transformers.ProcessorMixin) -> None:
         self._model: Any = model
         self._model.eval().requires_grad_(False)
         self._processor: Any = processor
-        self._tokenizer: PreTrainedTokenizerFast = self._processor.tokenizer
-        advice = model.generation_config or GenerationConfig()
+        self._tokenizer: transformers.PreTrainedTokenizerFast = self._processor.tokenizer
+        advice = model.generation_config or transformers.GenerationConfig()
         given = {name: getattr(advice, name) for name in ("temperature", "top_p", "top_k")}
         known: dict[str, Any] = {"temperature": 1.0}
         known |= {name: value for name, value in given.items() if value is not None}
@@ -394,22 +351,7 @@ class BatchGenerator:
             self._processor.apply_chat_template(list(each.turns), add_generation_prompt=True, tokenize=False)
             for each in conversations
         ]
-        inputs = self._inputs(texts, [list(each.images) for each in conversations])
-        counts: list[int] = inputs["attention_mask"].sum(-1).tolist()
-        rows = [self._row(*row) for row in zip(batch, texts, counts, strict=True)]
-        self._model.generate(
-            **inputs,
-            generation_config=self._config(
-                do_sample=False, max_new_tokens=max(pending.request.limit for pending in batch)
-            ),
-            logits_processor=LogitsProcessorList([RowSampler(rows, self._padding)]),
-            stopping_criteria=StoppingCriteriaList([RowsDone(rows)]),
-        )
-
-    def _config(self, **rest: Any) -> GenerationConfig:
-        return GenerationConfig(eos_token_id=list(self._ends), pad_token_id=self._padding, **rest)
-
-    def _inputs(self, texts: list[str], images: list[list[Any]]) -> Mapping[str, Any]:
+        images = [list(each.images) for each in conversations]
         try:
             # Replies grow on the right, so that padding belongs on the left.
             inputs = self._processor(
@@ -424,24 +366,37 @@ class BatchGenerator:
             if not any(images):
                 raise
             raise ImageUnreadable(f"The multimodal LLM does not take such an image: {error}.") from error
-        return inputs.to(self._model.device, dtype=self._model.dtype)
+        inputs = inputs.to(self._model.device, dtype=self._model.dtype)
+        counts: list[int] = inputs["attention_mask"].sum(-1).tolist()
+        rows = [self._row(*row) for row in zip(batch, texts, counts, strict=True)]
+        limit = max(pending.request.limit for pending in batch)
+        self._model.generate(
+            **inputs,
+            generation_config=self._config(do_sample=False, max_new_tokens=limit),
+            logits_processor=transformers.LogitsProcessorList([RowSampler(rows, self._padding)]),
+            stopping_criteria=transformers.StoppingCriteriaList([RowsDone(rows)]),
+        )
+
+    def _config(self, **rest: Any) -> transformers.GenerationConfig:
+        return transformers.GenerationConfig(eos_token_id=list(self._ends), pad_token_id=self._padding, **rest)
 
     def _row(self, pending: PendingGeneration, text: str, input_tokens: int) -> BatchRow:
         request, thinks = pending.request, text.rstrip().endswith(_THOUGHT_START)
+
+        def resolve(row: BatchRow, finish: Finish) -> None:
+            thought = self._decoded(row.thought).removesuffix(_THOUGHT_END).strip()
+            output_tokens = len(row.thought) + len(row.tokens)
+            pending.resolve(Generation(self._decoded(row.tokens), thought, finish, input_tokens, output_tokens))
+
         return BatchRow(
             request.sampling,
             request.limit,
             self._ends,
             None if request.grammar is None else self.grammars.matcher(request.grammar),
-            on_end=partial(self._resolve, pending, input_tokens),
+            on_end=resolve,
             is_canceled=pending.future.done,
             thought_end=self._tokenizer.get_vocab().get(_THOUGHT_END) if thinks else None,
         )
-
-    def _resolve(self, pending: PendingGeneration, input_tokens: int, row: BatchRow, finish: Finish) -> None:
-        thought = self._decoded(row.thought).removesuffix(_THOUGHT_END).strip()
-        output_tokens = len(row.thought) + len(row.tokens)
-        pending.resolve(Generation(self._decoded(row.tokens), thought, finish, input_tokens, output_tokens))
 
     def _decoded(self, tokens: list[int]) -> str:
         return str(self._tokenizer.decode(tokens, skip_special_tokens=True, clean_up_tokenization_spaces=False))

@@ -1,7 +1,5 @@
 """The multimodal LLM of this process as a model of pydantic-ai, which the reader asks like any provider's."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import traceback
@@ -18,21 +16,17 @@ from pydantic_ai.settings import ModelSettings
 from pydantic_ai.usage import RequestUsage
 
 from cow_service.errors import MllmUnavailable
-from cow_service.readers.local.generation import (
-    BatchGenerator,
-    Generation,
-    GenerationRequest,
-    PendingGeneration,
-    Sampling,
-    conversation_of,
-)
+from cow_service.readers.local import generation
+from cow_service.readers.local.generation import PendingGeneration
 from cow_service.weights.device import cpu_threads, is_out_of_memory
 
 
 class BatchWorker:
     """The one thread that runs a model. It lives while there are requests, so that it keeps no idle model alive."""
 
-    def __init__(self, generator: BatchGenerator, name: str, max_batch: int, threads: int | None = None) -> None:
+    def __init__(
+        self, generator: generation.BatchGenerator, name: str, max_batch: int, threads: int | None = None
+    ) -> None:
         self._generator = generator
         self._name = name
         self._max_batch = max_batch
@@ -41,7 +35,7 @@ class BatchWorker:
         self._lock = Lock()
         self._running = False
 
-    def submit(self, request: GenerationRequest) -> Future[Generation]:
+    def submit(self, request: generation.GenerationRequest) -> Future[generation.Generation]:
         """The reply to come; canceling it takes it out of the queue, or ends it at the next token.
 
         Its errors: `MllmUnavailable` out of memory, and those of `BatchGenerator.generate`.
@@ -57,19 +51,18 @@ class BatchWorker:
 
     def _work(self) -> None:
         with cpu_threads(self._threads):
-            while batch := self._take():
+            while True:
+                # An empty batch ends the thread, which the lock keeps a new request from missing.
+                with self._lock:
+                    batch: list[PendingGeneration] = []
+                    while self._queue and len(batch) < self._max_batch:
+                        pending = self._queue.popleft()
+                        if not pending.future.done():
+                            batch.append(pending)
+                    self._running = bool(batch)
+                if not batch:
+                    return
                 self._generate(batch)
-
-    def _take(self) -> list[PendingGeneration]:
-        """The next batch. An empty one ends the thread, which the lock keeps a new request from missing."""
-        with self._lock:
-            batch: list[PendingGeneration] = []
-            while self._queue and len(batch) < self._max_batch:
-                pending = self._queue.popleft()
-                if not pending.future.done():
-                    batch.append(pending)
-            self._running = bool(batch)
-            return batch
 
     def _generate(self, batch: list[PendingGeneration]) -> None:
         """Generates a batch. One that fails is split, until the error has found the request that it belongs to."""
@@ -137,7 +130,7 @@ class LocalModel(Model[None]):
     def __init__(
         self,
         name: str,
-        generator: BatchGenerator,
+        generator: generation.BatchGenerator,
         *,
         max_batch: int = 4,
         max_new_tokens: int = 1024,
@@ -206,31 +199,29 @@ class LocalModel(Model[None]):
 
     def _generation_request(
         self, messages: list[ModelMessage], settings: ModelSettings, parameters: ModelRequestParameters
-    ) -> GenerationRequest:
+    ) -> generation.GenerationRequest:
         if parameters.function_tools:
             raise UserError("A model in this process takes no tools.")
         if any(part.part_kind in _UNPREPARED for message in messages for part in message.parts):
             messages = self.prepare_messages(messages, parameters)  # as agents do before they ask
+        default = self._generator.default_sampling
+        sampling = generation.Sampling(
+            temperature=settings.get("temperature", default.temperature),
+            top_p=settings.get("top_p", default.top_p),
+            top_k=settings.get("top_k", default.top_k),
+            seed=settings.get("seed"),
+        )
+        limit = settings.get("max_tokens", self._max_new_tokens)
+        if sampling.temperature < 0 or not 0 < sampling.top_p <= 1 or sampling.top_k < 0 or limit < 1:
+            raise UserError(
+                "A model in this process takes a temperature from 0, a top_p above 0 and up to 1, a top_k from 0 and "
+                f"max_tokens from 1; not {sampling} and {settings.get('max_tokens')}."
+            )
         output = parameters.output_object if parameters.output_mode == "native" else None
         instructions = [part.content for part in self._get_instruction_parts(messages, parameters) or []]
-        return GenerationRequest(
-            conversation=conversation_of(messages, instructions, self._generator.special_tokens),
-            sampling=_sampling(settings, self._generator.default_sampling),
-            limit=min(settings.get("max_tokens", self._max_new_tokens), self._max_new_tokens),
+        return generation.GenerationRequest(
+            conversation=generation.conversation_of(messages, instructions, self._generator.special_tokens),
+            sampling=sampling,
+            limit=min(limit, self._max_new_tokens),
             grammar=None if output is None else self._generator.grammars.grammar(output.json_schema),
         )
-
-
-def _sampling(settings: ModelSettings, default: Sampling) -> Sampling:
-    found = Sampling(
-        temperature=settings.get("temperature", default.temperature),
-        top_p=settings.get("top_p", default.top_p),
-        top_k=settings.get("top_k", default.top_k),
-        seed=settings.get("seed"),
-    )
-    if found.temperature < 0 or not 0 < found.top_p <= 1 or found.top_k < 0 or settings.get("max_tokens", 1) < 1:
-        raise UserError(
-            "A model in this process takes a temperature from 0, a top_p above 0 and up to 1, a top_k from 0 and "
-            f"max_tokens from 1; not {found} and {settings.get('max_tokens')}."
-        )
-    return found

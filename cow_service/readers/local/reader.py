@@ -1,21 +1,186 @@
-"""The reader `local`: the same prompts as those of the reader `mllm`, for a model in this process."""
+"""The reader `local`: the same prompts as those of the reader `mllm`, for a model in this process.
 
-from __future__ import annotations
+It is loaded here: its manifest is found, its weights are checked, and foreign errors translated.
+"""
 
-from cow_service.readers.local.loading import load_local
+import json
+import re
+import traceback
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import transformers
+from pydantic import Field, ValidationError
+from pydantic_ai.settings import ModelSettings
+from transformers.models.auto.processing_auto import PROCESSOR_MAPPING
+
+from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
+from cow_service.readers.local.generation import BatchGenerator
+from cow_service.readers.local.model import LocalModel
+from cow_service.readers.local.tiny import make_tiny, still
 from cow_service.readers.mllm.client import MllmClient
-from cow_service.readers.mllm.models import ConfiguredModel, resolve_model
+from cow_service.readers.mllm.models import ConfiguredModel, mllm_manifests, resolve_model
 from cow_service.readers.mllm.reader import MllmReader
+from cow_service.records import Record
 from cow_service.settings import Settings
-from cow_service.weights.manifests import load_families
-from cow_service.weights.repositories import weights_identity
+from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed
+from cow_service.weights.manifests import Manifest, load_families
+from cow_service.weights.repositories import verify, weights_identity
+
+MAX_LISTED = 4  # weights in an error
+
+
+class LocalOptions(Record):
+    """How an MLLM runs in this process: the section `local` of its manifest."""
+
+    dtype: Literal["float32", "bfloat16", "float16", "auto"] = Field(
+        default="auto", description="Of the weights; auto takes them as they are saved."
+    )
+    device_map: str = Field(
+        default="auto", description="Over which GPUs accelerate spreads it, where COW_DEVICE is auto and there are any."
+    )
+    attn_implementation: str = "sdpa"
+    max_batch: int = Field(default=4, ge=1, le=256, description="Replies that are written together.")
+    max_new_tokens: int = Field(default=2048, ge=1, description="The most tokens of a reply.")
+    threads: int | None = Field(default=None, ge=1, description="Of the CPU; null for PyTorch's own number.")
 
 
 def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable`, `WeightsUnavailable`, `CheckpointInvalid`."""
     model = load_local(settings)
     manifest = resolve_model(settings).manifest
-    configured = ConfiguredModel(
-        model, manifest.name, manifest, load_families()[manifest.family or ""], model.deterministic
-    )
+    family = load_families()[manifest.family or ""]
+    configured = ConfiguredModel(model, manifest.name, manifest, family, model.deterministic)
     return MllmReader("local", MllmClient(configured, settings), weights_identity(manifest, settings))
+
+
+def load_local(settings: Settings) -> LocalModel:
+    """The model that `settings.mllm` names. One without sources is made here, at the sizes of its manifest.
+
+    Raises `ReaderUnavailable` for what there is not or this machine cannot do, `WeightsUnavailable` and
+    `CheckpointInvalid`.
+    """
+    manifests, name = mllm_manifests(), settings.mllm
+    usable = ", ".join(each.name for each in manifests.values() if each.sources or each.architecture)
+    if name is None:
+        raise ReaderUnavailable(f"No multimodal LLM is chosen: set COW_MLLM to one of {usable}.")
+    manifest = manifests.get(name)
+    if manifest is None:
+        raise ReaderUnavailable(
+            f"'{name}' is no multimodal LLM that runs in this process: set COW_MLLM to one of {usable}, or take the "
+            "reader 'mllm'."
+        )
+    own = settings.checkpoints.get(manifest.name)
+    if own is None and not manifest.sources and not manifest.architecture:
+        raise ReaderUnavailable(
+            f"'{manifest.name}' has no weights that run here: it is served by others. Take the reader 'mllm', or set "
+            f"COW_MLLM to one of {usable}."
+        )
+    try:
+        options = LocalOptions.model_validate(manifest.local)
+    except ValidationError as error:
+        places = ", ".join(".".join(str(part) for part in found["loc"]) for found in error.errors())
+        raise ReaderUnavailable(f"The manifest of '{manifest.name}' is wrong in `local`: {places}.") from error
+    places = device_map(settings.device, options.device_map)
+    with BUILD_LOCK, _translated(manifest.name):
+        if own is None and not manifest.sources:
+            model, processor = make_tiny(manifest.architecture)
+            torch.nn.Module.to(model, torch.device(places[""] if isinstance(places, dict) else "cuda"))
+        else:
+            folder = own or verify(manifest.sources["weights"], settings.weights_dir, manifest.name)
+            model, processor = _from_folder(folder, manifest, options, places)
+        generator = BatchGenerator(model, processor)
+    defaults: Any = {name: value for name, value in manifest.defaults.items() if name in ModelSettings.__annotations__}
+    return LocalModel(
+        manifest.name,
+        generator,
+        max_batch=options.max_batch,
+        max_new_tokens=options.max_new_tokens,
+        threads=options.threads,
+        settings=ModelSettings(**defaults),
+    )
+
+
+def device_map(device: str, spread: str) -> str | dict[str, str]:
+    """Where the weights go, as accelerate takes it. Raises `ReaderUnavailable` for a GPU that is not here."""
+    if device == "auto":
+        return spread if torch.cuda.is_available() else {"": "cpu"}
+    return {"": str(choose_device(device, ReaderUnavailable))}
+
+
+def _from_folder(
+    folder: Path, manifest: Manifest, options: LocalOptions, places: str | dict[str, str]
+) -> tuple[transformers.PreTrainedModel, transformers.ProcessorMixin]:
+    """The model and processor of a checkpoint. Opens safetensors only: a pickle can run code."""
+    _check(folder, manifest)
+    own: Any = {"local_files_only": True, "trust_remote_code": False}
+    config: transformers.PreTrainedConfig = transformers.AutoConfig.from_pretrained(folder, **own)
+    if type(config) in PROCESSOR_MAPPING:
+        kind: Any = PROCESSOR_MAPPING[type(config)]
+        # PIL's image processors everywhere: with torchvision's the same image would give other numbers where that is
+        # installed.
+        processor = still(kind).from_pretrained(folder, backend="pil", **own)
+    else:
+        processor = transformers.AutoProcessor.from_pretrained(folder, **own)
+    dtype: Any = options.dtype if options.dtype == "auto" else getattr(torch, options.dtype)
+    loaded: Any = transformers.AutoModelForImageTextToText.from_pretrained(
+        folder,
+        dtype=dtype,
+        device_map=places,
+        attn_implementation=options.attn_implementation,
+        use_safetensors=True,
+        output_loading_info=True,
+        **own,
+    )
+    model, found = loaded
+    # transformers only warns of these, and fills what is missing with random numbers.
+    for kind, what in (("missing_keys", "lacks"), ("unexpected_keys", "has, beyond its model,")):
+        if names := sorted(found[kind]):
+            raise CheckpointInvalid(
+                f"The checkpoint '{folder.name}' {what} {listed(names, MAX_LISTED)}. Download it again."
+            )
+    return model, processor
+
+
+def _check(folder: Path, manifest: Manifest) -> None:
+    try:
+        kind = str(json.loads((folder / "config.json").read_text(encoding="utf-8"))["model_type"])
+        files = sorted(file.name for file in folder.iterdir())
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise CheckpointInvalid(
+            f"'{folder.name}' is no folder of a transformers checkpoint: no `config.json` says its `model_type`."
+        ) from error
+    if not any(name.endswith(".safetensors") for name in files):
+        raise CheckpointInvalid(f"'{folder.name}' has no safetensors files, and pickles are never opened.")
+    # How places are written goes with the family. Another one's would be read wrong without a sign of it.
+    bare_kind, bare_family = (re.sub(r"[^a-z0-9]", "", name.lower()) for name in (kind, manifest.family or ""))
+    if not bare_kind.startswith(bare_family):
+        raise CheckpointInvalid(
+            f"'{folder.name}' is of the type '{kind}', and '{manifest.name}' of the family '{manifest.family}', which "
+            f"writes places in its own way. Name it under a manifest of its family in COW_CHECKPOINTS."
+        )
+
+
+@contextmanager
+def _translated(name: str) -> Generator[None]:
+    """Whatever transformers, safetensors or PyTorch raise becomes a `CowError` with the reason, without folders."""
+    try:
+        yield
+    except CowError:
+        raise
+    except Exception as error:
+        # The failed frames hold what was half loaded, and live as long as the traceback does.
+        traceback.clear_frames(error.__traceback__)
+        if is_out_of_memory(error):
+            raise ReaderUnavailable(
+                f"'{name}' does not fit into memory. Set COW_MLLM to a smaller model, or COW_DEVICE to a larger device."
+            ) from error
+        reason = re.sub(r"(?<!\w)(/[\w.+-]+)+/?", "…", (str(error).splitlines() or [""])[0])[:300]
+        if isinstance(error, ImportError):
+            raise ReaderUnavailable(
+                f"'{name}' cannot be loaded: {type(error).__name__}: {reason} Install what it names."
+            ) from error
+        raise CheckpointInvalid(f"'{name}' cannot be loaded: {type(error).__name__}: {reason}") from error

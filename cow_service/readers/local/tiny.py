@@ -4,21 +4,12 @@ It goes the whole way in a fraction of a second on a CPU. What it says means not
 deployment out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, cast
 
 import torch
+import transformers
 from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers
-from transformers import (
-    GenerationConfig,
-    PreTrainedTokenizerFast,
-    ProcessorMixin,
-    Qwen3VLConfig,
-    Qwen3VLForConditionalGeneration,
-    Qwen3VLProcessor,
-)
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 NAME = "tiny-qwen3-vl"
@@ -38,23 +29,23 @@ TEMPLATE = (
 )
 
 
-def make_tiny(architecture: Mapping[str, Any]) -> tuple[Qwen3VLForConditionalGeneration, ProcessorMixin]:
+def make_tiny(
+    architecture: Mapping[str, Any],
+) -> tuple[transformers.Qwen3VLForConditionalGeneration, transformers.ProcessorMixin]:
     """A model of these sizes and its processor; the same sizes give the same weights.
 
     Names are those of Qwen3-VL's configuration, with a dot where it nests: `text_config.hidden_size`.
     """
-    tokenizer = _tokenizer()
-    config = _configuration(architecture, tokenizer)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(SEED)
-        model = Qwen3VLForConditionalGeneration(config)
-    model.generation_config = GenerationConfig(eos_token_id=tokenizer.eos_token_id, pad_token_id=tokenizer.pad_token_id)
-    patch = architecture["vision_config.patch_size"]
-    images = Qwen2VLImageProcessorPil(patch_size=patch, temporal_patch_size=2, merge_size=2, size=PIXELS)
-    return model, still(Qwen3VLProcessor)(images, tokenizer, chat_template=TEMPLATE)
+    # Every byte is a token.
+    vocabulary = {byte: i for i, byte in enumerate(sorted(pre_tokenizers.ByteLevel.alphabet()))}
+    tokens = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
+    tokens.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
+    tokens.decoder = decoders.ByteLevel()
+    tokens.add_special_tokens([AddedToken(token, special=True) for token in SPECIAL])
+    tokens.add_tokens([AddedToken(token) for token in THOUGHT])
+    tokenizer = transformers.PreTrainedTokenizerFast(tokenizer_object=tokens, pad_token=PADDING, eos_token=END)
+    ids, end, padding = tokenizer.get_vocab(), tokenizer.eos_token_id, tokenizer.pad_token_id
 
-
-def _configuration(architecture: Mapping[str, Any], tokenizer: PreTrainedTokenizerFast) -> Qwen3VLConfig:
     text, vision = _section(architecture, "text_config"), _section(architecture, "vision_config")
     third = text["head_dim"] // 6  # half a head's channels turn: by time, height and width in about equal parts
     text["rope_parameters"] = {
@@ -63,16 +54,22 @@ def _configuration(architecture: Mapping[str, Any], tokenizer: PreTrainedTokeniz
         "mrope_interleaved": True,
         "mrope_section": [text["head_dim"] // 2 - 2 * third, third, third],
     }
-    ids: dict[str, Any] = {name: tokenizer.convert_tokens_to_ids(token) for name, token in (
-        ("image_token_id", IMAGE), ("video_token_id", VIDEO),
-        ("vision_start_token_id", VISION_START), ("vision_end_token_id", VISION_END),
-    )}  # fmt: skip
-    return Qwen3VLConfig(
-        text_config={**text, "vocab_size": len(tokenizer), "pad_token_id": tokenizer.pad_token_id},
+    config = transformers.Qwen3VLConfig(
+        text_config={**text, "vocab_size": len(tokenizer), "pad_token_id": padding},
         vision_config={**vision, "out_hidden_size": text["hidden_size"], "deepstack_visual_indexes": [0]},
         tie_word_embeddings=True,
-        **ids,
+        image_token_id=ids[IMAGE],
+        video_token_id=ids[VIDEO],
+        vision_start_token_id=ids[VISION_START],
+        vision_end_token_id=ids[VISION_END],
     )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(SEED)
+        model = transformers.Qwen3VLForConditionalGeneration(config)
+    model.generation_config = transformers.GenerationConfig(eos_token_id=end, pad_token_id=padding)
+    patch = vision["patch_size"]
+    images = Qwen2VLImageProcessorPil(patch_size=patch, temporal_patch_size=2, merge_size=2, size=PIXELS)
+    return model, still(transformers.Qwen3VLProcessor)(images, tokenizer, chat_template=TEMPLATE)
 
 
 def _section(architecture: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -80,18 +77,7 @@ def _section(architecture: Mapping[str, Any], name: str) -> dict[str, Any]:
     return {key.removeprefix(start): value for key, value in architecture.items() if key.startswith(start)}
 
 
-def _tokenizer() -> PreTrainedTokenizerFast:
-    """Every byte is a token."""
-    vocabulary = {byte: i for i, byte in enumerate(sorted(pre_tokenizers.ByteLevel.alphabet()))}
-    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
-    tokenizer.decoder = decoders.ByteLevel()
-    tokenizer.add_special_tokens([AddedToken(token, special=True) for token in SPECIAL])
-    tokenizer.add_tokens([AddedToken(token) for token in THOUGHT])
-    return PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token=PADDING, eos_token=END)
-
-
-def still(kind: type[ProcessorMixin]) -> Any:
+def still(kind: type[transformers.ProcessorMixin]) -> Any:
     """The processor class without videos, which alone would need torchvision.
 
     It keeps its name, so that what it saves is a usual checkpoint.

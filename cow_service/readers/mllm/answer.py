@@ -1,30 +1,15 @@
 """The prompts for the answer: a letter of the options and nothing else, or a few words where the question is open."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any, cast
+from typing import Any
 
 from cow_service.readers.base import AnswerReading, Imagined
+from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.hypothesis import hypothesis
-from cow_service.readers.mllm.replies import (
-    ReplyError,
-    Schema,
-    fields_of,
-    first_of,
-    is_broken_json,
-    is_none,
-    nullable,
-    one_of,
-    schema_of,
-    text_of,
-    values_in,
-    without_thinking,
-    words,
-)
+from cow_service.readers.mllm.replies import ReplyError
 from cow_service.readers.options import not_sure_option, option_saying, plain, question_without, says_not_sure
 from cow_service.records import AnswerOption
 
@@ -74,22 +59,23 @@ def answer_calls(
     ]
 
 
-def answer_schema(options: Sequence[AnswerOption], reasoning_length: int) -> Schema:
+def answer_schema(options: Sequence[AnswerOption], reasoning_length: int) -> replies.Schema:
     """JSON schema of the reply."""
-    schema = schema_of(reasoning_length=reasoning_length)
-    answer = one_of(*(option.letter for option in options)) if options else nullable(words(MAX_ANSWER))
+    answer = replies.nullable(replies.words(MAX_ANSWER))
+    if options:
+        answer = replies.one_of(*(option.letter for option in options))
+    schema = replies.schema_of(reasoning_length=reasoning_length)
     return schema | {"properties": schema["properties"] | {"answer": answer}, "required": ["reasoning", "answer"]}
 
 
 def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
     """The answer that a reply gives. Raises `ReplyError` where it gives none of the options, or more than one."""
-    said = without_thinking(reply)
-    values = values_in(said)
-    fields = [found for value in values for found in _objects(value)]
-    if any(key in found for found in fields for key in _KEYS):
-        readings = [reading for found in fields for reading in _in_fields(found, options)]
+    said = replies.without_thinking(reply)
+    objects = [fields for value in replies.values_in(said) for fields in _objects(value)]
+    if any(key in fields for fields in objects for key in _KEYS):
+        readings = [reading for fields in objects for reading in _read_fields(fields, options)]
     else:
-        readings = _in_prose(said, options)
+        readings = _read_prose(said, options)
     if not readings:
         raise ReplyError(f"`answer` is missing; {_remedy(options)}")
     if len({(reading.answer, reading.not_sure) for reading in readings}) > 1:
@@ -99,35 +85,44 @@ def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
 
 def _objects(value: object) -> Iterator[dict[str, Any]]:
     if isinstance(value, list):
-        for part in cast("list[object]", value):
+        for part in replies.listed(value):
             yield from _objects(part)
     elif isinstance(value, dict):
-        yield fields_of(cast("object", value))
+        yield replies.fields_of(value)
 
 
-def _in_fields(fields: dict[str, Any], options: Sequence[AnswerOption]) -> Iterator[AnswerReading]:
+def _read_fields(fields: dict[str, Any], options: Sequence[AnswerOption]) -> Iterator[AnswerReading]:
     """A reading of every field that answers; those beside the first must not say otherwise."""
-    reasoning = text_of(first_of(fields, *_REASONING_KEYS))[:MAX_REASONING]
+    reasoning = replies.text_of(replies.first_of(fields, *_REASONING_KEYS))[:MAX_REASONING]
     present = [fields[key] for key in _KEYS if key in fields]
-    for place, answer in enumerate(present):
-        if place == 0 or not is_none(answer):
-            yield _read(_unwrapped(answer), reasoning, options)
+    for written in present[:1] + [each for each in present[1:] if not replies.is_none(each)]:
+        answer = written  # or what stands in a list of one, or in an object
+        if isinstance(written, list) and len(replies.listed(written)) == 1:
+            (answer,) = replies.listed(written)
+        elif isinstance(written, dict):
+            answer = replies.first_of(replies.fields_of(written), *_KEYS, "text")
+        if not options:
+            yield _read_open(answer, reasoning)
+            continue
+        text = replies.text_of(answer)
+        option = _option(text, options)
+        if option is None:
+            meant = {option.letter: option for each in _announced(text) if (option := _option(each, options))}
+            if len(meant) != 1:
+                raise ReplyError(f"the answer '{str(answer)[:80]}' is none of the options; {_remedy(options)}")
+            (option,) = meant.values()
+        yield _reading_of(option, reasoning)
 
 
-def _unwrapped(answer: Any) -> Any:
-    """What stands in a list of one, or in an object."""
-    if isinstance(answer, list) and len(cast("list[object]", answer)) == 1:
-        return cast("list[object]", answer)[0]
-    if isinstance(answer, dict):
-        return first_of(fields_of(cast("object", answer)), *_KEYS, "text")
-    return answer
-
-
-def _in_prose(said: str, options: Sequence[AnswerOption]) -> list[AnswerReading]:
+def _read_prose(said: str, options: Sequence[AnswerOption]) -> list[AnswerReading]:
     """Answers that are announced as such in a text; else its first or last line, where that is one."""
-    if is_broken_json(said):
+    if replies.is_broken_json(said):
         return []
-    answers, lines = _announced(said), _edge_lines(said)
+    answers = _announced(said)
+    lines = [line.strip(MARKS) for line in _SPECIAL.sub(" ", said).splitlines() if line.strip(MARKS)]
+    if lines:
+        last = re.sub(r"^(?:so|therefore|thus|hence)\W+", "", lines[-1], flags=re.IGNORECASE)
+        lines = list(dict.fromkeys((lines[0], last)))
     if options:
         found = [option for each in answers or lines if (option := _option(each, options))]
         if answers and not found:
@@ -138,19 +133,6 @@ def _in_prose(said: str, options: Sequence[AnswerOption]) -> list[AnswerReading]
     return [_read_open(said, "")] if len(lines) == 1 and not said.startswith(("{", "[")) else []
 
 
-def _read(answer: Any, reasoning: str, options: Sequence[AnswerOption]) -> AnswerReading:
-    if not options:
-        return _read_open(answer, reasoning)
-    text = text_of(answer)
-    option = _option(text, options)
-    if option is None and text:
-        found = {option.letter: option for each in _announced(text) if (option := _option(each, options))}
-        option = next(iter(found.values())) if len(found) == 1 else None
-    if option is None:
-        raise ReplyError(f"the answer '{str(answer)[:80]}' is none of the options; {_remedy(options)}")
-    return _reading_of(option, reasoning)
-
-
 def _reading_of(option: AnswerOption, reasoning: str) -> AnswerReading:
     return AnswerReading(option.letter, says_not_sure(option.text), reasoning)
 
@@ -158,24 +140,18 @@ def _reading_of(option: AnswerOption, reasoning: str) -> AnswerReading:
 def _option(said: str, options: Sequence[AnswerOption]) -> AnswerOption | None:
     """The option that a short text means: by its letter, by its own words, or because neither is sure."""
     text = said.strip(MARKS)
-    found = _lettered(text, options) or option_saying(options, text)
-    if found is not None:
+    if letter := _LETTER.fullmatch(text):
+        # Behind the letter stands nothing, or that option's own text.
+        lettered = next((option for option in options if option.letter == letter["letter"].upper()), None)
+        rest = letter["text"].strip(MARKS + ")")
+        if lettered and (not rest or rest == lettered.text or plain(rest) == plain(lettered.text) != ""):
+            return lettered
+    if found := option_saying(options, text):
         return found
     begun = [o for o in options if re.match(rf"{re.escape(o.text)}\s*[,.;:!]\s", text, re.IGNORECASE)]
     if len(begun) == 1 and not says_not_sure(text):
         return begun[0]
     return not_sure_option(options) if says_not_sure(text) and len(text.split()) <= UNSURE_WORDS else None
-
-
-def _lettered(text: str, options: Sequence[AnswerOption]) -> AnswerOption | None:
-    """The option whose letter stands first, if what follows the letter is nothing or that option's own text."""
-    found = _LETTER.fullmatch(text)
-    if found is None:
-        return None
-    option = next((option for option in options if option.letter == found["letter"].upper()), None)
-    rest = found["text"].strip(MARKS + ")")
-    same = option is not None and (rest == option.text or plain(rest) == plain(option.text) != "")
-    return option if not rest or same else None
 
 
 def _read_open(answer: Any, reasoning: str) -> AnswerReading:
@@ -186,8 +162,8 @@ def _read_open(answer: Any, reasoning: str) -> AnswerReading:
             raise ReplyError(f"the answer is no usable number; {_remedy(())}")
         answer = f"{answer:g}"
     if isinstance(answer, list):
-        answer = ", ".join(text_of(part) for part in cast("list[object]", answer))
-    text = text_of(answer)[:MAX_ANSWER].strip()
+        answer = ", ".join(replies.text_of(part) for part in replies.listed(answer))
+    text = replies.text_of(answer)[:MAX_ANSWER].strip()
     unsure = says_not_sure(text) and len(text.split()) <= UNSURE_WORDS
     if plain(text) in {"", "null"} or unsure:
         return AnswerReading(None, True, reasoning)
@@ -209,12 +185,3 @@ def _announced(said: str) -> list[str]:
         if answers:
             return answers
     return []
-
-
-def _edge_lines(said: str) -> list[str]:
-    """First and last line of a text, without special tokens: where an answer that is not announced stands."""
-    lines = [line.strip(MARKS) for line in _SPECIAL.sub(" ", said).splitlines() if line.strip(MARKS)]
-    if not lines:
-        return []
-    last = re.sub(r"^(?:so|therefore|thus|hence)\W+", "", lines[-1], flags=re.IGNORECASE)
-    return list(dict.fromkeys((lines[0], last)))

@@ -4,8 +4,6 @@ What can be sent is; `ChatTurn.warnings` names the fields that were left out. Me
 as leaving them out would change what is asked.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import time
@@ -14,19 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
-from pydantic_ai.messages import (
-    BinaryContent,
-    ModelMessage,
-    ModelRequest,
-    ModelResponse,
-    SystemPromptPart,
-    TextPart,
-    ThinkingPart,
-    ToolCallPart,
-    ToolReturnPart,
-    UserContent,
-    UserPromptPart,
-)
+from pydantic_ai import messages as ai
 from pydantic_ai.models import Model, ModelRequestParameters
 from pydantic_ai.output import OutputObjectDefinition
 from pydantic_ai.settings import ModelSettings
@@ -51,7 +37,7 @@ FINISHED = {"stop": "stop", "length": "length", "content_filter": "content_filte
 class PreparedChat:
     """A chat as pydantic-ai takes it."""
 
-    messages: list[ModelMessage]
+    messages: list[ai.ModelMessage]
     settings: ModelSettings
     parameters: ModelRequestParameters
     warnings: tuple[str, ...]
@@ -71,16 +57,32 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
             continue
         if own in model.unsupported_settings or (name == "tool_choice" and not body.get("tools")):
             left_out.append(name)
-        else:
-            settings[own] = _setting(name, value)
-    output = _schema_of(body.get("response_format"))
-    if output is None and body.get("response_format") not in (None, *NEUTRAL["response_format"]):
+            continue
+        if name == "stop" and isinstance(value, str):
+            value = [value]
+        elif name == "tool_choice" and isinstance(value, dict):
+            value = [_at(value, "/tool_choice", "function", "name")]
+        settings[own] = value
+
+    output, response_format = None, body.get("response_format")
+    if isinstance(response_format, dict) and response_format.get("type") == "json_schema":
+        schema = _at(response_format, "/response_format", "json_schema", "schema")
+        output = OutputObjectDefinition(schema, response_format["json_schema"].get("name", "reply"))
+    elif response_format not in (None, *NEUTRAL["response_format"]):
         left_out.append("response_format")
-    parameters = ModelRequestParameters(
-        function_tools=[_tool(place, tool) for place, tool in enumerate(_list_of(body, "tools"))],
-        output_mode="text" if output is None else "native",
-        output_object=output,
-    )
+
+    tools: list[ToolDefinition] = []
+    for place, tool in enumerate(_list_of(body, "tools")):
+        pointer = f"/tools/{place}"
+        if not isinstance(tool, dict) or tool.get("type", "function") != "function":
+            raise _wrong(pointer, "only tools of the type `function` can be sent to this MLLM")
+        function = _at(tool, pointer, "function")
+        name = _at(function, pointer + "/function", "name")
+        schema = function.get("parameters") or {"type": "object", "properties": {}}
+        tools.append(ToolDefinition(name=name, description=function.get("description"), parameters_json_schema=schema))
+    mode = "text" if output is None else "native"
+    parameters = ModelRequestParameters(function_tools=tools, output_mode=mode, output_object=output)
+
     warnings: tuple[str, ...] = ()
     if left_out:
         names = ", ".join(f"`{name}`" for name in left_out)
@@ -90,30 +92,31 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
     return PreparedChat(list(_messages(body)), cast("ModelSettings", settings), parameters, warnings)
 
 
-def completion_of(response: ModelResponse, model: str) -> dict[str, Any]:
+def completion_of(response: ai.ModelResponse, model: str) -> dict[str, Any]:
     """The reply as a chat completion."""
-    texts = [part.content for part in response.parts if isinstance(part, TextPart)]
-    thoughts = [part.content for part in response.parts if isinstance(part, ThinkingPart) and part.content]
-    calls = [part for part in response.parts if isinstance(part, ToolCallPart)]
+    texts = [part.content for part in response.parts if isinstance(part, ai.TextPart)]
+    thoughts = [part.content for part in response.parts if isinstance(part, ai.ThinkingPart) and part.content]
+    calls = [part for part in response.parts if isinstance(part, ai.ToolCallPart)]
     message: dict[str, Any] = {"role": "assistant", "content": "".join(texts) if texts else None, "refusal": None}
     if thoughts:
         message["reasoning_content"] = "".join(thoughts)
     if calls:
-        functions = [{"name": call.tool_name, "arguments": call.args_as_json_str()} for call in calls]
         message["tool_calls"] = [
-            {"id": call.tool_call_id, "type": "function", "function": function}
-            for call, function in zip(calls, functions, strict=True)
+            {
+                "id": call.tool_call_id,
+                "type": "function",
+                "function": {"name": call.tool_name, "arguments": call.args_as_json_str()},
+            }
+            for call in calls
         ]
     usage = response.usage
-    finish = FINISHED.get(response.finish_reason or "stop", "stop")
+    finish = "tool_calls" if calls else FINISHED.get(response.finish_reason or "stop", "stop")
     return {
         "id": response.provider_response_id or f"chatcmpl-{uuid.uuid4()}",
         "object": "chat.completion",
         "created": int(time.time()),
         "model": response.model_name or model,
-        "choices": [
-            {"index": 0, "message": message, "finish_reason": "tool_calls" if calls else finish, "logprobs": None}
-        ],
+        "choices": [{"index": 0, "message": message, "finish_reason": finish, "logprobs": None}],
         "usage": {
             "prompt_tokens": usage.input_tokens,
             "completion_tokens": usage.output_tokens,
@@ -122,33 +125,7 @@ def completion_of(response: ModelResponse, model: str) -> dict[str, Any]:
     }
 
 
-def _setting(name: str, value: Any) -> Any:
-    if name == "stop":
-        return [value] if isinstance(value, str) else value
-    if name == "tool_choice" and isinstance(value, dict):
-        return [_at(cast("dict[str, Any]", value), "/tool_choice", "function", "name")]
-    return value
-
-
-def _schema_of(response_format: Any) -> OutputObjectDefinition | None:
-    if not isinstance(response_format, dict) or response_format.get("type") != "json_schema":
-        return None
-    asked = cast("dict[str, Any]", response_format)
-    schema = _at(asked, "/response_format", "json_schema", "schema")
-    return OutputObjectDefinition(schema, asked["json_schema"].get("name", "reply"))
-
-
-def _tool(place: int, tool: Any) -> ToolDefinition:
-    pointer = f"/tools/{place}"
-    if not isinstance(tool, dict) or tool.get("type", "function") != "function":
-        raise _wrong(pointer, "only tools of the type `function` can be sent to this MLLM")
-    function = _at(cast("dict[str, Any]", tool), pointer, "function")
-    name = _at(function, pointer + "/function", "name")
-    schema = function.get("parameters") or {"type": "object", "properties": {}}
-    return ToolDefinition(name=name, description=function.get("description"), parameters_json_schema=schema)
-
-
-def _messages(body: dict[str, Any]) -> Iterator[ModelMessage]:
+def _messages(body: dict[str, Any]) -> Iterator[ai.ModelMessage]:
     tools: dict[str, str] = {}  # names of the tools that were called, by the id of the call
     for place, message in enumerate(_list_of(body, "messages")):
         pointer = f"/messages/{place}"
@@ -157,50 +134,48 @@ def _messages(body: dict[str, Any]) -> Iterator[ModelMessage]:
         given = cast("dict[str, Any]", message)
         role, content = given.get("role"), list(_contents(given.get("content"), pointer + "/content"))
         if role in ("system", "developer"):
-            yield ModelRequest([SystemPromptPart(_text(content, pointer))])
+            yield ai.ModelRequest([ai.SystemPromptPart(_text(content, pointer))])
         elif role == "user":
-            yield ModelRequest([UserPromptPart(content)])
+            yield ai.ModelRequest([ai.UserPromptPart(content)])
         elif role == "assistant":
-            calls: list[ToolCallPart] = []
+            calls: list[ai.ToolCallPart] = []
             for call in _list_of(given, "tool_calls"):
                 name = _at(call, pointer + "/tool_calls", "function", "name")
-                calls.append(ToolCallPart(name, call["function"].get("arguments"), call.get("id", "")))
+                calls.append(ai.ToolCallPart(name, call["function"].get("arguments"), call.get("id", "")))
             tools |= {call.tool_call_id: call.tool_name for call in calls}
-            texts = [TextPart(text)] if (text := _text(content, pointer)) else []
-            yield ModelResponse([*texts, *calls])
+            texts = [ai.TextPart(text)] if (text := _text(content, pointer)) else []
+            yield ai.ModelResponse([*texts, *calls])
         elif role == "tool":
             call = given.get("tool_call_id", "")
-            yield ModelRequest([ToolReturnPart(tools.get(call, "tool"), _text(content, pointer), call)])
+            result = ai.ToolReturnPart(tools.get(call, "tool"), _text(content, pointer), call)
+            yield ai.ModelRequest([result])
         else:
             raise _wrong(pointer + "/role", f"messages of the role {str(role)[:40]!r} cannot be sent to this MLLM")
 
 
-def _contents(content: Any, pointer: str) -> Iterator[UserContent]:
+def _contents(content: Any, pointer: str) -> Iterator[ai.UserContent]:
     parts: list[Any] = [content] if isinstance(content, str) else list(content or ())
-    for place, part in enumerate(parts):
+    for number, part in enumerate(parts):
+        place = f"{pointer}/{number}"
         if isinstance(part, str):
             yield part
         elif isinstance(part, dict) and isinstance(part.get("text"), str):
             yield part["text"]
         elif isinstance(part, dict) and part.get("type") == "image_url":
-            yield _image(part, f"{pointer}/{place}")
+            given = part.get("image_url")
+            url = given.get("url") if isinstance(given, dict) else given
+            head, comma, data = str(url).partition(",")
+            if not (comma and head.lower().startswith("data:image/") and head.lower().endswith(";base64")):
+                raise _wrong(place, "images are sent to this MLLM as data URLs (data:image/png;base64,...) only")
+            try:
+                yield ai.BinaryContent(base64.b64decode(data, validate=True), media_type=head[5:-7].lower())
+            except binascii.Error as error:
+                raise _wrong(place, "the data URL is no base64") from error
         else:
-            raise _wrong(f"{pointer}/{place}", "only texts and images can be sent to this MLLM")
+            raise _wrong(place, "only texts and images can be sent to this MLLM")
 
 
-def _image(part: dict[str, Any], pointer: str) -> BinaryContent:
-    given = part.get("image_url")
-    url = given.get("url") if isinstance(given, dict) else given
-    head, comma, data = str(url).partition(",")
-    if not (comma and head.lower().startswith("data:image/") and head.lower().endswith(";base64")):
-        raise _wrong(pointer, "images are sent to this MLLM as data URLs (data:image/png;base64,...) only")
-    try:
-        return BinaryContent(base64.b64decode(data, validate=True), media_type=head[5:-7].lower())
-    except binascii.Error as error:
-        raise _wrong(pointer, "the data URL is no base64") from error
-
-
-def _text(content: list[UserContent], pointer: str) -> str:
+def _text(content: list[ai.UserContent], pointer: str) -> str:
     texts = [part for part in content if isinstance(part, str)]
     if len(texts) < len(content):
         raise _wrong(pointer, "images can be sent to this MLLM in `user` messages only")

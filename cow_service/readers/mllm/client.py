@@ -1,7 +1,5 @@
 """The client of a multimodal LLM: one prompt with its images out, a checked value in, or a typed error."""
 
-from __future__ import annotations
-
 import asyncio
 import concurrent.futures
 import hashlib
@@ -11,26 +9,12 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from threading import Thread
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar
 
 import anyio
-from pydantic_ai import Agent, BinaryContent, ModelRetry, RunContext, TextOutput
+from pydantic_ai import Agent, BinaryContent, ModelRetry, TextOutput
+from pydantic_ai import exceptions as errors
 from pydantic_ai.direct import model_request
-from pydantic_ai.exceptions import (
-    AgentRunError,
-    ContentFilterError,
-    ModelAPIError,
-    ModelAuthenticationError,
-    ModelConnectionError,
-    ModelContextWindowExceededError,
-    ModelHTTPError,
-    ModelNotFoundError,
-    ModelQuotaExceededError,
-    ModelRateLimitError,
-    ModelRequestRejectedError,
-    ModelTimeoutError,
-    UserError,
-)
 from pydantic_ai.messages import ModelMessage, ModelResponse
 from pydantic_ai.models import Model, ModelRequestParameters
 from pydantic_ai.models.wrapper import WrapperModel
@@ -77,14 +61,14 @@ class PromptCall(Generic[T]):
     temperature: float | None = None  # by default that of the manifest
 
 
-class _ReplyParser:
+class _ReplyParser(Generic[T]):
     """Parses the replies to one call, and remembers what was wrong with the last one."""
 
-    def __init__(self, parse: Callable[[str], Any]) -> None:
+    def __init__(self, parse: Callable[[str], T]) -> None:
         self._parse = parse
         self.fault, self.reply = "it was empty", ""
 
-    def __call__(self, reply: str) -> Any:
+    def read(self, reply: str) -> T:
         """The value of a reply. Raises `ModelRetry`, which has the model asked again with the reason."""
         self.reply = reply
         try:
@@ -107,12 +91,7 @@ class MllmClient:
         self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
         self._slots = asyncio.Semaphore(settings.mllm_concurrency)
         self._instructions = load_prompt(SYSTEM_PROMPT)
-        self._agent: Agent[_ReplyParser, Any] = Agent(
-            output_type=TextOutput(_parsed),
-            deps_type=_ReplyParser,
-            retries=MAX_REASKS,
-            instructions=self._instructions.render(),
-        )
+        self._agent = Agent(retries=MAX_REASKS, instructions=self._instructions.render())
         self._thread = EventLoopThread(model.model)
 
     def close(self) -> None:
@@ -156,18 +135,16 @@ class MllmClient:
     async def _chat(self, body: dict[str, Any]) -> ChatTurn:
         model = self.model.model
         chat = prepare_chat(body, model)
-        settings = chat.settings | ModelSettings(timeout=self._timeout, max_retries=0)
-        for name in model.unsupported_settings & settings.keys():
-            del settings[name]
+        settings = self._supported(chat.settings | ModelSettings(timeout=self._timeout, max_retries=0))
         try:
             async with self._slots:
                 with anyio.fail_after(self._timeout):
                     response = await model_request(
                         model, chat.messages, model_settings=settings, model_request_parameters=chat.parameters
                     )
-        except UserError as error:
+        except errors.UserError as error:
             raise InvalidRequest(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}") from error
-        except ModelHTTPError as error:
+        except errors.ModelHTTPError as error:
             message = f"{self._name} answered with status {error.status_code}: {reason_of(error)}."
             told = {"message": message, "type": "upstream_error", "param": None, "code": str(error.status_code)}
             retry = {} if error.retry_after is None else {"Retry-After": f"{error.retry_after:.0f}"}
@@ -176,9 +153,9 @@ class MllmClient:
             raise MllmUnavailable(
                 f"{self._name} gave no reply within {self._timeout:g} s (COW_MLLM_TIMEOUT)."
             ) from error
-        except ModelAPIError as error:
+        except errors.ModelAPIError as error:
             raise MllmUnavailable(f"{self._name} could not be asked: {reason_of(error)}.") from error
-        except AgentRunError as error:
+        except errors.AgentRunError as error:
             raise MllmBadReply(f"{self._name} gave a reply that could not be read.") from error
         return ChatTurn(completion_of(response, self.model.name), warnings=chat.warnings)
 
@@ -188,33 +165,56 @@ class MllmClient:
         schema = call.schema if self.model.supports_schema else None
         model = RetryingModel(self.model.model, self._slots, self._timeout, self._budget, schema)
         images = [BinaryContent(image, media_type=MEDIA_TYPE) for image in call.images]
-        content = [*images, prompt.render(**call.inputs)]
+        defaults = self.model.manifest.defaults
+        settings = ModelSettings(
+            max_tokens=int(defaults.get("max_tokens", 4096)),
+            timeout=self._timeout,
+            max_retries=0,  # `RetryingModel` retries, and it knows the budget
+            framing_announcement="never",
+        )
+        if "temperature" in defaults:
+            wanted = defaults["temperature"] if call.temperature is None else call.temperature
+            settings |= ModelSettings(temperature=float(wanted))
+            if given.seed is not None:
+                settings |= ModelSettings(seed=seed_of_vote(given.seed, call.vote))
         try:
             with anyio.fail_after(self._budget):
-                settings = self._settings(call, given.seed)
-                run = await self._agent.run(content, model=model, deps=parser, model_settings=settings, usage=used)
-                return cast("T", run.output)
+                run = await self._agent.run(
+                    [*images, prompt.render(**call.inputs)],
+                    output_type=TextOutput(parser.read),
+                    model=model,
+                    model_settings=self._supported(settings),
+                    usage=used,
+                )
+                return run.output
         except CowError as error:  # of a model that runs in this process
             return error
-        except (AgentRunError, UserError, TimeoutError) as error:
+        except (errors.AgentRunError, errors.UserError, TimeoutError) as error:
             return self._error(call, parser, model, error)
         finally:  # in the one thread of the event loop, so that calls at the same time do not lose each other's usage
             given.calls.add(Usage(calls=model.calls, input_tokens=used.input_tokens, output_tokens=used.output_tokens))
             given.calls.prompts |= {prompt.name: prompt.version, SYSTEM_PROMPT: self._instructions.version}
 
-    def _error(self, call: PromptCall[Any], parser: _ReplyParser, model: RetryingModel, error: Exception) -> CowError:
+    def _supported(self, settings: ModelSettings) -> ModelSettings:
+        for name in self.model.model.unsupported_settings & settings.keys():
+            del settings[name]
+        return settings
+
+    def _error(
+        self, call: PromptCall[Any], parser: _ReplyParser[Any], model: "RetryingModel", error: Exception
+    ) -> CowError:
         """The `CowError` for what pydantic-ai raised."""
         tries = f"{model.calls} {'try' if model.calls == 1 else 'tries'}"
-        if isinstance(error, UserError):  # what pydantic-ai will not send to this model
+        if isinstance(error, errors.UserError):  # what pydantic-ai will not send to this model
             return MllmUnavailable(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}")
-        if isinstance(error, ContentFilterError):
+        if isinstance(error, errors.ContentFilterError):
             return MllmBadReply(f"{self._name} refused to look at this: its content filter held the reply back.")
         if isinstance(error, TimeoutError):
             reason = "" if model.last_error is None else f": {reason_of(model.last_error)}"
             return MllmUnavailable(
                 f"{self._name} gave no usable reply within {self._budget:g} s (COW_MLLM_BUDGET) and {tries}{reason}."
             )
-        if isinstance(error, ModelAPIError):
+        if isinstance(error, errors.ModelAPIError):
             return MllmUnavailable(f"{self._name} could not be asked ({tries}): {reason_of(error)}.")
         fault = parser.fault
         if model.truncated:
@@ -228,23 +228,6 @@ class MllmClient:
     def _closed(self) -> MllmUnavailable:
         return MllmUnavailable(f"{self._name} is asked no more: this server is stopping.")
 
-    def _settings(self, call: PromptCall[Any], seed: int | None) -> ModelSettings:
-        defaults = self.model.manifest.defaults
-        settings = ModelSettings(
-            max_tokens=int(defaults.get("max_tokens", 4096)),
-            timeout=self._timeout,
-            max_retries=0,  # `RetryingModel` retries, and it knows the budget
-            framing_announcement="never",
-        )
-        if "temperature" in defaults:
-            wanted = defaults["temperature"] if call.temperature is None else call.temperature
-            settings |= ModelSettings(temperature=float(wanted))
-            if seed is not None:
-                settings |= ModelSettings(seed=seed_of_vote(seed, call.vote))
-        for name in self.model.model.unsupported_settings & settings.keys():
-            del settings[name]
-        return settings
-
 
 def seed_of_vote(seed: int, vote: int) -> int:
     """The seed that a vote is sent with: the request's for the first one, a digest of both for the others.
@@ -256,24 +239,23 @@ def seed_of_vote(seed: int, vote: int) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed} {vote}".encode()).digest()[:8]) % MAX_SEED
 
 
-def _parsed(context: RunContext[_ReplyParser], reply: str) -> Any:
-    return context.deps(reply)
-
-
 MIN_BACKOFF, MAX_BACKOFF = 0.5, 20.0  # seconds before a retry, where the server names no time
 CONNECT_SECONDS = 10.0  # after which an address that accepts no connection is given up: a restart takes longer anyway
-_NEVER_RETRIED = (ModelRequestRejectedError, ModelQuotaExceededError)
+_NEVER_RETRIED = (errors.ModelRequestRejectedError, errors.ModelQuotaExceededError)
 _RETRIED_STATUS = (
     HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.CONFLICT, HTTPStatus.TOO_EARLY, HTTPStatus.TOO_MANY_REQUESTS,
 )  # fmt: skip
-_REASONS: tuple[tuple[type[ModelAPIError], str], ...] = (
-    (ModelAuthenticationError, "it refused the key; set COW_MLLM_API_KEY, or the provider's own variable"),
-    (ModelNotFoundError, "there is no model of that name; COW_MLLM_MODEL says under which name it is served there"),
-    (ModelContextWindowExceededError, "the images and the question are more than it takes; send fewer frames"),
-    (ModelQuotaExceededError, "the account's quota is used up"),
-    (ModelRateLimitError, "it takes no more requests for now (429); lower COW_MLLM_CONCURRENCY, or try later"),
-    (ModelTimeoutError, "it did not reply in time; COW_MLLM_TIMEOUT says how long to wait"),
-    (ModelConnectionError, "it could not be reached, or broke off; check that it runs, and COW_MLLM_BASE_URL"),
+_REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
+    (errors.ModelAuthenticationError, "it refused the key; set COW_MLLM_API_KEY, or the provider's own variable"),
+    (
+        errors.ModelNotFoundError,
+        "there is no model of that name; COW_MLLM_MODEL says under which name it is served there",
+    ),
+    (errors.ModelContextWindowExceededError, "the images and the question are more than it takes; send fewer frames"),
+    (errors.ModelQuotaExceededError, "the account's quota is used up"),
+    (errors.ModelRateLimitError, "it takes no more requests for now (429); lower COW_MLLM_CONCURRENCY, or try later"),
+    (errors.ModelTimeoutError, "it did not reply in time; COW_MLLM_TIMEOUT says how long to wait"),
+    (errors.ModelConnectionError, "it could not be reached, or broke off; check that it runs, and COW_MLLM_BASE_URL"),
 )
 # What pydantic-ai's and the providers' code raises over a response that is not shaped as it should be.
 _MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError)
@@ -294,7 +276,7 @@ class RetryingModel(WrapperModel):
         self._budget = budget
         self._schema = schema
         self.calls = 0
-        self.last_error: ModelAPIError | None = None
+        self.last_error: errors.ModelAPIError | None = None
         self.truncated = False  # whether the last reply reached the limit of tokens
 
     async def request(
@@ -313,7 +295,7 @@ class RetryingModel(WrapperModel):
         def is_over(state: RetryCallState) -> bool:
             """Whether the budget ends before the next attempt, or the address has long accepted no connection."""
             error = state.outcome.exception() if state.outcome else None
-            refused = isinstance(error, ModelConnectionError) and error.phase == "connect"
+            refused = isinstance(error, errors.ModelConnectionError) and error.phase == "connect"
             unreachable = refused and (state.seconds_since_start or 0.0) > CONNECT_SECONDS
             return unreachable or stop_before_delay(self._budget)(state)
 
@@ -328,41 +310,41 @@ class RetryingModel(WrapperModel):
             async with self._slots:
                 with anyio.fail_after(self._timeout):
                     response = await super().request(messages, settings, parameters)
-        except ContentFilterError:
+        except errors.ContentFilterError:
             raise
-        except ModelAPIError as error:
+        except errors.ModelAPIError as error:
             self.last_error = error
             raise
         except TimeoutError as error:
-            self.last_error = ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s")
+            self.last_error = errors.ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s")
             raise self.last_error from error
-        except (AgentRunError, *_MALFORMED) as error:
-            self.last_error = ModelAPIError(self.model_name, "the reply was no chat completion")
+        except (errors.AgentRunError, *_MALFORMED) as error:
+            self.last_error = errors.ModelAPIError(self.model_name, "the reply was no chat completion")
             raise self.last_error from error
         self.truncated = response.finish_reason == "length"
         return response
 
 
-def reason_of(error: ModelAPIError) -> str:
+def reason_of(error: errors.ModelAPIError) -> str:
     """What went wrong and what to do about it, in words without addresses, keys or the server's own text."""
     for kind, words in _REASONS:
         if isinstance(error, kind):
             return words
-    if isinstance(error, ModelHTTPError):
+    if isinstance(error, errors.ModelHTTPError):
         return f"it answered with status {error.status_code}"
     return "its reply could not be read; check that COW_MLLM_BASE_URL is that of an OpenAI-compatible server"
 
 
 def _is_transient(error: BaseException) -> bool:
-    if isinstance(error, ModelHTTPError) and error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
+    if isinstance(error, errors.ModelHTTPError) and error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
         return error.status_code in _RETRIED_STATUS
-    return isinstance(error, ModelAPIError) and not isinstance(error, _NEVER_RETRIED)
+    return isinstance(error, errors.ModelAPIError) and not isinstance(error, _NEVER_RETRIED)
 
 
 def _backoff(state: RetryCallState) -> float:
     """Seconds until the next attempt: those that the server asked for, else exponential backoff, with jitter."""
     error = state.outcome.exception() if state.outcome else None
-    retry_after = error.retry_after if isinstance(error, ModelAPIError) else None
+    retry_after = error.retry_after if isinstance(error, errors.ModelAPIError) else None
     if retry_after is not None:
         return retry_after + random.uniform(0, MIN_BACKOFF)  # many callers were told the same
     return wait_random_exponential(MIN_BACKOFF, MAX_BACKOFF)(state)

@@ -5,8 +5,6 @@ Everything becomes pixels before any geometry: a direction read off numbers in t
 skewed by the aspect ratio of the image.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -157,9 +155,10 @@ class CoordinateFrame:
 
     def _pairs(self, written: object, count: int, what: str) -> list[tuple[float, float]]:
         """(x, y) pairs in the family's units."""
-        meant = _corners(written) if count == 2 else written
-        named = _by_name(meant, count)
-        numbers = _numbers(meant) if named is None else named
+        fields = fields_of(written) if count == 2 else {}
+        ends = next(([fields[a], fields[b]] for a, b in _CORNERS if a in fields and b in fields), written)
+        named = _by_name(ends, count)
+        numbers = _numbers(ends) if named is None else named
         if len(numbers) != 2 * count:
             raise ReplyError(f"{what} is {2 * count} numbers, not {_shown(written)}")
         pairs = list(zip(numbers[::2], numbers[1::2], strict=True))
@@ -199,12 +198,6 @@ def _numbers(written: object) -> list[float]:
         return [float(written)] if abs(written) < HUGE else []  # NaN is not less than anything
     parts = [_numbers(part) for part in cast("Sequence[object]", written)] if isinstance(written, list | tuple) else []
     return [number for part in parts for number in part] if all(parts) else []
-
-
-def _corners(written: object) -> object:
-    """The two points of an object such as {"start": ..., "end": ...}; anything else as it is."""
-    fields = fields_of(written)
-    return next(([fields[a], fields[b]] for a, b in _CORNERS if a in fields and b in fields), written)
 
 
 def _by_name(written: object, count: int) -> list[float] | None:

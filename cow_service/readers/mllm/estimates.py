@@ -4,8 +4,6 @@ They are read as leniently as they are written. What cannot be is left out, of e
 fails.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -128,11 +126,6 @@ def _metres(what: str, least: float, most: float) -> tuple[Any, Any]:
     return estimate(f"a {what} from {least:g} to {most:g} m", number(least, most), read)
 
 
-def _support(written: object, info: ValidationInfo) -> str | None:
-    context = context_of(info)
-    return support_named(text_of(written)[:MAX_SUPPORT], context.owner, context.others)
-
-
 def _depth_degrees(written: object, info: ValidationInfo) -> float | None:
     """Degrees out of the image plane, -90 (towards the camera) to 90 (away).
 
@@ -157,7 +150,16 @@ def _depth_degrees(written: object, info: ValidationInfo) -> float | None:
 
 Size = Annotated[float | None, *_metres("length", *SIZES)]
 Height = Annotated[float | None, *_metres("height", *HEIGHTS)]
-Support = Annotated[str | None, *estimate("`floor`, `air` or another object", words(MAX_SUPPORT), _support)]
+Support = Annotated[
+    str | None,
+    *estimate(
+        "`floor`, `air` or another object",
+        words(MAX_SUPPORT),
+        lambda written, info: support_named(
+            text_of(written)[:MAX_SUPPORT], context_of(info).owner, context_of(info).others
+        ),
+    ),
+]
 KnownShape = Annotated[Shape | None, *_word(SHAPES)]
 KnownSpeed = Annotated[SpeedWord | None, *_word(SPEEDS)]
 DepthDegrees = Annotated[

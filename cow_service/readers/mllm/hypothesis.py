@@ -1,16 +1,12 @@
 """What a simulation found, in words for the prompt of an answer: facts and how sure they are, never what to answer."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.media.overlay import named_strip
 from cow_service.narration import state_words
 from cow_service.readers.base import Imagined
-from cow_service.records import MEETINGS, AskedRelation, Doubt, Encounter, Outcome, Simulation, Trajectory
+from cow_service.records import MEETINGS, AskedRelation, Doubt, Outcome, Simulation
 
 AS_IT_IS = "As it is"  # the name of the frames with nothing changed
 EVENTS: dict[AskedRelation, tuple[str, str]] = {
@@ -46,18 +42,36 @@ def pictures(imagined: Imagined) -> tuple[NDArray[np.uint8], ...]:
 def hypothesis(imagined: Imagined) -> dict[str, object]:
     """What the simulation found, as inputs of the prompt; encounters only where there is no outcome to tell."""
     simulation = imagined.simulation
-    trajectory, mover = simulation.trajectory, simulation.grounding.object
-    changed = _changed(simulation)
+    trajectory, changed = simulation.trajectory, _changed(simulation)
+
+    # The facts of the outcome, how probable they are in each world, and what they rest on; none without an outcome.
     worlds = {"": trajectory} if trajectory.factual is None else {changed: trajectory, AS_IT_IS: trajectory.factual}
-    facts = _facts(worlds, _one_line(mover))
+    outcomes = {name: (each, each.outcome) for name, each in worlds.items() if each.outcome is not None}
+    facts: list[str] = []
+    if trajectory.outcome is not None and len(outcomes) == len(worlds):
+        facts += [_one_line(trajectory.outcome.facts)] if trajectory.outcome.facts else []
+        for name, (world, outcome) in outcomes.items():
+            if outcome.probability is not None:
+                event = _event(outcome, _one_line(simulation.grounding.object))
+                told = f"{_share(outcome.probability, world.ensemble)}: {event}."
+                facts.append(f"{name}, {told[0].lower()}{told[1:]}" if name else told)
+        if trajectory.outcome.depends_on:
+            facts.append(f"It depends most on {', '.join(DOUBTS[doubt] for doubt in trajectory.outcome.depends_on)}.")
+
+    encounters: list[str] = []
+    for each in () if facts else trajectory.encounters:
+        covered = "" if each.share is None else f", at most {each.share:.0%} covered"
+        sure = "" if each.probability is None else f"; {_share(each.probability, trajectory.ensemble).lower()}"
+        meets = f"{MEETINGS[each.kind]} the {_bare(each.object)}"
+        encounters.append(f"{meets}, {each.first_frame / trajectory.fps:.2f} s in{covered}{sure}")
     return {
         "sentence": simulation.motion.sentence,
         "times": ", ".join(f"{frame.time:.2f} s" for frame in simulation.frames),
         "law": trajectory.law,
         "changed": changed,
         "as_it_is": AS_IT_IS if imagined.factual_frames else "",
-        "facts": facts,
-        "encounters": () if facts else tuple(_encounter_words(each, trajectory) for each in trajectory.encounters),
+        "facts": tuple(facts),
+        "encounters": tuple(encounters),
         "encounters_known": simulation.encounters_known,
     }
 
@@ -70,25 +84,6 @@ def _changed(simulation: Simulation) -> str:
     placed = [_one_line(state_words(each)) for each in changes if each.kind == "place" and each.object.object in put]
     told = [*([f"{removed} removed"] if removed else []), *placed]
     return f"With {' and '.join(told)}" if told else ""
-
-
-def _facts(worlds: Mapping[str, Trajectory], mover: str) -> tuple[str, ...]:
-    """The facts of the outcome, how probable they are in each world, and what they rest on; empty without an outcome.
-
-    `worlds` by what they are called, the one that is asked about first: its facts tell of both.
-    """
-    outcome = next(iter(worlds.values())).outcome
-    if outcome is None or any(each.outcome is None for each in worlds.values()):
-        return ()
-    lines = [_one_line(outcome.facts)] if outcome.facts else []
-    for name, trajectory in worlds.items():
-        found = trajectory.outcome
-        if found is not None and found.probability is not None:
-            told = f"{_share(found.probability, trajectory.ensemble)}: {_event(found, mover)}."
-            lines.append(f"{name}, {told[0].lower()}{told[1:]}" if name else told)
-    if outcome.depends_on:
-        lines.append(f"It depends most on {', '.join(DOUBTS[doubt] for doubt in outcome.depends_on)}.")
-    return tuple(lines)
 
 
 def _event(outcome: Outcome, mover: str) -> str:
@@ -118,19 +113,10 @@ def _event(outcome: Outcome, mover: str) -> str:
     return f"{event}, first after {outcome.time:.2f} s ({early:.2f} to {late:.2f} s in the middle 80% of the worlds)"
 
 
-def _encounter_words(encounter: Encounter, trajectory: Trajectory) -> str:
-    covered = "" if encounter.share is None else f", at most {encounter.share:.0%} covered"
-    sure = "" if encounter.probability is None else f"; {_share(encounter.probability, trajectory.ensemble).lower()}"
-    meets = f"{MEETINGS[encounter.kind]} the {_bare(encounter.object)}"
-    return f"{meets}, {encounter.first_frame / trajectory.fps:.2f} s in{covered}{sure}"
-
-
 def _share(probability: float, worlds: int) -> str:
-    return (
-        f"In {probability:.0%} of {worlds} computed worlds"
-        if worlds
-        else f"With a computed probability of {probability:.0%}"
-    )
+    if not worlds:
+        return f"With a computed probability of {probability:.0%}"
+    return f"In {probability:.0%} of {worlds} computed worlds"
 
 
 def _bare(name: str) -> str:

@@ -1,77 +1,21 @@
 """Second prompt: where the object is and what is around it, which way it moves, and what tells so; third: the scale."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BeforeValidator, Field, PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
 
+from cow_service import records
+from cow_service.readers.mllm import coordinates, estimates, replies
 from cow_service.readers.mllm.client import PromptCall
-from cow_service.readers.mllm.coordinates import (
-    LEAST_LENGTH,
-    NUMBER,
-    CoordinateFrame,
-    EncodedImage,
-    covers_image,
-    names_corners,
-)
-from cow_service.readers.mllm.estimates import (
-    CAMERA,
-    FLOOR,
-    HEIGHT_DEVIATION,
-    MIN_HEIGHT_DEVIATION,
-    SIZE_DEVIATION,
-    SIZES,
-    CameraSense,
-    DepthDegrees,
-    Height,
-    KnownShape,
-    KnownSpeed,
-    ReadingContext,
-    Size,
-    Support,
-    context_of,
-    metres_of,
-    support_named,
-)
+from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, EncodedImage
 from cow_service.readers.mllm.identify import MAX_OTHERS
-from cow_service.readers.mllm.replies import (
-    COORDINATES,
-    Reply,
-    ReplyError,
-    Schema,
-    fields_of,
-    first_of,
-    is_none,
-    is_number,
-    listed,
-    name_of,
-    name_words,
-    nullable,
-    number,
-    one_of,
-    schema_of,
-    text_of,
-    truth_of,
-    values_in,
-    without_thinking,
-)
-from cow_service.records import (
-    BBox,
-    Cue,
-    Estimate,
-    LocatedObject,
-    MetresPerPixel,
-    ObjectPrior,
-    ObjectRole,
-    Point,
-    Vector,
-)
+from cow_service.readers.mllm.replies import Reply, ReplyError
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
 
@@ -83,7 +27,7 @@ MAX_LABEL = 80  # characters
 STRAIGHT = 60.0  # degrees from the image's vertical, within which a line can also lead towards or away
 STEEP = 60.0  # degrees out of the image plane, from which a motion leads straight towards or away
 LEAST_SPAN = 4.0  # px: measuring less is guessing
-DOWN: dict[str, Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}
+DOWN: dict[str, records.Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}
 _SIDES = {side: side for side in DOWN} | {"down": "bottom", "below": "bottom", "up": "top", "above": "top"}
 _LABEL_KEYS = ("label", "object", "name", "class")
 _DIRECTION_KEYS = ("direction", "motion_direction", "line", "vector")
@@ -92,7 +36,7 @@ _HEADINGS = frozenset({
     "objects", "object", "result", "results", "answer", "data", "detections", "detection", "location", "locations",
     "output", "response", "places", "items", "boxes", "bboxes", "final_result", "grounding",
 })  # fmt: skip
-_CUE_WORDS: dict[str, Cue] = {
+_CUE_WORDS: dict[str, records.Cue] = {
     "arrow": "arrow", "trail": "trail", "ghost": "trail", "orient": "orientation", "front": "orientation",
     "facing": "orientation", "text": "text", "question": "text", "word": "text", "gravity": "gravity",
 }  # fmt: skip
@@ -106,51 +50,38 @@ _POINT_TAG = re.compile(
 )
 # Two pairs are corners where nothing but these stands between; in a sentence they may be two objects.
 _CORNER_PAIRS = re.compile(rf"{_PAIR}\s*(?:,|-|–|→|to|and|through)?\s*{_PAIR}")
-_FOUR = re.compile(rf"[(\[]?\s*({NUMBER})\s*,\s*({NUMBER})\s*,\s*({NUMBER})\s*,\s*({NUMBER})\s*[)\]]?")
-_COORDINATES = WithJsonSchema({COORDINATES: 4})  # nullable
-
-
-def _box(written: object, info: ValidationInfo) -> BBox | None:
-    return None if is_none(written) else context_of(info).frame.bbox(written)
-
-
-def _line(written: object, info: ValidationInfo) -> tuple[Point, Point] | None:
-    if is_none(written) or text_of(written).lower() == "unknown":
-        return None
-    if info.data.get("cue", "") is None and not any(listed(written)):
-        return None  # zeros: how some models that see no direction fill the field
-    if isinstance(written, str) and not re.search(r"\d", written):
-        raise ReplyError(f"`direction` is given in words ('{written[:40]}'); give two points as four numbers")
-    return context_of(info).frame.ends(written)
-
-
-def _cue(written: object) -> Cue | None:
-    said = text_of(written).lower()
-    return next((cue for word, cue in _CUE_WORDS.items() if word in said), None)
+_FOUR = re.compile(r"[(\[]?\s*" + r"\s*,\s*".join([f"({NUMBER})"] * 4) + r"\s*[)\]]?")
+_COORDINATES = WithJsonSchema({replies.COORDINATES: 4})  # nullable
+Ends = tuple[records.Point, records.Point]  # of a line, px of the upright image
 
 
 class SeenObject(Reply):
     """An object at its place, and what may be estimated of it. Places are in px of the upright image."""
 
-    label: Annotated[str, BeforeValidator(lambda said: text_of(said)[:MAX_LABEL]), Field(max_length=MAX_LABEL)]
-    bbox: Annotated[BBox | None, PlainValidator(_box), _COORDINATES]
-    size: Size = None  # m
-    stands_on: Support = None
-    height_above: Height = None  # m
-    shape: KnownShape = None
+    label: Annotated[str, BeforeValidator(lambda said: replies.text_of(said)[:MAX_LABEL]), Field(max_length=MAX_LABEL)]
+    bbox: Annotated[records.BBox | None, _COORDINATES]
+    size: estimates.Size = None  # m
+    stands_on: estimates.Support = None
+    height_above: estimates.Height = None  # m
+    shape: estimates.KnownShape = None
+
+    @field_validator("bbox", mode="before")
+    @classmethod
+    def _read_bbox(cls, written: object, info: ValidationInfo) -> records.BBox | None:
+        return None if replies.is_none(written) else estimates.context_of(info).frame.bbox(written)
 
     @property
-    def prior(self) -> ObjectPrior | None:
+    def prior(self) -> records.ObjectPrior | None:
         """The estimates with widths; null where there are none."""
         size, height = self.size, self.height_above
-        width = None if height is None else max(HEIGHT_DEVIATION * height, MIN_HEIGHT_DEVIATION)
-        prior = ObjectPrior(
+        width = 0.0 if height is None else max(estimates.HEIGHT_DEVIATION * height, estimates.MIN_HEIGHT_DEVIATION)
+        prior = records.ObjectPrior(
             shape=self.shape,
-            size=None if size is None else Estimate(value=size, deviation=SIZE_DEVIATION * size),
+            size=None if size is None else records.Estimate(value=size, deviation=estimates.SIZE_DEVIATION * size),
             stands_on=self.stands_on,
-            height=None if height is None or width is None else Estimate(value=height, deviation=width),
+            height=None if height is None else records.Estimate(value=height, deviation=width),
         )
-        return None if prior == ObjectPrior() else prior
+        return None if prior == records.ObjectPrior() else prior
 
 
 class Surroundings(Reply):
@@ -163,12 +94,34 @@ class Line(Reply):
     """Which way the object moves, as far as the reply tells: `direction` in px of the upright image."""
 
     other_names: ClassVar = {"direction": _DIRECTION_KEYS[1:]}
-    cue: Annotated[Cue | None, PlainValidator(_cue), WithJsonSchema(one_of(*CUES))]
-    along_arrow: Annotated[bool | None, BeforeValidator(truth_of)]
-    camera: Annotated[CameraSense | None, BeforeValidator(lambda said: CAMERA.get(text_of(said).lower().strip(" .")))]
-    direction: Annotated[tuple[Point, Point] | None, PlainValidator(_line), _COORDINATES]
-    depth_degrees: DepthDegrees = None  # out of the image plane, positive away from the camera
-    speed: KnownSpeed = None
+    cue: Annotated[records.Cue | None, WithJsonSchema(replies.one_of(*CUES))]
+    along_arrow: Annotated[bool | None, BeforeValidator(replies.truth_of)]
+    camera: estimates.CameraSense | None
+    direction: Annotated[Ends | None, _COORDINATES]
+    depth_degrees: estimates.DepthDegrees = None  # out of the image plane, positive away from the camera
+    speed: estimates.KnownSpeed = None
+
+    @field_validator("cue", mode="before")
+    @classmethod
+    def _read_cue(cls, written: object) -> records.Cue | None:
+        said = replies.text_of(written).lower()
+        return next((cue for word, cue in _CUE_WORDS.items() if word in said), None)
+
+    @field_validator("camera", mode="before")
+    @classmethod
+    def _read_camera(cls, written: object) -> estimates.CameraSense | None:
+        return estimates.CAMERA.get(replies.text_of(written).lower().strip(" ."))
+
+    @field_validator("direction", mode="before")
+    @classmethod
+    def _read_direction(cls, written: object, info: ValidationInfo) -> Ends | None:
+        if replies.is_none(written) or replies.text_of(written).lower() == "unknown":
+            return None
+        if info.data.get("cue", "") is None and not any(replies.listed(written)):
+            return None  # zeros: how some models that see no direction fill the field
+        if isinstance(written, str) and not re.search(r"\d", written):
+            raise ReplyError(f"`direction` is given in words ('{written[:40]}'); give two points as four numbers")
+        return estimates.context_of(info).frame.ends(written)
 
 
 @dataclass(frozen=True)
@@ -178,12 +131,12 @@ class Located:
     A reply may give a point instead of a box. `label` is what the reply calls it.
     """
 
-    bbox: BBox | None = None
-    point: Point | None = None
+    bbox: records.BBox | None = None
+    point: records.Point | None = None
     label: str = ""
     clipped: bool = False  # the box reached over the image's edge
-    others: tuple[LocatedObject, ...] = ()
-    prior: ObjectPrior | None = None
+    others: tuple[records.LocatedObject, ...] = ()
+    prior: records.ObjectPrior | None = None
     line: Line | None = None
     warnings: tuple[str, ...] = ()  # of optional fields and other boxes that were left out
 
@@ -194,15 +147,15 @@ class Place:
 
     label: str
     box: Any
-    point: Any
-    fields: Mapping[str, Any]
+    point: Any = None
+    fields: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
 def locate_call(
     question: str,
     image: EncodedImage,
     name: str,
-    bbox: BBox | None,
+    bbox: records.BBox | None,
     others: Sequence[str],
     wants_direction: bool,
     reasoning_length: int,
@@ -223,19 +176,19 @@ def locate_call(
         "max_obstacles": MAX_OBSTACLES,
     }
     schema = locate_schema(frame, wants_box, wants_direction, reasoning_length)
-    return PromptCall(
-        "locate",
-        inputs,
-        (image.jpeg,),
-        schema,
-        lambda reply: read_located(reply, frame, name, others, wants_box, wants_direction),
+    read = partial(
+        read_located, frame=frame, wanted=name, others=others, wants_box=wants_box, wants_direction=wants_direction
     )
+    return PromptCall("locate", inputs, (image.jpeg,), schema, read)
 
 
-def locate_schema(frame: CoordinateFrame, wants_box: bool, wants_direction: bool, reasoning_length: int) -> Schema:
+def locate_schema(
+    frame: CoordinateFrame, wants_box: bool, wants_direction: bool, reasoning_length: int
+) -> replies.Schema:
     """JSON schema of the reply."""
     kinds = (*((SeenObject, Surroundings) if wants_box else ()), *((Line,) if wants_direction else ()))
-    return schema_of(*kinds, reasoning_length=reasoning_length, numbers=frame.numbers, box_key=frame.coordinates.box)
+    box_key = frame.coordinates.box
+    return replies.schema_of(*kinds, reasoning_length=reasoning_length, numbers=frame.numbers, box_key=box_key)
 
 
 def read_located(
@@ -245,52 +198,58 @@ def read_located(
 
     `others` are the things that the question names besides.
     """
-    said = without_thinking(reply)
-    values = values_in(said)
+    said = replies.without_thinking(reply)
+    values = replies.values_in(said)
     place = _find_place(values, said, frame, wanted) if wants_box else None
     if wants_box and place is None:
         return None
     warnings: list[str] = []
-    line = read_line(values, said, ReadingContext(frame, warnings=warnings)) if wants_direction else None
+    line = _read_line(values, said, estimates.ReadingContext(frame, warnings=warnings)) if wants_direction else None
     if place is None:
         return Located(line=line, warnings=tuple(warnings))
-    around = [found for value in values for found in _places(fields_of(value).get("others"), frame)]
-    named = list(_named([found for found in around if not is_none(found.box)], others))
+
+    around = [found for value in values for found in _places(replies.fields_of(value).get("others"), frame)]
+    named = list(_named([found for found in around if not replies.is_none(found.box)], others))
     names = [wanted, *(name for name, _, _ in named)]
-    seen = _seen(place, ReadingContext(frame, wanted, names, warnings))
-    objects: list[LocatedObject] = []
+
+    def seen(name: str, found: Place) -> SeenObject:
+        context = estimates.ReadingContext(frame, name, names, warnings)
+        return SeenObject.model_validate({**found.fields, "label": found.label, "bbox": found.box}, context=context)
+
+    mover = seen(wanted, place)
+    objects: list[records.LocatedObject] = []
     for name, role, other in named:
         try:
-            found = _seen(other, ReadingContext(frame, name, names, warnings))
+            found = seen(name, other)
         except ReplyError as error:  # the mover matters more than asking for this again
             warnings.append(f"The reader's box of '{name}' was left out: {error}.")
             continue
-        if found.bbox is not None and role == "obstacle" and covers_image(frame.width, frame.height, found.bbox):
+        if found.bbox is None:
+            continue
+        if role == "obstacle" and coordinates.covers_image(frame.width, frame.height, found.bbox):
             warnings.append(f"The reader's box of '{name}' was left out: it covers nearly the whole image.")
-        elif found.bbox is not None:
-            objects.append(LocatedObject(object=name, bbox=found.bbox, role=role, prior=found.prior, source="mllm"))
+            continue
+        objects.append(records.LocatedObject(object=name, bbox=found.bbox, role=role, prior=found.prior, source="mllm"))
     return Located(
-        bbox=seen.bbox,
-        point=frame.point(place.point) if seen.bbox is None else None,
+        bbox=mover.bbox,
+        point=frame.point(place.point) if mover.bbox is None else None,
         label=place.label,
-        clipped=seen.bbox is not None and frame.overshoots(place.box),
+        clipped=mover.bbox is not None and frame.overshoots(place.box),
         others=tuple(objects),
-        prior=seen.prior,
+        prior=mover.prior,
         line=line,
         warnings=tuple(warnings),
     )
 
 
-def _seen(place: Place, context: ReadingContext) -> SeenObject:
-    return SeenObject.model_validate({**place.fields, "label": place.label, "bbox": place.box}, context=context)
-
-
-def separate_objects(mover: BBox, others: Sequence[LocatedObject]) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
+def separate_objects(
+    mover: records.BBox, others: Sequence[records.LocatedObject]
+) -> tuple[tuple[records.LocatedObject, ...], tuple[str, ...]]:
     """The others without those that have the box of the mover or of one before them, and with few obstacles.
 
     A target that goes is told of in a warning.
     """
-    kept: list[LocatedObject] = []
+    kept: list[records.LocatedObject] = []
     warnings: list[str] = []
     for other in others:
         boxes = [mover, *(each.bbox for each in kept)]
@@ -304,98 +263,111 @@ def separate_objects(mover: BBox, others: Sequence[LocatedObject]) -> tuple[tupl
 
 def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wanted: str) -> Place | None:
     """The place that the reply gives for the object; None where it says that it does not see it."""
-    places = [place for value in values for place in _places(value, frame)] or list(_tagged_places(said))
+    places = [place for value in values for place in _places(value, frame)] or list(_places_in_prose(said))
     if not places:
-        if any(is_none(value) for value in values):
+        if any(map(replies.is_none, values)):
             return None
         raise ReplyError(
             f"`{frame.coordinates.box}` is missing; give the box of '{wanted}', or null if it is not there"
         )
     distinct = list({repr((place.box, place.point)): place for place in places}.values())
     if len(distinct) > 1:
-        meant = name_words(wanted)
-        named = [place for place in distinct if name_words(place.label) == meant]
+        meant = replies.name_words(wanted)
+        named = [place for place in distinct if replies.name_words(place.label) == meant]
         if not named:
-            shared = [len(set(name_words(place.label)) & set(meant)) for place in distinct]
+            shared = [len(set(replies.name_words(place.label)) & set(meant)) for place in distinct]
             named = [place for place, count in zip(distinct, shared, strict=True) if count == max(shared) > 0]
         if len(named) != 1:
             labels = ", ".join(f"'{place.label}'" for place in distinct)
             raise ReplyError(f"{len(distinct)} places are given ({labels}); give one box, that of '{wanted}'")
         distinct = named
     (place,) = distinct
-    return None if is_none(place.box) and is_none(place.point) else place
+    return None if replies.is_none(place.box) and replies.is_none(place.point) else place
 
 
 def _places(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[Place]:
     """Places in a value, each with what it is called: by a field of its own, or by the field in which it stands."""
     if isinstance(value, list):
-        parts = listed(value)
-        if parts and all(map(is_number, parts)):
-            yield Place(name, parts, None, {}) if len(parts) == 4 else Place(name, None, parts, {})
+        parts = replies.listed(value)
+        if parts and all(map(replies.is_number, parts)):
+            yield Place(name, parts) if len(parts) == 4 else Place(name, None, parts)
         for part in parts:
             if isinstance(part, dict | list):
                 yield from _places(part, frame, name)
-    fields = fields_of(value)
+    fields = replies.fields_of(value)
     boxes, points = (frame.coordinates.box, *BOX_KEYS), (frame.coordinates.point, *POINT_KEYS)
     has_place = not fields.keys().isdisjoint((*boxes, *points))
-    if has_place or names_corners(fields):
-        label = next((label for key in _LABEL_KEYS if (label := text_of(fields.get(key)))), name)
-        yield Place(label, first_of(fields, *boxes) if has_place else value, first_of(fields, *points), fields)
+    if has_place or coordinates.names_corners(fields):
+        label = next((label for key in _LABEL_KEYS if (label := replies.text_of(fields.get(key)))), name)
+        box = replies.first_of(fields, *boxes) if has_place else value
+        yield Place(label, box, replies.first_of(fields, *points), fields)
         return
     for key, held in fields.items():
         if isinstance(held, dict | list) and key not in ("others", *_DIRECTION_KEYS):
             yield from _places(held, frame, name if key in _HEADINGS else key.replace("_", " "))
 
 
-def _tagged_places(said: str) -> Iterator[Place]:
+def _places_in_prose(said: str) -> Iterator[Place]:
     """Places between tags, as some families write them in prose; else numbers in brackets, where they are alone."""
     for found in _BOX_TAG.finditer(said):
-        yield Place((found["label"] or "").strip(), found["box"], None, {})
+        yield Place((found["label"] or "").strip(), found["box"])
     for found in _POINT_TAG.finditer(said):
-        yield Place((found["label"] or "").strip(), None, found["point"], {})
+        yield Place((found["label"] or "").strip(), None, found["point"])
     if "<" in said:
         return
     pairs, four = re.findall(_PAIR, said), _FOUR.fullmatch(said.strip(" ."))
     if four is not None:
-        yield Place("", list(four.groups()), None, {})
+        yield Place("", list(four.groups()))
     elif len(pairs) == 2 and (corners := _CORNER_PAIRS.search(said)):
-        yield Place("", list(corners.groups()), None, {})
+        yield Place("", list(corners.groups()))
     elif len(pairs) == 1:
-        yield Place("", None, list(pairs[0]), {})
+        yield Place("", None, list(pairs[0]))
 
 
-def _named(places: Sequence[Place], targets: Sequence[str]) -> Iterator[tuple[str, ObjectRole, Place]]:
+def _named(places: Sequence[Place], targets: Sequence[str]) -> Iterator[tuple[str, records.ObjectRole, Place]]:
     """Each place with its name and role: the targets, each once, then all the rest but the floor."""
     left = list(places)
     for target in targets:
-        wanted = set(name_words(target))
-        labels = [(set(name_words(place.label)), place) for place in left]
+        wanted = set(replies.name_words(target))
+        labels = [(set(replies.name_words(place.label)), place) for place in left]
         same = [place for held, place in labels if held == wanted]
         alike = [place for held, place in labels if held and (held < wanted or wanted < held)]
         for place in same[:1] or (alike if len(alike) == 1 else []):
             left = [other for other in left if other is not place]
             yield target, "target", place
     for place in left:
-        label = text_of(place.label)[:MAX_LABEL]
-        if label and support_named(label, "", ()) != FLOOR:
+        label = replies.text_of(place.label)[:MAX_LABEL]
+        if label and estimates.support_named(label, "", ()) != estimates.FLOOR:
             yield label, "obstacle", place
 
 
-def read_line(values: Sequence[object], said: str, context: ReadingContext) -> Line:
+def _read_line(values: Sequence[object], said: str, context: estimates.ReadingContext) -> Line:
     """The one line that a reply gives. Raises `ReplyError` where it gives none, several, or one that cannot be."""
-    lines = [Line.model_validate(fields, context=context) for value in values for fields in _line_fields(value)]
-    if not lines and not values and "<" not in said and (corners := _CORNER_PAIRS.search(said)):
-        lines = [Line.model_validate({"direction": list(corners.groups())}, context=context)]
+    written = [fields for value in values for fields in _line_fields(value)]
+    if not written and not values and "<" not in said and (corners := _CORNER_PAIRS.search(said)):
+        written = [{"direction": list(corners.groups())}]
+    lines = [Line.model_validate(fields, context=context) for fields in written]
     if not lines:
         raise ReplyError("`direction` is missing; give two points on the line of the motion, or null")
     for one, other in itertools.pairwise(lines):
         if one.direction is None or other.direction is None:
             same = one.direction == other.direction and one.camera == other.camera
         else:
-            same = all(math.dist(*ends) <= LEAST_LENGTH for ends in zip(one.direction, other.direction, strict=True))
+            gaps = map(math.dist, one.direction, other.direction)
+            same = all(gap <= coordinates.LEAST_LENGTH for gap in gaps)
         if not same:
             raise ReplyError("several directions are given; give one")
-    line = _one_depth(max(lines, key=lambda line: (line.cue is not None, line.camera is not None)))
+    line = max(lines, key=lambda line: (line.cue is not None, line.camera is not None))
+
+    # The line is either straight towards or away (`camera`), or at an angle (`direction` and `depth_degrees`).
+    if line.depth_degrees is not None:
+        sense: estimates.CameraSense = "away" if line.depth_degrees > 0 else "towards"
+        steep = abs(line.depth_degrees) >= STEEP
+        if line.camera is not None:
+            oblique = line.direction is not None and not steep
+            line = line.model_copy(update={"camera": None} if oblique else {"depth_degrees": None})
+        elif steep and (line.direction is None or _leads(line.direction, sense)):
+            line = line.model_copy(update={"camera": sense, "depth_degrees": None})
     if line.direction is not None and line.camera is not None and not _leads(line.direction, line.camera):
         raise ReplyError(
             "`direction` and `camera` disagree; `camera` is for what moves straight towards or away from it, else null"
@@ -406,13 +378,13 @@ def read_line(values: Sequence[object], said: str, context: ReadingContext) -> L
 def _line_fields(value: object) -> Iterator[dict[str, Any]]:
     """The fields of each line in a value, without headings and lists around it."""
     if isinstance(value, list):
-        parts = listed(value)
-        if len(parts) == 4 and all(map(is_number, parts)):
+        parts = replies.listed(value)
+        if len(parts) == 4 and all(map(replies.is_number, parts)):
             yield {"direction": parts}
         for part in parts:
             if isinstance(part, dict):
                 yield from _line_fields(part)
-    fields = fields_of(value)
+    fields = replies.fields_of(value)
     if not fields.keys().isdisjoint(_DIRECTION_KEYS):
         yield fields
     elif {"start", "end"} <= fields.keys():
@@ -423,86 +395,75 @@ def _line_fields(value: object) -> Iterator[dict[str, Any]]:
                 yield from _line_fields(held)
 
 
-def _one_depth(line: Line) -> Line:
-    """The line either straight towards or away (`camera`), or at an angle (`direction` and `depth_degrees`)."""
-    if line.depth_degrees is None:
-        return line
-    sense: CameraSense = "away" if line.depth_degrees > 0 else "towards"
-    steep = abs(line.depth_degrees) >= STEEP
-    if line.camera is not None:
-        oblique = line.direction is not None and not steep
-        return line.model_copy(update={"camera": None} if oblique else {"depth_degrees": None})
-    if steep and (line.direction is None or _leads(line.direction, sense)):
-        return line.model_copy(update={"camera": sense, "depth_degrees": None})
-    return line
-
-
-def _leads(ends: tuple[Point, Point], camera: CameraSense) -> bool:
+def _leads(ends: Ends, camera: estimates.CameraSense) -> bool:
     """Whether a line in the image can be that of something that moves straight towards or away from the camera."""
     (x0, y0), (x1, y1) = ends
     down = 1 if camera == "towards" else -1
     return abs(math.degrees(math.atan2(x1 - x0, down * (y1 - y0)))) <= STRAIGHT
 
 
-def _reference_length(written: object) -> float | None:
-    metres = None if is_none(written) else metres_of(written)
-    if not is_none(written) and (metres is None or not SIZES[0] <= metres <= SIZES[1]):
-        raise ReplyError(f"`metres` is {str(written)[:40]}; give the length in metres as a number from 0.001 to 1000")
-    return metres
-
-
-def _reference_ends(written: object, info: ValidationInfo) -> tuple[Point, Point] | None:
-    if is_none(written) or info.data.get("metres") is None:
-        return None
-    ends = context_of(info).frame.ends(written)
-    if math.dist(*ends) < LEAST_SPAN:
-        raise ReplyError("`ends` are too close to measure by; take a longer thing")
-    return ends
-
-
-def _down(written: object) -> Vector:
-    side = "bottom" if is_none(written) else _SIDES.get(text_of(written).lower().removesuffix(" side"))
-    if side is None:
-        raise ReplyError(f"`down` is {written!r}; give the side of the image to which things fall: {', '.join(DOWN)}")
-    return DOWN[side]
-
-
 class Scale(Reply):
     """How large the scene is at an object that falls, and which way things fall."""
 
     other_names: ClassVar = {"metres": ("meters", "length")}
-    reference: Annotated[str | None, BeforeValidator(name_of)]
-    metres: Annotated[
-        float | None,
-        PlainValidator(_reference_length),
-        WithJsonSchema(nullable(number(*SIZES))),
-    ]
-    ends: Annotated[tuple[Point, Point] | None, PlainValidator(_reference_ends), _COORDINATES]
-    down: Annotated[Vector, PlainValidator(_down), WithJsonSchema(nullable(one_of(*DOWN)))]
+    reference: Annotated[str | None, BeforeValidator(replies.name_of)]
+    metres: Annotated[float | None, WithJsonSchema(replies.nullable(replies.number(*estimates.SIZES)))]
+    ends: Annotated[Ends | None, _COORDINATES]
+    down: Annotated[records.Vector, WithJsonSchema(replies.nullable(replies.one_of(*DOWN)))]
+
+    @field_validator("metres", mode="before")
+    @classmethod
+    def _read_metres(cls, written: object) -> float | None:
+        metres = None if replies.is_none(written) else estimates.metres_of(written)
+        if not replies.is_none(written) and (metres is None or not estimates.SIZES[0] <= metres <= estimates.SIZES[1]):
+            shown = str(written)[:40]
+            raise ReplyError(f"`metres` is {shown}; give the length in metres as a number from 0.001 to 1000")
+        return metres
+
+    @field_validator("ends", mode="before")
+    @classmethod
+    def _read_ends(cls, written: object, info: ValidationInfo) -> Ends | None:
+        if replies.is_none(written) or info.data.get("metres") is None:
+            return None
+        ends = estimates.context_of(info).frame.ends(written)
+        if math.dist(*ends) < LEAST_SPAN:
+            raise ReplyError("`ends` are too close to measure by; take a longer thing")
+        return ends
+
+    @field_validator("down", mode="before")
+    @classmethod
+    def _read_down(cls, written: object) -> records.Vector:
+        said = replies.text_of(written).lower().removesuffix(" side")
+        side = "bottom" if replies.is_none(written) else _SIDES.get(said)
+        if side is None:
+            sides = ", ".join(DOWN)
+            raise ReplyError(f"`down` is {written!r}; give the side of the image to which things fall: {sides}")
+        return DOWN[side]
 
     @property
-    def metres_per_pixel(self) -> MetresPerPixel | None:
+    def metres_per_pixel(self) -> records.MetresPerPixel | None:
         """Null where nothing was known of any size."""
         if self.metres is None or self.ends is None:
             return None
         span = math.dist(*self.ends)
         note = f"{self.reference or 'an object of known size'}: {self.metres:g} m over {span:.0f} px"
-        return MetresPerPixel(value=self.metres / span, source="reference", note=note)
+        return records.MetresPerPixel(value=self.metres / span, source="reference", note=note)
 
 
 def scale_call(image: EncodedImage, name: str, reasoning_length: int) -> PromptCall[Scale]:
     """The call that asks how large the scene is at the object `name`, and which way is down."""
     frame = image.coordinate_frame
     inputs: dict[str, object] = {"object": " ".join(name.split()), "units": frame.units, "line_order": frame.line_order}
-    schema = schema_of(Scale, reasoning_length=reasoning_length, numbers=frame.numbers)
-    return PromptCall("scale", inputs, (image.jpeg,), schema, lambda reply: read_scale(reply, frame))
+    schema = replies.schema_of(Scale, reasoning_length=reasoning_length, numbers=frame.numbers)
+    return PromptCall("scale", inputs, (image.jpeg,), schema, partial(read_scale, frame=frame))
 
 
 def read_scale(reply: str, frame: CoordinateFrame) -> Scale:
     """What a reply says of the scale. Raises `ReplyError`."""
-    objects = [fields for value in values_in(without_thinking(reply)) if "ends" in (fields := fields_of(value))]
+    values = replies.values_in(replies.without_thinking(reply))
+    objects = [fields for fields in map(replies.fields_of, values) if "ends" in fields]
     if not objects:
         raise ReplyError("`ends` and `metres` are missing; give both, or null for both")
     if len(objects) > 1:
         raise ReplyError("several references are given; give one")
-    return Scale.model_validate(objects[0], context=ReadingContext(frame))
+    return Scale.model_validate(objects[0], context=estimates.ReadingContext(frame))

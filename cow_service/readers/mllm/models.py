@@ -1,7 +1,5 @@
 """The multimodal LLM of the settings: its manifest and family, and a client model of pydantic-ai to call it with."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
@@ -34,6 +32,7 @@ class ConfiguredModel:
     manifest: Manifest
     family: Family
     deterministic: bool = False  # temperature 0 gives the same reply each time: no provider promises that
+    upstream: Upstream | None = None  # the OpenAI-compatible server; None for a protocol of its own
 
     @property
     def supports_schema(self) -> bool:
@@ -89,23 +88,30 @@ def manifest_for(model: str) -> Manifest:
     return manifests[UNKNOWN]
 
 
-def _family_of(manifest: Manifest, name: str) -> Family:
-    """The family of a model; of one that only the generic manifest fits, the one that its served name matches."""
-    families = load_families()
-    if manifest.name != UNKNOWN:
-        return families[manifest.family or UNKNOWN]
-    matching = (f for f in families.values() if any(fnmatchcase(name.lower(), pattern) for pattern in f.also))
-    return next(matching, families[UNKNOWN])
-
-
 def configure(settings: Settings) -> ConfiguredModel:
     """The model of the settings, ready to be called; nothing is sent. Raises `ReaderUnavailable`."""
     resolved = resolve_model(settings)
     manifest, provider, name = resolved.manifest, resolved.provider, resolved.name
-    family, base_url = _family_of(manifest, name), settings.mllm_base_url
+    base_url, families = settings.mllm_base_url, load_families()
+    family = families[manifest.family or UNKNOWN]
+    if manifest.name == UNKNOWN:  # its served name may tell more
+        matching = (f for f in families.values() if any(fnmatchcase(name.lower(), pattern) for pattern in f.also))
+        family = next(matching, families[UNKNOWN])
     key = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
+
+    # A server of OpenAI's protocol, whoever made it.
     if base_url is not None and provider not in OWN_PROTOCOL:
-        return ConfiguredModel(_openai_compatible(base_url, key, name, family), name, manifest, family)
+        profile = OpenAIModelProfile(
+            supports_json_schema_output=family.structured_output == "native",
+            # The older name is the one that every such server knows.
+            openai_chat_supports_max_completion_tokens=False,
+        )
+        server = OpenAICompatibleProvider("mllm", base_url=base_url, api_key=key or NO_KEY)
+        model = OpenAIChatModel(name, provider=server, profile=profile)
+        upstream = Upstream(base_url.rstrip("/"), name, key)
+        return ConfiguredModel(model, name, manifest, family, upstream=upstream)
+
+    # A provider, of whatever protocol.
     if provider is None:
         raise ReaderUnavailable(
             f"COW_MLLM={settings.mllm!r} is served by no provider: set COW_MLLM_BASE_URL to the server that serves it "
@@ -116,18 +122,13 @@ def configure(settings: Settings) -> ConfiguredModel:
     except (ReaderUnavailable, UserError, ValueError, ImportError) as error:
         reason = str(error).splitlines()[0]
         raise ReaderUnavailable(f"COW_MLLM={settings.mllm!r} cannot be used: {reason}") from error
-    return ConfiguredModel(model, name, manifest, family)
-
-
-def _openai_compatible(base_url: str, key: str | None, name: str, family: Family) -> Model:
-    """A model behind OpenAI's protocol, whoever made it."""
-    profile = OpenAIModelProfile(
-        supports_json_schema_output=family.structured_output == "native",
-        # The older name is the one that every such server knows.
-        openai_chat_supports_max_completion_tokens=False,
-    )
-    provider = OpenAICompatibleProvider("mllm", base_url=base_url, api_key=key or NO_KEY)
-    return OpenAIChatModel(name, provider=provider, profile=profile)
+    client: Any = getattr(model, "client", None)
+    # Azure's addresses and headers are its own.
+    if not isinstance(client, AsyncOpenAI) or isinstance(client, AsyncAzureOpenAI):
+        return ConfiguredModel(model, name, manifest, family)
+    key = client.api_key if client.api_key != NO_KEY else None
+    upstream = Upstream(str(client.base_url).rstrip("/"), name, key or None)
+    return ConfiguredModel(model, name, manifest, family, upstream=upstream)
 
 
 def _model_of(name: str, model: str, base_url: str | None, key: str | None) -> Model:
@@ -148,16 +149,3 @@ def _model_of(name: str, model: str, base_url: str | None, key: str | None) -> M
             raise
         raise ReaderUnavailable("it needs a key: set COW_MLLM_API_KEY, or the provider's own variable.") from error
     return infer_model(f"{name}:{model}", provider_factory=lambda _: provider)
-
-
-def upstream_of(settings: Settings, resolved: ResolvedModel, configured: ConfiguredModel) -> Upstream | None:
-    """The OpenAI-compatible server of the settings, or that of a provider; None for a protocol of its own."""
-    if settings.mllm_base_url is not None and resolved.provider not in OWN_PROTOCOL:
-        key = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
-        return Upstream(settings.mllm_base_url.rstrip("/"), resolved.name, key)
-    client: Any = getattr(configured.model, "client", None)
-    # Azure's addresses and headers are its own.
-    if not isinstance(client, AsyncOpenAI) or isinstance(client, AsyncAzureOpenAI):
-        return None
-    key = client.api_key if client.api_key != NO_KEY else None
-    return Upstream(str(client.base_url).rstrip("/"), resolved.name, key or None)

@@ -1,7 +1,5 @@
 """The reader that asks a multimodal LLM. A simulation takes two calls one after the other, an answer one more."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Sequence
@@ -9,44 +7,21 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
-from cow_service import __version__
+from cow_service import __version__, records
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import (
-    AnswerReading,
-    GroundingReading,
-    Imagined,
-    MotionHints,
-    MotionReading,
-    OtherMotionHint,
-    OtherMotionReading,
-    Quantity,
-    ReaderInput,
-)
-from cow_service.readers.chat import ChatTurn, Upstream
+from cow_service.readers import base
+from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage, covers_image, encode
 from cow_service.readers.mllm.estimates import HEADING_DEVIATION, SPEED_DEVIATION
 from cow_service.readers.mllm.hypothesis import pictures
-from cow_service.readers.mllm.identify import Change, Identified, identify_call
+from cow_service.readers.mllm.identify import Identified, identify_call
 from cow_service.readers.mllm.locate import Located, Scale, locate_call, scale_call, separate_objects
-from cow_service.readers.mllm.models import UNKNOWN, configure, resolve_model, upstream_of
+from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
-from cow_service.records import (
-    DIRECTED_KINDS,
-    FALLING_KINDS,
-    AnswerOption,
-    BBox,
-    Grounding,
-    Intervention,
-    LocatedObject,
-    MotionKind,
-    ReaderInfo,
-    Source,
-    Vector,
-)
 from cow_service.settings import Settings
 from cow_service.vision.arrow_choice import arrow_at
 from cow_service.vision.masks import iou
@@ -55,7 +30,7 @@ from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import PROMPTS
 
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
-DEFAULT_KIND: MotionKind = "linear"
+DEFAULT_KIND: records.MotionKind = "linear"
 ARROW_TOLERANCE = 25.0  # degrees between an arrow and what was read of it; past that the arrow is right
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
 
@@ -63,17 +38,26 @@ DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing e
 class MllmReader:
     """Asks one model for everything. It keeps its connections, and nothing of what it read."""
 
-    source: Source = "mllm"
+    source: records.Source = "mllm"
 
-    def __init__(self, name: str, client: MllmClient, origin: str = "", upstream: Upstream | None = None) -> None:
+    def __init__(self, name: str, client: MllmClient, origin: str = "") -> None:
         """`origin` says which server, or which weights."""
-        self.upstream = upstream
         self._client = client
         self._model = client.model
+        self.upstream = self._model.upstream
         self._origin = origin
         self._subject = f"The multimodal LLM '{self._model.name}'"
         self._reasoning = int(self._model.manifest.defaults.get("max_reasoning", DEFAULT_REASONING_LENGTH))
-        self.info = ReaderInfo(name=name, model=self._model.name)
+        self.info = records.ReaderInfo(name=name, model=self._model.name)
+        self._family_warnings: tuple[str, ...] = ()
+        if self._model.manifest.name == UNKNOWN:
+            family = self._model.family.name
+            taken = f"by its name it was taken for one of the family '{family}'"
+            if family == UNKNOWN:
+                taken = (
+                    "coordinates were asked for as fractions, and a model that is used to others may have given those"
+                )
+            self._family_warnings = (f"No manifest describes '{self._model.name}': {taken}.",)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -99,13 +83,12 @@ class MllmReader:
         """The reply to a chat of OpenAI's protocol, through pydantic-ai. Raises `InvalidRequest`, `MllmUnavailable`."""
         return await self._client.chat(body)
 
-    def ground(self, given: ReaderInput) -> GroundingReading:
+    def ground(self, given: base.ReaderInput) -> base.GroundingReading:
         """Two calls: what moves, in words; then where it is and, in the same call, which way it moves.
 
         Raises `ObjectNotFound`, `MllmBadReply`, `MllmUnavailable`.
         """
-        image = self._encode(given)
-        identified = self._client.complete(identify_call(given.question, image, self._reasoning), given)
+        image, identified = self._identify(given)
         if identified is None:
             raise ObjectNotFound(
                 f"{self._subject} sees nothing in the image that the question could move. {GIVE_PLACE}"
@@ -117,58 +100,83 @@ class MllmReader:
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
             warnings = box_warnings(given.scene, bbox, identified.object, located.clipped)
         others, doubles = separate_objects(bbox, located.others)
-        mover = LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
-        missing = f"{self._subject} does not see '{{name}}' in the image, which the question changes. {GIVE_PLACE}"
-        interventions = _located_changes(identified.changes, mover, others, missing)
+        mover = records.LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
+        known = {name_words(each.object): each for each in (mover, *others)}
+
+        def changed(name: str) -> records.LocatedObject:
+            found = known.get(name_words(name))
+            if found is None:
+                raise ObjectNotFound(
+                    f"{self._subject} does not see '{name}' in the image, which the question changes. {GIVE_PLACE}"
+                )
+            return found.model_copy(update={"role": "target"})
+
+        interventions = tuple(
+            records.Intervention(
+                kind=each.kind,
+                object=changed(each.object),
+                relation=each.relation,
+                targets=tuple(map(changed, each.targets)),
+            )
+            for each in identified.changes
+        )
         removed = {each.object.bbox for each in interventions if each.kind == "remove"}
         if located.label and set(name_words(located.label)).isdisjoint(name_words(identified.object)):
             mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
             warnings = (*warnings, mismatch)
-        return GroundingReading(
+        return base.GroundingReading(
             object=identified.object,
             bbox=bbox,
             point=located.point,
             others=tuple(other for other in others if other.bbox not in removed),
             interventions=interventions,
-            warnings=(*warnings, *located.warnings, *doubles, *self._family_warnings()),
+            warnings=(*warnings, *located.warnings, *doubles, *self._family_warnings),
             hints=hints if given.motion_wanted else None,
             prior=located.prior,
             asked=identified.asked,
         )
 
-    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
+    def read_motion(
+        self, given: base.ReaderInput, grounding: records.Grounding, hints: base.MotionHints | None
+    ) -> base.MotionReading:
         """No call with hints, else two.
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
         """
         warnings: tuple[str, ...] = ()
+        places = {name_words(each.object): each for each in grounding.others}
         if hints is None:
-            image = self._encode(given)
-            identified = self._client.complete(identify_call(given.question, image, self._reasoning), given)
+            image, identified = self._identify(given)
             located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
             warnings = () if located is None else located.warnings
-            known = {name_words(each.object) for each in grounding.others}
-            lost = [each.object for each in hints.also if name_words(each.object) not in known]
+            lost = [each.object for each in hints.also if name_words(each.object) not in places]
             hints = hints.model_copy(update={"also": tuple(each for each in hints.also if each.object not in lost)})
             warnings += tuple(f"'{name}' moves, too, and was left out: it has no place. {GIVE_OBJECT}" for name in lost)
+        others: list[base.OtherMotionReading] = []
+        for hint in hints.also:
+            place = places.get(name_words(hint.object))
+            if place is None:
+                raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found. {GIVE_DIRECTION}")
+            others.append(base.OtherMotionReading(place, hint.kind, hint.direction, hint.depth))
         kind = hints.kind or DEFAULT_KIND
-        others = _located_others(hints.also, grounding.others)
-        reading = MotionReading(kind, None, "text", sentence=hints.sentence, warnings=warnings, others=others)
-        if kind in FALLING_KINDS:
+        reading = base.MotionReading(
+            kind, None, "text", sentence=hints.sentence, warnings=warnings, others=tuple(others)
+        )
+        if kind in records.FALLING_KINDS:
             reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
             if hints.scale_error:
                 warning = f"The scale of the scene could not be read ({hints.scale_error}): the default one was taken."
                 reading = replace(reading, warnings=(*warnings, warning))
-        return self._directed(given, grounding, reading, hints) if kind in DIRECTED_KINDS else reading
+        return self._directed(given, grounding, reading, hints) if kind in records.DIRECTED_KINDS else reading
 
     def answer(
         self,
-        given: ReaderInput,
-        options: Sequence[AnswerOption],
-        grounding: Grounding | None,
-        imagined: Imagined | None,
+        given: base.ReaderInput,
+        options: Sequence[records.AnswerOption],
+        grounding: records.Grounding | None,
+        imagined: base.Imagined | None,
         votes: int,
-    ) -> tuple[AnswerReading, ...]:
+    ) -> tuple[base.AnswerReading, ...]:
         """One call per vote, all at the same time. Raises `MllmBadReply`, `MllmUnavailable` where all of them fail."""
         with given.cpu():
             pixels = (given.scene.image, *(() if imagined is None else pictures(imagined)))
@@ -180,13 +188,20 @@ class MllmReader:
             raise next(each for each in results if isinstance(each, CowError))
         return readings
 
-    def _encode(self, given: ReaderInput) -> EncodedImage:
+    def _identify(self, given: base.ReaderInput) -> tuple[EncodedImage, Identified | None]:
+        """The image as it is sent, and what is asked of it."""
         with given.cpu():
-            return encode(given.scene.image, self._model.family)
+            image = encode(given.scene.image, self._model.family)
+        return image, self._client.complete(identify_call(given.question, image, self._reasoning), given)
 
     def _locate(
-        self, given: ReaderInput, image: EncodedImage, identified: Identified | None, name: str, bbox: BBox | None
-    ) -> tuple[Located | None, MotionHints]:
+        self,
+        given: base.ReaderInput,
+        image: EncodedImage,
+        identified: Identified | None,
+        name: str,
+        bbox: records.BBox | None,
+    ) -> tuple[Located | None, base.MotionHints]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
         None where the place was not asked for, or the object not seen. Raises `MllmBadReply`, `MllmUnavailable`.
@@ -196,9 +211,9 @@ class MllmReader:
         if identified is not None and bbox is None:
             named = (*identified.must_be_found, *given.sought, *identified.others)
             others = tuple(dict.fromkeys(each for each in named if name_words(each) != name_words(name)))
-        wants_direction = given.motion_wanted and kind in DIRECTED_KINDS
+        wants_direction = given.motion_wanted and kind in records.DIRECTED_KINDS
         wants_place = bbox is None or wants_direction
-        wants_scale = given.motion_wanted and kind in FALLING_KINDS
+        wants_scale = given.motion_wanted and kind in records.FALLING_KINDS
         calls: list[PromptCall[Any]] = []
         if wants_place:
             calls.append(locate_call(given.question, image, name, bbox, others, wants_direction, self._reasoning))
@@ -218,11 +233,15 @@ class MllmReader:
             hints |= {"metres_per_pixel": scaled.metres_per_pixel, "down": scaled.down}
         elif isinstance(scaled, CowError):
             hints["scale_error"] = scaled.code
-        return located, MotionHints(**hints)
+        return located, base.MotionHints(**hints)
 
     def _directed(
-        self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints
-    ) -> MotionReading:
+        self,
+        given: base.ReaderInput,
+        grounding: records.Grounding,
+        reading: base.MotionReading,
+        hints: base.MotionHints,
+    ) -> base.MotionReading:
         """The reading with its direction, checked against the drawn arrow where one is the cue."""
         if hints.ends is None and hints.camera is None:
             raise CannotReadDirection(
@@ -232,7 +251,7 @@ class MllmReader:
         reading = replace(
             reading, distance=hints.distance, duration=hints.duration, until=hints.until, steps=hints.then
         )
-        if isinstance(hints.speed, Quantity):
+        if isinstance(hints.speed, base.Quantity):
             reading = replace(reading, speed=hints.speed)
         elif hints.speed is not None:
             reading = replace(reading, speed=hints.speed, speed_deviation=SPEED_DEVIATION)
@@ -250,24 +269,13 @@ class MllmReader:
         with given.cpu():
             return follow_arrow(given.scene, grounding.bbox, replace(reading, along_arrow=hints.along_arrow))
 
-    def _family_warnings(self) -> tuple[str, ...]:
-        manifest, family = self._model.manifest, self._model.family
-        if manifest.name != UNKNOWN:
-            return ()
-        taken = "coordinates were asked for as fractions, and a model that is used to others may have given those"
-        if family.name != UNKNOWN:
-            taken = f"by its name it was taken for one of the family '{family.name}'"
-        return (f"No manifest describes '{self._model.name}': {taken}.",)
-
 
 def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable` where COW_MLLM cannot be used."""
-    configured = configure(settings)
-    upstream = upstream_of(settings, resolve_model(settings), configured)
-    return MllmReader("mllm", MllmClient(configured, settings), settings.mllm_base_url or "", upstream)
+    return MllmReader("mllm", MllmClient(configure(settings), settings), settings.mllm_base_url or "")
 
 
-def follow_arrow(scene: Scene, bbox: BBox, reading: MotionReading) -> MotionReading:
+def follow_arrow(scene: Scene, bbox: records.BBox, reading: base.MotionReading) -> base.MotionReading:
     """The reading, with the direction of the arrow drawn at the object where the two are at odds.
 
     `along_arrow` says whether the object moves with it; where the reader does not say, only the arrow's axis counts.
@@ -292,7 +300,7 @@ def follow_arrow(scene: Scene, bbox: BBox, reading: MotionReading) -> MotionRead
     return replace(reading, direction=drawn, along_arrow=along, sentence=None, warnings=warnings)
 
 
-def box_warnings(scene: Scene, bbox: BBox, name: str, clipped: bool) -> tuple[str, ...]:
+def box_warnings(scene: Scene, bbox: records.BBox, name: str, clipped: bool) -> tuple[str, ...]:
     """What speaks against a box that was given for an object of this name; empty where nothing does.
 
     `clipped`: the box reached over the image's edge.
@@ -314,40 +322,6 @@ def box_warnings(scene: Scene, bbox: BBox, name: str, clipped: bool) -> tuple[st
     return tuple(found)
 
 
-def _angle(a: Vector, b: Vector) -> float:
+def _angle(a: records.Vector, b: records.Vector) -> float:
     """Degrees between two vectors, 0 to 180."""
     return abs(math.degrees(math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])))
-
-
-def _located_changes(
-    changes: Sequence[Change], mover: LocatedObject, others: Sequence[LocatedObject], missing: str
-) -> tuple[Intervention, ...]:
-    """The changes with the places of their objects. Raises `ObjectNotFound`, with `missing` and the name put in."""
-    known = {name_words(each.object): each for each in (mover, *others)}
-
-    def place(name: str) -> LocatedObject:
-        found = known.get(name_words(name))
-        if found is None:
-            raise ObjectNotFound(missing.format(name=name))
-        return found.model_copy(update={"role": "target"})
-
-    return tuple(
-        Intervention(
-            kind=each.kind, object=place(each.object), relation=each.relation, targets=tuple(map(place, each.targets))
-        )
-        for each in changes
-    )
-
-
-def _located_others(
-    hints: Sequence[OtherMotionHint], others: Sequence[LocatedObject]
-) -> tuple[OtherMotionReading, ...]:
-    """Other movers with their places. Raises `CannotReadDirection` for one that was not found."""
-    known = {name_words(each.object): each for each in others}
-    found: list[OtherMotionReading] = []
-    for hint in hints:
-        place = known.get(name_words(hint.object))
-        if place is None:
-            raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found. {GIVE_DIRECTION}")
-        found.append(OtherMotionReading(place, hint.kind, hint.direction, hint.depth))
-    return tuple(found)

@@ -4,8 +4,6 @@ Models fence their JSON, quote it as Python does, think aloud before it or write
 repaired by a library, but only where its brackets close: a reply that was cut short must not become a shorter number.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator
