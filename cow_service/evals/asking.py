@@ -1,24 +1,39 @@
-"""One question, asked once: the order of its options, what its replies choose, and what is observed of it."""
+"""One question, asked once: the order of its options, who is asked, what is replied, and what is observed of it.
 
-from __future__ import annotations
+There are two ways to ask: a multimodal LLM itself through Inspect, or the service's own `/answer`.
+"""
 
 import ast
+import base64
 import hashlib
 import random
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import permutations
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
-from cow_service.evals.imagination import NO_USAGE, Arm, Evidence
-from cow_service.evals.items import Item, Observation, question_text
+from inspect_ai import model as inspect_model
+
+from cow_service.client import AsyncAnswer, AsyncClient
+from cow_service.client.errors import error_from
+from cow_service.errors import MllmUnavailable
+from cow_service.evals.imagination import NO_USAGE, REFUSALS, Arm, Evidence, Imagination, asked_once, evidence_of
+from cow_service.evals.items import Item, Observation, Pictures, question_text
+from cow_service.media.artifacts import media_type_of
 from cow_service.readers.mllm.answer import read_answer
 from cow_service.readers.mllm.replies import ReplyError
 from cow_service.readers.options import plain
-from cow_service.records import AnswerOption, Usage
+from cow_service.readers.prompts import load_prompt
+from cow_service.records import AnswerOption, Usage, Verdict
+from cow_service.stages.answering import gate_of
+from cow_service.stages.keys import FirstAnswers
 
+GATE_VOTES = 3
+GATE_THRESHOLD = 1.0
+PROMPT = "eval-question"
+OVERLAY = "Not sent to the model: the overlay of the simulation that the frames are of."
 # Where the public rules and ours differ, for readers of a report.
 DIFFERENCES = (
     "A reply that gives an option's text instead of its letter is read here; the paper's rules take the text's first "
@@ -196,3 +211,131 @@ def happens(item: Item) -> bool | None:
     """Whether what is asked happens, by the truth; None where the right option is neither yes nor no."""
     said = plain(next(option.text for option in item.options if option.letter == item.answer))
     return {"yes": True, "true": True, "no": False, "false": False}.get(said.partition(" ")[0])
+
+
+@dataclass(frozen=True)
+class PromptAsker:
+    """Asks a model. Every reply is kept as soon as it has come, and never asked for again in the same run."""
+
+    model: inspect_model.Model
+    imagination: Imagination
+    pictures: Pictures
+    key: str  # of the run: replies of other runs are not taken
+
+    async def __call__(self, case: Case) -> CaseReplies:
+        """Imagines where the arm says so, and asks. Raises `MllmUnavailable`, and what a simulation failed with."""
+        first: tuple[Reply, ...] = ()
+        if case.arm.gated:
+            alone = self._messages(case, Evidence())
+            first = tuple([await self._ask(case, alone, f"first {vote}") for vote in range(GATE_VOTES)])
+            letters = [letter for reply in first if (letter := case.read(reply.text)) is not None]
+            leader, verdict = leading(letters), None
+            if leader is not None:
+                votes = dict(Counter(letters).most_common())
+                verdict = Verdict(answer=leader, not_sure=leader == case.item.abstain, votes=votes)
+            # Whether to imagine is decided by the rule of `/answer`.
+            if not gate_of(FirstAnswers(verdict=verdict, asked=len(first)), GATE_THRESHOLD).imagined:
+                return CaseReplies(first)
+        trials = range(case.arm.tries)
+        evidence = tuple([await self.imagination.evidence(case.item, case.arm.shown, trial) for trial in trials])
+        replies: list[Reply] = []
+        messages: list[inspect_model.ChatMessage] = []
+        for trial, found in enumerate(evidence):
+            messages = self._messages(case, found)
+            replies.append(await self._ask(case, messages, f"look {trial}"))
+        return CaseReplies((*first, *replies), evidence, len(first), tuple(messages))
+
+    async def _ask(self, case: Case, messages: list[inspect_model.ChatMessage], purpose: str) -> Reply:
+        # The repeat is part of the key by itself: it is Inspect's epoch.
+        scopes = {"run": self.key, "arm": case.arm.name, "item": case.item.id, "purpose": purpose}
+        try:
+            output = await self.model.generate(messages, cache=inspect_model.CachePolicy(expiry=None, scopes=scopes))
+        except Exception as error:
+            # Providers raise what they like; Inspect has tried again where that may help.
+            told = getattr(error, "provider_message", None) or str(error)
+            raise MllmUnavailable(f"{self.model} gave no reply: {told}") from error
+        usage = Usage(calls=1)
+        if (used := output.usage) is not None:
+            cached = (used.input_tokens_cache_read or 0) + (used.input_tokens_cache_write or 0)
+            usage = Usage(calls=1, input_tokens=used.input_tokens + cached, output_tokens=used.output_tokens)
+        return Reply(output.completion, usage, output.time or 0.0)
+
+    def _messages(self, case: Case, evidence: Evidence) -> list[inspect_model.ChatMessage]:
+        """One message: pictures, then the question."""
+        with_image = case.arm.with_image or not evidence.frames
+        shown = "image-and-facts" if evidence.facts else "nothing"
+        if evidence.frames:
+            shown = "image-and-frames" if with_image else "frames"
+        text = load_prompt(PROMPT).render(question=case.question, shown=shown, facts=evidence.facts)
+        digests = (*((case.item.image,) if with_image else ()), *evidence.frames)
+        return [message(digests, text, self.pictures)]
+
+
+@dataclass(frozen=True)
+class AnswerAsker:
+    """Asks a server. The same run never asks the same twice: requests have idempotency keys."""
+
+    client: AsyncClient
+    pictures: Pictures
+    options: Mapping[str, Any]  # fields of the requests
+    key: str  # of the run
+
+    async def __call__(self, case: Case) -> CaseReplies:
+        """Asks, once per try of the arm."""
+        imagine = "never" if case.arm.shown == "nothing" else "auto" if case.arm.gated else "always"
+        asked = [await self._ask(case, imagine, trial) for trial in range(case.arm.tries)]
+        return CaseReplies(tuple(reply for reply, _ in asked), tuple(found for _, found in asked))
+
+    async def _ask(self, case: Case, imagine: Literal["always", "auto", "never"], trial: int) -> tuple[Reply, Evidence]:
+        options: Any = {**self.options, **({"seed": trial} if trial else {})}
+        image = self.pictures.path(case.item.image)
+
+        async def ask(key: str) -> AsyncAnswer:
+            return await self.client.answer(image, case.question, idempotency_key=key, imagine=imagine, **options)
+
+        parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))
+        answer = await asked_once(ask, *parts)
+        found = Evidence()
+        if answer.simulation_problem is not None:
+            problem = error_from(answer.simulation_problem.model_dump())
+            if not isinstance(problem, REFUSALS):
+                raise problem
+            found = Evidence(refusal=problem)
+        elif answer.simulation is not None:
+            found = await evidence_of(answer.simulation, self.client, self.pictures)
+        # Usage and stages are of everything together: what is not of the simulation stands with the reply.
+        seconds = max(0.0, sum(answer.timings.values()) - found.seconds)
+        # In the form that the paper's prompt asks for.
+        said = answer.answer or ("Not sure" if answer.not_sure else "")
+        reasons = answer.reasoning.replace("'", "\u2019")
+        text = f"{{'Reasoning': '{reasons}', 'Answer': '{said}'}}"
+        return Reply(text, answer.usage_total, seconds), found
+
+
+def message(digests: Iterable[str], text: str, pictures: Pictures) -> inspect_model.ChatMessageUser:
+    """Pictures, then a text."""
+    content: list[inspect_model.Content] = []
+    for data in map(pictures.read, digests):
+        url = f"data:{media_type_of(data)};base64,{base64.b64encode(data).decode()}"
+        content.append(inspect_model.ContentImage(image=url))
+    return inspect_model.ChatMessageUser(content=[*content, inspect_model.ContentText(text=text)])
+
+
+def conversation(
+    case: Case, asked: CaseReplies, overlay: str | None, pictures: Pictures
+) -> list[inspect_model.ChatMessage]:
+    """What a viewer shows: what was asked last, every reply, and in the first repeat the overlay.
+
+    What `/answer` sends by itself is not known here: in its place stand the image, the frames and the question.
+    """
+    frames = [digest for found in asked.evidence for digest in found.frames]
+    sent: tuple[inspect_model.ChatMessage, ...] = asked.messages or (
+        message((case.item.image, *frames), case.question, pictures),
+    )
+    shown: list[inspect_model.ChatMessage] = [
+        *sent,
+        *(inspect_model.ChatMessageAssistant(content=reply.text) for reply in asked.replies),
+    ]
+    if overlay is not None and case.repeat == 1:
+        shown.append(message((overlay,), OVERLAY, pictures))
+    return shown

@@ -1,7 +1,5 @@
 """What is shown beside a question in each arm of an evaluation, and the simulations that it takes."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import re
@@ -171,7 +169,12 @@ class Imagination:
             return Evidence(refusal=refusal, usage=usage, seconds=time.monotonic() - begun)
         found = replace(await evidence_of(simulation, self._client, self._pictures), usage=usage, seconds=seconds)
         if shown == "facts":
-            return replace(found, frames=(), facts=_facts(simulation))
+            # In the words in which `/answer` tells it.
+            told: Any = hypothesis(Imagined(simulation, ()))
+            nothing = (
+                "The moving object meets nothing." if told["encounters_known"] else "It is not known what it meets."
+            )
+            return replace(found, frames=(), facts=(*told["facts"], *told["encounters"]) or (nothing,))
         return replace(found, probability=None) if shown == "wrong-direction" else found
 
     async def _simulate(self, item: Item, trial: int, changes: Mapping[str, Any]) -> AsyncSimulation:
@@ -195,15 +198,6 @@ async def evidence_of(simulation: AsyncSimulation, client: AsyncClient, pictures
         probability=None if outcome is None else outcome.probability,
         seconds=sum(simulation.timings.values()),
         simulated=True,
-    )
-
-
-def _facts(simulation: Simulation) -> tuple[str, ...]:
-    """What a simulation found, in the words in which `/answer` tells it."""
-    told: Any = hypothesis(Imagined(simulation, ()))
-    found = tuple(told["facts"]) + tuple(told["encounters"])
-    return found or (
-        "The moving object meets nothing." if told["encounters_known"] else "It is not known what it meets.",
     )
 
 

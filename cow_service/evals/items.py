@@ -1,7 +1,5 @@
 """What is asked and what comes of it: an item is one question on one image, with its options and its truth."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path

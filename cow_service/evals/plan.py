@@ -1,7 +1,5 @@
 """What is to be asked, checked before anything is, and as the record of the run."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform
@@ -96,13 +94,20 @@ def info_of(plan: Plan, items: Sequence[Item], found: Collected, arms: Sequence[
     if plan.ask == "prompt":
         generation = {"temperature": plan.temperature, "max_tokens": plan.max_tokens or MAX_TOKENS}
         settings["generation"] = {**generation, "base_url": plan.base_url}
+    mllm = plan.mllm
+    if mllm is None and plan.url is not None:  # the service answers by itself
+        mllm = f"cow at {plan.url}" + ("" if plan.reader is None else f", reader {plan.reader}")
+    elif mllm is None:
+        own = load_settings()
+        reader = plan.reader or own.reader
+        mllm = f"cow/{own.mllm}" if reader == "mllm" and own.mllm else f"cow/{reader}"
     return RunInfo(
         data=plan.data,
         data_digest=digest_of(items),
         counts=dict(sorted(counts.items())),
         faults=tuple(found.faults),
         notes=tuple(found.notes),
-        mllm=plan.mllm or _own_name(plan),
+        mllm=mllm,
         ask=plan.ask,
         arms=tuple(arm.name for arm in arms),
         repeats=plan.repeats,
@@ -112,15 +117,6 @@ def info_of(plan: Plan, items: Sequence[Item], found: Collected, arms: Sequence[
         token=secrets.token_hex(16),
         created_at=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-
-
-def _own_name(plan: Plan) -> str:
-    """Who answers where the service does by itself."""
-    if plan.url is not None:
-        return f"cow at {plan.url}" + ("" if plan.reader is None else f", reader {plan.reader}")
-    settings = load_settings()
-    reader = plan.reader or settings.reader
-    return f"cow/{settings.mllm}" if reader == "mllm" and settings.mllm else f"cow/{reader}"
 
 
 def merged(before: RunInfo | None, wanted: RunInfo, *, again: bool) -> RunInfo:

@@ -1,21 +1,11 @@
 """A folder of results: what was asked, and what came of it, which stands in Inspect's logs alone."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from inspect_ai.log import (
-    EvalLog,
-    EvalSample,
-    ProvenanceData,
-    invalidate_samples,
-    list_eval_logs,
-    read_eval_log,
-    write_eval_log,
-)
+from inspect_ai import log as inspect_log
 from pydantic import ValidationError
 
 from cow_service.errors import InvalidRequest
@@ -29,8 +19,7 @@ LOGS = "logs"  # Inspect's
 CACHE = "cache"  # every reply that has come
 SERVER = "server"  # the data and the log of a server in the process
 REPORT = "report"
-
-
+ITEM, OBSERVATION = "item", "observation"  # where a sample of a log holds them
 # What a log holds beside: pictures and every step of the way.
 _NOT_READ = {"messages", "events", "attachments", "output", "store", "timelines"}
 _CANCELED = "CancelledError("  # how Inspect writes down what an interrupt cut off
@@ -91,8 +80,8 @@ def _unreadable(folder: Path, name: str, error: Exception) -> InvalidRequest:
 def read_observations(folder: Path) -> list[Observation]:
     """The observations of all logs of a folder; of a question that was asked again, the last."""
     found: dict[tuple[str, str, int], Observation] = {}
-    for info in list_eval_logs(str(folder), descending=False):  # the oldest first
-        log = read_eval_log(info, exclude_fields=_NOT_READ)
+    for info in inspect_log.list_eval_logs(str(folder), descending=False):  # the oldest first
+        log = inspect_log.read_eval_log(info, exclude_fields=_NOT_READ)
         for sample in log.samples or ():
             each = _observation(log, sample)
             if each is not None:
@@ -103,7 +92,7 @@ def read_observations(folder: Path) -> list[Observation]:
     return list(found.values())
 
 
-def _observation(log: EvalLog, sample: EvalSample) -> Observation | None:
+def _observation(log: inspect_log.EvalLog, sample: inspect_log.EvalSample) -> Observation | None:
     """What came of a sample; None where it was canceled."""
     for score in (sample.scores or {}).values():
         if score.metadata and OBSERVATION in score.metadata:
@@ -120,14 +109,11 @@ def _observation(log: EvalLog, sample: EvalSample) -> Observation | None:
 def forget_failures(folder: Path) -> int:
     """Marks what failed, so that it is asked again; returns how many there were."""
     count = 0
-    for info in list_eval_logs(str(folder)):
-        log = read_eval_log(info)
+    for info in inspect_log.list_eval_logs(str(folder)):
+        log = inspect_log.read_eval_log(info)
         failed = [sample.uuid for sample in log.samples or () if sample.error is not None and sample.uuid]
         if failed:
-            why = ProvenanceData(author="cow eval", reason="asked again: --retry-failed")
-            write_eval_log(invalidate_samples(log, failed, why), info.name)
+            why = inspect_log.ProvenanceData(author="cow eval", reason="asked again: --retry-failed")
+            inspect_log.write_eval_log(inspect_log.invalidate_samples(log, failed, why), info.name)
             count += len(failed)
     return count
-
-
-ITEM, OBSERVATION = "item", "observation"  # where a sample of a log holds them

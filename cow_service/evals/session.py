@@ -1,12 +1,10 @@
 """What every task of an evaluation shares: the server that it asks, where its pictures are kept, and its progress."""
 
-from __future__ import annotations
-
 import asyncio
 import tempfile
 import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -40,7 +38,7 @@ class Session:
     reply_key: str  # of the run: names its replies
     options: Mapping[str, Any]  # fields of the requests for simulations and answers
     items: Sequence[Item] | None = None  # of its tasks; None: each task loads its own
-    progress: Progress | None = None
+    progress: "Progress | None" = None
     _clients: dict[int, tuple[AsyncClient, Imagination]] = field(default_factory=dict)
 
     def count(self, arm: str, seen: Observation | None) -> None:
@@ -68,7 +66,7 @@ def session(
 
     Raises the `CowError` for which that server cannot be started.
     """
-    with _server(folder, url, settings) as address:
+    with nullcontext(url) if url is not None else _server(folder, settings) as address:
         _active.append(Session(address, Pictures(folder / PICTURES), key, reply_key, options))
         try:
             yield _active[-1]
@@ -82,28 +80,21 @@ def active_session() -> Session | None:
 
 
 @contextmanager
-def _server(folder: Path, url: str | None, settings: Mapping[str, Any]) -> Generator[str]:
-    if url is not None:
-        yield url
-        return
+def _server(folder: Path, settings: Mapping[str, Any]) -> Generator[str]:
     from cow_service.server import serving  # noqa: PLC0415 - where a server is named, none is imported
     from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
     known = load_settings(data_dir=folder / SERVER, host="127.0.0.1", port=0, **settings)
     (folder / SERVER).mkdir(parents=True, exist_ok=True)
-    with (folder / SERVER / LOG).open("a", encoding="utf-8") as log:
+    with (folder / SERVER / LOG).open("a", encoding="utf-8") as log, ExitStack() as stack:
         logging.set_up(known, out=log, err=log)
+        stack.callback(logging.set_up, known)
         service = Service(known)
         pool = WorkerPool(known, service.metrics) if known.workers else None
-        try:
-            if pool is not None:
-                pool.start()  # it computes in processes of its own: replies are read, and kept, as they come
-            with serving(service, pool) as address:
-                yield address
-        finally:
-            if pool is not None:
-                pool.close()
-            logging.set_up(known)
+        if pool is not None:
+            stack.callback(pool.close)
+            pool.start()  # it computes in processes of its own: replies are read, and kept, as they come
+        yield stack.enter_context(serving(service, pool))
 
 
 def own_folder() -> Path:

@@ -1,7 +1,5 @@
 """Rates, and what is gained by an arm over another: paired by question and repeat, drawn by scene."""
 
-from __future__ import annotations
-
 import math
 import statistics
 import zlib
@@ -124,7 +122,9 @@ def gain(arm: Sequence[Observation], baseline: Sequence[Observation], resamples:
 
     The interval is a bootstrap over scenes, studentized, and never narrower than few scenes allow.
     """
-    pairs = _pairs(arm, baseline)
+    there = {(each.item, each.repeat): each for each in baseline if each.failure is None}
+    replied = [each for each in arm if each.failure is None]
+    pairs = [(each, there[place]) for each in replied if (place := (each.item, each.repeat)) in there]
     if not pairs:
         return None
     sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
@@ -151,20 +151,9 @@ def gain(arm: Sequence[Observation], baseline: Sequence[Observation], resamples:
     )
 
 
-def _pairs(arm: Iterable[Observation], baseline: Iterable[Observation]) -> list[tuple[Observation, Observation]]:
-    """Replies to the same question in the same repeat."""
-    there = {(each.item, each.repeat): each for each in baseline if each.failure is None}
-    return [
-        (each, there[each.item, each.repeat])
-        for each in arm
-        if each.failure is None and (each.item, each.repeat) in there
-    ]
-
-
 def _most(values: Iterable[bool]) -> bool:
     """Whether more than half are true."""
-    known = list(values)
-    return 2 * sum(known) > len(known)
+    return statistics.fmean(values) > 0.5
 
 
 def bootstrap_interval(table: NDArray[np.float64], resamples: int = RESAMPLES) -> tuple[float, float]:
@@ -246,17 +235,17 @@ def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibrat
     table = np.array(list(told.values()), dtype=np.float64)
     base = table[:, 1].mean()
     places = np.minimum((table[:, 0] * bins).astype(int), bins - 1)
+    found: list[Bin] = []
+    for place in np.unique(places).tolist():
+        rows = table[places == place]
+        mean, happened = map(float, rows.mean(axis=0))
+        found.append(Bin(low=place / bins, high=(place + 1) / bins, count=len(rows), told=mean, happened=happened))
     return Calibration(
         count=len(table),
         brier=float(np.mean((table[:, 0] - table[:, 1]) ** 2)),
         base_brier=float(base * (1 - base)),
-        bins=tuple(_bin(table[places == place], place, bins) for place in range(bins) if (places == place).any()),
+        bins=tuple(found),
     )
-
-
-def _bin(rows: NDArray[np.float64], place: int, bins: int) -> Bin:
-    told, happened = rows.mean(axis=0)
-    return Bin(low=place / bins, high=(place + 1) / bins, count=len(rows), told=float(told), happened=float(happened))
 
 
 def cost(observations: Sequence[Observation], input_price: float = math.nan, output_price: float = math.nan) -> Cost:

@@ -1,7 +1,5 @@
 """Reads data sets: CausalSpatial's layout, scenes with truth, JSON Lines, CSV, TSV and Parquet."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The forms of data sets: CausalSpatial as published, scenes with truth, and JSON Lines, CSV, TSV or Parquet tables."""
 
-from __future__ import annotations
-
 import base64
 import binascii
 import csv

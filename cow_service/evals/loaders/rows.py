@@ -1,7 +1,5 @@
 """A row of any data set, checked, and as an item."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """The figures of a report: colours that the colour-blind can tell apart, one marker per arm, axes without ornament."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 What it shows stands in it as compact JSON: texts, pictures and lists that come again are named by their place.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

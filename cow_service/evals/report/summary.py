@@ -1,7 +1,5 @@
 """What a report says: rates, gains, calibration and cost of every arm of every run, computed once for all its forms."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tables of a report, with what the paper printed beside them, as Markdown, CSV and LaTeX."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -1,7 +1,5 @@
 """Writes a report: tables, plots, a page with every item, and a manifest."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import warnings
