@@ -6,8 +6,8 @@
 import atexit
 import os
 import secrets
-from collections.abc import Callable, Generator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import rich
@@ -173,10 +173,13 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
     if not progress.left:
         return
     keys = f"{info.token} {info.rounds}", info.token
-    with session(wanted.out, wanted.url, info.settings["requests"], *keys, **settings) as shared:
+    console = rich.get_console()
+    with session(wanted.out, wanted.url, info.settings["requests"], *keys, **settings) as shared, ExitStack() as stack:
         _check_server(shared.url, wanted)
         shared.items, shared.progress = items, progress
-        with progress.shown(), _quiet_inspect():
+        stack.callback(setattr, console, "quiet", console.quiet)
+        console.quiet = True  # Inspect says nothing of its own on standard output
+        with progress.shown():
             _, ended = eval_set(
                 tasks=[
                     causalspatial(data=info.data_digest, arm=arm, ask=wanted.ask, seed=wanted.seed) for arm in info.arms
@@ -201,17 +204,6 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
             )
     if len(ended) < len(info.arms):  # Inspect takes an interrupt for an end
         raise KeyboardInterrupt
-
-
-@contextmanager
-def _quiet_inspect() -> Generator[None]:
-    """Meanwhile Inspect says nothing of its own on standard output."""
-    console = rich.get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before
 
 
 def _check_server(url: str, wanted: plan.Plan) -> None:

@@ -6,19 +6,10 @@ from pathlib import Path
 
 from cow_service.errors import InvalidRequest
 from cow_service.evals.items import Pictures
-from cow_service.evals.loaders.formats import (
-    READERS,
-    SUBSETS,
-    load_causalspatial,
-    scene_folders,
-    scene_rows,
-    subset_shards,
-    table_rows,
-)
-from cow_service.evals.loaders.rows import MAX_SHOWN, Collected, RowFault, collect, digest_of, refuse_faults
+from cow_service.evals.loaders import formats
+from cow_service.evals.loaders.rows import MAX_SHOWN, Collected, collect, digest_of
 
-__all__ = ["CAUSALSPATIAL", "SUBSETS", "Collected", "RowFault", "digest_of", "load"]
-
+__all__ = ["CAUSALSPATIAL", "Collected", "digest_of", "load"]
 
 CAUSALSPATIAL = "Mwxinnn/CausalSpatial"
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+", re.ASCII)
@@ -31,42 +22,43 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
     `InvalidRequest`, which names them; with `skip_faulty` they are left out, and so they are of data in CausalSpatial's
     layout, whose published rows cannot be mended here. A file that was cut off is refused always.
     """
-    unknown = [subset for subset in subsets if subset not in SUBSETS]
+    unknown = [subset for subset in subsets if subset not in formats.SUBSETS]
     if unknown:
-        raise InvalidRequest(f"There is no subset '{unknown[0]}': CausalSpatial has {', '.join(SUBSETS)}.")
+        raise InvalidRequest(f"There is no subset '{unknown[0]}': CausalSpatial has {', '.join(formats.SUBSETS)}.")
     path = Path(data)
     if not path.exists() and _HUB_NAME.fullmatch(data):
         path = _download(data)
-    found, published = _found(path, data, subsets or SUBSETS, pictures, skip_faulty)
+    wanted = subsets or formats.SUBSETS
+    published = path.is_dir() and bool(formats.subset_shards(path, wanted))
+    if published:
+        found = formats.load_causalspatial(path, wanted, pictures)
+    elif path.is_file() and path.suffix.lower() in formats.READERS:
+        found = collect(formats.table_rows(path, ignore_columns=skip_faulty), pictures)
+    elif path.is_dir() and formats.scene_folders(path):
+        found = collect(formats.scene_rows(path), pictures)
+    else:
+        what = "is not there" if not path.exists() else "holds none of these"
+        raise InvalidRequest(
+            f"'{data}' {what}: give a folder in CausalSpatial's layout (collision/*.parquet), a folder of scenes "
+            f"(*/meta.json with image.jpg), a file ({', '.join(formats.READERS)}), or the name of a data set, such as "
+            f"{CAUSALSPATIAL}."
+        )
     if found.broken:
         raise InvalidRequest("\n".join(found.broken[:MAX_SHOWN]) + ".")
-    absent = [subset for subset in subsets if published and not subset_shards(path, [subset])]
+    absent = [subset for subset in subsets if published and not formats.subset_shards(path, [subset])]
     if absent:
         raise InvalidRequest(f"'{data}' has no subset '{absent[0]}': a folder of that name with Parquet files.")
-    if not skip_faulty and not published:
-        refuse_faults(found)
+    count = len(found.faults)
+    if count and not skip_faulty and not published:
+        more = f"\n... and {count - MAX_SHOWN} more" if count > MAX_SHOWN else ""
+        raise InvalidRequest(
+            f"{count} {'row' if count == 1 else 'rows'} cannot be asked; mend them, or leave them out with "
+            "--skip-faulty:\n" + "\n".join(found.faults[:MAX_SHOWN]) + more
+        )
     if not found.items:
         reasons = "\n".join(found.faults[:5])
         raise InvalidRequest(f"'{data}' holds no question that can be asked.{' ' if reasons else ''}{reasons}")
     return found
-
-
-def _found(
-    path: Path, data: str, subsets: Sequence[str], pictures: Pictures, skip_faulty: bool
-) -> tuple[Collected, bool]:
-    """What a folder or file holds, and whether it is in CausalSpatial's layout."""
-    if path.is_file() and path.suffix.lower() in READERS:
-        return collect(table_rows(path, ignore_columns=skip_faulty), pictures), False
-    if path.is_dir() and subset_shards(path, subsets):
-        return load_causalspatial(path, subsets, pictures), True
-    if path.is_dir() and scene_folders(path):
-        return collect(scene_rows(path), pictures), False
-    what = "is not there" if not path.exists() else "holds none of these"
-    raise InvalidRequest(
-        f"'{data}' {what}: give a folder in CausalSpatial's layout (collision/*.parquet), a folder of scenes "
-        f"(*/meta.json with image.jpg), a file ({', '.join(READERS)}), or the name of a data set, such as "
-        f"{CAUSALSPATIAL}."
-    )
 
 
 def _download(name: str) -> Path:

@@ -113,23 +113,23 @@ def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Row | Ro
                     hint = f"did you mean `{close[0]}`?" if close else columns
                     yield RowFault(f"{place}: unknown column `{name}`: {hint}")
             told.update(unknown)
-            if not unknown:
-                yield _table_row(path, place, fields)
+            if unknown:
+                continue
+            values: dict[str, Any] = {
+                _NAMES[name]: value for name, value in fields.items() if name in _NAMES and value not in (None, "")
+            }
+            try:
+                _require(values, REQUIRED)
+                image = _image(values.pop("image"), path.parent)
+                options = _options(values.pop("options", None), fields)
+            except RowFault as fault:
+                yield RowFault(f"{place}: {fault}")
+                continue
+            texts: dict[str, Any] = {name: str(value) for name, value in values.items()}
+            named = texts.pop("id", place.rpartition(" ")[2])
+            yield Row(place=place, id=named, source_id=named, image=image, options=options, **texts)
     except RowFault as fault:
         yield fault
-
-
-def _table_row(path: Path, place: str, fields: dict[str, Any]) -> Row | RowFault:
-    values = {_NAMES[name]: value for name, value in fields.items() if name in _NAMES and value not in (None, "")}
-    try:
-        _require(values, REQUIRED)
-        image = _image(values.pop("image"), path.parent)
-        options = _options(values.pop("options", None), fields)
-    except RowFault as fault:
-        return RowFault(f"{place}: {fault}")
-    named = str(values.pop("id", place.rpartition(" ")[2]))
-    texts: dict[str, Any] = {name: str(value) for name, value in values.items()}
-    return Row(place=place, id=named, source_id=named, image=image, options=options, **texts)
 
 
 def _require(fields: dict[str, Any], names: Sequence[str]) -> None:
@@ -236,14 +236,18 @@ def subset_shards(folder: Path, subsets: Sequence[str]) -> dict[str, list[Path]]
 
 def load_causalspatial(folder: Path, subsets: Sequence[str], pictures: Pictures) -> Collected:
     """The items of a folder in the layout of the published data, or of sets made like it."""
-    abstaining: dict[str, str] = {}
-    found = collect(_rows(folder, subsets, abstaining), pictures, repeated_rows=True)
-    found.notes[:0] = [*_shared_ids(found.items), *_without_abstain(found.items, abstaining)]
+    abstaining: dict[str, str] = {}  # by id: what the column `not_sure` says
+    found = collect(_published_rows(folder, subsets, abstaining), pictures, repeated_rows=True)
+    ids = Counter((item.id.partition("/")[0], item.source_id) for item in found.items)
+    shared = Counter(subset for (subset, _), count in ids.items() for _ in range(count) if count > 1)
+    told = "rows share their id with others; items are told apart by subset, shard and row."
+    notes = [f"{subset}: {count} {told}" for subset, count in shared.items()]
+    found.notes[:0] = [*notes, *_without_abstain(found.items, abstaining)]
     return found
 
 
-def _rows(folder: Path, subsets: Sequence[str], abstaining: dict[str, str]) -> Iterator[Row | RowFault]:
-    """A row each; `abstaining` gets what the column `not_sure` says of it, by its id."""
+def _published_rows(folder: Path, subsets: Sequence[str], abstaining: dict[str, str]) -> Iterator[Row | RowFault]:
+    """The rows of all files. What the column `not_sure` says of a row goes into `abstaining`."""
     for subset, shards in subset_shards(folder, subsets).items():
         for shard, path in enumerate(shards):
             name = path.relative_to(folder).as_posix()
@@ -281,17 +285,6 @@ def _published_row(folder: Path, subset: str, unique: str, place: str, fields: d
         level=REAL if real or level is None else f"L{level[1]}",
         oracle=oracle_frames(folder / TRUTH / subset / source) if (folder / TRUTH).is_dir() else (),
     )
-
-
-def _shared_ids(items: Sequence[Item]) -> list[str]:
-    """Which ids several rows of a subset have."""
-    counts = Counter((item.id.partition("/")[0], item.source_id) for item in items)
-    shared: Counter[str] = Counter()
-    for (subset, _), count in counts.items():
-        if count > 1:
-            shared[subset] += count
-    told = "rows share their id with others; items are told apart by subset, shard and row."
-    return [f"{subset}: {count} {told}" for subset, count in shared.items()]
 
 
 def _without_abstain(items: Sequence[Item], abstaining: dict[str, str]) -> list[str]:

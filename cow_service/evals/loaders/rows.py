@@ -7,25 +7,16 @@ from dataclasses import dataclass, field
 
 from pydantic import ValidationError
 
-from cow_service.errors import CowError, InvalidRequest
-from cow_service.evals.items import (
-    LETTERS,
-    TASKS,
-    UNKNOWN_LEVEL,
-    Item,
-    Pictures,
-    Task,
-    Wording,
-    appended_wording,
-    listed_wording,
-    question_text,
-)
+from cow_service.errors import CowError
+from cow_service.evals import items
+from cow_service.evals.items import Item, Pictures, Task
 from cow_service.readers.options import not_sure_option, option_saying
 from cow_service.records import AnswerOption
 
+MAX_SHOWN = 20  # faults in an error
 _LETTER = re.compile(r"^\s*[(\[]?\s*([A-Za-z])\s*[)\].:]?\s*$")
 _LETTER_AND_TEXT = re.compile(r"^\s*(?:[(\[]\s*([A-Za-z])\s*[)\]]|([A-Z])\s*[.:)])\s*(\S.*)$", re.DOTALL)
-_TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **{task: task for task in TASKS}}
+_TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **{task: task for task in items.TASKS}}
 
 
 class RowFault(ValueError):
@@ -69,7 +60,7 @@ def item_of(row: Row, pictures: Pictures) -> Item:
             answer=_answer(row.answer, options),
             abstain=None if abstain is None else abstain.letter,
             task=task_of(row.task),
-            level=row.level or UNKNOWN_LEVEL,
+            level=row.level or items.UNKNOWN_LEVEL,
             scene=row.scene or image,
             oracle=tuple(_picture(each, "oracle frame", pictures) for each in row.oracle),
         )
@@ -86,21 +77,21 @@ def task_of(name: str | None) -> Task:
     return "other"
 
 
-def _wording(row: Row) -> Wording:
+def _wording(row: Row) -> items.Wording:
     """The question around its options. Raises `RowFault` where it has none, or they are no options."""
     if not row.question or not row.question.strip():
         raise RowFault("`question` is empty")
     if row.options is None:
-        listed = listed_wording(row.question)
+        listed = items.listed_wording(row.question)
         if listed is None:
             raise RowFault("the question lists no options, such as (A) Yes, (B) No, and the row has none either")
         return listed
     texts = [str(text).strip() for text in row.options]
     if len(texts) < 2 or not all(texts) or len({text.lower() for text in texts}) < len(texts):
         raise RowFault(f"`options` must be two or more different texts, got {texts}")
-    if len(texts) > len(LETTERS):
-        raise RowFault(f"`options` are at most {len(LETTERS)}, got {len(texts)}")
-    return appended_wording(row.question.rstrip(), texts)
+    if len(texts) > len(items.LETTERS):
+        raise RowFault(f"`options` are at most {len(items.LETTERS)}, got {len(texts)}")
+    return items.appended_wording(row.question.rstrip(), texts)
 
 
 def _answer(given: str | None, options: Sequence[AnswerOption]) -> str:
@@ -129,14 +120,11 @@ def _picture(data: bytes | None, name: str, pictures: Pictures) -> str:
         raise RowFault(f"the {name} cannot be used: {error.detail}") from error
 
 
-MAX_SHOWN = 20
-
-
 @dataclass
 class Collected:
     """What a data set holds."""
 
-    items: list[Item] = field(default_factory=list)
+    items: list[Item] = field(default_factory=list[Item])
     faults: list[str] = field(default_factory=list)  # a row each, with its place: what is left out
     broken: list[str] = field(default_factory=list)  # files that cannot be read to their end
     notes: list[str] = field(default_factory=list)  # what was found and worked around
@@ -159,7 +147,7 @@ def collect(rows: Iterable[Row | RowFault], pictures: Pictures, *, repeated_rows
         except RowFault as fault:
             found.faults.append(f"{row.place}: {fault}")
             continue
-        key = item.image, question_text(item)
+        key = item.image, items.question_text(item)
         before = asked.get(key)
         if item.id in by_id:
             found.faults.append(f"{row.place}: the id {item.id!r} stands in {by_id[item.id].row} too")
@@ -175,18 +163,7 @@ def collect(rows: Iterable[Row | RowFault], pictures: Pictures, *, repeated_rows
     return found
 
 
-def refuse_faults(found: Collected) -> None:
-    """Raises `InvalidRequest` that names every row that cannot be asked, up to `MAX_SHOWN`."""
-    if not found.faults:
-        return
-    more = f"\n... and {len(found.faults) - MAX_SHOWN} more" if len(found.faults) > MAX_SHOWN else ""
-    raise InvalidRequest(
-        f"{len(found.faults)} {'row' if len(found.faults) == 1 else 'rows'} cannot be asked; mend them, or leave them "
-        "out with --skip-faulty:\n" + "\n".join(found.faults[:MAX_SHOWN]) + more
-    )
-
-
-def digest_of(items: Iterable[Item]) -> str:
+def digest_of(asked: Iterable[Item]) -> str:
     """Of all that is asked, pictures and truth included, wherever it came from."""
-    parts = sorted(item.model_dump_json(exclude={"row"}) for item in items)
+    parts = sorted(item.model_dump_json(exclude={"row"}) for item in asked)
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

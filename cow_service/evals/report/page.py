@@ -22,6 +22,7 @@ from markupsafe import Markup
 
 from cow_service.evals.items import Item, Observation
 from cow_service.evals.report.summary import BASELINE, ArmSummary, baseline_run
+from cow_service.evals.report.tables import p_text
 from cow_service.evals.runs import PICTURES, EvalRun
 
 PAGE = "index.html"
@@ -58,10 +59,22 @@ def write_page(
     arms = page_arms(runs, summaries)
     core, replies = page_data(runs, arms, _PictureLinks(folder, runs, copy_pictures))
     style, script = "".join(map(_source, STYLES)), "'use strict';\n" + "".join(map(_source, SCRIPTS))
+    # Nothing but this script, this style, and pictures beside the page: whatever a reply says, it does nothing.
+    allowed = {
+        "default-src": "'none'",
+        "img-src": "'self' file: data:",
+        "style-src": _digest(style),
+        "script-src": _digest(script),
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template.filters |= {"percent": _percent, "points": _points, "p": _p}
+    template.filters["percent"] = _percent
+    template.filters["points"] = _points
+    template.filters["p"] = p_text
+    titled = [(TITLES.get(path.stem, path.stem), path) for path in plots if path.suffix == ".svg"]
     text = template.from_string(_source("template.html")).render(
-        policy=_policy(style, script),
+        policy="; ".join(f"{name} {value}" for name, value in allowed.items()),
         style=Markup(style),
         script=Markup(script),
         core=Markup(script_json(core)),
@@ -73,11 +86,7 @@ def write_page(
         against={each.name: arms[each.against].name for each in arms if each.against is not None},
         gains={(each.name, of.task): of.gain for each in summaries for of in each.gains},
         sections=sections,
-        plots=[
-            (TITLES.get(path.stem, path.stem), Markup(inline_svg(path, TITLES.get(path.stem, path.stem))))
-            for path in plots
-            if path.suffix == ".svg"
-        ],
+        plots=[(title, Markup(inline_svg(path, title))) for title, path in titled],
     )
     partial = folder / f".{PAGE}.partial"
     # A carriage return would change the text that the policy's digests are of.
@@ -89,23 +98,6 @@ def _source(name: str) -> str:
     return (files("cow_service.evals.report") / "page" / name).read_text(encoding="utf-8")
 
 
-def _policy(style: str, script: str) -> str:
-    """Nothing but this script, this style, and pictures beside the page: whatever a reply says, it does nothing."""
-
-    def digest(text: str) -> str:
-        return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-    rules = {
-        "default-src": "'none'",
-        "img-src": "'self' file: data:",
-        "style-src": digest(style),
-        "script-src": digest(script),
-        "base-uri": "'none'",
-        "form-action": "'none'",
-    }
-    return "; ".join(f"{name} {value}" for name, value in rules.items())
-
-
 def _percent(share: float | None, digits: int = 1) -> str:
     return "" if share is None else f"{100 * share:.{digits}f}"
 
@@ -114,10 +106,8 @@ def _points(share: float) -> str:
     return f"{100 * share:+.1f}".replace("-", "−")
 
 
-def _p(value: Any) -> str:
-    if value is None:
-        return ""
-    return "< 0.001" if value < 0.001 else f"{value:.3f}"
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 class _Interned:
@@ -280,22 +270,18 @@ def inline_svg(path: Path, name: str) -> str:
     kept = {each.attrib[LINK][1:] for each in root.iter() if LINK in each.attrib}
     kept |= {each.attrib["id"] for each in root.iter(f"{SVG}clipPath")}
     for each in root.iter():
-        _plain(each, kept)
+        each.tag = each.tag.removeprefix(SVG)
+        if each.attrib.get("id") not in kept:
+            each.attrib.pop("id", None)
+        if LINK in each.attrib:
+            each.attrib["href"] = each.attrib.pop(LINK)
+        # Declarations of the style attribute become attributes of their own.
+        for declaration in each.attrib.pop("style", "").split(";"):
+            key, _, value = declaration.partition(":")
+            if value:
+                each.attrib[key.strip()] = THEMED.get(value.strip(), value.strip())
     for side in ("width", "height"):
         root.attrib[side] = f"{float(root.attrib[side].removesuffix('pt')) * PIXELS_PER_POINT:.0f}"
     # What matplotlib says in a style element, which the policy of the page does not let in.
     root.attrib |= {"stroke-linejoin": "round", "role": "img", "aria-label": name}
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def _plain(element: ElementTree.Element, kept: set[str]) -> None:
-    """Declarations of the style attribute as attributes of their own; ids that nothing refers to go."""
-    element.tag = element.tag.removeprefix(SVG)
-    if element.attrib.get("id") not in kept:
-        element.attrib.pop("id", None)
-    if LINK in element.attrib:
-        element.attrib["href"] = element.attrib.pop(LINK)
-    for declaration in element.attrib.pop("style", "").split(";"):
-        key, _, value = declaration.partition(":")
-        if value:
-            element.attrib[key.strip()] = THEMED.get(value.strip(), value.strip())

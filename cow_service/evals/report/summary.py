@@ -9,19 +9,10 @@ import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
 from cow_service.errors import InvalidRequest
+from cow_service.evals import statistics
 from cow_service.evals.items import TASKS, Observation, Task
 from cow_service.evals.runs import EvalRun
-from cow_service.evals.statistics import (
-    Calibration,
-    Cost,
-    Gain,
-    Rates,
-    calibration,
-    cost,
-    gain,
-    rates,
-    with_holm,
-)
+from cow_service.evals.statistics import Calibration, Cost, Gain, Rates
 from cow_service.records import Record
 
 BASELINE = "never"
@@ -71,13 +62,15 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
     for place, run in enumerate(runs):
         for arm in run.info.arms:
             observations = run.of_arm(arm)
-            of_all = rates(observations)
+            of_all = statistics.rates(observations)
             if of_all is None:
                 continue
             name = f"{run.info.mllm}, {arm}" if several else arm
             known = {each.name for each in found}
             compared = None if arm == BASELINE else baseline_run(runs, run)
             baseline = [] if compared is None else compared.of_arm(BASELINE)
+            price = (prices or {}).get(run.info.mllm)
+            paid = () if price is None else (price.input, price.output)
             found.append(
                 ArmSummary(
                     run=place,
@@ -86,10 +79,10 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
                     name=f"{name} ({place + 1})" if name in known else name,
                     rates=of_all,
                     cells=_cells(observations),
-                    gain=gain(observations, baseline),
+                    gain=statistics.gain(observations, baseline),
                     gains=_gains(observations, baseline),
-                    calibration=calibration(observations),
-                    cost=_cost(observations, (prices or {}).get(run.info.mllm)),
+                    calibration=statistics.calibration(observations),
+                    cost=statistics.cost(observations, *paid),
                 )
             )
     return tuple(found)
@@ -107,7 +100,7 @@ def _cells(observations: Sequence[Observation]) -> tuple[Cell, ...]:
     for task, of_task in _by_task(observations).items():
         levels = sorted({each.level for each in of_task})
         for level in (None, *levels):
-            of_level = rates([each for each in of_task if level in (None, each.level)])
+            of_level = statistics.rates([each for each in of_task if level in (None, each.level)])
             if of_level is not None:
                 cells.append(Cell(task=task, level=level, rates=of_level))
     return tuple(cells)
@@ -115,12 +108,12 @@ def _cells(observations: Sequence[Observation]) -> tuple[Cell, ...]:
 
 def _gains(observations: Sequence[Observation], baseline: Sequence[Observation]) -> tuple[TaskGain, ...]:
     there = _by_task(baseline)
-    found: list[tuple[Task, Gain | None]] = [
-        (task, gain(of_task, there.get(task, []))) for task, of_task in _by_task(observations).items()
-    ]
-    known: list[tuple[Task, Gain]] = [(task, each) for task, each in found if each is not None]
-    adjusted = with_holm([each for _, each in known])
-    return tuple(TaskGain(task=task, gain=each) for (task, _), each in zip(known, adjusted, strict=True))
+    known: list[tuple[Task, Gain]] = []
+    for task, of_task in _by_task(observations).items():
+        gain = statistics.gain(of_task, there.get(task, []))
+        known += [] if gain is None else [(task, gain)]
+    adjusted = statistics.with_holm([gain for _, gain in known])
+    return tuple(TaskGain(task=task, gain=gain) for (task, _), gain in zip(known, adjusted, strict=True))
 
 
 def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation]]:
@@ -128,10 +121,6 @@ def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation
     for each in observations:
         found[each.task].append(each)
     return {task: found[task] for task in TASKS if task in found}
-
-
-def _cost(observations: Sequence[Observation], price: Price | None) -> Cost:
-    return cost(observations) if price is None else cost(observations, price.input, price.output)
 
 
 _TABLE: TypeAdapter[dict[str, Price]] = TypeAdapter(dict[str, Price])

@@ -13,24 +13,16 @@ from cow_service.evals.report.summary import ArmSummary
 from cow_service.evals.runs import EvalRun
 from cow_service.evals.statistics import Cost, Gain, Rates, Spread
 
-_LATEX = {
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$"},
-}
-
-
+_LATEX = str.maketrans(
+    {character: f"\\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$"}
+)
 SOURCE = "CausalSpatial, arXiv 2601.13304"
 # Of all questions, in percent.
-PRINTED_TPR: dict[str, float] = {
-    "GPT-5": 54.17,
-    "Gemini 2.5 Pro": 50.55,
-    "Qwen3-VL-30B-T": 50.50,
-    "human": 84.49,
-}
+PRINTED_TPR = {"GPT-5": 54.17, "Gemini 2.5 Pro": 50.55, "Qwen3-VL-30B-T": 50.50, "human": 84.49}
 # Of COW with Qwen3-VL-30B-A3B-I over the same model without, in points.
 PRINTED_GAINS: dict[Task, float] = {"collision": 2.40, "trajectory": 2.20}
 PRINTED_MODEL = "Qwen3-VL-30B-A3B-I with COW"
-
 PROTOCOL = (
     "Options are shown in a random order, another one in every repeat and the same in every arm; the public scripts "
     "show them as the data has them.",
@@ -45,8 +37,6 @@ DATA = (
     "The option that abstains is found by its text, not by the column `not_sure`.",
     "Items are told apart by subset, shard and row: ids are not unique.",
 )
-
-
 DIFFERENCES = {"Protocol": PROTOCOL, "Reading replies": READING, "Data": DATA}  # from the paper, by what they are about
 ALL = "all"
 NONE = ""  # a cell of which nothing is known
@@ -115,14 +105,14 @@ def gains(summaries: Sequence[ArmSummary]) -> Table:
         "95% interval": lambda gain: f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}",
         "helped": lambda gain: str(gain.helped),
         "hurt": lambda gain: str(gain.hurt),
-        "McNemar p": lambda gain: _p(gain.p),
-        "Holm p": lambda gain: NONE if gain.p_holm is None else _p(gain.p_holm),
+        "McNemar p": lambda gain: p_text(gain.p),
+        "Holm p": lambda gain: p_text(gain.p_holm),
     }
     known = [
         (each.name, task, gain)
         for each in summaries
-        for task, gain in ((ALL, each.gain), *((one.task, one.gain) for one in each.gains))
-        if each.gain is not None and gain is not None
+        if each.gain is not None
+        for task, gain in ((ALL, each.gain), *((of.task, of.gain) for of in each.gains))
     ]
     rows = [(name, task, *(cell(gain) for cell in columns.values())) for name, task, gain in known]
     if rows:
@@ -152,13 +142,10 @@ def _with_columns(whole: Table, header: tuple[str, ...]) -> Table:
 
 def calibration(summaries: Sequence[ArmSummary]) -> Table:
     """How good the probabilities are that the simulations told."""
-    rows = [
-        (each.name, str(known.count), f"{known.brier:.3f}", f"{known.base_brier:.3f}")
-        for each in summaries
-        if (known := each.calibration) is not None
-    ]
+    known = [(each.name, found) for each in summaries if (found := each.calibration) is not None]
+    rows = tuple((name, str(found.count), f"{found.brier:.3f}", f"{found.base_brier:.3f}") for name, found in known)
     header = ("arm", "questions", "Brier score", "of the base rate")
-    return Table("calibration", "Told probabilities of what is asked", header, tuple(rows))
+    return Table("calibration", "Told probabilities of what is asked", header, rows)
 
 
 def costs(summaries: Sequence[ArmSummary]) -> Table:
@@ -203,7 +190,10 @@ def _spread(spread: Spread) -> str:
     return f"{100 * spread.mean:.2f}" + ("" if spread.sd is None else f" ± {100 * spread.sd:.2f}")
 
 
-def _p(value: float) -> str:
+def p_text(value: float | None) -> str:
+    """A p value; empty for none."""
+    if value is None:
+        return NONE
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
 
 
@@ -232,14 +222,10 @@ def csv_text(table: Table) -> str:
 
 def latex(table: Table) -> str:
     """A `table` with the rules of the package booktabs."""
-
-    def escaped(text: str) -> str:
-        return "".join(_LATEX.get(character, character) for character in text)
-
-    header, *body = (" & ".join(map(escaped, row)) + r" \\" for row in (table.header, *table.rows))
-    columns = "l" + "r" * (len(table.header) - 1)
+    header, *body = (" & ".join(cell.translate(_LATEX) for cell in row) + r" \\" for row in (table.header, *table.rows))
+    title, columns = table.title.translate(_LATEX), "l" + "r" * (len(table.header) - 1)
     lines = (
-        r"\begin{table}", r"\centering", rf"\caption{{{escaped(table.title)}}}", rf"\begin{{tabular}}{{{columns}}}",
+        r"\begin{table}", r"\centering", rf"\caption{{{title}}}", rf"\begin{{tabular}}{{{columns}}}",
         r"\toprule", header, r"\midrule", *body, r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
     )  # fmt: skip
     return "\n".join(lines)

@@ -8,24 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from cow_service.errors import InvalidRequest, StorageUnavailable
+from cow_service.evals.report import tables
 from cow_service.evals.report.page import write_page
 from cow_service.evals.report.summary import ArmSummary, Price, summarize
-from cow_service.evals.report.tables import (
-    DIFFERENCES,
-    csv_text,
-    gains_in_short,
-    in_short,
-    latex,
-    markdown,
-    pairs,
-    tables,
-)
 from cow_service.evals.runs import EvalRun
 
 PLOTS = ("gains", "rates", "calibration", "cost")
 SUFFIXES = (".svg", ".png")
 PNG_DPI = 150
-FORMATS = {"md": markdown, "csv": csv_text, "tex": latex}
+FORMATS = {"md": tables.markdown, "csv": tables.csv_text, "tex": tables.latex}
 
 
 def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]) -> str:
@@ -42,24 +33,29 @@ def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]
         _write(runs, summaries, out)
     except OSError as error:
         raise StorageUnavailable(f"'{out}' cannot be written: {error.strerror or error}.") from error
-    shown = [table for table in (in_short(summaries), gains_in_short(summaries)) if table.rows]
-    return "\n\n".join(markdown(table) for table in shown)
+    shown = [table for table in (tables.in_short(summaries), tables.gains_in_short(summaries)) if table.rows]
+    return "\n\n".join(map(tables.markdown, shown))
 
 
 def _write(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary], out: Path) -> None:
     (out / "tables").mkdir(parents=True, exist_ok=True)
-    known = tables(summaries)
-    for table in (*known, pairs(runs, summaries)):
+    known = tables.tables(summaries)
+    for table in (*known, tables.pairs(runs, summaries)):
         for extension, text in FORMATS.items():
             if table.name != "pairs" or extension == "csv":
                 (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
     plots = write_plots(out / "plots", summaries)
-    differs = [(f"Differences from the paper: {about.lower()}", told) for about, told in DIFFERENCES.items()]
-    write_page(out, runs, summaries, plots, [(heading, "\n".join(told)) for heading, told in differs])
-    parts = [f"## {table.title}\n\n{markdown(table)}" for table in known]
-    parts += [f"## {heading}\n\n" + "\n".join(f"- {each}" for each in told) for heading, told in differs]
+    differs = {f"Differences from the paper: {about.lower()}": told for about, told in tables.DIFFERENCES.items()}
+    write_page(out, runs, summaries, plots, [(heading, "\n".join(told)) for heading, told in differs.items()])
+    parts = [f"## {table.title}\n\n{tables.markdown(table)}" for table in known]
+    parts += [f"## {heading}\n\n" + "\n".join(f"- {each}" for each in told) for heading, told in differs.items()]
     (out / "report.md").write_text("\n\n".join(["# Evaluation", _asked(runs), *parts]) + "\n", "utf-8")
-    _write_manifest(runs, out)
+
+    # What was asked, with which versions, prompts and seeds, and the digest of every file of the report.
+    files = sorted(path for path in out.rglob("*") if path.is_file() and path.name != "manifest.json")
+    digests = {path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    manifest = {"runs": [run.info.model_dump(mode="json") for run in runs], "files": digests}
+    (out / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _asked(runs: Sequence[EvalRun]) -> str:
@@ -75,15 +71,6 @@ def _asked(runs: Sequence[EvalRun]) -> str:
         failures = sorted({each.failure for each in run.observations if each.failure is not None})
         lines += [f"- failed: {' '.join(failure.split())}" for failure in failures]
     return "\n".join(lines)
-
-
-def _write_manifest(runs: Sequence[EvalRun], out: Path) -> None:
-    """What was asked, with which versions, prompts and seeds, and the digest of every file of the report."""
-    files: dict[str, str] = {}
-    for path in sorted(path for path in out.rglob("*") if path.is_file() and path.name != "manifest.json"):
-        files[path.relative_to(out).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
-    manifest: dict[str, Any] = {"runs": [run.info.model_dump(mode="json") for run in runs], "files": files}
-    (out / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def write_plots(folder: Path, summaries: Sequence[ArmSummary]) -> tuple[Path, ...]:
