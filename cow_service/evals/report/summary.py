@@ -111,7 +111,8 @@ def _gains(observations: Sequence[Observation], baseline: Sequence[Observation])
     known: list[tuple[Task, Gain]] = []
     for task, of_task in _by_task(observations).items():
         gain = statistics.gain(of_task, there.get(task, []))
-        known += [] if gain is None else [(task, gain)]
+        if gain is not None:
+            known.append((task, gain))
     adjusted = statistics.with_holm([gain for _, gain in known])
     return tuple(TaskGain(task=task, gain=gain) for (task, _), gain in zip(known, adjusted, strict=True))
 
