@@ -7,6 +7,8 @@ Objects of a scene (bottles, cones, pencils) fail one of the two.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -14,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask, full_size
+from cow_service.records import BBox, Point
+from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask
 from cow_service.vision.types import Floats, Mask
 
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
@@ -27,8 +30,8 @@ CERTAIN_FIT = 0.88  # from here on, later strokes at the same place are skipped
 class Arrow:
     """A drawn arrow, in pixels of the image it was found in. It says where the drawing points, not what moves."""
 
-    tail: tuple[float, float]
-    tip: tuple[float, float]
+    tail: Point
+    tip: Point
     colour: tuple[int, int, int]  # RGB
     filled: bool
     mask: Mask  # [H, W]: the drawing with its outline and its fringe
@@ -41,52 +44,16 @@ class Arrow:
         length = float(np.hypot(dx, dy))
         return dx / length, dy / length
 
-
-@dataclass(frozen=True)
-class _Shape:
-    tail: Floats
-    tip: Floats
-    filled: bool
-    fit: float
-
-
-@dataclass(frozen=True)
-class _Profile:
-    """The width of a patch along an axis from tail to tip, and the axis that its shaft then has."""
-
-    extent: Floats  # [n] px: the width at every px along the axis; NaN where nothing lies
-    start: float  # px along the axis, from the centre that the points were measured from
-    end: float
-    thickness: float
-    head_width: float
-    peak: int  # where along the axis it is widest
-    neck: int  # where the head begins
-    middle: float  # px beside the axis: the middle of the head
-    axis: Floats  # unit vector along the shaft
-    centre: Floats  # a point on it
-
-    def is_arrow_like(self) -> bool:
-        """Whether the shaft keeps its width, and the head is symmetric, of plausible length and tapers to a tip."""
-        extent, thickness, head_width, peak = self.extent, self.thickness, self.head_width, self.peak
-        n = len(extent)
-        head = extent[peak:]
-        shaft_extent = extent[max(1, n // 20) : max(self.neck - 1, n // 3)]
-        steady = float(np.nanmean(np.abs(shaft_extent - thickness) <= max(1.6, 0.3 * thickness)))
-        head_length = n - 1 - peak
-        return not (
-            steady < 0.75
-            or len(shaft_extent) < 0.25 * n
-            or head_length < 0.35 * (head_width - thickness) / 2
-            or head_length > 0.7 * n
-            or head_length > 2.5 * head_width
-            or abs(self.middle) > 0.22 * head_width + 1
-            or float(np.nanmean(np.diff(head) <= 1.5)) < 0.9
-            or head[-1] > 0.45 * head_width + thickness
-        )
+    def gap(self, bbox: BBox) -> float:
+        """Distance from a box to the nearer end, in sizes of the box."""
+        x0, y0, x1, y1 = bbox
+        ends = (self.tail, self.tip)
+        away = min(math.hypot(max(x0 - x, 0, x - x1), max(y0 - y, 0, y - y1)) for x, y in ends)
+        return away / max(x1 - x0, y1 - y0)
 
 
-def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[Arrow, ...]:
-    """Drawn arrows among the strokes of an image whose full size is [height, width]; overlapping findings are one."""
+def find_arrows(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[Arrow, ...]:
+    """Drawn arrows among the strokes of an image; overlapping findings are one."""
     found: list[tuple[_Shape, Stroke]] = []
     for stroke in strokes:
         corners = np.array([stroke.x, stroke.y, *stroke.patch.shape])  # drawings can be found twice
@@ -106,69 +73,118 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int,
         mask = drawing_mask(image.pixels, stroke)
         taken |= mask
         offset = np.array([stroke.x, stroke.y])
-        tail, tip = ((point + offset + 0.5) / image.scale - 0.5 for point in (shape.tail, shape.tip))
-        arrows.append(
-            Arrow(
-                tail=(float(tail[0]), float(tail[1])),
-                tip=(float(tip[0]), float(tip[1])),
-                colour=stroke.colour,
-                filled=shape.filled,
-                mask=full_size(mask, size),
-                fit=shape.fit,
-            )
-        )
+        tail, tip = (((point + offset + 0.5) / image.scale - 0.5).tolist() for point in (shape.tail, shape.tip))
+        arrows.append(Arrow(tuple(tail), tuple(tip), stroke.colour, shape.filled, image.full(mask), shape.fit))
     return tuple(arrows)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    tail: Floats
+    tip: Floats
+    filled: bool
+    fit: float
 
 
 def fit_arrow(patch: Mask, hollow: bool = False) -> _Shape | None:
     """The arrow that a patch [h, w] is, or None. Coordinates are those of the patch.
 
     A `hollow` drawing has two flat colours, which no object of a scene has: its head need not be much wider than its
-    shaft.
+    shaft. Shaft and head are read off the width profile along an axis from tail to tip, which is refined on the shaft.
     """
-    least_head = HOLLOW_HEAD if hollow else HEAD
+    least_head, least_fit = (HOLLOW_HEAD, MIN_HOLLOW_FIT) if hollow else (HEAD, MIN_FIT)
     ys, xs = np.nonzero(patch)
     points = np.stack([xs, ys], axis=1).astype(np.float64)
     centre = points.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((points - centre).T))
-    best: _Shape | None = None
     hull = cv2.convexHull(points.astype(np.float32))[:, 0]
     gaps = hull[:, None] - hull[None]
     i, j = np.unravel_index(int((gaps**2).sum(axis=2).argmax()), (len(hull), len(hull)))
     diameter = (hull[i] - hull[j]).astype(np.float64)
-    for axis in (vectors[:, 1], diameter / np.linalg.norm(diameter)):
-        for sign in (1.0, -1.0):
-            shape = _measure(points, centre, sign * axis, patch, least_head)
-            if shape is not None and (best is None or shape.fit > best.fit):
-                best = shape
-    return best if best is not None and best.fit >= (MIN_HOLLOW_FIT if hollow else MIN_FIT) else None
+    best: _Shape | None = None
+    for axis, sign in itertools.product((vectors[:, 1], diameter / np.linalg.norm(diameter)), (1.0, -1.0)):
+        profile = _profile(points, centre, sign * axis, least_head)
+        for _ in range(2):
+            if profile is not None:
+                profile = _profile(points, profile.centre, profile.axis, least_head)
+        if profile is None or not profile.is_arrow_like():
+            continue
+        for filled in (True, False):
+            fit = profile.overlap(patch, filled)
+            if fit >= least_fit and (best is None or fit > best.fit):
+                best = _Shape(profile.tail, profile.tip, filled, fit)
+    return best
 
 
-def _measure(points: Floats, centre: Floats, axis: Floats, patch: Mask, least_head: float) -> _Shape | None:
-    """Reads shaft and head off the width profile along `axis` (tail to tip); the axis is refined on the shaft."""
-    profile = _profile(points, centre, axis, least_head)
-    for _ in range(2):
-        if profile is not None:
-            profile = _profile(points, profile.centre, profile.axis, least_head)
-    if profile is None or not profile.is_arrow_like():
-        return None
-    tail, tip = profile.centre + profile.axis * profile.start, profile.centre + profile.axis * profile.end
-    thickness, head_width = profile.thickness, profile.head_width
-    head_length = len(profile.extent) - 1 - profile.peak
-    fits = {filled: _overlap(patch, tail, tip, thickness, head_width, head_length, filled) for filled in (True, False)}
-    filled = fits[True] >= fits[False]
-    return _Shape(tail, tip, filled, fits[filled])
+@dataclass(frozen=True)
+class _Profile:
+    """The width of a patch along an axis from tail to tip, and the axis that its shaft then has."""
+
+    extent: Floats  # [n] px: the width at every px along the axis; NaN where nothing lies
+    tail: Floats
+    tip: Floats
+    thickness: float
+    head_width: float
+    peak: int  # where along the axis it is widest
+    neck: int  # where the head begins
+    middle: float  # px beside the axis: the middle of the head
+    axis: Floats  # unit vector along the shaft
+    centre: Floats  # a point on it
+
+    def is_arrow_like(self) -> bool:
+        """Whether the shaft keeps its width, and the head is symmetric, of plausible length and tapers to a tip."""
+        extent, thickness, head_width, peak = self.extent, self.thickness, self.head_width, self.peak
+        n = len(extent)
+        shaft_extent = extent[max(1, n // 20) : max(self.neck - 1, n // 3)]
+        steady = float(np.nanmean(np.abs(shaft_extent - thickness) <= max(1.6, 0.3 * thickness)))
+        head_length = n - 1 - peak
+        return not (
+            steady < 0.75
+            or len(shaft_extent) < 0.25 * n
+            or head_length < 0.35 * (head_width - thickness) / 2
+            or head_length > min(0.7 * n, 2.5 * head_width)
+            or abs(self.middle) > 0.22 * head_width + 1
+            or float(np.nanmean(np.diff(extent[peak:]) <= 1.5)) < 0.9
+            or extent[-1] > 0.45 * head_width + thickness
+        )
+
+    def overlap(self, patch: Mask, filled: bool) -> float:
+        """Intersection over union of a patch and the ideal arrow of these measures."""
+        tail, tip, thickness = self.tail, self.tip, self.thickness
+        axis = (tip - tail) / np.linalg.norm(tip - tail)
+        normal = np.array([-axis[1], axis[0]])
+        pad = int(thickness) + 3
+        ideal = np.zeros((patch.shape[0] + 2 * pad, patch.shape[1] + 2 * pad), np.uint8)
+
+        def fixed(*points: Floats) -> NDArray[np.int32]:
+            return np.round((np.array(points) + pad) * 16).astype(np.int32)
+
+        half = self.head_width / 2 if filled else max(0.0, (self.head_width - thickness) / 2)
+        base = tip - axis * (len(self.extent) - 1 - self.peak)
+        barbs = base + normal * half, base - normal * half
+        across = normal * max(0.5, thickness / 2 - 0.25)
+        point = tip - axis * thickness / 2
+        shaft_end = base if filled else point
+        shaft = fixed(tail + across, shaft_end + across, shaft_end - across, tail - across)
+        cv2.fillPoly(ideal, [shaft], 1, cv2.LINE_8, 4)
+        if filled:
+            cv2.fillPoly(ideal, [fixed(barbs[0], tip, barbs[1])], 1, cv2.LINE_8, 4)
+        else:
+            for barb in barbs:
+                start, end = fixed(barb, point).tolist()
+                cv2.line(ideal, start, end, 1, max(1, round(thickness)), cv2.LINE_8, 4)
+        real, drawn = np.pad(patch, pad), ideal.astype(bool)
+        return float((real & drawn).sum() / max(1, (real | drawn).sum()))
 
 
 def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) -> _Profile | None:
     """The widths of a patch's points [N, 2] along an axis, or None where they are no shaft followed by a wider head."""
     normal = np.array([-axis[1], axis[0]])
     along, across = (points - centre) @ axis, (points - centre) @ normal
-    start, end = float(along.min()), float(along.max())
-    length = end - start
+    length = float(along.max() - along.min())
     if length < MIN_LENGTH:
         return None
-    bins = np.clip((along - start).astype(int), 0, int(length))
+    bins = np.clip((along - along.min()).astype(int), 0, int(length))
     n = int(length) + 1
     high, low = np.full(n, -1e9), np.full(n, 1e9)
     np.maximum.at(high, bins, across)
@@ -189,46 +205,13 @@ def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) ->
     shaft = (bins > n // 20) & (bins < max(neck - 1, n // 3))
     if shaft.sum() < 12:
         return None
-    vx, vy, x0, y0 = (
-        float(v) for v in cv2.fitLine(points[shaft].astype(np.float32), cv2.DIST_L2, 0, 0.01, 0.01).ravel()
-    )
-    line = np.array([vx, vy]) if vx * axis[0] + vy * axis[1] > 0 else -np.array([vx, vy])
+    fitted = cv2.fitLine(points[shaft].astype(np.float32), cv2.DIST_L2, 0, 0.01, 0.01).ravel().astype(np.float64)
+    line, origin = fitted[:2], fitted[2:]
+    line = line if line[0] * axis[0] + line[1] * axis[1] > 0 else -line
     middle = float(high[peak] + low[peak]) / 2
-    origin = np.array([x0, y0])
     along = (points - origin) @ line
-    start, end = float(along.min()), float(along.max())
-    return _Profile(extent, start, end, thickness, head_width, peak, neck, middle, line, origin)
-
-
-def _overlap(
-    patch: Mask, tail: Floats, tip: Floats, thickness: float, head_width: float, head_length: float, filled: bool
-) -> float:
-    """Intersection over union of the patch and the ideal arrow of these measures."""
-    axis = (tip - tail) / np.linalg.norm(tip - tail)
-    normal = np.array([-axis[1], axis[0]])
-    pad = int(thickness) + 3
-    ideal = np.zeros((patch.shape[0] + 2 * pad, patch.shape[1] + 2 * pad), np.uint8)
-    half = head_width / 2 if filled else max(0.0, (head_width - thickness) / 2)
-    base = tip - axis * head_length
-    barbs = [base + normal * half, base - normal * half]
-
-    def fixed(points: list[Floats]) -> NDArray[np.int32]:
-        return np.round((np.array(points) + pad) * 16).astype(np.int32)
-
-    w = max(0.5, thickness / 2 - 0.25)
-    shaft_end = base if filled else tip - axis * thickness / 2
-    body = [tail + normal * w, shaft_end + normal * w, shaft_end - normal * w, tail - normal * w]
-    cv2.fillPoly(ideal, [fixed(body)], 1, cv2.LINE_8, 4)
-    if filled:
-        cv2.fillPoly(ideal, [fixed([barbs[0], tip, barbs[1]])], 1, cv2.LINE_8, 4)
-    else:
-        line = max(1, round(thickness))
-        for barb in barbs:
-            start, end = fixed([barb, tip - axis * thickness / 2])
-            cv2.line(ideal, start.tolist(), end.tolist(), 1, line, cv2.LINE_8, 4)
-    real = np.pad(patch, pad)
-    drawn = ideal.astype(bool)
-    return float((real & drawn).sum() / max(1, (real | drawn).sum()))
+    tail, tip = origin + line * along.min(), origin + line * along.max()
+    return _Profile(extent, tail, tip, thickness, head_width, peak, neck, middle, line, origin)
 
 
 MIN_SIDE = 14  # px at the working size
@@ -240,49 +223,35 @@ COVERED = 0.85  # share of that rectangle's outline that the stroke covers: dash
 class DrawnBox:
     """A rectangle drawn over the image to mark something. It does not say what."""
 
-    bbox: tuple[float, float, float, float]  # x0, y0, x1, y1, px: inside the line
+    bbox: BBox  # x0, y0, x1, y1, px: inside the line
     colour: tuple[int, int, int]  # RGB
     mask: Mask  # [H, W]: the line with its fringe
 
 
-def find_boxes(image: WorkingImage, strokes: Iterable[Stroke], size: tuple[int, int]) -> tuple[DrawnBox, ...]:
-    """Drawn boxes among the strokes of an image whose full size is [height, width], largest first."""
+def find_boxes(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[DrawnBox, ...]:
+    """Drawn boxes among the strokes of an image, largest first."""
     boxes: list[DrawnBox] = []
     for stroke in strokes:
-        if stroke.hollow:  # a box is drawn around something: its inside is not drawn
+        patch, (h, w) = stroke.patch, stroke.patch.shape
+        if stroke.hollow or min(h, w) < MIN_SIDE:  # a box is drawn around something: its inside is not drawn
             continue
-        line = _line_width(stroke.patch)
-        if line is None:
+        sides = (patch[:, w // 2], patch[:, w // 2][::-1], patch[h // 2], patch[h // 2][::-1])
+        starts = [int(np.argmax(side)) for side in sides]  # the line begins within a fringe of 2 px
+        widths = [
+            start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0
+            for start, side in zip(starts, sides, strict=True)
+        ]
+        line = int(np.median(widths))
+        if not 1 <= line <= 0.2 * min(h, w):
             continue
-        h, w = stroke.patch.shape
+        frame = np.ones((h, w), bool)
+        frame[line + 1 : h - line - 1, line + 1 : w - line - 1] = False
+        rim = [patch[:line].any(0), patch[-line:].any(0), patch[:, :line].any(1), patch[:, -line:].any(1)]
+        if patch[frame].sum() < ON_OUTLINE * patch.sum() or np.concatenate(rim).mean() < COVERED:
+            continue
         inner = (stroke.x + line, stroke.y + line, stroke.x + w - line, stroke.y + h - line)
         x0, y0, x1, y1 = (value / image.scale for value in inner)
-        if any(np.abs(np.array(box.bbox) - (x0, y0, x1, y1)).max() < 8 / image.scale for box in boxes):
-            continue
-        mask = full_size(drawing_mask(image.pixels, stroke), size)
-        boxes.append(DrawnBox((x0, y0, x1, y1), stroke.colour, mask))
+        if all(np.abs(np.array(box.bbox) - (x0, y0, x1, y1)).max() >= 8 / image.scale for box in boxes):
+            mask = image.full(drawing_mask(image.pixels, stroke))
+            boxes.append(DrawnBox((x0, y0, x1, y1), stroke.colour, mask))
     return tuple(sorted(boxes, key=lambda box: -(box.bbox[2] - box.bbox[0]) * (box.bbox[3] - box.bbox[1])))
-
-
-def _line_width(patch: Mask) -> int | None:
-    """Width in px of the line, where the patch [h, w] is the outline of an upright rectangle; else None."""
-    h, w = patch.shape
-    if min(h, w) < MIN_SIDE:
-        return None
-    sides = (patch[:, w // 2], patch[:, w // 2][::-1], patch[h // 2], patch[h // 2][::-1])
-    starts = [int(np.argmax(side)) for side in sides]  # the line begins within a fringe of 2 px
-    widths = [
-        start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0
-        for start, side in zip(starts, sides, strict=True)
-    ]
-    line = int(np.median(widths))
-    if not 1 <= line <= 0.2 * min(h, w):
-        return None
-    outline = np.zeros((h, w), np.uint8)
-    cv2.rectangle(outline, (0, 0), (w - 1, h - 1), 1, -1)
-    outline[line + 1 : h - line - 1, line + 1 : w - line - 1] = 0
-    frame = outline.astype(bool)
-    rim = np.concatenate([patch[:line].any(0), patch[-line:].any(0), patch[:, :line].any(1), patch[:, -line:].any(1)])
-    if patch[frame].sum() < ON_OUTLINE * patch.sum() or rim.mean() < COVERED:
-        return None
-    return line

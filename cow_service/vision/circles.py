@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.records import BBox
+from cow_service.records import BBox, Point
 from cow_service.vision.contrast import lab_gradients
 from cow_service.vision.masks import lab_of, scaled
 from cow_service.vision.types import Floats, Floats32, Image, Mask
@@ -49,13 +49,18 @@ class Circle:
     on_edges: frozenset[int]  # bins of the circumference, clockwise from the right
 
     @property
+    def centre(self) -> Point:
+        """px."""
+        return self.x, self.y
+
+    @property
     def support(self) -> float:
         """Share of the circumference that lies on edges."""
         return len(self.on_edges) / BINS
 
     def is_same(self, other: Circle) -> bool:
         """Whether another circle is about the same."""
-        apart = math.hypot(self.x - other.x, self.y - other.y)
+        apart = math.dist(self.centre, other.centre)
         return apart < SAME * other.radius and abs(self.radius - other.radius) < SAME * other.radius
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision.types import Floats, Floats32, Image, Mask
@@ -75,9 +76,20 @@ def iou(a: BBox, b: BBox) -> float:
     return width * height / both
 
 
+def dilated(mask: Mask, width: int = 3, times: int = 1) -> Mask:
+    """A mask [H, W] grown by a square of a width (px), so many times."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((width, width), np.uint8), iterations=times) > 0
+
+
 def outline_of(mask: Mask) -> Mask:
     """The pixels [H, W] of a mask that have a pixel outside it beside them."""
     return mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+
+
+def outer_contour(mask: Mask) -> NDArray[np.int32]:
+    """The points [N, 1, 2] (x, y, px) of the outer outline of a mask's largest patch. It must not be empty."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(max(contours, key=cv2.contourArea), np.int32)
 
 
 def hull(mask: Mask) -> Mask:

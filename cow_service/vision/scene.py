@@ -18,7 +18,7 @@ from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, iou, without_holes
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region, disc_region, find_regions, region_of
 from cow_service.vision.segmentation import CutQuality, cut_quality, mask_from_bbox, mask_from_point
-from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes, working_image
+from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
 from cow_service.vision.types import Image, Mask
@@ -143,18 +143,18 @@ class Scene:
 
     @cached_property
     def _strokes(self) -> tuple[WorkingImage, tuple[Stroke, ...]]:
-        small = working_image(self.image)
+        small = WorkingImage.of(self.image)
         return small, tuple(find_strokes(small.pixels))
 
     @cached_property
     def arrows(self) -> tuple[Arrow, ...]:
         """Arrows drawn over the image, best fit first."""
-        return find_arrows(*self._strokes, (self.height, self.width))
+        return find_arrows(*self._strokes)
 
     @cached_property
     def boxes(self) -> tuple[DrawnBox, ...]:
         """Boxes drawn over the image, largest first."""
-        return find_boxes(*self._strokes, (self.height, self.width))
+        return find_boxes(*self._strokes)
 
     @cached_property
     def cues(self) -> Mask:

@@ -6,6 +6,7 @@ their shape.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import scaled
+from cow_service.vision.masks import outer_contour, scaled
 from cow_service.vision.types import Image, Mask
 
 WORKING_SIDE = 896  # px: longer images are searched at this size
@@ -50,6 +51,14 @@ class Stroke:
     colour: Colour  # RGB; of a rim where the stroke has one
     hollow: bool = False  # a rim and the one flat colour that it encloses, both in the patch
 
+    def surroundings(self, image: Image, pad: int) -> tuple[tuple[slice, slice], NDArray[np.uint8]]:
+        """Rows and columns of the image up to `pad` px around it, and its patch there: 1 where it is, else 0."""
+        (h, w), top, left = self.patch.shape, max(0, self.y - pad), max(0, self.x - pad)
+        window = slice(top, self.y + h + pad), slice(left, self.x + w + pad)
+        patch = np.zeros(image[window].shape[:2], np.uint8)
+        patch[self.y - top : self.y - top + h, self.x - left : self.x - left + w] = self.patch
+        return window, patch
+
 
 @dataclass(frozen=True)
 class WorkingImage:
@@ -57,34 +66,47 @@ class WorkingImage:
 
     pixels: Image
     scale: float
+    size: tuple[int, int]  # of the image itself: height and width
 
+    @staticmethod
+    def of(image: Image) -> WorkingImage:
+        """The image, scaled down where it is longer than the working size."""
+        scale = min(1.0, WORKING_SIDE / max(image.shape[:2]))
+        return WorkingImage(scaled(image, scale), scale, (image.shape[0], image.shape[1]))
 
-def working_image(image: Image) -> WorkingImage:
-    """The image, scaled down where it is longer than the working size."""
-    scale = min(1.0, WORKING_SIDE / max(image.shape[:2]))
-    return WorkingImage(scaled(image, scale), scale)
+    def full(self, mask: Mask) -> Mask:
+        """A mask of working size at the size of the image itself."""
+        if mask.shape == self.size:
+            return mask
+        return cv2.resize(mask.astype(np.uint8), self.size[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 def find_strokes(image: Image) -> Iterator[Stroke]:
     """Candidates in an RGB image [h, w, 3] of working size. A drawing can be found twice, with slight differences."""
-    for (bx, by, bw, bh), thin in ((patch.box, patch.mask) for patch in _patches(_thin_structures(image), most=1.0)):
+    # Where something narrow stands out from what is around it, and a little beyond.
+    half = scaled(image, 0.5)
+    around = cv2.medianBlur(half, THIN // 2 | 1)
+    narrow = (cv2.absdiff(half, around).max(axis=2) > STANDS_OUT).astype(np.uint8) * 255
+    narrow = cv2.resize(cv2.dilate(narrow, _SQUARE), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    for (bx, by, bw, bh), thin in (
+        (patch.box, patch.mask) for patch in _patches(np.asarray(narrow, np.uint8), most=1.0)
+    ):
         window = image[by : by + bh, bx : bx + bw]
         allowed = thin.astype(np.uint8) * np.uint8(255)
         known: dict[Box, int] = {}
-        for colour in _flat_colours(window[thin]):
-            for tolerance in TOLERANCES:
-                same = np.asarray(cv2.bitwise_and(_alike(window, colour, tolerance), allowed), np.uint8)
-                for patch in _patches(same, most=0.30, flat=partial(_alike, window, colour, FLAT)):
-                    before = known.get(patch.box)
-                    if before is not None and abs(patch.area - before) <= ALIKE * before:
-                        continue
-                    known[patch.box] = patch.area
-                    if 2 * patch.flat < patch.area:
-                        continue
-                    stroke = Stroke(bx + patch.box[0], by + patch.box[1], patch.mask, colour)
-                    if _is_drawn(image, stroke):
-                        yield stroke
-                        yield from _hollow(image, stroke)
+        for colour, tolerance in itertools.product(_flat_colours(window[thin]), TOLERANCES):
+            same = np.asarray(cv2.bitwise_and(_alike(window, colour, tolerance), allowed), np.uint8)
+            for patch in _patches(same, most=0.30, flat=partial(_alike, window, colour, FLAT)):
+                before = known.get(patch.box)
+                if before is not None and abs(patch.area - before) <= ALIKE * before:
+                    continue
+                known[patch.box] = patch.area
+                if 2 * patch.flat < patch.area:
+                    continue
+                stroke = Stroke(bx + patch.box[0], by + patch.box[1], patch.mask, colour)
+                if _is_drawn(image, stroke):
+                    yield stroke
+                    yield from _hollow(image, stroke)
 
 
 def _alike(image: Image, colour: Colour, tolerance: int) -> NDArray[np.uint8]:
@@ -95,18 +117,12 @@ def _alike(image: Image, colour: Colour, tolerance: int) -> NDArray[np.uint8]:
 
 def drawing_mask(image: Image, stroke: Stroke) -> Mask:
     """Mask [h, w] of the stroke with the outline around it, if it has one, and the fringe that compression leaves."""
-    pad = FRINGE + 2 * OUTLINE_MOST
-    h, w = stroke.patch.shape
-    y0, x0 = max(0, stroke.y - pad), max(0, stroke.x - pad)
-    window = slice(y0, stroke.y + h + pad), slice(x0, stroke.x + w + pad)
-    near = image[window]
-    patch = np.zeros(near.shape[:2], np.uint8)
-    patch[stroke.y - y0 : stroke.y - y0 + h, stroke.x - x0 : stroke.x - x0 + w] = stroke.patch
+    window, patch = stroke.surroundings(image, FRINGE + 2 * OUTLINE_MOST)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
     reach, grown = FRINGE, cv2.dilate(patch, kernel)
     for width in range(1, OUTLINE_MOST + 1):
         wider = cv2.dilate(grown, kernel)
-        ring = near[(wider > 0) & (grown == 0)].astype(np.float32)
+        ring = image[window][(wider > 0) & (grown == 0)].astype(np.float32)
         if len(ring):
             colour = np.median(ring, axis=0)
             is_ink = colour.min() > 225 or colour.max() < 30  # outlines are white or black
@@ -118,39 +134,16 @@ def drawing_mask(image: Image, stroke: Stroke) -> Mask:
     return mask
 
 
-def full_size(mask: Mask, size: tuple[int, int]) -> Mask:
-    """A mask of working size at the image's full size [height, width]."""
-    if mask.shape == size:
-        return mask
-    return cv2.resize(mask.astype(np.uint8), (size[1], size[0]), interpolation=cv2.INTER_NEAREST).astype(bool)
-
-
-def _thin_structures(image: Image) -> NDArray[np.uint8]:
-    """255 where something narrow stands out from what is around it, and a little beyond."""
-    half = scaled(image, 0.5)
-    around = cv2.medianBlur(half, THIN // 2 | 1)
-    thin = (cv2.absdiff(half, around).max(axis=2) > STANDS_OUT).astype(np.uint8) * 255
-    thin = cv2.dilate(thin, np.ones((3, 3), np.uint8))
-    thin = cv2.resize(thin, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
-    return np.asarray(thin, np.uint8)
-
-
 def _is_drawn(image: Image, stroke: Stroke) -> bool:
     """Whether a patch of one colour has a sharp edge all around, unlike shading."""
-    x, y, (h, w) = stroke.x, stroke.y, stroke.patch.shape
-    pad = 4
-    x0, y0 = max(0, x - pad), max(0, y - pad)
-    x1, y1 = min(image.shape[1], x + w + pad), min(image.shape[0], y + h + pad)
-    inside = np.zeros((y1 - y0, x1 - x0), np.uint8)
-    inside[y - y0 : y - y0 + h, x - x0 : x - x0 + w] = stroke.patch
+    window, inside = stroke.surroundings(image, 4)
     near = cv2.dilate(inside, _SQUARE, iterations=2)
-    ring = cv2.dilate(near, _SQUARE) > near
-    beyond = image[y0:y1, x0:x1][ring].astype(np.int16)
+    beyond = image[window][cv2.dilate(near, _SQUARE) > near].astype(np.int16)
     sharp = (np.abs(beyond - np.array(stroke.colour, np.int16)) > SHARP).any(axis=1)
     if np.count_nonzero(sharp) <= SHARP_SHARE * len(beyond):
         return False
-    reach = max(h, w)  # what has the colour of its surroundings is floor that is seen between two objects
-    around = image[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
+    # What has the colour of its surroundings is floor that is seen between two objects.
+    around = image[stroke.surroundings(image, max(stroke.patch.shape))[0]]
     alike = np.count_nonzero(_alike(around, stroke.colour, FLAT)) - np.count_nonzero(stroke.patch)
     return alike <= GAP_SHARE * around.shape[0] * around.shape[1]
 
@@ -159,44 +152,34 @@ def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
     """The hollow drawing of which a stroke may be the rim, and that of which it may be the inside."""
     whole = _outlined(stroke.patch)
     if np.count_nonzero(whole & ~stroke.patch) > LEAST_INSIDE * np.count_nonzero(whole):
-        h, w = stroke.patch.shape
         inside = cv2.erode((whole & ~stroke.patch).astype(np.uint8), _SQUARE, borderValue=0) > 0
-        pixels = image[stroke.y : stroke.y + h, stroke.x : stroke.x + w][inside].astype(np.int16)
+        pixels = image[stroke.surroundings(image, 0)[0]][inside].astype(np.int16)
         if len(pixels) and np.median(np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)) <= TOLERANCES[1]:
             yield Stroke(stroke.x, stroke.y, whole, stroke.colour, hollow=True)
-    elif cv2.erode(stroke.patch.astype(np.uint8), _SQUARE, borderValue=0).sum() > LEAST_INSIDE * stroke.patch.sum():
-        yield from _with_rim(image, stroke)
-
-
-def _with_rim(image: Image, inside: Stroke) -> Iterator[Stroke]:
-    """A flat patch with the rim around it, where that has a colour of its own, unlike the patch and what lies beyond.
-
-    Compression may have broken such a rim: as a stroke of its own it is then not found.
-    """
+        return
+    if cv2.erode(stroke.patch.astype(np.uint8), _SQUARE, borderValue=0).sum() <= LEAST_INSIDE * stroke.patch.sum():
+        return
+    # The rim around a flat patch has a colour of its own, unlike the patch and what lies beyond. Compression may have
+    # broken it: as a stroke of its own it is then not found.
     pad = OUTLINE_MOST + FRINGE + 1
-    h, w = inside.patch.shape
-    y0, x0 = max(0, inside.y - pad), max(0, inside.x - pad)
-    near = image[y0 : inside.y + h + pad, x0 : inside.x + w + pad].astype(np.int16)
-    patch = np.zeros(near.shape[:2], np.uint8)
-    patch[inside.y - y0 : inside.y - y0 + h, inside.x - x0 : inside.x - x0 + w] = inside.patch
+    window, patch = stroke.surroundings(image, pad)
+    near = image[window].astype(np.int16)
     grown = [patch, *(cv2.dilate(patch, _CROSS, iterations=i) for i in (1, 3, OUTLINE_MOST + 1, pad - 2, pad))]
     rim, beyond = (
         np.median(near[(grown[outer] > 0) & (grown[inner] == 0)], axis=0) for inner, outer in ((1, 2), (4, 5))
     )
-    unlike = min(np.abs(rim - beyond).max(), np.abs(rim - np.array(inside.colour)).max())
-    if unlike <= SHARP:
-        return
-    is_rim = (grown[3] > 0) & (2 * np.abs(near - rim).sum(axis=2) < np.abs(near - beyond).sum(axis=2))
-    count, labels, _, _ = cv2.connectedComponentsWithStats(((patch > 0) | is_rim).astype(np.uint8), connectivity=4)
-    kept = labels == np.bincount(labels[patch > 0], minlength=count).argmax()
-    yield Stroke(x0, y0, _outlined(kept), (int(rim[0]), int(rim[1]), int(rim[2])), hollow=True)
+    if min(np.abs(rim - beyond).max(), np.abs(rim - np.array(stroke.colour)).max()) > SHARP:
+        is_rim = (grown[3] > 0) & (2 * np.abs(near - rim).sum(axis=2) < np.abs(near - beyond).sum(axis=2))
+        count, labels = cv2.connectedComponents(((patch > 0) | is_rim).astype(np.uint8), connectivity=4)
+        kept = labels == np.bincount(labels[patch > 0], minlength=count).argmax()
+        colour = int(rim[0]), int(rim[1]), int(rim[2])
+        yield Stroke(window[1].start, window[0].start, _outlined(kept), colour, hollow=True)
 
 
 def _outlined(patch: Mask) -> Mask:
     """The area [h, w] within the outer outline of a patch."""
-    contours, _ = cv2.findContours(patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     whole = np.zeros(patch.shape, np.uint8)
-    cv2.drawContours(whole, [max(contours, key=cv2.contourArea)], -1, 1, -1)
+    cv2.drawContours(whole, [outer_contour(patch)], -1, 1, -1)
     return whole > 0
 
 
@@ -254,16 +237,12 @@ def _patches(same: NDArray[np.uint8], most: float, flat: Callable[[], NDArray[np
     squared = stats[:, 2].astype(np.int64) ** 2 + stats[:, 3].astype(np.int64) ** 2
     fitting = (stats[:, 4] >= 40) & (squared >= MIN_LENGTH**2) & (stats[:, 4] <= most * squared)
     fitting[0] = False  # the background
-    chosen = np.nonzero(fitting)[0].tolist()
     flats = np.zeros(len(stats), np.int64)
-    if flat is not None and chosen:
+    if flat is not None and fitting.any():
         flats = np.bincount(labels[flat()[window] > 0], minlength=len(stats))
     patches: list[_Patch] = []
-    for i in chosen:
+    for i in np.nonzero(fitting)[0].tolist():
         x, y, w, h, area = stats[i].tolist()
-        patches.append(
-            _Patch(
-                (left + x, top + y, w, h), area, int(flats[i]), np.asarray(labels[y : y + h, x : x + w], np.int32), i
-            )
-        )
+        own = np.asarray(labels[y : y + h, x : x + w], np.int32)
+        patches.append(_Patch((left + x, top + y, w, h), area, int(flats[i]), own, i))
     return patches

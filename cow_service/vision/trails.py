@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -22,99 +23,6 @@ from cow_service.vision.types import Floats, Image, Mask
 UNLIKE, LEAST_CONTRAST = 0.3, 12.0  # difference of appearance over the contrast, at most; grey levels of that contrast
 LEAST_OPACITY = 0.08
 MOST_UNREST = 12.0  # grey levels of a background's variation that are allowed for
-# Radii: offsets from the centre at which appearances are compared.
-OFFSETS = np.array([(r * math.cos(t), r * math.sin(t)) for r in (0.25, 0.5, 0.7, 0.85)
-                    for t in np.linspace(0, 2 * math.pi, 24, endpoint=False)])  # fmt: skip
-_TURNS = np.linspace(0, 2 * math.pi, 48, endpoint=False)
-AROUND_RIM = np.concatenate([f * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1) for f in (1.15, 1.3)])  # the same
-
-
-@dataclass(frozen=True, eq=False)
-class Appearance:
-    """How circles of an RGB image [H, W, 3] look inside and about them, in grey levels."""
-
-    image: Image
-
-    def contrast(self, circle: Circle) -> float:
-        """Lower quartile of the steps from inside to outside over the edges on a circle."""
-        turns = (np.array(sorted(circle.on_edges)) + 0.5) * 2 * math.pi / BINS
-        rim = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-        inside, outside = (self._at(circle, factor * rim) for factor in (0.85, 1.15))
-        return float(np.percentile(np.linalg.norm(inside - outside, axis=1), 25))
-
-    def alike(self, chain: Sequence[Circle]) -> bool:
-        """Whether all look like the first or the last, faded or not."""
-        return self.opacities(chain) is not None
-
-    def opacities(self, chain: Sequence[Circle], compared: bool = True) -> Floats | None:
-        """Opacity [N] of each circle against one that is the most opaque; None where they do not look alike.
-
-        Without `compared` they are known to.
-        """
-        rings: list[Floats] = []  # colours around each, others left out
-        for i, circle in enumerate(chain):
-            outside = self._free(i, chain, AROUND_RIM, 1.1)
-            rings.append(self._at(circle, AROUND_RIM[outside] if outside.sum() > 8 else AROUND_RIM))
-        about = [np.median(ring, axis=0) for ring in rings]
-        unrest = [float(np.median(np.linalg.norm(r - a, axis=1))) for r, a in zip(rings, about, strict=True)]
-        inner = [self._at(circle, OFFSETS) for circle in chain]
-        free = [self._free(i, chain, OFFSETS, 1.05) for i in range(len(chain))]
-        strength = [float(np.abs(v[f] - b).mean()) if f.any() else 0.0
-                    for v, b, f in zip(inner, about, free, strict=True)]  # fmt: skip
-        model = max((0, len(chain) - 1), key=lambda i: strength[i])
-        shares: list[float] = []
-        for i in range(len(chain)):
-            both = free[i] & free[model]
-            if np.count_nonzero(both) < 6:
-                both = free[i] | free[model]
-            seen, wanted = inner[i][both], inner[model][both]
-            share = _opacity(seen - about[i], wanted - about[model], seen - wanted, unrest[i] if compared else math.inf)
-            if share is None:
-                return None
-            shares.append(share)
-        return np.array(shares)
-
-    def _at(self, circle: Circle, offsets: Floats) -> Floats:
-        """Colours [N, 3] at offsets [N, 2] (radii) from a circle's centre."""
-        xs = np.clip(circle.x + circle.radius * offsets[:, 0], 0, self.image.shape[1] - 1).astype(int)
-        ys = np.clip(circle.y + circle.radius * offsets[:, 1], 0, self.image.shape[0] - 1).astype(int)
-        return self.image[ys, xs].astype(np.float64)
-
-    def _free(self, i: int, chain: Sequence[Circle], offsets: Floats, factor: float) -> Mask:
-        """Which offsets [N, 2] (radii) of a circle lie in no other, their radii multiplied."""
-        points = np.array([chain[i].x, chain[i].y]) + chain[i].radius * offsets
-        return ~inside_any(points, [other for j, other in enumerate(chain) if j != i], factor)
-
-
-def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float | None:
-    """The share of a model's contrast [N, 3] that is seen [N, 3]; None where what is seen is no share of it.
-
-    `plain` [N, 3] are the differences of the colours themselves, which do not depend on the background; `unrest`
-    is how much that varies (grey levels), infinite where they are known to be alike.
-    """
-    contrast = float(np.median(np.linalg.norm(model, axis=1)))
-    if contrast < LEAST_CONTRAST:
-        return None
-    if float(np.median(np.linalg.norm(plain, axis=1))) < UNLIKE * contrast / 2:
-        return 1.0
-    share = float((seen * model).sum() / (model**2).sum())
-    rest = float(np.median(np.linalg.norm(seen - share * model, axis=1)))
-    if math.isinf(unrest):
-        return min(max(share, LEAST_OPACITY), 1.0)
-    allowed = min(unrest, MOST_UNREST)
-    if not LEAST_OPACITY < share < 1.15 or rest > UNLIKE * contrast * share + allowed:
-        return None
-    return min(share, 1.0)
-
-
-def inside_any(points: Floats, circles: Sequence[Circle], factor: float) -> Mask:
-    """Which points [N, 2] (px) lie inside any of circles, their radii multiplied."""
-    inside = np.zeros(len(points), bool)
-    for circle in circles:
-        inside |= np.hypot(points[:, 0] - circle.x, points[:, 1] - circle.y) < factor * circle.radius
-    return inside
-
-
 END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
 PALE_SUPPORT, PREDICTED = 0.4, 0.2  # the same of one that a trail's path leads to, and how near to it, in radii
 SURE_SUPPORT = 0.3  # of the circumference: with more, no better circle is sought nearby
@@ -129,7 +37,21 @@ MOST_SAG = 0.3  # of the distance of two positions: how far those between may li
 MAX_POSITIONS = 12
 MAX_PAIRS = 6  # circles that look alike, between and beyond which others are sought
 SAME_POSITION_IOU = 0.4
-AROUND = np.array([(0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25)])  # radii: where a circle is sought
+
+
+Chain = tuple[Circle, ...]  # along a path, in order
+
+
+def _ring(turns: Floats, *radii: float) -> Floats:
+    """Points [N, 2] around the origin."""
+    return np.concatenate([radius * np.stack([np.cos(turns), np.sin(turns)], axis=1) for radius in radii])
+
+
+RIM = _ring((np.arange(BINS) + 0.5) * 2 * math.pi / BINS, 1.0)  # the middles of a circumference's bins, radii
+# Offsets from a centre (radii): where appearances are compared, inside and around a rim, and where circles are sought.
+INSIDE = _ring(np.linspace(0, 2 * math.pi, 24, endpoint=False), 0.25, 0.5, 0.7, 0.85)
+AROUND_RIM = _ring(np.linspace(0, 2 * math.pi, 48, endpoint=False), 1.15, 1.3)
+AROUND = np.array([(0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25)])
 
 
 @dataclass(frozen=True)
@@ -204,12 +126,11 @@ class TrailEnd:
     is_oldest: bool = False  # that end is the oldest position, the other one the present
 
 
-def trail_of(trails: Sequence[Trail], bbox: BBox, end: TrailEnd | None = None) -> Trail | None:
-    """The trail that has a position in a box [x0, y0, x1, y1], with its present position at an end that is named."""
-    for trail in trails:
-        if any(iou(position.bbox, bbox) >= SAME_POSITION_IOU for position in trail.positions):
-            return trail if end is None else trail.ending(end)
-    return None
+def trail_of(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
+    """The trail that has a position in a box [x0, y0, x1, y1]."""
+    return next(
+        (trail for trail in trails if any(iou(p.bbox, bbox) >= SAME_POSITION_IOU for p in trail.positions)), None
+    )
 
 
 def trail_ending_at(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
@@ -226,143 +147,230 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     edges = Edges.of(image)
     if edges is None:
         return ()
-    appearance = Appearance(image)
-    ends = [circle for circle in edges.circles() if circle.support >= END_SUPPORT]
-    ends = [circle for circle in ends if appearance.contrast(circle) >= LEAST_CONTRAST]
+    search = _Search(edges, image)
+    ends = [c for c in edges.circles() if c.support >= END_SUPPORT and search.contrast(c) >= LEAST_CONTRAST]
     trails: list[Trail] = []
     tried = 0
     for a, b in itertools.combinations(ends, 2):
-        known = any(
-            math.dist((circle.x, circle.y), position.centre) < 0.6 * position.radius
-            for circle in (a, b)
-            for trail in trails
-            for position in trail.positions
-        )
+        found = [position for trail in trails for position in trail.positions]
+        known = any(math.dist(c.centre, p.centre) < 0.6 * p.radius for c in (a, b) for p in found)
         # Whether they may be positions of one ball with others between or beyond them.
-        apart, mean = math.dist((a.x, a.y), (b.x, b.y)), (a.radius + b.radius) / 2
+        apart, mean = math.dist(a.centre, b.centre), (a.radius + b.radius) / 2
         small, large = sorted((a.radius, b.radius))
         may_be_one = 0.25 * mean < apart < MOST_GAP * 3 * mean and large < SIZES**3 * small
-        if tried < MAX_PAIRS and not known and may_be_one and appearance.alike((a, b)):
+        if tried < MAX_PAIRS and not known and may_be_one and search.are_alike((a, b)):
             tried += 1
-            chain = _chain(edges, appearance, a, b)
-            trail = None if chain is None else _trail(appearance, chain)
-            if trail is not None:
-                trails.append(trail)
+            trail = search.trail_through(a, b)
+            trails += [] if trail is None else [trail]
     whole: list[Trail] = []
     for trail in sorted(trails, key=lambda trail: -len(trail.positions)):
-        if not any(
-            math.dist(p.centre, q.centre) < 0.6 * max(p.radius, q.radius)
-            for other in whole
-            for p in trail.positions
-            for q in other.positions
-        ):
+        pairs = ((p, q) for other in whole for p in trail.positions for q in other.positions)
+        if not any(math.dist(p.centre, q.centre) < 0.6 * max(p.radius, q.radius) for p, q in pairs):
             whole.append(trail)
     return tuple(whole)
 
 
-def _chain(edges: Edges, appearance: Appearance, a: Circle, b: Circle) -> tuple[Circle, ...] | None:
-    """The circles along the path through two of them, in order; None where they are fewer than three, or no path."""
-    best: tuple[Circle, ...] = ()
-    reach = 0.5 * math.dist((a.x, a.y), (b.x, b.y)) + 1.6 * max(a.radius, b.radius)
-    low, high = (min(a.x, b.x) - reach, min(a.y, b.y) - reach), (max(a.x, b.x) + reach, max(a.y, b.y) + reach)
-    near = edges.within((*low, *high))
-    for inner in range(3 * MAX_POSITIONS // 4):
-        chain = _between(near, appearance, a, b, inner)
-        if chain is None:
-            continue
-        chain = _beyond(edges, appearance, _beyond(edges, appearance, chain)[::-1])
-        if (
-            len(chain) > max(2, len(best))
-            and _is_path(chain)
-            and appearance.alike(chain)
-            and _is_outlined(edges, chain)
-        ):
-            best = chain
-    for _ in range(2):  # both ends
-        best = _prolonged(edges, appearance, best)[::-1] if best else best
-    return best or None
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Looks for circles along a path in an RGB image [H, W, 3] that look like one ball, faded or not."""
 
+    edges: Edges
+    image: Image
 
-def _prolonged(edges: Edges, appearance: Appearance, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
-    """A chain with circles that its path leads on to, though too pale, or too much overlaid, to be compared."""
-    while len(chain) < MAX_POSITIONS:
-        x, y = (3 * getattr(chain[-1], at) - 3 * getattr(chain[-2], at) + getattr(chain[-3], at) for at in "xy")
-        found = _fit_near(edges, x, y, chain[-1].radius)
-        if found is None or found.support < PALE_SUPPORT or any(found.is_same(other) for other in chain):
-            return chain
-        near = math.dist((found.x, found.y), (x, y)) < PREDICTED * found.radius
-        if not near or not _is_path((*chain, found)) or appearance.contrast(found) < LEAST_CONTRAST / 2:
-            return chain
-        chain = (*chain, found)
-    return chain
+    def trail_through(self, a: Circle, b: Circle) -> Trail | None:
+        """The trail through two positions; None where fewer than three lie along a path.
 
+        Its more opaque end is the last; where they are alike, that of which more is seen.
+        """
+        best: Chain = ()
+        reach = 0.5 * math.dist(a.centre, b.centre) + 1.6 * max(a.radius, b.radius)
+        low, high = (min(a.x, b.x) - reach, min(a.y, b.y) - reach), (max(a.x, b.x) + reach, max(a.y, b.y) + reach)
+        near = self.edges.within((*low, *high))
+        for inner in range(3 * MAX_POSITIONS // 4):
+            chain = self.between(near, a, b, inner)
+            if chain is None:
+                continue
+            chain = self.beyond(self.beyond(chain)[::-1])
+            if len(chain) > max(2, len(best)) and _is_path(chain) and self.are_alike(chain) and self.is_outlined(chain):
+                best = chain
+        if not best:
+            return None
+        chain = self.prolonged(self.prolonged(best)[::-1])[::-1]
+        shares = self.opacities(chain, compared=False)
+        if shares is None:
+            return None
+        opacity = np.clip(shares / shares.max(), 0, 1)
+        positions = tuple(Position(c.x, c.y, c.radius, float(o)) for c, o in zip(chain, opacity, strict=True))
+        overlap = all(math.dist(p.centre, q.centre) < 0.95 * (p.radius + q.radius) for p, q in pairwise(positions))
+        known = abs(float(opacity[0] - opacity[-1])) > 1 - FADED
+        faded = known and float(np.sort(opacity)[:-1].max()) < FADED
+        rank = (opacity[0], opacity[-1]) if known else (chain[0].support, chain[-1].support)
+        ordered = positions if rank[1] >= rank[0] else positions[::-1]
+        return Trail(ordered, overlap or faded or (known and len(chain) > 3), known)
 
-def _between(edges: Edges, appearance: Appearance, a: Circle, b: Circle, inner: int) -> tuple[Circle, ...] | None:
-    """Two circles with so many others between them, evenly along an arc that bulges to one side or the other."""
-    apart = math.dist((a.x, a.y), (b.x, b.y))
-    gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
-    if not LEAST_GAP * mean < gap < MOST_GAP * mean:
-        return None
-    across = np.array([a.y - b.y, b.x - a.x]) / apart
-    shares = np.arange(1, inner + 1) / (inner + 1)
-    most = MOST_SAG * apart if inner else 0.0
-    for bulge in sorted([0.0, *np.arange(-most, most + 1e-9, 0.35 * mean).tolist()], key=abs):
-        chain, seeds = [a], []
-        for t in shares:
-            middle = np.array([a.x, a.y]) * (1 - t) + np.array([b.x, b.y]) * t + 4 * t * (1 - t) * bulge * across
-            seeds.append((float(middle[0]), float(middle[1]), a.radius ** (1 - t) * b.radius**t))
-        for seed in seeds:
-            found = _fit_near(edges, *seed)
-            if found is None or any(found.is_same(other) for other in (*chain, b)):
-                break
-            chain.append(found)
-        if len(chain) == inner + 1 and _is_path((*chain, b)) and appearance.alike((*chain, b)):
-            return (*chain, b)
-    return None
-
-
-def _beyond(edges: Edges, appearance: Appearance, chain: tuple[Circle, ...]) -> tuple[Circle, ...]:
-    """A chain with what goes on after its last circle."""
-    while len(chain) < MAX_POSITIONS:
-        last, before = chain[-1], chain[-2]
-        seeds = [(2 * last.x - before.x, 2 * last.y - before.y)]
-        if len(chain) > 2:
-            seeds.insert(0, (3 * last.x - 3 * before.x + chain[-3].x, 3 * last.y - 3 * before.y + chain[-3].y))
-        else:
-            dx, dy = last.x - before.x, last.y - before.y
-            for cosine, sine in ((math.cos(angle), math.sin(angle)) for angle in (-0.35, 0.35, -0.7, 0.7)):
-                seeds.append((last.x + dx * cosine - dy * sine, last.y + dx * sine + dy * cosine))
-        longer = None
-        for x, y in seeds:
-            found = _fit_near(edges, x, y, last.radius**2 / before.radius)
-            if found is not None and not any(found.is_same(other) for other in chain):
-                longer = (*chain, found)
-                if _is_path(longer) and appearance.alike(longer):
+    def between(self, edges: Edges, a: Circle, b: Circle, inner: int) -> Chain | None:
+        """Two circles with so many others between them, evenly along an arc that bulges to one side or the other."""
+        apart = math.dist(a.centre, b.centre)
+        gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
+        if not LEAST_GAP * mean < gap < MOST_GAP * mean:
+            return None
+        start, end, across = np.array(a.centre), np.array(b.centre), np.array([a.y - b.y, b.x - a.x]) / apart
+        most = MOST_SAG * apart if inner else 0.0
+        for bulge in sorted([0.0, *np.arange(-most, most + 1e-9, 0.35 * mean).tolist()], key=abs):
+            chain = [a]
+            for t in np.arange(1, inner + 1) / (inner + 1):
+                x, y = (start * (1 - t) + end * t + 4 * t * (1 - t) * bulge * across).tolist()
+                found = _fit_near(edges, x, y, a.radius ** (1 - t) * b.radius**t)
+                if found is None or any(found.is_same(other) for other in (*chain, b)):
                     break
-                longer = None
-        if longer is None:
-            return chain
-        chain = longer
-    return chain
+                chain.append(found)
+            whole = (*chain, b)
+            if len(whole) == inner + 2 and _is_path(whole) and self.are_alike(whole):
+                return whole
+        return None
+
+    def beyond(self, chain: Chain) -> Chain:
+        """A chain with what goes on after its last circle."""
+        while len(chain) < MAX_POSITIONS:
+            last, before = chain[-1], chain[-2]
+            dx, dy = last.x - before.x, last.y - before.y
+            seeds = [(2 * last.x - before.x, 2 * last.y - before.y)]
+            if len(chain) > 2:
+                seeds.insert(0, (3 * last.x - 3 * before.x + chain[-3].x, 3 * last.y - 3 * before.y + chain[-3].y))
+            else:
+                turns = [(math.cos(angle), math.sin(angle)) for angle in (-0.35, 0.35, -0.7, 0.7)]
+                seeds += [(last.x + dx * c - dy * s, last.y + dx * s + dy * c) for c, s in turns]
+            for x, y in seeds:
+                found = _fit_near(self.edges, x, y, last.radius**2 / before.radius)
+                if found is None or any(found.is_same(other) for other in chain):
+                    continue
+                if _is_path((*chain, found)) and self.are_alike((*chain, found)):
+                    chain = (*chain, found)
+                    break
+            else:
+                break
+        return chain
+
+    def prolonged(self, chain: Chain) -> Chain:
+        """A chain with circles that its path leads on to, though too pale, or too much overlaid, to be compared."""
+        while len(chain) < MAX_POSITIONS:
+            x, y = (3 * getattr(chain[-1], at) - 3 * getattr(chain[-2], at) + getattr(chain[-3], at) for at in "xy")
+            found = _fit_near(self.edges, x, y, chain[-1].radius)
+            if found is None or found.support < PALE_SUPPORT or any(found.is_same(other) for other in chain):
+                break
+            near = math.dist(found.centre, (x, y)) < PREDICTED * found.radius
+            if not near or not _is_path((*chain, found)) or self.contrast(found) < LEAST_CONTRAST / 2:
+                break
+            chain = (*chain, found)
+        return chain
+
+    def is_outlined(self, chain: Chain) -> bool:
+        """Whether edges show as much of each circle as the others leave to be seen, and the notches between them.
+
+        Circles that were fitted into a bottle do not pass.
+        """
+        notches = [notch for a, b in pairwise(chain) if (notch := self.edges.notch(a, b)) is not None]
+        if notches and float(np.median(notches)) < NOTCHED:
+            return False
+        for i, circle in enumerate(chain):
+            seen = _is_free(chain, i, RIM, 1.0)
+            on = np.isin(np.arange(BINS), list(circle.on_edges))
+            if np.count_nonzero(on & seen) < SEEN_SUPPORT * max(1, np.count_nonzero(seen)):
+                return False
+        return min(chain[0].support, chain[-1].support) >= END_SUPPORT
+
+    def contrast(self, circle: Circle) -> float:
+        """Lower quartile of the steps from inside to outside over the edges on a circle, grey levels."""
+        rim = RIM[sorted(circle.on_edges)]
+        inside, outside = (self.colours(circle, factor * rim) for factor in (0.85, 1.15))
+        return float(np.percentile(np.linalg.norm(inside - outside, axis=1), 25))
+
+    def are_alike(self, chain: Chain) -> bool:
+        """Whether all look like the first or the last, faded or not."""
+        return self.opacities(chain) is not None
+
+    def opacities(self, chain: Chain, compared: bool = True) -> Floats | None:
+        """Opacity [N] of each circle against one that is the most opaque; None where they do not look alike.
+
+        Without `compared` they are known to.
+        """
+        about, unrest, inner, free = list[Floats](), list[float](), list[Floats](), list[Mask]()
+        for i, circle in enumerate(chain):
+            outside = _is_free(chain, i, AROUND_RIM, 1.1)
+            ring = self.colours(circle, AROUND_RIM[outside] if outside.sum() > 8 else AROUND_RIM)
+            about.append(np.median(ring, axis=0))
+            unrest.append(float(np.median(np.linalg.norm(ring - about[i], axis=1))))
+            inner.append(self.colours(circle, INSIDE))
+            free.append(_is_free(chain, i, INSIDE, 1.05))
+        strength = [float(np.abs(v[f] - b).mean()) if f.any() else 0.0
+                    for v, b, f in zip(inner, about, free, strict=True)]  # fmt: skip
+        model = max((0, len(chain) - 1), key=lambda i: strength[i])
+        shares: list[float] = []
+        for i in range(len(chain)):
+            both = free[i] & free[model]
+            if np.count_nonzero(both) < 6:
+                both = free[i] | free[model]
+            seen, wanted = inner[i][both], inner[model][both]
+            share = _opacity(seen - about[i], wanted - about[model], seen - wanted, unrest[i] if compared else math.inf)
+            if share is None:
+                return None
+            shares.append(share)
+        return np.array(shares)
+
+    def colours(self, circle: Circle, offsets: Floats) -> Floats:
+        """Colours [N, 3] at offsets [N, 2] (radii) from a circle's centre."""
+        xs = np.clip(circle.x + circle.radius * offsets[:, 0], 0, self.image.shape[1] - 1).astype(int)
+        ys = np.clip(circle.y + circle.radius * offsets[:, 1], 0, self.image.shape[0] - 1).astype(int)
+        return self.image[ys, xs].astype(np.float64)
+
+
+def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float | None:
+    """The share of a model's contrast [N, 3] that is seen [N, 3]; None where what is seen is no share of it.
+
+    `plain` [N, 3] are the differences of the colours themselves, which do not depend on the background; `unrest`
+    is how much that varies (grey levels), infinite where they are known to be alike.
+    """
+    contrast = float(np.median(np.linalg.norm(model, axis=1)))
+    if contrast < LEAST_CONTRAST:
+        return None
+    if float(np.median(np.linalg.norm(plain, axis=1))) < UNLIKE * contrast / 2:
+        return 1.0
+    share = float((seen * model).sum() / (model**2).sum())
+    rest = float(np.median(np.linalg.norm(seen - share * model, axis=1)))
+    if math.isinf(unrest):
+        return min(max(share, LEAST_OPACITY), 1.0)
+    allowed = min(unrest, MOST_UNREST)
+    if not LEAST_OPACITY < share < 1.15 or rest > UNLIKE * contrast * share + allowed:
+        return None
+    return min(share, 1.0)
+
+
+def _is_free(chain: Chain, i: int, offsets: Floats, factor: float) -> Mask:
+    """Which offsets [N, 2] (radii) of a circle lie in none of the others, whose radii are multiplied."""
+    points = np.array(chain[i].centre) + chain[i].radius * offsets
+    others = np.array([(other.x, other.y, other.radius) for other in (*chain[:i], *chain[i + 1 :])])
+    away = np.hypot(points[:, :1] - others[:, 0], points[:, 1:] - others[:, 1])
+    return np.all(away >= factor * others[:, 2], axis=1)
 
 
 def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
     """The circle with most edges on it within half a radius of a place."""
     near: list[Circle] = []
     places = np.array([x, y]) + radius * AROUND
-    for place in places[edges.may_fit(places, radius)].tolist():
-        circle = edges.fit(place[0], place[1], radius)
-        close = circle is not None and math.dist((circle.x, circle.y), (x, y)) < 0.6 * radius
-        if circle is not None and close and 1 / SIZES < circle.radius / radius < SIZES:
-            near.append(circle)
-            if circle.support > SURE_SUPPORT:
+    for column, row in places[edges.may_fit(places, radius)].tolist():
+        found = edges.fit(column, row, radius)
+        if found is None or not 1 / SIZES < found.radius / radius < SIZES:
+            continue
+        if math.dist(found.centre, (x, y)) < 0.6 * radius:
+            near.append(found)
+            if found.support > SURE_SUPPORT:
                 break
     return max(near, key=lambda circle: circle.support, default=None)
 
 
-def _is_path(chain: Sequence[Circle]) -> bool:
+def _is_path(chain: Chain) -> bool:
     """Whether place and size change smoothly along circles."""
-    places = np.array([(c.x, c.y) for c in chain])
+    places = np.array([c.centre for c in chain])
     legs = np.diff(places, axis=0)
     gaps = np.linalg.norm(legs, axis=1)
     radii = np.array([c.radius for c in chain])
@@ -377,40 +385,3 @@ def _is_path(chain: Sequence[Circle]) -> bool:
     uneven = np.abs(np.diff(np.log(radii), 2)).max()
     spread = gaps[1:] / gaps[:-1]
     return bool(uneven < 0.12 and (spread > SPACING[0]).all() and (spread < SPACING[1]).all())
-
-
-def _is_outlined(edges: Edges, chain: Sequence[Circle]) -> bool:
-    """Whether edges show as much of each circle as the others leave to be seen, and the notches between them.
-
-    Circles that were fitted into a bottle do not pass.
-    """
-    notches = [edges.notch(a, b) for a, b in itertools.pairwise(chain)]
-    seen_notches = [notch for notch in notches if notch is not None]
-    if seen_notches and float(np.median(seen_notches)) < NOTCHED:
-        return False
-    turns = (np.arange(BINS) + 0.5) * 2 * math.pi / BINS
-    for i, circle in enumerate(chain):
-        rim = np.stack([circle.x + circle.radius * np.cos(turns), circle.y + circle.radius * np.sin(turns)], axis=1)
-        seen = ~inside_any(rim, [other for j, other in enumerate(chain) if j != i], 1.0)
-        on = np.isin(np.arange(BINS), list(circle.on_edges))
-        if np.count_nonzero(on & seen) < SEEN_SUPPORT * max(1, np.count_nonzero(seen)):
-            return False
-        if i in (0, len(chain) - 1) and circle.support < END_SUPPORT:
-            return False
-    return True
-
-
-def _trail(appearance: Appearance, chain: tuple[Circle, ...]) -> Trail | None:
-    """The trail of a chain, its more opaque end last; where they are alike, that of which more is seen."""
-    shares = appearance.opacities(chain, compared=False)
-    if shares is None:
-        return None
-    opacity = np.clip(shares / shares.max(), 0, 1)
-    positions = tuple(Position(c.x, c.y, c.radius, float(o)) for c, o in zip(chain, opacity, strict=True))
-    neighbours = itertools.pairwise(positions)
-    overlap = all(math.dist(a.centre, b.centre) < 0.95 * (a.radius + b.radius) for a, b in neighbours)
-    known = abs(float(opacity[0] - opacity[-1])) > 1 - FADED
-    faded = float(np.sort(opacity)[:-1].max()) < FADED if known else False
-    rank = (opacity[0], opacity[-1]) if known else (chain[0].support, chain[-1].support)
-    ordered = positions if rank[1] >= rank[0] else positions[::-1]
-    return Trail(ordered, overlap or faded or (known and len(chain) > 3), known)
