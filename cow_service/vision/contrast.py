@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import lab_of, scaled
+from cow_service.vision.masks import dilated, lab_of, scaled
 from cow_service.vision.types import Floats32, Image
 
 CHROMA_STEP = 9.0  # Lab units from the surroundings: an object
@@ -74,7 +75,7 @@ def _surroundings(coarse: Image) -> Image:
     """
     first = _wide_median(coarse)
     off = np.hypot(*np.moveaxis(coarse[..., 1:].astype(np.float32) - first[..., 1:], 2, 0))
-    plain = (cv2.dilate((off > STRONG_CHROMA_STEP).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0).astype(np.float32)
+    plain = (~dilated(off > STRONG_CHROMA_STEP)).astype(np.float32)
     if plain.all() or plain.mean() < 0.5:
         return first
     side = (min(coarse.shape[:2]),) * 2
@@ -131,9 +132,8 @@ def colour_names(lightness: float, a: float, b: float) -> frozenset[str]:
     """Every name that people may give a Lab colour: its own, and that across a border it lies next to."""
     chroma, hue = math.hypot(a, b), math.atan2(b, a)
     names: set[str] = {"grey"} if chroma < CHROMATIC and GREYS[0] < lightness < GREYS[1] else set()
-    for turn in (-HUE_MARGIN, 0.0, HUE_MARGIN):
-        for more in (-CHROMA_MARGIN, 0.0, CHROMA_MARGIN):
-            for lift in (-LIGHTNESS_MARGIN, 0.0, LIGHTNESS_MARGIN):
-                angle, radius = hue + math.radians(turn), max(0.0, chroma + more)
-                names.add(colour_name(lightness + lift, radius * math.cos(angle), radius * math.sin(angle)))
+    for turn, more, lift in product((-1.0, 0.0, 1.0), repeat=3):
+        angle, radius = hue + math.radians(turn * HUE_MARGIN), max(0.0, chroma + more * CHROMA_MARGIN)
+        l_star = lightness + lift * LIGHTNESS_MARGIN
+        names.add(colour_name(l_star, radius * math.cos(angle), radius * math.sin(angle)))
     return frozenset(names)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.types import Floats, Floats32, Image
+from cow_service.vision.masks import CroppedMask, lab_of
+from cow_service.vision.types import Floats, Image
 
 FLATTEST, ROUNDEST = 0.12, 0.7  # of the ellipse's width: its height
 LEAST_RIM = 0.75  # of half the width of the mask: a narrower rim beside a handle is not looked for
@@ -23,6 +23,8 @@ THICKNESS = 0.93  # inner of outer radius, where no inner edge is seen
 MEASURED_SIGMA, ASSUMED_SIGMA = 0.04, 0.06  # of the logarithm of the opening's width
 TAPERED = 0.35  # of the rim's width: a floor is not narrower
 
+Rim = tuple[float, float, float, float]  # an ellipse: x, y, half width, half height, px
+
 
 @dataclass(frozen=True)
 class SeenOpening:
@@ -32,7 +34,7 @@ class SeenOpening:
     deviation: float  # one standard deviation of its logarithm
     bottom: float  # half the outer width at its lower end
     square: bool = False  # four walls, not a round one
-    rim: tuple[float, float, float, float] | None = None  # x, y, half width, half height of its ellipse, px
+    rim: Rim | None = None  # its ellipse
     has_edge: bool = False  # the inner edge of a rim is seen
     foot_hidden: bool = False  # something stands before its lower end: it is higher than it is seen
 
@@ -46,17 +48,16 @@ def measure_opening(image: Image, mask: CroppedMask, square: bool = False) -> Se
     share = min(1.0, 2 * rim[2] / (x1 - x0))  # a handle stands beside the rim
     inner = _inner_share(image, mask, rim)
     bottom = 1.0 if square else _bottom(mask, rim)
-    if inner is None:
-        return SeenOpening(THICKNESS * share, ASSUMED_SIGMA, bottom * share, square, rim)
-    return SeenOpening(inner * share, MEASURED_SIGMA, bottom * share, square, rim, True)
+    known, sigma = (THICKNESS, ASSUMED_SIGMA) if inner is None else (inner, MEASURED_SIGMA)
+    return SeenOpening(known * share, sigma, bottom * share, square, rim, inner is not None)
 
 
-def _outer_rim(mask: CroppedMask) -> tuple[float, float, float, float] | None:
+def _outer_rim(mask: CroppedMask) -> Rim | None:
     """The ellipse (x, y, half width, half height, px) whose upper half is the upper outline of a mask."""
     patch = mask.patch
     height, width = patch.shape
     tops = np.where(patch.any(axis=0), patch.argmax(axis=0), height).astype(np.float64)
-    found: list[tuple[float, tuple[float, float, float, float]]] = []
+    found: list[tuple[float, Rim]] = []
     for tall in np.arange(max(1.0, FLATTEST * width / 2), min(ROUNDEST * width / 2, 0.9 * height), 0.5).tolist():
         across = np.nonzero(patch[min(height - 1, round(tall))])[0]
         half, middle = float(across[-1] - across[0] + 1) / 2, float(across[-1] + across[0] + 1) / 2
@@ -76,47 +77,44 @@ def _outer_rim(mask: CroppedMask) -> tuple[float, float, float, float] | None:
     return min(each for each in found if each[1][2] > SAME_WIDTH * widest)[1]
 
 
-def _inner_share(image: Image, mask: CroppedMask, rim: tuple[float, float, float, float]) -> float | None:
+def _inner_share(image: Image, mask: CroppedMask, rim: Rim) -> float | None:
     """The inner ellipse's width, of the outer's: where the colours change most at both its sides.
 
     There the height of the ellipse, which is known least, matters least.
     """
     x, y, half, tall = rim
-    shown = (image[mask.rows, mask.columns] / np.float32(255)).astype(np.float32)
-    lab = np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2LAB), np.float32)
-    step = max(0.015, 1.0 / half)
+    lab, step = lab_of(image[mask.rows, mask.columns]), max(0.015, 1.0 / half)
     shares = np.arange(NARROWEST, min(WIDEST, 1 - step - OUTLINE / half), 0.005)  # the outline is an edge, too
-    profile = _along(lab, (x - mask.columns.start, y - mask.rows.start, half, tall), shares + step)
-    inside = _along(lab, (x - mask.columns.start, y - mask.rows.start, half, tall), shares - step)
-    change = np.linalg.norm(profile - inside, axis=2).mean(axis=1)
+    if not len(shares):
+        return None
+    sides = np.linspace(-BESIDE, BESIDE, 20)
+    angles = np.radians(np.concatenate([sides, 180 + sides]))
+    colours: list[Floats] = []  # [S, 40, 3] at the sides of ellipses that are a step wider, and narrower
+    for tried in (shares + step, shares - step):
+        columns = (x - mask.columns.start + half * tried[:, None] * np.cos(angles) - 0.5).astype(np.float32)
+        rows = (y - mask.rows.start + tall * tried[:, None] * np.sin(angles) - 0.5).astype(np.float32)
+        found = cv2.remap(lab, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        colours.append(np.asarray(found, np.float64))
+    change = np.linalg.norm(colours[0] - colours[1], axis=2).mean(axis=1)
     if change.max() <= EDGE:
         return None
     edge = change > 0.9 * change.max()  # as wide as the step: its middle is taken
     return float((shares * change)[edge].sum() / change[edge].sum())
 
 
-def _along(lab: Floats32, rim: tuple[float, float, float, float], shares: Floats) -> Floats:
-    """Colours [S, A, 3] at the sides of ellipses of so many shares of the rim."""
-    x, y, half, tall = rim
-    angles = np.radians(np.concatenate([np.linspace(-BESIDE, BESIDE, 20), 180 + np.linspace(-BESIDE, BESIDE, 20)]))
-    columns = (x + half * shares[:, None] * np.cos(angles) - 0.5).astype(np.float32)
-    rows = (y + tall * shares[:, None] * np.sin(angles) - 0.5).astype(np.float32)
-    found = cv2.remap(lab, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, np.float64)
-
-
-def _bottom(mask: CroppedMask, rim: tuple[float, float, float, float]) -> float:
+def _bottom(mask: CroppedMask, rim: Rim) -> float:
     """Outer width at the lower end, of the rim's: the sides run straight from the rim to an ellipse of its form."""
     x, y, half, tall = rim
     x -= mask.columns.start
     first, last = round(y - mask.rows.start), mask.patch.shape[0]
-    rows = np.arange(first, first + max(2, round(0.7 * (last - first))))
-    rows = rows[rows < last]
-    right = np.array([float(np.nonzero(row)[0][-1] + 1) - x if row.any() else 0.0 for row in mask.patch[rows]])
-    left = np.array([x - float(np.nonzero(row)[0][0]) if row.any() else half for row in mask.patch[rows]])
-    sides = np.minimum(left, right)  # a handle is on one side
+    rows = np.arange(first, min(last, first + max(2, round(0.7 * (last - first)))))
     if len(rows) < 3:
         return 1.0
+    patch = mask.patch[rows]
+    seen = patch.any(axis=1)
+    right = np.where(seen, patch.shape[1] - patch[:, ::-1].argmax(axis=1) - x, 0.0)
+    left = np.where(seen, x - patch.argmax(axis=1), half)
+    sides = np.minimum(left, right)  # a handle is on one side
     slope = float(np.polyfit(rows - first, sides, 1)[0])
     lowest = (half + slope * (last - first)) / max(1 + slope * tall / half, 0.1)
     return min(1.0, max(TAPERED, lowest / half))

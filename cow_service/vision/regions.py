@@ -8,7 +8,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,7 +18,18 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision.completion import as_disc, is_underside, neck_between, standing_on, white_sides
 from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, View, colour_name, colour_names, view_of
-from cow_service.vision.masks import CroppedMask, bbox_of, enlarged, iou, lab_of, outline_of, scaled, window_of
+from cow_service.vision.masks import (
+    CroppedMask,
+    bbox_of,
+    dilated,
+    enlarged,
+    iou,
+    lab_of,
+    outer_contour,
+    outline_of,
+    scaled,
+    window_of,
+)
 from cow_service.vision.types import Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
@@ -78,14 +89,13 @@ class _Found:
     is_disc: bool
 
     def region(self, size: tuple[int, int]) -> Region:
-        """A part that was self, as a region of the image (height and width)."""
+        """It as a region of the image (height and width)."""
         soft = self.mask.astype(np.float32)
         near = window_of(self.mask, round(6 * MASK_SIGMA))
         if near is not None:
             soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
         mask = enlarged(soft, size)
-        contours, _ = cv2.findContours(mask.patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        outline = max(contours, key=cv2.contourArea)
+        outline = outer_contour(mask.patch)
         _, radius = cv2.minEnclosingCircle(outline)
         roundness = float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))
         return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc)
@@ -157,10 +167,8 @@ def disc_region(image: Image, disc: Mask) -> Region:
 
 def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
     """Whether a component is a strip of wall or floor: it runs along much of an edge of the image, or spans it."""
-    x, y, w, h, area = (int(v) for v in stats)
-    height, width = shape[:2]
-    on_side = x == 0 or x + w == width
-    on_top, on_bottom = y == 0, y + h == height
+    (x, y, w, h, area), (height, width) = stats.tolist(), shape
+    on_side, on_top, on_bottom = x == 0 or x + w == width, y == 0, y + h == height
     spans = w > 0.5 * width or h > 0.75 * height
     sliver = (on_top or on_side) and (area < 0.45 * w * h or min(w, h) < 0.12 * max(w, h))
     return spans or sliver or (on_side and (on_top or on_bottom))
@@ -169,32 +177,25 @@ def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
 def _is_wall(view: View, part: Mask, border: Mask) -> bool:
     """Whether a pale part runs along the image's border for much of its own length, as a strip of wall does."""
     along = part & border
-    if not along.any() or float(np.median(view.bright[part])) <= 0:
-        return False
-    if float(np.median(view.chroma[part])) >= 2 * CHROMA_STEP:
+    if not along.any() or np.median(view.bright[part]) <= 0 or np.median(view.chroma[part]) >= 2 * CHROMA_STEP:
         return False
     (rows, columns), (edge_rows, edge_columns) = np.nonzero(part), np.nonzero(along)
     wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
     return bool(np.ptp(edge_columns) > ALONG_BORDER * wide or np.ptp(edge_rows) > ALONG_BORDER * high)
 
 
-def _balls(view: View, component: Mask) -> Iterator[Mask]:
-    """Discs among the pale patches between the edges of a component: white balls before or on something white."""
-    pale = component & (np.minimum(view.chroma_gap, view.chroma) < CHROMA_STEP) & (view.bright > -12)
-    taken = np.zeros(component.shape, bool)
-    for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
-        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
-            body = cv2.dilate(patch.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2) > 0
-            disc = as_disc(body, view.edges, view.edge_threshold, grow=EDGE_BAND)
-            if disc is not None and not (disc & taken).any():
-                taken |= disc
-                yield disc
-
-
 def _parts(view: View, component: Mask) -> list[Mask]:
     """Splits a component into white balls and by colour; wheels, necks and lights stay with what they sit on."""
-    balls = list(_balls(view, component))
-    rest = _blobs(component & ~np.any(balls, axis=0) if balls else component, MIN_REST * component.sum())
+    # Discs among the pale patches between the edges: white balls before or on something white.
+    pale = component & (np.minimum(view.chroma_gap, view.chroma) < CHROMA_STEP) & (view.bright > -12)
+    balls, taken = list[Mask](), np.zeros(component.shape, bool)
+    for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
+        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
+            disc = as_disc(dilated(patch, times=2), view.edges, view.edge_threshold, grow=EDGE_BAND)
+            if disc is not None and not (disc & taken).any():
+                taken |= disc
+                balls.append(disc)
+    rest = _blobs(component & ~taken, MIN_REST * component.sum())
     if balls:  # what is left along the edge of a ball is blur
         rest = [blob for blob in rest if _half_width(blob) > EDGE_BAND]
     return balls + [part for blob in rest for part in _coloured_parts(view, blob)]
@@ -202,8 +203,7 @@ def _parts(view: View, component: Mask) -> list[Mask]:
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     area = int(component.sum())
-    lab = view.lab
-    chroma = view.chroma
+    lab, chroma = view.lab, view.chroma
     hue = np.degrees(np.arctan2(lab[..., 2], lab[..., 1]))
     coloured = component & (view.chroma_gap > CHROMA_STEP) & (chroma > CHROMA_STEP)
     least = min(0.12 * area, OWN_AREA)
@@ -223,9 +223,7 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     dark = _blobs(black, min(0.35 * area, OWN_AREA))
     broad = max((_half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
     seeds.extend(_blobs(bright, min(0.3 * area, OWN_AREA)))
-    for seed in dark:
-        if _half_width(seed) > OWN_WIDTH * broad or seed.sum() > 0.35 * area:
-            seeds.append(seed)
+    seeds += [seed for seed in dark if _half_width(seed) > OWN_WIDTH * broad or seed.sum() > 0.35 * area]
     if len(seeds) <= 1:
         return [component]
     distances = np.stack([cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds])
@@ -276,7 +274,7 @@ def _with_mouths(view: View, found: Sequence[_Found]) -> list[_Found]:
 
 def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
     """Adds to each part what stands on it; smaller parts that are taken up by this are left out."""
-    edges = cv2.dilate((view.edges > view.edge_threshold).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    edges = dilated(view.edges > view.edge_threshold)
     areas = [int(np.count_nonzero(one.mask)) for one in found]
     kept = dict(enumerate(found))
     for i in sorted(kept, key=lambda i: -areas[i]):
@@ -300,13 +298,15 @@ def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
 def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
     """Joins dark lower ends, such as a car's wheels with the shade between them, with what they carry."""
     dark: list[_Found] = []
-    for one in found:
-        lightness, a, b = (float(value) for value in np.median(one.lab, axis=0))
+    whole: dict[int, _Found] = {}
+    for i, one in enumerate(found):
+        lightness, a, b = np.median(one.lab, axis=0).tolist()
         if not one.is_disc and lightness < DARK and colour_name(lightness, a, b) in {"black", "brown"}:
             dark.append(one)
-    whole = {i: one for i, one in enumerate(found) if all(one is not other for other in dark)}
+        else:
+            whole[i] = one
     for part in dark:
-        box, near = bbox_of(part.mask), cv2.dilate(part.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        box, near = bbox_of(part.mask), dilated(part.mask)
         carried = [i for i, one in whole.items() if (one.mask & near).any() and is_underside(box, bbox_of(one.mask))]
         if len(carried) == 1:
             body = whole[carried[0]]
@@ -320,5 +320,5 @@ def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
     """The name of the colour of pixels [N, 3] (Lab), and all that people may use for it."""
     chroma = np.hypot(lab[:, 1], lab[:, 2])
     sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
-    seen = [float(v) for v in np.median(sample, axis=0)]
-    return colour_name(*seen), colour_names(*seen)
+    lightness, a, b = np.median(sample, axis=0).tolist()
+    return colour_name(lightness, a, b), colour_names(lightness, a, b)
