@@ -6,15 +6,15 @@ By colour alone, a ball's region lacks its highlight and includes its contact sh
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, EDGE_THRESHOLDS, View
-from cow_service.vision.masks import hull, outline_of, window_of
+from cow_service.vision.masks import dilated, hull, outline_of, window_of
 from cow_service.vision.types import Floats, Floats32, Mask
 
 TRIES = 120  # circles through three points of the outline
@@ -53,7 +53,7 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
     angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)
     columns, rows = np.round(x + radius * np.cos(angles)).astype(int), np.round(y + radius * np.sin(angles)).astype(int)
     seen = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    strong = cv2.dilate((edges > edge_threshold).astype(np.uint8), np.ones((3, 3), np.uint8))
+    strong = dilated(edges > edge_threshold)
     if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < ON_EDGES:
         return None
     # On a ball's rays nothing is stronger than its outline; a circle around a cube or mug meets edges elsewhere.
@@ -87,7 +87,14 @@ def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
 def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
     """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None where too few do."""
     rng = np.random.default_rng(0)  # the same outline must give the same circle
-    circles = _circles_through(outline[rng.integers(0, len(outline), (TRIES, 3))])
+    a, b, c = np.moveaxis(outline[rng.integers(0, len(outline), (TRIES, 3))], 1, 0)  # [T, 2] each: not finite on a line
+    ab, ac = b - a, c - a
+    doubled = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    ab2, ac2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = (ac[:, 1] * ab2 - ab[:, 1] * ac2) / doubled
+        y = (ab[:, 0] * ac2 - ac[:, 0] * ab2) / doubled
+    circles = np.column_stack([a[:, 0] + x, a[:, 1] + y, np.hypot(x, y)])
     reach = float(np.ptp(outline, axis=0).max())
     circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] >= LEAST_RADIUS) & (circles[:, 2] <= reach)]
     if not len(circles):
@@ -99,20 +106,8 @@ def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
         return None
     chosen = outline[close[best]]
     terms = np.column_stack([2 * chosen, np.ones(len(chosen))])  # x^2 + y^2 = 2ax + 2by + c, least squares
-    a, b, c = np.linalg.lstsq(terms, (chosen**2).sum(axis=1), rcond=None)[0]
-    return float(a), float(b), float(np.sqrt(max(c + a * a + b * b, 0.0))), float(close[best].mean())
-
-
-def _circles_through(triples: Floats) -> Floats:
-    """Circles [T, 3] (x, y, radius) through triples of points [T, 3, 2]; not finite where they lie on a line."""
-    a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
-    ab, ac = b - a, c - a
-    doubled = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
-    ab2, ac2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = (ac[:, 1] * ab2 - ab[:, 1] * ac2) / doubled
-        y = (ab[:, 0] * ac2 - ac[:, 0] * ab2) / doubled
-    return np.column_stack([a[:, 0] + x, a[:, 1] + y, np.hypot(x, y)])
+    u, v, w = np.linalg.lstsq(terms, (chosen**2).sum(axis=1), rcond=None)[0].tolist()
+    return u, v, math.sqrt(max(w + u * u + v * v, 0.0)), float(close[best].mean())
 
 
 NECK_FLAT = 0.45  # of its width: a mouth seen from above is no higher
@@ -146,7 +141,7 @@ def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
     ends = np.nonzero(neck.any(axis=0))[0]
     beside = np.zeros(neck.shape, bool)
     beside[rows.stop : below.start, max(0, int(ends[0]) - width // 2) : int(ends[-1]) + width // 2] = True
-    beside &= cv2.dilate((neck | mouth | body).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+    beside &= ~dilated(neck | mouth | body, 5)
     inner = cv2.erode(neck.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     if not beside.any() or not inner.any():
         return None
@@ -190,44 +185,35 @@ def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | N
         differs &= steps > BLUR * np.percentile(steps[differs], 90)
     if not differs[above - LEAST_HEIGHT : above].any():
         return None
-    body = cv2.dilate(part[strip].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    _, labels = cv2.connectedComponents((differs | body).astype(np.uint8), connectivity=8)
-    joined = np.unique(labels[part[strip]])
-    found = differs & np.isin(labels, joined[joined > 0])
-    seen = _above_rim(found[:above])
-    if seen is None or abs(float(np.nonzero(seen)[1].mean()) + left - middle) > OFF_MIDDLE * width:
+    found = differs & _joined(differs | dilated(part[strip]), part[strip], 8)
+    # The rows above the object's rim, which may cross the whole strip and is low itself.
+    rim = np.nonzero(found[:above, 0] | found[:above, -1])[0]
+    seen = found[: int(rim[0]) if len(rim) else above]
+    high = np.nonzero(seen.any(axis=1))[0]
+    goes_on = not len(high) or high[0] == 0 or above - len(seen) > LEAST_HEIGHT
+    is_low = goes_on or above - int(high[0]) < LEAST_HEIGHT
+    if is_low or abs(float(np.nonzero(seen)[1].mean()) + left - middle) > OFF_MIDDLE * width:
         return None
     found &= cv2.dilate(np.any(seen, axis=0, keepdims=True).astype(np.uint8), np.ones((1, 3), np.uint8)) > 0
-    if np.median(steps[found]) < CLEAR_STEP:
+    if np.median(steps[found]) < CLEAR_STEP or np.mean(edges[strip][outline_of(found)]) < SHARP:
         return None
-    colours = [lab[area][: len(seen)][seen] for area in (strip, *sides)]
-    if _is_shadow(*colours) or np.mean(edges[strip][outline_of(found)]) < SHARP:
+    # A shadow has the colours of the sides, all three darkened by the same share.
+    own, *others = (lab[area][: len(seen)][seen] for area in (strip, *sides))
+    floor, (lightness, *hue) = np.median(np.concatenate(others), axis=0), np.median(own, axis=0)
+    share = float(lightness) / max(1.0, float(floor[0]))
+    darkest = float(np.percentile(own[:, 0], DARK)) / max(1.0, float(floor[0]))
+    if share < 1 and darkest > SHADE_DEPTH and float(np.hypot(*(hue - share * floor[1:]))) < SHADE_HUE:
         return None
     whole = np.zeros(part.shape, bool)
     whole[strip] = found
     return whole
 
 
-def _above_rim(found: Mask) -> Mask | None:
-    """The rows above the object's rim of what is found [n, m] above its upper end; None where it goes on or is low.
-
-    The rim, which may cross the whole strip, is low itself.
-    """
-    rim = np.nonzero(found[:, 0] | found[:, -1])[0]
-    seen = found[: int(rim[0])] if len(rim) else found
-    rows = np.nonzero(seen.any(axis=1))[0]
-    if not len(rows) or rows[0] == 0 or len(found) - len(seen) > LEAST_HEIGHT:
-        return None
-    return seen if len(found) - int(rows[0]) >= LEAST_HEIGHT else None
-
-
-def _is_shadow(seen: Floats32, *sides: Floats32) -> bool:
-    """Whether Lab colours [N, 3] are those of the sides [N, 3], all three darkened by the same share."""
-    floor = np.median(np.concatenate(sides), axis=0)
-    lightness, *hue = np.median(seen, axis=0)
-    share = float(lightness) / max(1.0, float(floor[0]))
-    darkest = float(np.percentile(seen[:, 0], DARK)) / max(1.0, float(floor[0]))
-    return share < 1 and darkest > SHADE_DEPTH and float(np.hypot(*(hue - share * floor[1:]))) < SHADE_HUE
+def _joined(mask: Mask, seeds: Mask, connectivity: int) -> Mask:
+    """The connected patches of a mask [h, w] in which seeds [h, w] lie."""
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
+    touched = np.unique(labels[seeds])
+    return np.isin(labels, touched[touched > 0])
 
 
 INSIDE = 0.8  # of a dark part's box that lies in the thing's, grown by `BESIDE` and by `LOW`
@@ -254,7 +240,6 @@ HANGS = 0.7  # of a side's width that lies below the top
 SHARP_TOP = 0.7  # of a top's outline that lies on edges: with less it is a shine on the floor
 WEAK_EDGES = (0.45, 1.8)  # as `EDGE_THRESHOLDS`: the sides of something surely white stand out by as little
 
-_KERNEL = np.ones((3, 3), np.uint8)
 _Box = tuple[int, int, int, int]  # x, y, width, height
 
 
@@ -263,30 +248,16 @@ class _Tops:
 
     def __init__(self, view: View, white: Mask) -> None:
         _, labels, stats, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
-        self.white = white
         self.labels = np.asarray(labels, np.int32)
         self.boxes: list[_Box] = [(int(x), int(y), int(w), int(h)) for x, y, w, h in stats[:, :4]]
         self.areas = [int(area) for area in stats[:, 4]]
-        self._near_edges = (
-            cv2.dilate((view.edges > view.edge_threshold).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        )
-        self._chroma = view.chroma
+        self._near_edges = dilated(view.edges > view.edge_threshold, 5)
 
     def is_sharp(self, top: int) -> bool:
         """Whether its outline lies on edges."""
         x, y, w, h = self.boxes[top]
         around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
         return float(np.mean(self._near_edges[around][outline_of(self.labels[around] == top)])) > SHARP_TOP
-
-    def surely_white(self) -> frozenset[int]:
-        """Those that have no colour of their own and a sharp outline."""
-        found: list[int] = []
-        for top, ((x, y, w, h), area) in enumerate(zip(self.boxes, self.areas, strict=True)):
-            window = slice(y, y + h), slice(x, x + w)
-            if top and area >= LEAST_WHITE:
-                chroma = float(np.median(self._chroma[window][self.labels[window] == top]))
-                found += [top] if chroma < CHROMA_STEP and self.is_sharp(top) else []
-        return frozenset(found)
 
     def has_side(self, top: int, side: _Box, area: int, lit: bool) -> bool:
         """Whether a side is that of a top: small beside it, and lit or right below it."""
@@ -296,19 +267,6 @@ class _Tops:
         hangs = overlap > HANGS * w and y >= ty
         return self.areas[top] >= LEAST_TOP and area < MAX_RATIO * self.areas[top] and (lit or hangs)
 
-    def lit_fronts(self, view: View) -> Mask:
-        """Slightly lit pixels joined to a bright top, right below it and no further down than the top is wide."""
-        lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | self.white
-        fronts = np.zeros(lit.shape, bool)
-        for top, (x, y, w, h) in enumerate(self.boxes):
-            if top == 0 or self.areas[top] < LEAST_TOP or not 0.2 * w < h < 0.8 * w or not self.is_sharp(top):
-                continue
-            window = slice(y, y + h + w), slice(x, x + w)
-            _, blobs = cv2.connectedComponents(lit[window].astype(np.uint8), connectivity=4)
-            joined = np.unique(blobs[self.labels[window] == top])
-            fronts[window] |= np.isin(blobs, joined[joined > 0])
-        return fronts
-
 
 def white_sides(view: View, core: Mask) -> Mask:
     """Patches enclosed by edges at a bright neutral top: the other faces of something white, lit or in shade.
@@ -316,32 +274,40 @@ def white_sides(view: View, core: Mask) -> Mask:
     `core` [h, w] are the pixels that are surely of an object.
     """
     neutral = (view.chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
-    tops = _Tops(view, core & (view.bright > BRIGHT_STEP) & neutral)
-    sides = tops.lit_fronts(view)
-    white = tops.surely_white()
-    for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if white else [])):
+    white = core & (view.bright > BRIGHT_STEP) & neutral
+    tops = _Tops(view, white)
+    lit_too = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | white
+    sides, surely_white = np.zeros(white.shape, bool), set[int]()
+    for top, ((x, y, w, h), area) in enumerate(zip(tops.boxes, tops.areas, strict=True)):
+        if top == 0 or area < LEAST_TOP or not tops.is_sharp(top):
+            continue
+        if 0.2 * w < h < 0.8 * w:  # slightly lit pixels joined to it, right below and no further down than it is wide
+            window = slice(y, y + h + w), slice(x, x + w)
+            sides[window] |= _joined(lit_too[window], tops.labels[window] == top, 4)
+        own = tops.labels[y : y + h, x : x + w] == top
+        if area >= LEAST_WHITE and float(np.median(view.chroma[y : y + h, x : x + w][own])) < CHROMA_STEP:
+            surely_white.add(top)
+    for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if surely_white else [])):
         weak = thresholds == WEAK_EDGES
         for near, patch, box in _enclosed(view, *thresholds):
-            if weak and float(np.median(view.chroma[near][patch > 0])) > CHROMA_STEP:
+            if weak and float(np.median(view.chroma[near][patch])) > CHROMA_STEP:
                 continue
-            touched = set(np.unique(tops.labels[near][cv2.dilate(patch, _KERNEL, iterations=4) > 0]).tolist()) - {0}
-            lit = len(touched) > 0 and float(np.median(view.bright[near][patch > 0])) > BRIGHT_REACH
-            if any(tops.has_side(top, box, int(patch.sum()), lit) for top in (touched & white if weak else touched)):
-                sides[near] |= cv2.dilate(patch, _KERNEL, iterations=2) > 0
+            touched = set(np.unique(tops.labels[near][dilated(patch, times=4)]).tolist()) - {0}
+            lit = len(touched) > 0 and float(np.median(view.bright[near][patch])) > BRIGHT_REACH
+            area = int(np.count_nonzero(patch))
+            if any(tops.has_side(top, box, area, lit) for top in (touched & surely_white if weak else touched)):
+                sides[near] |= dilated(patch, times=2)
     return sides
 
 
-def _enclosed(view: View, floor: float, factor: float) -> Iterator[tuple[tuple[slice, slice], NDArray[np.uint8], _Box]]:
+def _enclosed(view: View, floor: float, factor: float) -> Iterator[tuple[tuple[slice, slice], Mask, _Box]]:
     """Patches between edges that do not reach the image's border: where they lie, their mask there, and their box."""
     height, width = view.edges.shape
     edge_threshold = max(floor, factor * view.median_edge)
-    edges = cv2.morphologyEx((view.edges > edge_threshold).astype(np.uint8), cv2.MORPH_CLOSE, _KERNEL)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
-    for i in range(1, count):
-        x, y, w, h, area = (int(v) for v in stats[i])
-        if area < LEAST_FACE_SIDE or area > MAX_SIDE * height * width:
-            continue
-        if x == 0 or y == 0 or x + w == width or y + h == height:
-            continue
-        near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
-        yield near, (labels[near] == i).astype(np.uint8), (x, y, w, h)
+    edges = cv2.morphologyEx((view.edges > edge_threshold).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
+    for i, (x, y, w, h, area) in enumerate(stats.tolist()):
+        at_border = x == 0 or y == 0 or x + w == width or y + h == height
+        if i and not at_border and LEAST_FACE_SIDE <= area <= MAX_SIDE * height * width:
+            near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
+            yield near, labels[near] == i, (x, y, w, h)

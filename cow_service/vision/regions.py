@@ -16,20 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
+from cow_service.vision import masks
 from cow_service.vision.completion import as_disc, is_underside, neck_between, standing_on, white_sides
 from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, View, colour_name, colour_names, view_of
-from cow_service.vision.masks import (
-    CroppedMask,
-    bbox_of,
-    dilated,
-    enlarged,
-    iou,
-    lab_of,
-    outer_contour,
-    outline_of,
-    scaled,
-    window_of,
-)
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
@@ -91,11 +81,11 @@ class _Found:
     def region(self, size: tuple[int, int]) -> Region:
         """It as a region of the image (height and width)."""
         soft = self.mask.astype(np.float32)
-        near = window_of(self.mask, round(6 * MASK_SIGMA))
+        near = masks.window_of(self.mask, round(6 * MASK_SIGMA))
         if near is not None:
             soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
-        mask = enlarged(soft, size)
-        outline = outer_contour(mask.patch)
+        mask = masks.enlarged(soft, size)
+        outline = masks.outer_contour(mask.patch)
         _, radius = cv2.minEnclosingCircle(outline)
         roundness = float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))
         return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc)
@@ -105,7 +95,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
-    view = view_of(scaled(image, scale))
+    view = view_of(masks.scaled(image, scale))
     # What is surely of an object: of another hue, clearly brighter, or nearly black.
     black = (view.lab[..., 0] < BLACK_SHARE * view.around).astype(np.uint8)
     solid_black = cv2.morphologyEx(black, cv2.MORPH_OPEN, _DISC) > 0  # a contact shadow is a thin strip
@@ -132,7 +122,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
                 continue
             disc = as_disc(part, near.edges, view.edge_threshold)
             # An object's outline lies on edges; that of a patch of light does not.
-            strong = cv2.dilate(near.edges, np.ones((5, 5), np.uint8))[outline_of(part)] > view.edge_threshold
+            strong = cv2.dilate(near.edges, np.ones((5, 5), np.uint8))[masks.outline_of(part)] > view.edge_threshold
             if disc is not None or float(np.mean(strong)) > SHARP_SHARE:
                 whole = np.zeros(solid.shape, bool)
                 whole[window] = part if disc is None else disc
@@ -145,7 +135,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
 
 def is_same_object(a: BBox, b: BBox) -> bool:
     """Whether two boxes are of one object."""
-    return iou(a, b) >= SAME_OBJECT_IOU
+    return masks.iou(a, b) >= SAME_OBJECT_IOU
 
 
 def is_among(bbox: BBox, others: Iterable[BBox]) -> bool:
@@ -155,13 +145,13 @@ def is_among(bbox: BBox, others: Iterable[BBox]) -> bool:
 
 def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
     """The region that best overlaps a box [x0, y0, x1, y1], if it is the same object."""
-    best = max(regions, key=lambda region: iou(region.bbox, bbox), default=None)
+    best = max(regions, key=lambda region: masks.iou(region.bbox, bbox), default=None)
     return best if best is not None and is_same_object(best.bbox, bbox) else None
 
 
 def disc_region(image: Image, disc: Mask) -> Region:
     """A ball of an RGB image [H, W, 3] whose mask [H, W] is known."""
-    names = _names(lab_of(image[disc][None])[0])
+    names = _names(masks.lab_of(image[disc][None])[0])
     return Region(CroppedMask.of(disc), *names, roundness=1.0, confidence=1.0, is_disc=True)
 
 
@@ -191,7 +181,7 @@ def _parts(view: View, component: Mask) -> list[Mask]:
     balls, taken = list[Mask](), np.zeros(component.shape, bool)
     for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
         for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
-            disc = as_disc(dilated(patch, times=2), view.edges, view.edge_threshold, grow=EDGE_BAND)
+            disc = as_disc(masks.dilated(patch, times=2), view.edges, view.edge_threshold, grow=EDGE_BAND)
             if disc is not None and not (disc & taken).any():
                 taken |= disc
                 balls.append(disc)
@@ -249,7 +239,7 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     median distance from the surroundings in Lab over `SURE_CONTRAST`. Size: its area over `SURE_AREA` (square roots of
     both). Border: 1 less half the share of its outline along the image's border, beyond which it may go on.
     """
-    outline = outline_of(part)
+    outline = masks.outline_of(part)
     inner = outline & ~border
     nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
     sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
@@ -274,7 +264,7 @@ def _with_mouths(view: View, found: Sequence[_Found]) -> list[_Found]:
 
 def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
     """Adds to each part what stands on it; smaller parts that are taken up by this are left out."""
-    edges = dilated(view.edges > view.edge_threshold)
+    edges = masks.dilated(view.edges > view.edge_threshold)
     areas = [int(np.count_nonzero(one.mask)) for one in found]
     kept = dict(enumerate(found))
     for i in sorted(kept, key=lambda i: -areas[i]):
@@ -306,8 +296,10 @@ def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
         else:
             whole[i] = one
     for part in dark:
-        box, near = bbox_of(part.mask), dilated(part.mask)
-        carried = [i for i, one in whole.items() if (one.mask & near).any() and is_underside(box, bbox_of(one.mask))]
+        box, near = masks.bbox_of(part.mask), masks.dilated(part.mask)
+        carried = [
+            i for i, one in whole.items() if (one.mask & near).any() and is_underside(box, masks.bbox_of(one.mask))
+        ]
         if len(carried) == 1:
             body = whole[carried[0]]
             whole[carried[0]] = replace(body, mask=body.mask | part.mask)

@@ -17,7 +17,7 @@ from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, iou, without_holes
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region, disc_region, find_regions, region_of
-from cow_service.vision.segmentation import CutQuality, cut_quality, mask_from_bbox, mask_from_point
+from cow_service.vision.segmentation import fault_of, mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
@@ -76,13 +76,6 @@ def _is_part(region: Region, other: Obstacle) -> bool:
     return bool(region.mask.shared_with(near))
 
 
-# What is cut out around a point is taken for an object from here on. Objects of scenes with known truth have an area
-# of 0.009 and more; of their good cuts one in twenty has less on edges, most tufts of fur or grass have.
-LEAST_AREA = 0.0025  # of the square of the image's shorter side
-LEAST_ON_EDGE = 0.75  # of the outline
-LEAST_SOLIDITY = 0.5
-
-
 @dataclass(frozen=True)
 class Cutout:
     """The object at a point of the image."""
@@ -90,16 +83,6 @@ class Cutout:
     bbox: BBox
     mask: Mask | None = None  # [H, W], where it is no region of the image: it was cut out around the point
     fault: str | None = None  # why what was cut out can be no object, in words
-
-
-def _fault_of(quality: CutQuality, bbox: BBox) -> str | None:
-    if quality.area < LEAST_AREA:
-        return f"what lies there is only {bbox[2] - bbox[0]:.0f} x {bbox[3] - bbox[1]:.0f} px large"
-    if quality.on_edge < LEAST_ON_EDGE:
-        return f"only {quality.on_edge:.0%} of the outline of what lies there can be seen"
-    if quality.solidity < LEAST_SOLIDITY:
-        return "what lies there is ragged, and looks like a part of something"
-    return None
 
 
 Found = TypeVar("Found")
@@ -287,7 +270,7 @@ class Scene:
         if self.region_of(bbox) is not None:
             return Cutout(bbox)
         mask = self.silhouette(bbox)
-        return Cutout(bbox, mask, _fault_of(cut_quality(self.clean, mask), bbox))
+        return Cutout(bbox, mask, fault_of(self.clean, mask))
 
     def bbox_at(self, point: tuple[float, float]) -> BBox:
         """Tight box [x0, y0, x1, y1] of the object at a point [x, y]: the smallest region there, or else segmented."""
