@@ -414,7 +414,7 @@ def test_a_ball_partly_hidden_at_the_start_is_whole_later() -> None:
     x0, y0, x1, y1 = world.bodies[1]["bbox"]
     whole = np.hypot(xs - x, ys - y) < r
     filmed.scene.preset_mask(filmed.grounding.bbox, lambda: whole & ~((xs > x0) & (xs < x1) & (ys > y0) & (ys < y1)))
-    filmed.scene._masks.clear()
+    filmed.scene._found.clear()
     frame = frame_of(filmed, 1)
     assert redness(frame).sum() > 0.93 * whole.sum()
 

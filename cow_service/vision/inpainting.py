@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import scaled_size, three_channels, window_of
+from cow_service.vision.masks import dilated, scaled_size, three_channels, window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 INPAINT_RADIUS = 4  # px
@@ -70,8 +70,7 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
         filled = shading + _texture(image, hole, avoid, around.crop, width, most)
     # It fades out next to the hole, and over a longer way in the object's shadow.
     fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
-    wide = cv2.dilate(around.shadow.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    reaches = np.where(wide, np.float32(max(fade, around.rim)), np.float32(around.rim))
+    reaches = np.where(dilated(around.shadow, 5), np.float32(max(fade, around.rim)), np.float32(around.rim))
     share = np.asarray(np.clip(1 - around.away / reaches, 0, 1) * around.known, np.float32)
     share[around.inside] = 1
     result = image.copy()
@@ -122,7 +121,7 @@ def _surroundings(image: Image, hole: Mask, avoid: Mask | None, margin: int) -> 
 def _is_varied(source: Floats32, inside: Mask, known: Mask) -> bool:
     """Whether what lies around the hole is no plain surface: it has texture, or several colours, or an edge runs in."""
     reach = 2 * max(4, int(0.25 * np.sqrt(np.count_nonzero(inside)))) + 1
-    ring = (cv2.dilate(inside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & known
+    ring = dilated(inside, reach) & known
     if not ring.any():
         return False
     if float(source[ring].std(axis=0).max()) > VARIED:
@@ -211,7 +210,7 @@ def exemplar_inpaint(source: Floats32, unknown: Mask, forbidden: Mask, shading: 
     todo = cv2.resize(unknown.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
     barred = cv2.resize((unknown | forbidden).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
     result, weight = np.zeros_like(source), np.zeros(unknown.shape, np.float32)
-    inner = todo.copy()
+    inner, grow = todo.copy(), FEATHER / scale
     while inner.any():
         depth = cv2.distanceTransform(np.pad(inner, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         depth[~inner] = np.inf
@@ -219,9 +218,24 @@ def exemplar_inpaint(source: Floats32, unknown: Mask, forbidden: Mask, shading: 
         tile = _around(y, TILE // 2, coarse.shape[0]), _around(x, TILE // 2, coarse.shape[1])
         offset = _best_offset(coarse, inner, barred, y, x)
         if offset is not None:
-            _copy(result, weight, source, tile, offset, scale)
             moved = tuple(slice(s.start + o, s.stop + o) for s, o in zip(tile, offset, strict=True))
             coarse[tile] = np.where(inner[tile][..., None], coarse[moved], coarse[tile])
+            # The full-size patch, inside the image where it lies and where it is taken from, fades out at its rim.
+            shifts = [round(o / scale) for o in offset]
+            spans = [
+                (max(0, -shift, int(s.start / scale - grow)), min(n, n - shift, int(s.stop / scale + grow)))
+                for s, shift, n in zip(tile, shifts, (height, width), strict=True)
+            ]
+            if all(last > first for first, last in spans):
+                ramp_y, ramp_x = (
+                    np.minimum(np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1)) / grow, 1.0)
+                    for n in (last - first for first, last in spans)
+                )
+                fade = np.outer(ramp_y, ramp_x).astype(np.float32) ** 2
+                there = tuple(slice(first, last) for first, last in spans)
+                taken = tuple(slice(s.start + o, s.stop + o) for s, o in zip(there, shifts, strict=True))
+                result[there] += source[taken] * fade[..., None]
+                weight[there] += fade
         inner[tile] = False
     mixed = result / np.maximum(weight, 1e-6)[..., None]
     return np.where((weight > 1e-3)[..., None], mixed, shading).astype(np.float32)
@@ -256,29 +270,3 @@ def _best_offset(coarse: Floats32, todo: Mask, barred: Mask, y: int, x: int) -> 
     if not np.isfinite(error[best]):
         return None
     return int(best[0]) - window[0].start, int(best[1]) - window[1].start
-
-
-def _copy(
-    result: Floats32,
-    weight: Floats32,
-    source: Floats32,
-    tile: tuple[slice, slice],
-    offset: tuple[int, int],
-    scale: float,
-) -> None:
-    """Adds the full-size patch of a coarse tile, fading out at its rim."""
-    height, width = weight.shape
-    grow = FEATHER / scale
-    y0, y1 = max(0, int(tile[0].start / scale - grow)), min(height, int(tile[0].stop / scale + grow))
-    x0, x1 = max(0, int(tile[1].start / scale - grow)), min(width, int(tile[1].stop / scale + grow))
-    dy, dx = round(offset[0] / scale), round(offset[1] / scale)
-    y0, y1 = max(y0, -dy), min(y1, height - dy)
-    x0, x1 = max(x0, -dx), min(x1, width - dx)
-    if y1 <= y0 or x1 <= x0:
-        return
-    ramp_y, ramp_x = (
-        np.minimum(np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1)) / grow, 1.0) for n in (y1 - y0, x1 - x0)
-    )
-    fade = np.outer(ramp_y, ramp_x).astype(np.float32) ** 2
-    result[y0:y1, x0:x1] += source[y0 + dy : y1 + dy, x0 + dx : x1 + dx] * fade[..., None]
-    weight[y0:y1, x0:x1] += fade

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from threading import Lock
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 
-from cow_service.records import BBox, LocatedObject
+from cow_service.errors import CannotReadDirection
+from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import CroppedMask, bbox_of, iou, without_holes
+from cow_service.vision.masks import CroppedMask, bbox_of, dilated, iou, without_holes
 from cow_service.vision.regions import SAME_OBJECT_IOU, Region, disc_region, find_regions, region_of
 from cow_service.vision.segmentation import fault_of, mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
@@ -24,6 +24,8 @@ from cow_service.vision.trails import Trail, find_trails, trail_ending_at
 from cow_service.vision.types import Image, Mask
 
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
+REACH = 1.5  # sizes of an object: an arrow further away is not its own
+RIVAL = 0.6  # of a rival's distance: what is nearer than that is clearly the nearest
 DOUBTFUL = 0.75  # confidence below which the same holds of a small region that touches another obstacle
 
 
@@ -47,7 +49,7 @@ def find_obstacles(
     """
     body = silhouette(mover)
     body_area, whole = np.count_nonzero(body), without_holes(body)
-    near = cv2.dilate(body.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    near = dilated(body, 7)
     obstacles: list[Obstacle] = []
     for other in named:
         if iou(other.bbox, mover) < SAME_OBJECT_IOU:
@@ -62,18 +64,13 @@ def find_obstacles(
             continue
         if area < OWN_SHARE * body_area and region.mask.shared_with(near):
             continue
-        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU or _is_part(region, other) for other in obstacles):
+        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU for other in obstacles):
+            continue
+        larger = [other.mask for other in obstacles if area < OWN_SHARE * other.mask.area]
+        if region.confidence < DOUBTFUL and any(region.mask.shared_with(dilated(mask.full(), 7)) for mask in larger):
             continue
         obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
     return tuple(obstacles)
-
-
-def _is_part(region: Region, other: Obstacle) -> bool:
-    """Whether a doubtful region is the shadow or a part of a larger obstacle that it touches."""
-    if region.confidence >= DOUBTFUL or region.mask.area >= OWN_SHARE * other.mask.area:
-        return False
-    near = cv2.dilate(other.mask.full().astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    return bool(region.mask.shared_with(near))
 
 
 @dataclass(frozen=True)
@@ -101,12 +98,8 @@ class Scene:
     image: Image
     mover: BBox | None = None  # the present position of what moves, once it is known: it tells which end of a trail is
     trail_named: bool = False  # the question speaks of a trail: balls that look alike, one after another, are one
-    _masks: dict[BBox, Mask] = field(default_factory=dict, repr=False)
     _found: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any], repr=False)
     _preset: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
-    _obstacles: dict[tuple[BBox, tuple[LocatedObject, ...]], tuple[Obstacle, ...]] = field(
-        default_factory=dict, repr=False
-    )
 
     def once(self, key: Hashable, measure: Callable[[], Found]) -> Found:
         """What `measure` finds in this image, found once for the same key."""
@@ -201,7 +194,7 @@ class Scene:
 
     def _with_trails(self, **changes: Any) -> Scene:
         """The same image with other trails in it."""
-        other = replace(self, **{"_masks": {}, "_found": {}, "_preset": {}, "_obstacles": {}, **changes})
+        other = replace(self, **{"_found": {}, "_preset": {}, **changes})
         other.__dict__.update({key: self.__dict__[key] for key in OF_THE_IMAGE if key in self.__dict__})
         return other
 
@@ -216,22 +209,47 @@ class Scene:
         """Takes over what another scene of the same image has measured."""
         self.__dict__.update({key: value for key, value in measured.items() if key not in self.__dict__})
 
+    def arrows_near(self, bbox: BBox) -> list[Arrow]:
+        """Arrows that start or end close to a box and at no other object, nearest first."""
+        others = [region.bbox for region in self.regions if iou(region.bbox, bbox) < SAME_OBJECT_IOU]
+        near: list[Arrow] = []
+        for arrow in self.arrows:
+            (x, y), gap = arrow.tail, arrow.gap(bbox)
+            elsewhere = any(x0 <= x < x1 and y0 <= y < y1 for x0, y0, x1, y1 in others) and gap > REACH / 4
+            near += [arrow] if gap <= REACH and not elsewhere else []
+        return sorted(near, key=lambda arrow: arrow.gap(bbox))
+
+    def arrow_at(self, bbox: BBox) -> Arrow | None:
+        """The arrow of the object in a box: the only one near it, or the one clearly nearest."""
+        near = self.arrows_near(bbox)
+        gaps = [arrow.gap(bbox) for arrow in near]
+        return near[0] if len(near) == 1 or (near and gaps[0] <= RIVAL * gaps[1]) else None
+
+    def at_arrow(self, regions: Sequence[Region]) -> list[Region]:
+        """Of several regions the one at which the only arrow stands, if it stands at one of them and clearly so."""
+        if len(self.arrows) != 1:
+            return []
+        ranked = sorted((self.arrows[0].gap(region.bbox), i) for i, region in enumerate(self.regions))
+        nearest, found = ranked[0][0], self.regions[ranked[0][1]]
+        alone = len(ranked) == 1 or nearest < RIVAL * ranked[1][0]
+        return [found] if found in regions and nearest <= REACH and alone else []
+
     def region_of(self, bbox: BBox) -> Region | None:
         """The region that a box [x0, y0, x1, y1] is about, if there is one."""
         return region_of(self.regions, bbox)
 
     def silhouette(self, bbox: BBox) -> Mask:
         """Mask [H, W] of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
-        if bbox not in self._masks:
-            region = None if bbox in self._preset else self.region_of(bbox)
+
+        def cut() -> Mask:
             if bbox in self._preset:
-                mask = self._preset[bbox]()
-            elif region is not None and region.is_disc:
-                mask = region.mask.full()
-            else:
-                mask = mask_from_bbox(self.clean, bbox, None if region is None else region.mask.full())
-            self._masks[bbox] = mask
-        return self._masks[bbox]
+                return self._preset[bbox]()
+            region = self.region_of(bbox)
+            if region is not None and region.is_disc:
+                return region.mask.full()
+            return mask_from_bbox(self.clean, bbox, None if region is None else region.mask.full())
+
+        return self.once(("mask", bbox), cut)
 
     def preset_mask(self, bbox: BBox, mask: Callable[[], Mask]) -> None:
         """Gives the mask that an earlier run segmented for a box; it may have been segmented from a point instead."""
@@ -239,14 +257,7 @@ class Scene:
 
     def changed(self, image: Image, clean: Image) -> Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
-        other = replace(
-            self,
-            image=image,
-            _masks=dict(self._masks),
-            _found=dict(self._found),
-            _preset=dict(self._preset),
-            _obstacles=dict(self._obstacles),
-        )
+        other = replace(self, image=image, _found=dict(self._found), _preset=dict(self._preset))
         known = {"cues": self.cues, "arrows": self.arrows, "boxes": self.boxes, "regions": self.regions}
         other.__dict__.update(known, clean=clean)  # where cached properties are kept
         return other
@@ -254,15 +265,13 @@ class Scene:
     def with_mask(self, bbox: BBox, mask: Mask) -> Scene:
         """The same with another mask [H, W] of the object in a box."""
         other = self.changed(self.image, self.clean)
-        other._masks[bbox] = mask
+        other._found["mask", bbox] = mask
         return other
 
     def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
         """The objects beside the mover in a box, `named` ones by their name; found once for the same arguments."""
-        key = mover, tuple(named)
-        if key not in self._obstacles:
-            self._obstacles[key] = find_obstacles(self.regions, self.silhouette, mover, named)
-        return self._obstacles[key]
+        find = partial(find_obstacles, self.regions, self.silhouette, mover, named)
+        return self.once(("obstacles", mover, tuple(named)), find)
 
     def locate(self, point: tuple[float, float]) -> Cutout:
         """The object at a point [x, y]: the region there, else what can be cut out around it."""
@@ -281,8 +290,28 @@ class Scene:
             return min(under, key=lambda region: region.mask.area).bbox
         mask = mask_from_point(self.clean, (float(x), float(y)))
         bbox = bbox_of(mask)
-        self._masks[bbox] = mask
+        self._found["mask", bbox] = mask
         return bbox
+
+
+def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
+    """The mover's arrow. Raises `CannotReadDirection`, which ends with `remedy`, where it has none or several."""
+    arrow, near = scene.arrow_at(grounding.bbox), scene.arrows_near(grounding.bbox)
+    if arrow is not None:
+        return arrow
+    ends = "; ".join(
+        f"from ({a.tail[0]:.0f}, {a.tail[1]:.0f}) to ({a.tip[0]:.0f}, {a.tip[1]:.0f})" for a in near or scene.arrows
+    )
+    if not scene.arrows:
+        fault = "no drawn arrow was found: looked for one flat colour with a straight shaft and a head"
+    elif not near:
+        fault = f"what was found stands elsewhere than the {grounding.object}: {ends}"
+    else:
+        raise CannotReadDirection(
+            f"The question speaks of one arrow, but {len(near)} were found, and none is clearly that of the "
+            f"{grounding.object}: {ends}. {remedy}"
+        )
+    raise CannotReadDirection(f"The question speaks of an arrow, but {fault}. {remedy}")
 
 
 MOST_IMAGES = 8

@@ -105,7 +105,7 @@ class _Floor:
             best[((xs - x) / (cleared * a)) ** 2 + ((ys - y) / (cleared * b)) ** 2 <= 1] = 0
 
     def stands_alone(self, seen: Ellipse) -> bool:
-        """Whether the self is lighter than the ellipse on each of its four sides, unlike beside an edge of light."""
+        """Whether the floor is lighter than the ellipse on each of its four sides, unlike beside an edge of light."""
         x, y, a, b = seen
         rows = slice(max(0, int(y - RING[1] * b)), int(y + RING[1] * b) + 2)
         columns = slice(max(0, int(x - RING[1] * a)), int(x + RING[1] * a) + 2)
@@ -137,7 +137,7 @@ class _Floor:
         return np.where(whole, dark, 0).astype(np.float32)
 
     def fit_ellipse(self, seen: Ellipse) -> Shadow | None:
-        """A soft tilted ellipse on a smooth self, fitted to the lightness around what was seen."""
+        """A soft tilted ellipse on a smooth floor, fitted to the lightness around what was seen."""
         x, y, a, b = seen
         rows = slice(max(0, round(y - 2.2 * b - 2)), round(y + 2.2 * b + 3))
         columns = slice(max(0, round(x - 1.8 * a)), round(x + 1.8 * a + 1))
@@ -180,31 +180,26 @@ class _Floor:
         )
         if not fits:
             return None
-        spread = wide**2 / 4, high**2 / 4 * (1 + tilt**2), tilt * wide * high / 4
-        half = 2 * float(np.sqrt(spread[1]))
-        return Shadow((px - wide, py - half, px + wide, py + half), (px, py), spread, shade)
+        (xx, yy, xy), (fx, fy) = (wide**2 / 4, high**2 / 4 * (1 + tilt**2), tilt * wide * high / 4), self.stretch
+        half = 2 * float(np.sqrt(yy))
+        bbox = ((px - wide) * fx, (py - half + self.top) * fy, (px + wide) * fx, (py + half + self.top) * fy)
+        return Shadow(bbox, (px * fx, (py + self.top) * fy), (xx * fx * fx, yy * fy * fy, xy * fx * fy), shade)
 
 
 def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None where it has none or several patches could be it."""
-    return scene.once(("shadow", bbox), lambda: _find_shadow(scene, bbox))
 
+    def find() -> Shadow | None:
+        if scene.region_of(bbox) is None or bbox[2] - bbox[0] < LEAST_WIDTH:
+            return None
+        floor = _Floor.below(bbox, scene)
+        found = [shadow for ellipse in floor.candidates() if (shadow := floor.fit_ellipse(ellipse)) is not None]
+        found.sort(key=lambda shadow: -shadow.shade)
+        if not found or (len(found) > 1 and found[1].shade > RIVAL_SHADE * found[0].shade):
+            return None
+        return found[0]
 
-def _find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
-    region = scene.region_of(bbox)
-    width = bbox[2] - bbox[0]
-    if region is None or width < LEAST_WIDTH:
-        return None
-    floor = _Floor.below(bbox, scene)
-    fits = [shadow for shadow in (floor.fit_ellipse(ellipse) for ellipse in floor.candidates()) if shadow is not None]
-    fits.sort(key=lambda fit: -fit.shade)
-    if not fits or (len(fits) > 1 and fits[1].shade > RIVAL_SHADE * fits[0].shade):
-        return None
-    shadow = fits[0]
-    fx, fy = floor.stretch
-    (x0, y0, x1, y1), (x, y), (xx, yy, xy) = shadow.bbox, shadow.centre, shadow.spread
-    box = (x0 * fx, (y0 + floor.top) * fy, x1 * fx, (y1 + floor.top) * fy)
-    return Shadow(box, (x * fx, (y + floor.top) * fy), (xx * fx * fx, yy * fy * fy, xy * fx * fy), shadow.shade)
+    return scene.once(("shadow", bbox), find)
 
 
 def _soft_ellipse(points: Floats, parameters: Floats) -> Floats:

@@ -25,9 +25,8 @@ from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Source, Vector
 from cow_service.settings import Settings
-from cow_service.vision.arrow_choice import arrow_of, arrows_near, at_arrow
 from cow_service.vision.regions import Region, is_same_object
-from cow_service.vision.scene import Scene
+from cow_service.vision.scene import Scene, arrow_of
 
 
 class EmbeddedReader:
@@ -192,7 +191,7 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
         )
     fitting = matching.best_matches(regions, phrase, question.others)
     if len(fitting) > 1 and question.mentions_arrow:
-        fitting = at_arrow(scene, fitting) or fitting
+        fitting = scene.at_arrow(fitting) or fitting
     seen = describe(scene.regions)
     if not fitting:
         raise CannotGround(f"Looked for '{phrase.text}' and found nothing that fits. Seen: {seen}. {GIVE_PLACE}")
@@ -278,7 +277,7 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
 
 def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
     """Along the only arrow drawn at the mover, where the question names no direction at all."""
-    near = arrows_near(scene, grounding.bbox)
+    near = scene.arrows_near(grounding.bbox)
     clause = (item for item in question.clause if item.phrase is not None and item.phrase.head in ARROWS)
     if any(item.start not in question.read for item in clause):
         raise CannotReadDirection(

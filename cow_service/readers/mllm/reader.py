@@ -23,7 +23,6 @@ from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
 from cow_service.settings import Settings
-from cow_service.vision.arrow_choice import arrow_at
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
 from cow_service.vision.scene import Scene
@@ -280,7 +279,7 @@ def follow_arrow(scene: Scene, bbox: records.BBox, reading: base.MotionReading) 
 
     `along_arrow` says whether the object moves with it; where the reader does not say, only the arrow's axis counts.
     """
-    arrow = arrow_at(scene, bbox)
+    arrow = scene.arrow_at(bbox)
     if arrow is None or reading.direction is None:
         return reading
     along = reading.along_arrow
