@@ -104,10 +104,6 @@ class Ground:
         slope = np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
         return self.factor * self.camera.focal * slope @ steps
 
-    def support_of(self, body: int) -> int | None:
-        """The still body that a body stands on at the first frame; None for the floor and in the air."""
-        return next((i for i in self.still if self.bodies[i].object == self.bodies[body].support), None)
-
     def lower_end(self, body: int) -> float:
         """Metres above the floor of a body's lower end, at the first frame."""
         it = self.bodies[body]
@@ -143,39 +139,44 @@ class Sprite:
     fixed: Floats32 | None  # [a, b, 4]: does not turn
     turning: Floats32 | None  # [a, b, 4]: turns about `start`
     origin: tuple[float, float]  # x, y of its top left corner at the first frame, px
-    start: tuple[float, float]  # x, y of the body's centre at the first frame, px
+    start: Floats  # [2] x, y of the body's centre at the first frame, px
 
     def at(self, point: Floats, scale: float, rotation: float, size: tuple[int, int]) -> tuple[Window, Floats32] | None:
         """Its window and pixels [a, b, 4] with its centre at `point` (px); None outside a frame of `size`."""
         parts = [(part, turn) for part, turn in ((self.fixed, 0.0), (self.turning, rotation)) if part is not None]
         height, width = parts[0][0].shape[:2]
-        offset = np.array(self.origin) - np.array(self.start)
+        offset = np.array(self.origin) - self.start
         around = offset + np.array([[0, 0], [width, 0], [0, height], [width, height]])
         corners = np.concatenate([point + around @ turning(scale, turn).T for _, turn in parts])
         window = clipped(corners.min(axis=0) - 1, corners.max(axis=0) + 1, size)
         if window is None:
             return None
-        first, *others = (self._warped(part, point, scale, turn, window) for part, turn in parts)
-        return window, sum(others, first)
-
-    def _warped(self, part: Floats32, point: Floats, scale: float, degrees: float, window: Window) -> Floats32:
-        # Pixel centres, not corners, are what warpAffine maps.
-        cell = 1.0
-        while scale * cell < SMALLEST and min(part.shape[:2]) > 3:
-            width, height = max(1, part.shape[1] // 2), max(1, part.shape[0] // 2)
-            half = cv2.resize(part[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-            part = np.asarray(half, np.float32)
-            cell *= 2
-        turn = turning(scale, degrees)
-        rows, columns = window
-        first = np.array(self.origin) + 0.5 * cell - np.array(self.start)
-        shift = point + turn @ first - 0.5 - np.array([columns.start, rows.start])
-        size = columns.stop - columns.start, rows.stop - rows.start
-        transform = np.column_stack([turn * cell, shift])
-        return np.asarray(cv2.warpAffine(part, transform, size, flags=cv2.INTER_LINEAR), np.float32)
+        drawn: list[Floats32] = []
+        for part, turn in parts:
+            cells, step = part, 1.0
+            while scale * step < SMALLEST and min(cells.shape[:2]) > 3:
+                width, height = max(1, cells.shape[1] // 2), max(1, cells.shape[0] // 2)
+                half = cv2.resize(cells[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+                cells, step = np.asarray(half, np.float32), 2 * step
+            transform = warping(step, self.origin, turning(scale, turn), self.start, point, window)
+            drawn.append(np.asarray(cv2.warpAffine(cells, *transform, flags=cv2.INTER_LINEAR), np.float32))
+        return window, sum(drawn[1:], drawn[0])
 
 
-def cut_out(image: Image, mask: Mask, hidden: Mask | None, start: tuple[float, float], shape: Shape | None) -> Sprite:
+def warping(
+    step: float, origin: tuple[float, float], matrix: Floats, start: Floats, to: Floats, window: Window
+) -> tuple[Floats, tuple[int, int]]:
+    """For `cv2.warpAffine`, the transform [2, 3] and size of a window of what has gone from `start` `to` a place (px).
+
+    It lies on cells of `step` px from `origin` on, and is turned and scaled by a matrix. Centres of cells are mapped.
+    """
+    rows, columns = window
+    first = np.array(origin) + 0.5 * step - start
+    shift = to + matrix @ first - 0.5 - np.array([columns.start, rows.start])
+    return np.column_stack([matrix * step, shift]), (columns.stop - columns.start, rows.stop - rows.start)
+
+
+def cut_out(image: Image, mask: Mask, hidden: Mask | None, start: Floats, shape: Shape | None) -> Sprite:
     """The body under a mask [h, w]; its part `hidden` behind others gets the colours next to it."""
     whole = mask if hidden is None else mask | hidden
     inside = window_of(whole, MARGIN) or (slice(0, 1), slice(0, 1))
@@ -192,23 +193,17 @@ def cut_out(image: Image, mask: Mask, hidden: Mask | None, start: tuple[float, f
     origin = float(inside[1].start), float(inside[0].start)
     if shape != "sphere":
         return Sprite(None, pixels, origin, start)
-    detail = _detail(blended, body)
-    if detail is None:
-        return Sprite(pixels, None, origin, start)
-    turning = np.dstack([detail * alpha[..., None], np.zeros_like(alpha)]).astype(np.float32)
-    return Sprite(pixels - turning, turning, origin, start)
-
-
-def _detail(colours: Floats32, body: Mask) -> Floats32 | None:
-    """What is printed on a ball [a, b, 3], without its shading; None where it is plain."""
+    # What is printed on a ball turns with it, without its shading.
     sigma = max(1.0, SHADING_SIGMA * float(np.sqrt(body.sum())))
     weight = body.astype(np.float32)
     shares = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
-    shading = cv2.GaussianBlur(colours * weight[..., None], (0, 0), sigma) / shares[..., None]
-    detail = np.asarray((colours - shading) * weight[..., None], np.float32)
+    shading = cv2.GaussianBlur(blended * weight[..., None], (0, 0), sigma) / shares[..., None]
+    detail = np.asarray((blended - shading) * weight[..., None], np.float32)
     core = cv2.erode(weight, np.ones((5, 5), np.uint8)) > 0
-    printed = core.any() and float(np.percentile(np.abs(detail[core]).max(axis=1), 80)) > PRINTED
-    return detail if printed else None
+    if not core.any() or float(np.percentile(np.abs(detail[core]).max(axis=1), 80)) <= PRINTED:
+        return Sprite(pixels, None, origin, start)
+    turns = np.dstack([detail * alpha[..., None], np.zeros_like(alpha)]).astype(np.float32)
+    return Sprite(pixels - turns, turns, origin, start)
 
 
 def clipped(low: Floats, high: Floats, size: tuple[int, int]) -> Window | None:
@@ -282,7 +277,7 @@ class MovingBody:
         """At a frame of the clip."""
         point, scale = np.array(self.path.points[frame]), self.path.scale[frame]
         corners = point + (np.array(self.bbox).reshape(2, 2) - self.start) * scale
-        x0, y0, x1, y1 = (float(v) for v in corners.ravel())
+        x0, y0, x1, y1 = corners.ravel().tolist()
         bbox = (x0, y0, x1, y1)
         if self.ground is None:
             return Extent(bbox, self.airborne)
@@ -301,7 +296,8 @@ def moving_bodies(given: GeneratorInput, size: tuple[int, int], ground: Ground |
             bbox, mask = obstacle.bbox, obstacle.mask.full()
         # Without a camera, points follow the grounded point, wherever a given path begins.
         start = given.grounding.point if ground is None and path.body == 0 else path.points[0]
-        support = None if ground is None else ground.support_of(path.body)
+        on = None if ground is None else ground.bodies[path.body].support
+        support = None if ground is None else next((i for i in ground.still if ground.bodies[i].object == on), None)
         found.append(MovingBody(path, bbox, np.array(start), resized_mask(mask, size), airborne, ground, support))
     return tuple(found)
 

@@ -24,7 +24,7 @@ from cow_service.generators.cutout.shadows import Shadow, UnshadedScene, take_sh
 from cow_service.media.images import fit_within
 from cow_service.vision.inpainting import fill_hole
 from cow_service.vision.masks import CroppedMask, hull, iou, resized_mask, window_of
-from cow_service.vision.openings import SeenOpening, measure_opening
+from cow_service.vision.openings import measure_opening
 from cow_service.vision.types import Image, Mask
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
@@ -104,7 +104,7 @@ def take_apart(given: GeneratorInput) -> Layers:
             image,
             body.mask,
             _hidden(body, moving, still, eye),
-            (factor * float(body.start[0]), factor * float(body.start[1])),
+            factor * body.start,
             None if ground is None else ground.bodies[body.path.body].shape,
         )
         for body in moving
@@ -126,7 +126,29 @@ def without_bodies(
             hole |= noisy
         if cues is not None:  # where a cue next to the body was inpainted, the body's colour has spread
             hole |= cues & _dilated(hole, 2 * growth + 1, 3)
-        image = _without_body(image, hole, body, moving, still, eye)
+        window = window_of(hole, 2)
+        if window is None:
+            continue
+        # First what is behind it is completed, then the rest filled with floor.
+        objects, behind = np.zeros_like(hole), list[StillBody]()
+        for other in still:
+            objects |= other.mask
+            if other.mask[window].any() and body.extent(0).is_in_front_of(other.extent, eye):
+                behind.append(other)
+        solid = objects & ~body.mask
+        for other in behind:
+            if other.index == body.support:  # its top around the foot was in the shadow
+                solid &= ~other.mask
+        rest = hole & ~solid
+        for other in moving:
+            objects |= other.mask & ~body.mask if other is not body else False
+        for other in behind:
+            part = other.outline & rest
+            if part.any():
+                image = fill_hole(image, part, ~other.mask)
+                rest &= ~part
+                objects |= part
+        image = fill_hole(image, rest, objects)
     return image
 
 
@@ -143,34 +165,6 @@ def _hidden(body: MovingBody, moving: Sequence[MovingBody], still: Sequence[Stil
         return None
     hidden = (hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
     return hidden if hidden.any() else None
-
-
-def _without_body(
-    image: Image, hole: Mask, body: MovingBody, moving: Sequence[MovingBody], still: Sequence[StillBody], eye: float
-) -> Image:
-    """The image with one body taken out: first what is behind it is completed, then the rest filled with floor."""
-    window = window_of(hole, 2)
-    if window is None:
-        return image
-    objects, behind = np.zeros_like(hole), list[StillBody]()
-    for other in still:
-        objects |= other.mask
-        if other.mask[window].any() and body.extent(0).is_in_front_of(other.extent, eye):
-            behind.append(other)
-    solid = objects & ~body.mask
-    for other in behind:
-        if other.index == body.support:  # its top around the foot was in the shadow
-            solid &= ~other.mask
-    rest = hole & ~solid
-    for other in moving:
-        objects |= other.mask & ~body.mask if other is not body else False
-    for other in behind:
-        part = other.outline & rest
-        if part.any():
-            image = fill_hole(image, part, ~other.mask)
-            rest &= ~part
-            objects |= part
-    return fill_hole(image, rest, objects)
 
 
 def _dilated(mask: Mask, width: int, iterations: int = 1) -> Mask:
@@ -205,23 +199,16 @@ def _containers(
             continue
         it, body = ground.bodies[index], paths.get(index)
         mask = masks[index]
-        front_mask = mask & _below_rim(mask, measure_opening(image, CroppedMask.of(mask)))
+        # Below the nearer edge of its opening; without a rim, below the mask's upper third.
+        cropped = CroppedMask.of(mask)
+        seen, (x0, y0, x1, y1) = measure_opening(image, cropped), cropped.bbox
+        x, y, half, tall = seen.rim or ((x0 + x1) / 2, y0 + (y1 - y0) / 6, (x1 - x0) / 2, (y1 - y0) / 6)
+        inner = min(1.0, seen.inner * (x1 - x0) / 2 / half)
+        rows, columns = np.ogrid[: mask.shape[0], : mask.shape[1]]
+        off = np.clip((columns + 0.5 - x) / (inner * half), -1, 1)
+        front_mask = mask & (rows + 0.5 > y + inner * tall * np.sqrt(1 - off**2))
         front = StillBody(index, front_mask, ground.extent(index, it.bbox))
-        sprite = None
-        if body is not None:
-            start = (ground.factor * float(body.start[0]), ground.factor * float(body.start[1]))
-            sprite = cut_out(image, front_mask, None, start, it.shape)
+        sprite = None if body is None else cut_out(image, front_mask, None, ground.factor * body.start, it.shape)
         holds = results[content] in ("inside", "sticks-out")
         found.append(Container(index, content, holds, front, ground, body, sprite))
     return tuple(found)
-
-
-def _below_rim(mask: Mask, seen: SeenOpening) -> Mask:
-    """Where an image is below the nearer edge of an opening [h, w]; without a rim, below the mask's upper third."""
-    height, width = mask.shape
-    rows, columns = np.mgrid[:height, :width] + 0.5
-    x0, y0, x1, y1 = CroppedMask.of(mask).bbox
-    x, y, half, tall = seen.rim or ((x0 + x1) / 2, y0 + (y1 - y0) / 6, (x1 - x0) / 2, (y1 - y0) / 6)
-    inner = min(1.0, seen.inner * (x1 - x0) / 2 / half)
-    off = np.clip((columns - x) / (inner * half), -1, 1)
-    return rows > y + inner * tall * np.sqrt(1 - off**2)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from cow_service.generators.cutout.bodies import Window, warping
+from cow_service.records import BBox
 from cow_service.vision.inpainting import push_pull, quadratic_terms
 from cow_service.vision.masks import window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
@@ -35,8 +37,6 @@ ALIKE = 0.6  # of the darkness beside the object: it is, if it is as dark as thi
 CONTACT = 5  # px at the working size: so far under the object its shadow is as dark as at its rim
 
 IDENTITY, ORIGIN = np.eye(2), np.zeros(2)
-Box = tuple[float, float, float, float]
-Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,14 @@ class Shade:
         self, window: Window, matrix: Floats = IDENTITY, to: Floats = ORIGIN, start: Floats = ORIGIN
     ) -> Floats32:
         """The share of light taken away in a window [a, b, 3], when `start` has gone `to` (px), turned by a matrix."""
-        return self._warped(self.dark, window, matrix, to, start, cv2.BORDER_CONSTANT)
+        transform = warping(self.step, self.origin, matrix, start, to, window)
+        return np.asarray(cv2.warpAffine(self.dark, *transform, flags=cv2.INTER_LINEAR), np.float32)
 
     def lit_floor(self, window: Window) -> Floats32:
         """The floor's colours [a, b, 3] in the light, in a window of the image."""
-        return self._warped(self.floor, window, IDENTITY, ORIGIN, ORIGIN, cv2.BORDER_REPLICATE)
+        transform = warping(self.step, self.origin, IDENTITY, ORIGIN, ORIGIN, window)
+        found = cv2.warpAffine(self.floor, *transform, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found, np.float32)
 
     def corners(self, matrix: Floats = IDENTITY, to: Floats = ORIGIN, start: Floats = ORIGIN) -> tuple[Floats, Floats]:
         """The corners (px), least and greatest, between which `darkness` takes light away."""
@@ -66,31 +69,19 @@ class Shade:
         there = to + corners @ matrix.T
         return there.min(axis=0), there.max(axis=0)
 
-    def _warped(
-        self, cells: Floats32, window: Window, matrix: Floats, to: Floats, start: Floats, border: int
-    ) -> Floats32:
-        rows, columns = window
-        first = np.array(self.origin) + 0.5 * self.step - start
-        shift = to + matrix @ first - 0.5 - np.array([columns.start, rows.start])
-        size = columns.stop - columns.start, rows.stop - rows.start
-        transform = np.column_stack([matrix * self.step, shift])
-        return np.asarray(cv2.warpAffine(cells, transform, size, flags=cv2.INTER_LINEAR, borderMode=border), np.float32)
 
-
-def contact_shade(image: Image, body: Mask, box: Box, floor: Mask) -> Shade | None:
+def contact_shade(image: Image, body: Mask, box: BBox, floor: Mask) -> Shade | None:
     """The shadow on the floor beneath and beside an object [h, w] that stands there; None where it has none.
 
     `floor` [h, w] is where there may be floor: no pixel of any object. Beneath the object it is continued from beside.
     """
     side = max(box[2] - box[0], box[3] - box[1])
-    around = (
-        *(box[0] - SIDEWAYS * side, box[1] + UP * (box[3] - box[1])),
-        *(box[2] + SIDEWAYS * side, box[3] + DOWN * side),
-    )
+    x0, y0, x1, y1 = box
+    around = x0 - SIDEWAYS * side, y0 + UP * (y1 - y0), x1 + SIDEWAYS * side, y1 + DOWN * side
     return _measured(image, body, floor, around, side, NEAR, reject_open=True)
 
 
-def cast_shade(image: Image, ellipse: Mask, box: Box, floor: Mask) -> Shade | None:
+def cast_shade(image: Image, ellipse: Mask, box: BBox, floor: Mask) -> Shade | None:
     """The shadow at an ellipse [h, w] on the floor, whose box is given (px); None where the floor is not darker."""
     width, height = box[2] - box[0], box[3] - box[1]
     around = box[0] - 0.6 * width, box[1] - 0.8 * height, box[2] + 0.6 * width, box[3] + 0.8 * height
@@ -98,7 +89,7 @@ def cast_shade(image: Image, ellipse: Mask, box: Box, floor: Mask) -> Shade | No
 
 
 def _measured(
-    image: Image, seed: Mask, floor: Mask, around: Box, side: float, fade: tuple[float, float], *, reject_open: bool
+    image: Image, seed: Mask, floor: Mask, around: BBox, side: float, fade: tuple[float, float], *, reject_open: bool
 ) -> Shade | None:
     """The dark patches of the floor that touch the seed [h, w], within a box (px), at a smaller size."""
     height, width = floor.shape

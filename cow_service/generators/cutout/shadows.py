@@ -57,14 +57,14 @@ class AttachedShadow:
 
     shade: Shade
     path: Path
-    start: tuple[float, float]  # px of the clip
+    start: Floats  # [2] px of the clip
     factor: float  # clip px per image px
 
     def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
         """One shadow, on the floor."""
         matrix = np.eye(2) * self.path.scale[frame]
         to = self.factor * np.array(self.path.points[frame])
-        yield from _patch(self.shade, matrix, to, np.array(self.start), size, None)
+        yield from _patch(self.shade, matrix, to, self.start, size, None)
 
 
 @dataclass(frozen=True)
@@ -227,8 +227,7 @@ def take_shadows(
         if shade is None:
             continue
         if ground is None:
-            start = (factor * float(body.start[0]), factor * float(body.start[1]))
-            shadows.append(AttachedShadow(shade, body.path, start, factor))
+            shadows.append(AttachedShadow(shade, body.path, factor * body.start, factor))
         else:
             shadows.append(ContactShadow(ground, body.path, shade, body.support))
         image, noisy[index] = _without_shade(image, shade, masks[0] if masks else ~objects)
