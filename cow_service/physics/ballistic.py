@@ -3,8 +3,6 @@
 They lie in the plane of the first depth unless the motion leads out of it, as the paper has it: there is no floor.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -67,6 +67,23 @@ class SeenBody:
         overlap = min(x1, right) - max(x0, left)
         return overlap > LEAST_OVERLAP * min(x1 - x0, right - left) and y0 + y1 < top + bottom
 
+    def carries(self, other: SeenBody) -> bool:
+        """Whether the foot of another one lies on its top, and it is wider and lower than that.
+
+        What stands behind a thing ends at its upper edge; what stands on it has some of its top to either side.
+        """
+        x, y = other.foot
+        (x0, y0, x1, y1), (left, top, right, _) = self.bbox, other.bbox
+        wide, high = self.shape in ("box", "cylinder") and x1 - x0 > WIDER * (right - left), ON_TOP * (y1 - y0)
+        if not (wide and x0 < x < x1 and y0 < y < y0 + high and top < y0):
+            return False
+        shown, mask = math.inf, self.mask
+        for column in (left - BESIDE, right + BESIDE):
+            at = int(column) - mask.columns.start
+            rows = np.nonzero(mask.patch[:, at])[0] if 0 <= at < mask.patch.shape[1] else np.zeros(0)
+            shown = min(shown, y - (float(rows[0] + mask.rows.start) if len(rows) else math.inf))
+        return shown > SHOWN * (right - left)
+
     @property
     def is_flying(self) -> bool:
         """Said to be in the air."""
@@ -82,30 +99,6 @@ def supports_of(bodies: Sequence[SeenBody]) -> list[int | None]:
         if said in ("floor", "air") or named:
             found.append(named[0] if said not in ("floor", "air") else None)
             continue
-        under = [i for i, other in enumerate(bodies) if other is not body and _carries(other, body)]
+        under = [i for i, other in enumerate(bodies) if other is not body and other.carries(body)]
         found.append(min(under, key=lambda i: bodies[i].bbox[3]) if under else None)
     return found
-
-
-def _carries(support: SeenBody, body: SeenBody) -> bool:
-    """Whether the foot of a body lies on the top of a thing that is wider and lower than it.
-
-    What stands behind a thing ends at its upper edge; what stands on it has some of its top to either side.
-    """
-    x, y = body.foot
-    (x0, y0, x1, y1), (left, top, right, _) = support.bbox, body.bbox
-    possible = (
-        support.shape in ("box", "cylinder")
-        and x1 - x0 > WIDER * (right - left)
-        and x0 < x < x1
-        and y0 < y < y0 + ON_TOP * (y1 - y0)
-        and top < y0
-    )
-    if not possible:
-        return False
-    shown, mask = math.inf, support.mask
-    for column in (left - BESIDE, right + BESIDE):
-        at = int(column) - mask.columns.start
-        rows = np.nonzero(mask.patch[:, at])[0] if 0 <= at < mask.patch.shape[1] else np.zeros(0)
-        shown = min(shown, y - (float(rows[0] + mask.rows.start) if len(rows) else math.inf))
-    return shown > SHOWN * (right - left)

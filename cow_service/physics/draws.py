@@ -1,7 +1,5 @@
 """Standard normal draws for an ensemble of worlds: evenly spread, the same every time."""
 
-from __future__ import annotations
-
 from statistics import NormalDist
 
 import numpy as np

@@ -231,7 +231,13 @@ class _Engine:
         x, y, z = (np.array(body.position) * self.scale + self.origin[k]).tolist()
         builder = RigidBody.kinematic_position_based() if body.follows is not None else RigidBody.dynamic()
         lift = GAP if body.falls and not body.ghost else 0.0
-        builder = builder.translation((x, y + lift, z)).rotation(_rotation(body))
+        rotation = (0.0, body.yaw, 0.0)  # axis times angle, radians
+        if body.turn is not None:
+            a, b, c, w = body.turn
+            length = math.sqrt(a * a + b * b + c * c)
+            angle = 2 * math.atan2(length, w) / max(length, 1e-12)
+            rotation = (a * angle, b * angle, c * angle)
+        builder = builder.translation((x, y + lift, z)).rotation(rotation)
         builder = builder.gravity_scale(1.0 if body.falls else 0.0)
         if body.is_active:
             x, y, z = (v * self.scale for v in body.velocity)
@@ -360,37 +366,22 @@ class _Engine:
             self.velocities[k, i, row, 1] = 0.0
 
 
-def _rotation(body: RigidShape) -> tuple[float, float, float]:
-    """Axis times angle (radians)."""
-    if body.turn is None:
-        return 0.0, body.yaw, 0.0
-    x, y, z, w = body.turn
-    length = math.sqrt(x * x + y * y + z * z)
-    angle = 2 * math.atan2(length, w) / max(length, 1e-12)
-    return x * angle, y * angle, z * angle
-
-
 def _combined(collider: ColliderBuilder) -> ColliderBuilder:
     rule = CoefficientCombineRule.MULTIPLY
     return collider.friction_combine_rule(rule).restitution_combine_rule(rule)
 
 
 def _colliders(body: RigidShape, scale: float) -> list[ColliderBuilder]:
-    """Of one solid piece, or a container's floor and wall segments."""
-    width, height = body.half_width * scale, body.half_height * scale
-    if body.hollow is not None:
-        return _container_colliders(body, body.hollow, scale)
-    if body.shape == "sphere":
-        solid = Collider.ball(width)
-    elif body.shape == "box":
-        solid = Collider.cuboid(width, height, body.half_depth * scale)
-    else:
-        solid = Collider.cylinder(height, width) if body.shape == "cylinder" else Collider.cone(height, width)
-    return [solid.density(body.density)]
-
-
-def _container_colliders(body: RigidShape, hollow: Hollow, scale: float) -> list[ColliderBuilder]:
-    """A floor, and convex segments of the wall that stands on it."""
+    """Of one solid piece, or a container's floor and the convex segments of the wall that stands on it."""
+    width, height, hollow = body.half_width * scale, body.half_height * scale, body.hollow
+    if hollow is None:
+        if body.shape == "sphere":
+            solid = Collider.ball(width)
+        elif body.shape == "box":
+            solid = Collider.cuboid(width, height, body.half_depth * scale)
+        else:
+            solid = Collider.cylinder(height, width) if body.shape == "cylinder" else Collider.cone(height, width)
+        return [solid.density(body.density)]
     half_width, half_height = body.half_width, body.half_height
     foot = hollow.bottom + half_width - hollow.opening  # m: outer radius of the floor, or half its side
     turn = math.pi / hollow.sides
@@ -399,9 +390,8 @@ def _container_colliders(body: RigidShape, hollow: Hollow, scale: float) -> list
     circle = np.asarray(circle / math.cos(turn), np.float64)
     rings: list[Floats] = []
     levels = ((half_width, hollow.opening, half_height), (foot, hollow.bottom, half_height - hollow.depth))
-    for outer, inner, height in levels:
-        level = np.array([0.0, height, 0.0])
-        rings += [circle * outer + level, circle * inner + level]
+    for outer, inner, level in levels:
+        rings += [circle * radius + np.array([0.0, level, 0.0]) for radius in (outer, inner)]
     half, radius = (2 * half_height - hollow.depth) / 2 * scale, foot * scale
     # A flat cylinder stands on the floor as a hull of its corners does not: that sinks into it.
     floor = Collider.cylinder(half, radius) if hollow.sides > BOX_SIDES else Collider.cuboid(radius, half, radius)

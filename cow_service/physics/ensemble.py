@@ -1,7 +1,5 @@
 """The likeliest world, and the ensemble of worlds around it: what is shown, and how sure that is."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -45,20 +43,30 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     What is shown must not contradict what is answered: where an answer is sure and the likeliest world differs from
     it, the likeliest world of those that agree is shown.
     """
-    given = (world, world.as_it_is()) if world.is_changed else (world,)
-    queries = (query, _as_it_is(query))[: len(given)]
+    given, queries = (world,), [query]
+    if world.is_changed:
+        as_it_is = query
+        if query is not None and query.asked.form == "changes":  # of the world as it is: what it is that would change
+            form = "what-happens" if query.target is None else "whether"
+            as_it_is = replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
+        given, queries = (world, world.as_it_is()), [query, as_it_is]
     if size == 0:
-        return tuple(
-            EnsembleResult(each, _run(each, likeliest()), None, asked, None)
-            for each, asked in zip(given, queries, strict=True)
-        )
+        pairs = zip(given, queries, strict=True)
+        return tuple(EnsembleResult(each, _run(each, likeliest()), None, asked, None) for each, asked in pairs)
     rows = ensemble(size)
     # Side by side: the engine's steps, half of the time, are not held up by the interpreter's lock.
     with ThreadPoolExecutor(1) as beside:
         likely = beside.submit(lambda: [_run(each, likeliest()) for each in given])
         worlds = [_run(each, rows, EVERY) for each in given]
         shown = likely.result()
-    decided = _decide(queries, worlds, rows)
+    decided: list[Decided | None] = []
+    for asked, each in zip(queries, worlds, strict=True):
+        if asked is None or (asked.asked.form == "changes" and len(worlds) == 1):
+            decided.append(None)
+        elif asked.asked.form == "changes":
+            decided.append(decide_change(asked, each.events, worlds[1].events, rows))
+        else:
+            decided.append(decide(asked, each.events, rows))
     if query is not None and any(each is not None and each.sure for each in decided):
         shown = _agreeing(given, query, decided, rows, worlds, shown)
     return tuple(EnsembleResult(*parts) for parts in zip(given, shown, worlds, queries, decided, strict=True))
@@ -67,26 +75,6 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
 def _run(world: WorldInput, draws: Floats, every: int = 1) -> ObservedWorlds:
     worlds = run_world(world, draws, every)
     return ObservedWorlds(worlds, find_world_events(worlds, world.bodies, world.fps, draws, world.size))
-
-
-def _as_it_is(query: Query | None) -> Query | None:
-    """What is asked of the world as it is where a change is asked about: what it is that would change."""
-    if query is None or query.asked.form != "changes":
-        return query
-    form = "what-happens" if query.target is None else "whether"
-    return replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
-
-
-def _decide(queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], rows: Floats) -> list[Decided | None]:
-    found: list[Decided | None] = []
-    for query, each in zip(queries, worlds, strict=True):
-        if query is None:
-            found.append(None)
-        elif query.asked.form != "changes":
-            found.append(decide(query, each.events, rows))
-        else:
-            found.append(decide_change(query, each.events, worlds[1].events, rows) if len(worlds) > 1 else None)
-    return found
 
 
 def _agreeing(

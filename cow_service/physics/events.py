@@ -1,7 +1,5 @@
 """What bodies that move meet in worlds that were run: when one first touches, hides or is hidden by each other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,40 +37,6 @@ def set_off(shapes: Sequence[RigidShape], run: WorldRun) -> dict[int, float]:
     for late in sorted(run.moved - moving.keys()):  # what stood on something that was pushed away
         moving[late] = max(moving.values())
     return moving
-
-
-def times_moved(worlds: Worlds) -> Floats:
-    """[K, B]: when each body has been displaced (s), never for what stays where it is."""
-    positions = np.stack([run.positions for run in worlds.runs])
-    half = np.array([[shape.half_width for shape in shapes] for shapes in worlds.shapes])
-    away = np.linalg.norm(positions - positions[:, :, :1], axis=3)
-    return _first(away > DISPLACED * half[..., None], worlds)
-
-
-def times_tipped(worlds: Worlds) -> Floats:
-    """[K, B]: when the upright axis of each body first leans by more than 45 degrees (s); never for spheres.
-
-    Of worlds whose turns were recorded.
-    """
-    count, frames = len(worlds.shapes[0]), worlds.runs[0].positions.shape[1]
-    leans = np.zeros((len(worlds.runs), count, frames), bool)
-    draws = zip(worlds.shapes, worlds.runs, strict=True)
-    which = [(k, i) for k, (shapes, run) in enumerate(draws) for i in run.moved if shapes[i].shape != "sphere"]
-    if which:
-        turns = np.concatenate([worlds.runs[k].turns[i] for k, i in which])
-        upright = turned(turns, np.array([0.0, 1.0, 0.0]))[:, 1].reshape(len(which), frames)
-        leans[tuple(np.array(which).T)] = upright < math.cos(TIPPED)
-    return _first(leans, worlds)
-
-
-def times_landed(worlds: Worlds) -> Floats:
-    """[K, B]: when each body first meets the floor (s)."""
-    times = np.full((len(worlds.runs), len(worlds.shapes[0])), NEVER)
-    for k, run in enumerate(worlds.runs):
-        for meeting in run.meetings:
-            if meeting.b is None:
-                times[k, meeting.a] = min(times[k, meeting.a], meeting.time)
-    return times
 
 
 def _first(happens: Mask, worlds: Worlds) -> Floats:
@@ -124,17 +88,33 @@ def find_world_events(
     worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, size: tuple[int, int]
 ) -> WorldEvents:
     """The events of every draw [K, P] in an image of a size (width, height; px)."""
-    started = set_off(worlds.shapes[0], worlds.runs[0])
+    runs, shapes, count = worlds.runs, worlds.shapes, len(bodies)
+    started = set_off(shapes[0], runs[0])
     order = tuple(sorted(started, key=lambda body: (body != 0, started[body])))
-    paths = [seen_paths(worlds, body) for body in range(len(bodies))]
+    paths = [seen_paths(worlds, body) for body in range(count)]
     inside = [np.all((path.points >= 0) & (path.points < np.array(size)), axis=2) & ~path.passed for path in paths]
-    outside = ~np.stack(inside, axis=1)
+    # What is displaced from where it was has moved.
+    positions = np.stack([run.positions for run in runs])
+    away = np.linalg.norm(positions - positions[:, :, :1], axis=3)
+    displaced = away > DISPLACED * np.array([[shape.half_width for shape in each] for each in shapes])[..., None]
+    # What leans by more than 45 degrees has tipped over; spheres never do.
+    leans = np.zeros(away.shape, bool)
+    which = [(k, i) for k, run in enumerate(runs) for i in run.moved if shapes[k][i].shape != "sphere"]
+    if which:
+        turns = np.concatenate([runs[k].turns[i] for k, i in which])
+        upright = turned(turns, np.array([0.0, 1.0, 0.0]))[:, 1].reshape(len(which), -1)
+        leans[tuple(np.array(which).T)] = upright < math.cos(TIPPED)
+    landed = np.full((len(runs), count), NEVER)
+    for k, run in enumerate(runs):
+        for meeting in run.meetings:
+            if meeting.b is None:
+                landed[k, meeting.a] = min(landed[k, meeting.a], meeting.time)
     return WorldEvents(
         of=_Lazily(lambda subject: _events_of(subject, worlds, bodies, fps, draws, paths)),
-        moved=times_moved(worlds),
-        tipped=times_tipped(worlds),
-        gone=_first(outside, worlds),
-        landed=times_landed(worlds),
+        moved=_first(displaced, worlds),
+        tipped=_first(leans, worlds),
+        gone=_first(~np.stack(inside, axis=1), worlds),
+        landed=landed,
         placed=None if worlds.placements is None else worlds.placements.times,
         order=order,
     )

@@ -130,7 +130,16 @@ class _Picture:
         if motion.kind == "fall" and asked is not None and mover.is_above(bodies[asked]):
             below = self.standing(asked, cameras.at_height(np.ones(len(draws))), draws)
             if below is not None and not bodies[asked].is_flying:
-                height = _height_over(ball, height, below.centre[:, 2], fit, draws)
+                # In most draws it hangs over what is asked about, which is seen at a distance of so many heights of
+                # the camera. What a shadow tells of the height weighs against it.
+                aside = HUNG_SIGMA * ball.half_width * draws[:, COLUMN["turn"]]
+                aligned = (ball.centre[:, 2] + aside) / below.centre[:, 2]
+                in_radii = 2 * (aligned[0] + ball.centre[0, 1]) / (ball.half_width[0] + ball.half_height[0])
+                if in_radii > 0:
+                    off = (np.log(in_radii) - fit.mean[2]) / np.sqrt(fit.covariance[2, 2])
+                    weight = HUNG * np.exp(-0.5 * off**2)
+                    is_over = quantiles(draws[:, COLUMN["depth"]]) < weight / (1 + weight)
+                    height = np.where(is_over, aligned, height)
         cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
         flying = in_the_air(cameras, mover.bbox, mover.shape, depth)
         return cameras, [flying, *(self.body_at(i, cameras, depth) for i in range(1, len(bodies)))]
@@ -165,22 +174,6 @@ class _Picture:
         along = abs(float(way[[0, 2]] @ sight))
         across = math.sqrt(max(0.0, 1 - along**2))
         return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
-
-
-def _height_over(mover: LiftedBody, heights: Floats, ahead_per_height: Floats, fit: CameraFit, draws: Floats) -> Floats:
-    """Heights [K] (m) of the camera, of which most draws have the mover over what is asked about.
-
-    `heights` [K] are those of the fit's draws. What is asked about stands `ahead_per_height` [K] times the height of
-    the camera ahead of it, over the floor. What a shadow tells of the height weighs against it.
-    """
-    aside = HUNG_SIGMA * mover.half_width * draws[:, COLUMN["turn"]]
-    aligned = (mover.centre[:, 2] + aside) / ahead_per_height
-    in_radii = 2 * (aligned[0] + mover.centre[0, 1]) / (mover.half_width[0] + mover.half_height[0])
-    if in_radii <= 0:
-        return heights
-    off = (np.log(in_radii) - fit.mean[2]) / np.sqrt(fit.covariance[2, 2])
-    weight = HUNG * np.exp(-0.5 * off**2)
-    return np.where(quantiles(draws[:, COLUMN["depth"]]) < weight / (1 + weight), aligned, heights)
 
 
 def _velocity(

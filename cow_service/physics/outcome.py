@@ -4,8 +4,6 @@ The rule, the same for every form of question: an answer is sure where it has at
 where it has at least `ROBUST` of them.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

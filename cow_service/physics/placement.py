@@ -6,8 +6,6 @@ a tenth of the container's depth below the rim, is `on-the-rim`: it is held up t
 in the worlds in which it ends as it was meant to: inside; on top; or, beside others, without overlapping them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import BOX_SIDES, Hollow, Meeting, RigidShape, WorldRun, hollow_of, run_worlds
+from cow_service.physics.engine import BOX_SIDES, Meeting, RigidShape, WorldRun, hollow_of, run_worlds
 from cow_service.records import PlacementResult, PlaceRelation
 from cow_service.vision.openings import SeenOpening
 from cow_service.vision.types import Floats, Mask
@@ -271,13 +269,9 @@ def classify(
 
     `released` are its bodies as one is released, `lying` as they were before; `run` is what they did from then on.
     """
-    target, body = goal.targets[0], goal.body
-    hollow = released[target].hollow
     if goal.relation in ("into", "onto"):
-        tipped = _upright(run.turns[target, -1]) < TIPPED
-        if hollow is not None and goal.relation == "into":
-            return _into(goal, released, run, hollow, tipped)
-        return _onto(goal, released, run, tipped), math.nan, math.nan
+        return _on_target(goal, released, run)
+    body = goal.body
     clearance = math.nan
     if goal.relation == "between":
         first, second = (released[i] for i in goal.targets)
@@ -295,41 +289,36 @@ def classify(
     return ("tips" if tips else "beside"), clearance, math.nan
 
 
-def _into(
-    goal: PlacementGoal, released: Sequence[RigidShape], run: WorldRun, hollow: Hollow, tipped: bool
+def _on_target(
+    goal: PlacementGoal, released: Sequence[RigidShape], run: WorldRun
 ) -> tuple[PlacementResult, float, float]:
-    body, container = released[goal.body], released[goal.targets[0]]
+    """As `classify`, of what is put into or onto something."""
+    body, target = released[goal.body], released[goal.targets[0]]
+    (there, turn), (middle, lean) = ((run.positions[i, -1], run.turns[i, -1]) for i in (goal.body, goal.targets[0]))
+    tall, tipped, hollow = _half_height(body, turn), _upright(lean) < TIPPED, target.hollow
+    low, high = there[1] - tall, there[1] + tall
+    off = math.hypot(there[0] - middle[0], there[2] - middle[2])
+    if hollow is None or goal.relation == "onto":
+        tipped &= target.shape != "sphere"
+        sunk = low < middle[1] + _half_height(target, lean) - SUNK * min(body.half_height, target.half_height)
+        if sunk or off > target.half_width + body.half_width:
+            return ("tips" if tipped else "falls-off"), math.nan, math.nan
+        tipped |= body.shape != "sphere" and _upright(turn) < TIPPED
+        return ("tips" if tipped else "on-top"), math.nan, math.nan
     half = body.half_width  # with which it goes through the opening: of a box through a round one, its diagonal
     if body.shape == "box":
         square = hollow.sides == BOX_SIDES
         half = max(half, body.half_depth) if square else math.hypot(half, body.half_depth)
-    clearance = 1 - half / hollow.opening
-    there, middle = run.positions[goal.body, -1], run.positions[goal.targets[0], -1]
-    rim, tall = middle[1] + container.half_height, _half_height(body, run.turns[goal.body, -1])
-    low, high = there[1] - tall, there[1] + tall
+    clearance, rim = 1 - half / hollow.opening, middle[1] + target.half_height
     above = float(np.clip((high - rim) / max(high - low, 1e-9), 0.0, 1.0))
-    off = math.hypot(there[0] - middle[0], there[2] - middle[2])
-    if off > container.half_width and low < rim:
-        return ("tips" if tipped else "falls-off"), clearance, above
+    result: PlacementResult = "sticks-out" if high - rim > STICKS_OUT * hollow.depth else "inside"
     if tipped:
-        return "tips", clearance, above
-    if clearance <= 0 or rim - low < GONE_IN * hollow.depth:
-        return "on-the-rim", clearance, above
-    return ("sticks-out" if high - rim > STICKS_OUT * hollow.depth else "inside"), clearance, above
-
-
-def _onto(goal: PlacementGoal, released: Sequence[RigidShape], run: WorldRun, tipped: bool) -> PlacementResult:
-    index = goal.targets[0]
-    body, target = released[goal.body], released[index]
-    there, middle, turn = run.positions[goal.body, -1], run.positions[index, -1], run.turns[goal.body, -1]
-    low = there[1] - _half_height(body, turn)
-    top = middle[1] + _half_height(target, run.turns[index, -1])
-    off = math.hypot(there[0] - middle[0], there[2] - middle[2])
-    if low < top - SUNK * min(body.half_height, target.half_height) or off > target.half_width + body.half_width:
-        return "tips" if tipped and target.shape != "sphere" else "falls-off"
-    if (tipped and target.shape != "sphere") or (body.shape != "sphere" and _upright(turn) < TIPPED):
-        return "tips"
-    return "on-top"
+        result = "tips"
+    elif off > target.half_width and low < rim:
+        result = "falls-off"
+    elif clearance <= 0 or rim - low < GONE_IN * hollow.depth:
+        result = "on-the-rim"
+    return result, clearance, above
 
 
 def _half_height(body: RigidShape, turn: Floats) -> float:

@@ -1,7 +1,5 @@
 """From worlds that were run back to the image: points, apparent size, turns, and how far they spread."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

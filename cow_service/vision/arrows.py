@@ -5,8 +5,6 @@ is that of a shaft followed by a head that tapers to a tip, and if an ideal arro
 Objects of a scene (bottles, cones, pencils) fail one of the two.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable

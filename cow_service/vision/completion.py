@@ -3,8 +3,6 @@
 By colour alone, a ball's region lacks its highlight and includes its contact shadow; the circle does neither.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Inpainting: fills what is left behind when a thin drawing or a whole object is taken out of an image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """Measures the opening of a container that is seen from above: the ellipse of its rim, outside and inside."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -5,8 +5,6 @@ does a patch enclosed by edges below a bright top: the shaded side of a white ob
 hue, are left out. Where the surroundings vary too much (most photographs), no region is returned instead of wrong ones.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Segments an object with GrabCut: from its box, from a point on it, or from a first guess of its mask."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Arrays by what they hold. They need no OpenCV, which machines with a GPU and nothing else may lack."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 A frame is put together from far to near: the background, the shadows on it, then each sprite behind what is nearer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import cmp_to_key
 

@@ -1,7 +1,5 @@
 """Takes a scene apart: the background without what moves and its shadows, sprites, and what stands still."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
@@ -43,21 +41,6 @@ class CutoutOptions(BaseModel):
 
 
 @dataclass(frozen=True)
-class Layers:
-    """What is composed, at the clip's size."""
-
-    image: Image  # [h, w, 3]: the scene before anything moves
-    background: Image  # [h, w, 3] without what moves and its shadows
-    moving: tuple[MovingBody, ...]
-    sprites: tuple[Sprite, ...]  # of the moving bodies
-    shadows: tuple[Shadow, ...]
-    still: tuple[StillBody, ...]
-    containers: tuple[Container, ...]  # into which bodies are put
-    eye: float  # m: the camera's height above the floor, 0 where unknown
-    factor: float  # clip px per image px
-
-
-@dataclass(frozen=True)
 class Container:
     """A container that a body is put into, and the part of it that is drawn over what is inside."""
 
@@ -83,6 +66,21 @@ class Container:
         front = self.front.extent
         inside = body.extent(frame).bottom < front.top - DEEPER * (front.top - front.bottom)
         return self.holds and inside and self.takes(body, frame)
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What is composed, at the clip's size."""
+
+    image: Image  # [h, w, 3]: the scene before anything moves
+    background: Image  # [h, w, 3] without what moves and its shadows
+    moving: tuple[MovingBody, ...]
+    sprites: tuple[Sprite, ...]  # of the moving bodies
+    shadows: tuple[Shadow, ...]
+    still: tuple[StillBody, ...]
+    containers: tuple[Container, ...]  # into which bodies are put
+    eye: float  # m: the camera's height above the floor, 0 where unknown
+    factor: float  # clip px per image px
 
 
 def take_apart(given: GeneratorInput) -> Layers:

@@ -5,8 +5,6 @@ out of the image, and multiplying by that puts it back, with the floor's texture
 keeps its hue, but for the light that a coloured object throws on it; what differs more is no shadow.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

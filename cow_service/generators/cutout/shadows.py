@@ -5,8 +5,6 @@ light. And what comes down onto a surface takes that surface's light from the sk
 distance d from the centre of a sphere of radius r, at a height h above a plane, loses h r^2 / d^3 of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
