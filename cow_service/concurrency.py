@@ -100,7 +100,7 @@ class BackgroundThread(ABC):
     def start(self) -> None:
         """Starts the thread."""
         self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+        self._thread = threading.Thread(target=self.run, name=self._name, daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
@@ -111,7 +111,7 @@ class BackgroundThread(ABC):
             self._thread = None
 
     @abstractmethod
-    def _run(self) -> None:
+    def run(self) -> None:
         """Works until `_stop` is set."""
 
 

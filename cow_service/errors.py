@@ -47,8 +47,6 @@ An error's docstring is its title on the wire. Its message says what was wrong, 
 it never holds a path, a trace or a secret. The SDK raises the same classes for the same codes.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from typing import Any
 

@@ -3,8 +3,6 @@
 The built-in backends are registered in `pyproject.toml` exactly as those of a third party would be.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Runs one process: an HTTP server with its engine, readiness and a graceful shutdown, or a worker without HTTP."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import signal

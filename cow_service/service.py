@@ -1,7 +1,5 @@
 """The composition root: settings in, a service that simulates out. Nothing else chooses a backend."""
 
-from __future__ import annotations
-
 import re
 import uuid
 from functools import partial
@@ -9,7 +7,7 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 from cow_service import errors
 from cow_service.concurrency import PrioritySemaphore
@@ -112,7 +110,16 @@ class Service:
         Raises `InvalidRequest` for names of backends that nobody has, the errors of `image_of`, and whatever `progress`
         raises.
         """
-        backends = self._backends(request)
+        reader, generator = self._names_of(request)
+        backends = Backends(
+            reader_name=reader,
+            reader=partial(self._reader, reader),
+            words=lambda: cast(WordReader, self.readers.get(WORD_READER)),
+            generator=partial(self._generator, generator),
+            artifacts=self.artifacts,
+            cpu=self.cpu,
+            device=partial(self._device, generator),
+        )
         request = self.keep_masks(request)
         created_at = created_at or now()
         # Also with an image at hand: a run begins in its turn, and its job counts as queued until then.
@@ -140,8 +147,7 @@ class Service:
         Raises `InvalidRequest` for backends that nobody has and for options that the generator does not take, and
         `ReaderUnavailable` or `GeneratorUnavailable` where their modules are needed here and not installed.
         """
-        reader = self._known("reader", request.reader or self.settings.reader, self.readers)
-        name = self._known("generator", request.generator or self.settings.generator, self.generators)
+        reader, name = self._names_of(request)
         if self.settings.role != "api":  # else workers have what it lacks
             _check_modules(reader, errors.ReaderUnavailable)
             _check_modules(name, errors.GeneratorUnavailable)
@@ -170,7 +176,7 @@ class Service:
         reader = self._reader(name)
         return reader if isinstance(reader, ChatReader) else None
 
-    def __enter__(self) -> Service:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -186,20 +192,6 @@ class Service:
         self.artifacts.check()
         self._reader(self.settings.reader)
         self._generator(self.settings.generator)
-
-    def _backends(self, request: SimulateRequest) -> Backends:
-        """Who does the work of a request. Raises `InvalidRequest` for a name that nobody has."""
-        reader = self._known("reader", request.reader or self.settings.reader, self.readers)
-        generator = self._known("generator", request.generator or self.settings.generator, self.generators)
-        return Backends(
-            reader_name=reader,
-            reader=partial(self._reader, reader),
-            words=lambda: cast(WordReader, self.readers.get(WORD_READER)),
-            generator=partial(self._generator, generator),
-            artifacts=self.artifacts,
-            cpu=self.cpu,
-            device=partial(self._device, generator),
-        )
 
     def _device(self, name: str) -> PrioritySemaphore:
         """Held while a generator works: one of its own where it has a device or a limit, else that of the CPU."""
@@ -244,11 +236,14 @@ class Service:
         kept = ImageArtifact(artifact=self.artifacts.put(data, "image/png").sha256)
         return place.model_copy(update={"mask": kept})
 
-    def _known(self, role: str, name: str, registry: Registry[Reader] | Registry[Generator]) -> str:
-        if name not in registry.names():
-            detail = f"There is no {role} '{name}'. There are: {', '.join(registry.names()) or 'none'}."
-            raise errors.InvalidRequest(detail, errors=(errors.FieldError(f"/{role}", detail),))
-        return name
+    def _names_of(self, request: SimulateRequest) -> tuple[str, str]:
+        """Its reader and its generator. Raises `InvalidRequest` for a name that nobody has."""
+        reader, generator = request.reader or self.settings.reader, request.generator or self.settings.generator
+        for role, name, registry in (("reader", reader, self.readers), ("generator", generator, self.generators)):
+            if name not in registry.names():
+                detail = f"There is no {role} '{name}'. There are: {', '.join(registry.names()) or 'none'}."
+                raise errors.InvalidRequest(detail, errors=(errors.FieldError(f"/{role}", detail),))
+        return reader, generator
 
     def _describe(self, role: str, name: str) -> BackendInfo:
         manifest = find_manifest(name)

@@ -1,7 +1,5 @@
 """Settings of the service, from the environment: each `COW_` plus the field's name in capitals."""
 
-from __future__ import annotations
-
 import base64
 import re
 from pathlib import Path
@@ -188,8 +186,11 @@ class Settings(BaseSettings):
     @classmethod
     def _signs(cls, secret: SecretStr | None) -> SecretStr | None:
         each = [] if secret is None else secret.get_secret_value().split(" ")
-        if secret is not None and (len(each) > MAX_SECRETS or not all(map(_is_secret, each))):
-            raise ValueError("not whsec_ and base64 of 24 to 64 bytes")
+        for text in each:
+            begin, _, coded = text.partition("_")
+            size = len(base64.b64decode(coded, validate=True))  # or a ValueError
+            if begin != "whsec" or size not in SECRET_BYTES or len(each) > MAX_SECRETS:
+                raise ValueError("not whsec_ and base64 of 24 to 64 bytes")
         return secret
 
     @property
@@ -213,14 +214,6 @@ class Settings(BaseSettings):
         if checkpoint is None or not checkpoint.exists():
             return ()
         return ("transformer", "base") if (checkpoint / "vae").is_dir() else ("transformer",)
-
-
-def _is_secret(text: str) -> bool:
-    begin, _, coded = text.partition("_")
-    try:
-        return begin == "whsec" and len(base64.b64decode(coded, validate=True)) in SECRET_BYTES
-    except ValueError:
-        return False
 
 
 # Messages about settings that may hold a secret, whose value is not repeated.

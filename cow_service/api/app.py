@@ -1,7 +1,5 @@
 """The HTTP application: routes, middleware and the OpenAPI document around one service."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager

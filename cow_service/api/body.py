@@ -4,8 +4,6 @@ JSON is read as RFC 8259 has it, more strictly than parsers do by default: what 
 refused.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter
@@ -73,46 +71,6 @@ class RawBody:
     image: bytes | None = None
 
 
-async def receive(request: Request) -> RawBody:
-    """Receives the body.
-
-    Raises `BodyTypeUnsupported`, `BodyTooLarge`, `BodyTooSlow`, and for a form also `MalformedBody`.
-    """
-    raw_type, parameters = parse_options_header(request.headers.get("content-type", ""))
-    media_type = raw_type.decode("latin-1")[:SHOWN_CHARACTERS]
-    if media_type == "multipart/form-data":
-        charset = parameters.get(b"charset", b"utf-8").decode("latin-1").lower()
-        if charset not in ("utf-8", "utf8", "us-ascii", "ascii"):
-            raise BodyTypeUnsupported(
-                f"The form has the character set '{charset[:SHOWN_CHARACTERS]}': send UTF-8, and name no other."
-            )
-        return await _receive_form(request)
-    if media_type == "application/json" or media_type.endswith("+json"):
-        return RawBody(json=b"".join([part async for part in request.stream()]))
-    raise BodyTypeUnsupported(
-        f"The body has the media type '{media_type or 'none'}'. Send application/json or multipart/form-data."
-    )
-
-
-def parse(raw: RawBody, model: type[Body], service: Service) -> tuple[Body, DecodedImage | None]:
-    """The validated request, and the image of a form, stored and decoded. CPU work: not for the event loop."""
-    try:
-        if raw.json is not None:
-            return model.model_validate(read_object(raw.json, "The body")), None
-        given = read_object(raw.request, "The form field `request`")
-        twice = [name for name in ("image", "question") if name in given and getattr(raw, name) is not None]
-        _check_unique(twice, "stands in the form and in its field `request`; give it once")
-        if raw.question is not None:
-            given["question"] = raw.question
-        image = None
-        if raw.image is not None:
-            artifact, image = service.keep_image(raw.image)
-            given["image"] = {"artifact": artifact.sha256}
-        return model.model_validate(given), image
-    except ValidationError as error:
-        raise invalid(error) from error
-
-
 class _FormParser(MultiPartParser):
     """Records whether the last boundary arrived: fields cut off before it must not count as omitted."""
 
@@ -122,7 +80,24 @@ class _FormParser(MultiPartParser):
         self.ended = True
 
 
-async def _receive_form(request: Request) -> RawBody:
+async def receive(request: Request) -> RawBody:
+    """Receives the body.
+
+    Raises `BodyTypeUnsupported`, `BodyTooLarge`, `BodyTooSlow`, and for a form also `MalformedBody`.
+    """
+    raw_type, parameters = parse_options_header(request.headers.get("content-type", ""))
+    media_type = raw_type.decode("latin-1")[:SHOWN_CHARACTERS]
+    if media_type == "application/json" or media_type.endswith("+json"):
+        return RawBody(json=b"".join([part async for part in request.stream()]))
+    if media_type != "multipart/form-data":
+        raise BodyTypeUnsupported(
+            f"The body has the media type '{media_type or 'none'}'. Send application/json or multipart/form-data."
+        )
+    charset = parameters.get(b"charset", b"utf-8").decode("latin-1").lower()
+    if charset not in ("utf-8", "utf8", "us-ascii", "ascii"):
+        raise BodyTypeUnsupported(
+            f"The form has the character set '{charset[:SHOWN_CHARACTERS]}': send UTF-8, and name no other."
+        )
     try:
         async with aclosing(request.stream()) as stream:
             parser = _FormParser(request.headers, stream, max_files=3, max_fields=8)
@@ -153,6 +128,25 @@ async def _receive_form(request: Request) -> RawBody:
         )
     finally:
         await form.close()
+
+
+def parse(raw: RawBody, model: type[Body], service: Service) -> tuple[Body, DecodedImage | None]:
+    """The validated request, and the image of a form, stored and decoded. CPU work: not for the event loop."""
+    try:
+        if raw.json is not None:
+            return model.model_validate(read_object(raw.json, "The body")), None
+        given = read_object(raw.request, "The form field `request`")
+        twice = [name for name in ("image", "question") if name in given and getattr(raw, name) is not None]
+        _check_unique(twice, "stands in the form and in its field `request`; give it once")
+        if raw.question is not None:
+            given["question"] = raw.question
+        image = None
+        if raw.image is not None:
+            artifact, image = service.keep_image(raw.image)
+            given["image"] = {"artifact": artifact.sha256}
+        return model.model_validate(given), image
+    except ValidationError as error:
+        raise invalid(error) from error
 
 
 def _check_unique(twice: list[str], detail: str) -> None:

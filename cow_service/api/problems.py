@@ -1,7 +1,5 @@
 """Errors on the wire: RFC 9457 `application/problem+json`, one shape for all."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Callable

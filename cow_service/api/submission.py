@@ -1,7 +1,5 @@
 """From a request to its job, and from the job to the response: at once, after some seconds, or when it has ended."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re
@@ -60,6 +58,23 @@ async def _owner(request: Request) -> str | None:
 
 Engine = Annotated[JobEngine, from_app("engine")]
 Owner = Annotated[str | None, Depends(_owner)]
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """How a caller wants to be answered."""
+
+    respond_async: bool = False
+    wait: int | None = None  # seconds
+    key: str | None = None  # the idempotency key
+    fresh: bool = False  # no results of earlier requests
+    minimal: bool = False  # results without their long lists
+
+    @property
+    def applied(self) -> str:
+        """`Preference-Applied` of a response that is the job."""
+        applied = ("respond-async",) if self.respond_async else ()
+        return ", ".join(applied if self.wait is None else (*applied, f"wait={self.wait}"))
 
 
 @dataclass
@@ -296,23 +311,6 @@ async def unless_disconnected(
 MAX_WAIT_SECONDS = 600
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
 MINIMAL_APPLIED = {"Preference-Applied": "return=minimal"}
-
-
-@dataclass(frozen=True)
-class Preferences:
-    """How a caller wants to be answered."""
-
-    respond_async: bool = False
-    wait: int | None = None  # seconds
-    key: str | None = None  # the idempotency key
-    fresh: bool = False  # no results of earlier requests
-    minimal: bool = False  # results without their long lists
-
-    @property
-    def applied(self) -> str:
-        """`Preference-Applied` of a response that is the job."""
-        applied = ("respond-async",) if self.respond_async else ()
-        return ", ".join(applied if self.wait is None else (*applied, f"wait={self.wait}"))
 
 
 def preferences_of(headers: Headers) -> Preferences:

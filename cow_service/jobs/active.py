@@ -1,7 +1,5 @@
 """The jobs that this process runs or waits for: progress, cancellation requests, decoded images, waiting callers."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import time

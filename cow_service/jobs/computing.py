@@ -3,16 +3,15 @@
 A job engine gives its jobs to a `Computer`: its own process, or others (`cow_service.workers`).
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
+from weakref import WeakValueDictionary
 
 import psutil
 from pydantic import ValidationError
@@ -70,31 +69,24 @@ class Outages:
                 wait = min(2 * wait, LONGEST_WAIT)
 
 
-@dataclass
 class KeyLocks:
     """A lock for each key in use: what one job computes, another one waits for."""
 
-    _guard: threading.Lock = field(default_factory=threading.Lock)
-    _locks: dict[str, tuple[threading.Lock, int]] = field(default_factory=dict[str, tuple[threading.Lock, int]])
+    def __init__(self) -> None:
+        self._guard = threading.Lock()
+        self._locks: WeakValueDictionary[str, threading.Lock] = WeakValueDictionary()  # whoever waits keeps the lock
 
     @contextmanager
     def held(self, key: str, check_canceled: Callable[[], None]) -> Generator[None]:
         """Holds the lock of a key. What `check_canceled` raises ends the wait for it."""
         with self._guard:
-            lock, users = self._locks.get(key, (threading.Lock(), 0))
-            self._locks[key] = (lock, users + 1)
+            lock = self._locks.setdefault(key, threading.Lock())
+        while not lock.acquire(timeout=CANCEL_POLL_SECONDS):
+            check_canceled()
         try:
-            while not lock.acquire(timeout=CANCEL_POLL_SECONDS):
-                check_canceled()
-            try:
-                yield
-            finally:
-                lock.release()
+            yield
         finally:
-            with self._guard:
-                lock, users = self._locks.pop(key)
-                if users > 1:
-                    self._locks[key] = (lock, users - 1)
+            lock.release()
 
 
 @dataclass
@@ -118,7 +110,12 @@ class StoredStep:
 
         A job that computes one of `key.also` at this moment is not waited for: it reads more than is wanted here.
         """
-        digest, *also = (self._stored_as(each, key.shareable) for each in (key.digest, *key.also))
+        scope: dict[str, str] = {}  # of those that may find the result, where not all jobs may
+        if self.fresh or not key.shareable:
+            scope = {"job": self.job_id}
+        elif self.owner is not None:
+            scope = {"owner": self.owner}
+        digest, *also = (digest_of({**scope, "key": each}) if scope else each for each in (key.digest, *key.also))
         with self.hold_key(digest, self.outages.check_canceled):
             found = self.outages.wait_through(
                 lambda: next((each for key in (digest, *also) if (each := self._find(stage, key)) is not None), None)
@@ -138,12 +135,6 @@ class StoredStep:
             stored = digest, self.job_id, stage, text, result.artifacts, trajectory
             self.outages.wait_through(lambda: self.database.store_result(*stored))
             return result, False
-
-    def _stored_as(self, digest: str, shareable: bool) -> str:
-        """What a result is stored under, where not all jobs may find it."""
-        if self.fresh or not shareable:
-            return digest_of({"job": self.job_id, "key": digest})
-        return digest if self.owner is None else digest_of({"owner": self.owner, "key": digest})
 
     def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:
         """A stored result all of whose artifacts are there, and whether it is another job's."""

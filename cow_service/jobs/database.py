@@ -19,6 +19,7 @@ from urllib.parse import quote
 import sqlalchemy as sa
 from pydantic_core import from_json
 from sqlalchemy import event
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import Canceled, StorageUnavailable
@@ -191,8 +192,7 @@ class Database:
         A server with a store of its own would take jobs whose images it does not have, and fail them.
         """
         with self.transaction() as connection:
-            first = "INSERT INTO cow_artifact_store (id, address) VALUES (1, :address) ON CONFLICT DO NOTHING"
-            connection.execute(sa.text(first), {"address": address})
+            connection.execute(self.insert(STORES).on_conflict_do_nothing(), {"id": 1, "address": address})
             known = connection.execute(sa.select(STORES.c.address)).scalar_one()
         if known != address:
             raise StorageUnavailable(
@@ -210,6 +210,10 @@ class Database:
         """The rows of a single query, with the values of its parameters."""
         with database_errors(), self._reading.connect() as connection:
             return connection.execute(query, values).all()
+
+    def insert(self, table: sa.Table) -> postgresql.Insert | sqlite.Insert:
+        """An insertion that can say what becomes of rows that are there."""
+        return (postgresql if self.file is None else sqlite).insert(table)
 
     @contextmanager
     def transaction(self) -> Generator[sa.Connection]:
@@ -244,10 +248,6 @@ class Database:
     def close(self) -> None:
         """Closes its connections."""
         self.engine.dispose()
-
-    def notify(self, channel: str, payload: str) -> None:
-        """Tells all who listen to a channel of PostgreSQL."""
-        self.read(sa.select(sa.func.pg_notify(channel, payload)))
 
     def session(self) -> psycopg.Connection[Any]:
         """A connection to PostgreSQL of the caller's own. Raises `psycopg.Error`."""
@@ -329,10 +329,9 @@ class Database:
     def take_turn(self, task: str, seconds: float) -> bool:
         """Whether no process has begun a task of maintenance for so long: it is then the caller's alone."""
         now = time.time()
-        first = sa.text("INSERT INTO cow_maintenance (task, begun) VALUES (:task, 0) ON CONFLICT DO NOTHING")
         due = MAINTENANCE.c.task == task, MAINTENANCE.c.begun <= now - seconds
         with self.transaction() as connection:
-            connection.execute(first, {"task": task})
+            connection.execute(self.insert(MAINTENANCE).on_conflict_do_nothing(), {"task": task, "begun": 0})
             return connection.execute(sa.update(MAINTENANCE).where(*due).values(begun=now)).rowcount > 0
 
     def give_turn_back(self, task: str) -> None:
@@ -388,22 +387,17 @@ def unpacked(kept: bytes) -> Any:
 def database_errors() -> Generator[None]:
     """Translates the database's errors to `StorageUnavailable`. Their own text may hold addresses, and is left out.
 
-    What belongs to a job that was deleted meanwhile cannot be stored: this raises `Canceled`.
+    What belongs to a job that was deleted meanwhile cannot be stored: this raises `Canceled`. PostgreSQL's driver,
+    which takes long to import, is asked for its errors only where it is in use.
     """
     try:
         yield
-    except (SQLAlchemyError, sqlite3.Error, *_driver_errors()) as error:
+    except (SQLAlchemyError, sqlite3.Error, getattr(sys.modules.get("psycopg"), "Error", sqlite3.Error)) as error:
         if "IntegrityError" in (kind.__name__ for kind in type(error).__mro__):
             raise Canceled("The job was deleted before it was done.") from error
         raise StorageUnavailable(
             f"The job database cannot be used ({type(error).__name__}): see COW_DATABASE_URL, and the disk it is on."
         ) from error
-
-
-def _driver_errors() -> tuple[type[Exception], ...]:
-    """Those of PostgreSQL's driver, which takes long to import where it is not needed."""
-    driver = sys.modules.get("psycopg")
-    return () if driver is None else (driver.Error,)
 
 
 def _address(settings: Settings) -> tuple[str, Path | None]:

@@ -6,11 +6,10 @@ database may take it. Each attempt to compute it is a workflow of DBOS. One proc
 process.
 """
 
-from __future__ import annotations
-
 import threading
 import uuid
 from collections.abc import Iterable
+from contextlib import ExitStack
 from http import HTTPStatus
 
 from dbos import DBOS
@@ -189,23 +188,19 @@ class JobEngine:
         settings = self.service.settings
         queue = queue_of(spec.reader, spec.generator, settings)
         step = step_of(settings.key_weights.get(owner or "", 1.0))
-        with self._submitting:  # the number of jobs must not change between the check and the insertion
-            starts = self.check_capacity(owner, queue) == 0 and self._dispatcher.hold_place(queue)
-            try:
-                job = self.jobs.insert(job_id, spec, owner, queue, step, self._parts.executor if starts else None)
-            except BaseException:
+        with ExitStack() as unless_started:
+            with self._submitting:  # the number of jobs must not change between the check and the insertion
+                starts = self.check_capacity(owner, queue) == 0 and self._dispatcher.hold_place(queue)
                 if starts:
-                    self._dispatcher.free_place(queue)
-                raise
-        if job is None:
-            if starts:
-                self._dispatcher.free_place(queue)
-        elif starts:
-            self._dispatcher.hand_over(job, image)
-        else:
-            self._dispatcher.wake()
-            self._notifications.send(Notification("queued", job_id))
-        return job is not None
+                    unless_started.callback(self._dispatcher.free_place, queue)
+                job = self.jobs.insert(job_id, spec, owner, queue, step, self._parts.executor if starts else None)
+            if job is not None and starts:
+                unless_started.pop_all()
+                self._dispatcher.hand_over(job, image)
+            elif job is not None:
+                self._dispatcher.wake()
+                self._notifications.send(Notification("queued", job_id))
+            return job is not None
 
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> JobState:
         """The state of a job. Raises `JobNotFound`, also for the job of another owner."""

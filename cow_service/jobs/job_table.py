@@ -3,8 +3,6 @@
 Every change of a job is one transaction. Methods raise `StorageUnavailable` where the database cannot be used.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json
@@ -18,7 +16,6 @@ from uuid import uuid4
 import sqlalchemy as sa
 from pydantic import AwareDatetime, BaseModel, Field
 from pydantic_core import to_json
-from sqlalchemy.dialects import postgresql, sqlite
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds
 from cow_service.jobs.active import At, share_done
@@ -187,10 +184,11 @@ class JobTable:
                 **{"executor": executor, "run": None if executor is None else run, "starts": int(executor is not None)},
                 "spec": packed(spec.model_dump_json()),
             }
-            if connection.execute(self._insert(JOBS).returning(JOBS.c.id), row).one_or_none() is None:
+            added = self._database.insert(JOBS).on_conflict_do_nothing().returning(JOBS.c.id)
+            if connection.execute(added, row).one_or_none() is None:
                 return None
             needed = [{"sha256": sha256, "job_id": job_id} for sha256 in {spec.image, *spec.masks}]
-            connection.execute(self._insert(REFERENCES), needed)
+            connection.execute(self._database.insert(REFERENCES).on_conflict_do_nothing(), needed)
             if behind := [job.id for job in jobs if moves(job, owner, spec.priority, turn)]:
                 waits = JOBS.c.id.in_(behind), JOBS.c.executor.is_(None)
                 connection.execute(sa.update(JOBS).where(*waits).values(turn=JOBS.c.turn + step))
@@ -292,9 +290,15 @@ class JobTable:
         found = _state(rows[0], at)
         if found.job.status == "queued":
             return replace(found, job=found.job.model_copy(update=self._place_in_queue(rows[0])))
-        if full and found.job.status == "succeeded":
-            return replace(found, content=_content(rows[0]))
-        return found
+        if not full or found.job.status != "succeeded":
+            return found
+        content: dict[str, Any] = unpacked(rows[0].result)
+        if rows[0].trajectory is not None:
+            (content.get("simulation") or content)["trajectory"] = unpacked(rows[0].trajectory)  # null until now
+        if rows[0].format != FORMAT:  # as it is written today
+            model = Answer if found.job.kind == "answer" else Simulation
+            content = model.model_validate(content).model_dump(mode="json")
+        return replace(found, content=content)
 
     def page(self, owner: str | None, filters: JobFilters, all_at: Mapping[str, At]) -> JobPage:
         """Jobs of an owner, newest first; of everybody where there are no owners. Raises `InvalidRequest`."""
@@ -367,11 +371,6 @@ class JobTable:
             artifacts = set(connection.execute(theirs).scalars())
             connection.execute(sa.delete(JOBS).where(JOBS.c.id.in_(jobs)))
         return artifacts - self._database.referenced(artifacts)
-
-    def _insert(self, table: sa.Table) -> postgresql.Insert | sqlite.Insert:
-        """An insertion that skips rows that are there."""
-        dialect = postgresql if self._database.file is None else sqlite
-        return dialect.insert(table).on_conflict_do_nothing()
 
     def _end(self, job_id: str, status: JobStatus, run: str | None = None, **values: Any) -> bool:
         """Ends an open job, and has its webhook called. Of an attempt: only if it is the latest."""
@@ -470,17 +469,6 @@ def _state(row: sa.Row[Any], at: At | None) -> JobState:
         problem=None if error is None else Problem(**error.as_problem()),
     )
     return JobState(job, row.owner, error=error, ended=row.ended)
-
-
-def _content(row: sa.Row[Any]) -> dict[str, Any]:
-    """The result of a job, as it is written today."""
-    content: dict[str, Any] = unpacked(row.result)
-    if row.trajectory is not None:
-        (content.get("simulation") or content)["trajectory"] = unpacked(row.trajectory)  # null until now
-    if row.format != FORMAT:
-        model = Answer if row.kind == "answer" else Simulation
-        return model.model_validate(content).model_dump(mode="json")
-    return content
 
 
 def _text(moment: datetime, *, round_up: bool = False) -> str:

@@ -1,7 +1,5 @@
 """Background work of a job engine: recovers jobs, notices cancellations, and cleans up what nobody needs any more."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import math
@@ -143,7 +141,7 @@ class SessionLease(BackgroundThread):
                 self._session.close()
             self._session = None
 
-    def _run(self) -> None:
+    def run(self) -> None:
         """Keeps the session alive, and takes the lease again after an outage."""
         while not self._stop.wait(BEAT_SECONDS):
             with self._guard:
@@ -195,7 +193,8 @@ class Maintenance(BackgroundThread):
         if not self._stop.is_set():
             collect_artifacts(self._parts.service, self._parts.database, self._stop.is_set)
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Does each kind of work when it is due."""
         looked = cleaned = time.monotonic()  # recovered jobs refer to their artifacts before anything is removed
         while not self._stop.is_set():
             self._logged(self._recover)

@@ -3,8 +3,6 @@
 All of it only makes things quick: what counts is in the database.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from abc import abstractmethod
@@ -14,6 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 import psycopg
+import sqlalchemy as sa
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError
@@ -71,9 +70,11 @@ class PostgresNotifications(Notifications):
         else:
             self._sent[notification.job_id] = now
         with suppress(CowError):
-            self._parts.database.notify(CHANNEL, json.dumps([self._parts.executor, asdict(notification)]))
+            payload = json.dumps([self._parts.executor, asdict(notification)])
+            self._parts.database.read(sa.select(sa.func.pg_notify(CHANNEL, payload)))
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Receives, and opens another session where one is lost."""
         while not self._stop.is_set():
             try:
                 with self._parts.database.session() as session:
@@ -94,7 +95,8 @@ class PolledNotifications(Notifications):
     def send(self, notification: Notification) -> None:
         """Does nothing."""
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Looks the more rarely, the longer a look takes."""
         took = 0.0
         while not self._stop.wait(max(POLL_SECONDS, POLL_SHARE * took)):
             began = time.monotonic()

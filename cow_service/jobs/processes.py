@@ -1,7 +1,5 @@
 """The processes on a job database: what each tells of itself, and what they and the queues are doing together."""
 
-from __future__ import annotations
-
 import logging
 import os
 import platform
@@ -13,7 +11,6 @@ from functools import partial
 from typing import Literal, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
 
 from cow_service import __version__
 from cow_service.concurrency import BackgroundThread
@@ -53,8 +50,8 @@ class ProcessTable:
 
     def write(self, info: ProcessInfo) -> None:
         """Notes that a process is alive, and what it does; deletes rows of those long gone."""
-        dialect = postgresql if self._database.file is None else sqlite
-        row = dialect.insert(PROCESSES).values(executor=info.executor_id, seen=self._now, info=info.model_dump_json())
+        row = self._database.insert(PROCESSES)
+        row = row.values(executor=info.executor_id, seen=self._now, info=info.model_dump_json())
         kept = {"seen": row.excluded.seen, "info": row.excluded.info}
         with self._database.transaction() as connection:
             connection.execute(row.on_conflict_do_update(index_elements=["executor"], set_=kept))
@@ -137,7 +134,8 @@ class Processes(BackgroundThread):
                 progress, seconds = share_done(active.kind, stage, done), round(time.monotonic() - active.begun, 1)
                 yield WorkerJob(id=job_id, kind=active.kind, stage=stage, progress=progress, seconds=seconds)
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Writes the row of this process, again and again."""
         capacities = ((name, self._computer.capacity(name)) for name in known_queues(self._parts.service.settings))
         queues = {name: capacity for name, capacity in capacities if capacity > 0}
         while not self._stop.is_set():

@@ -8,8 +8,6 @@ step that is the shorter the greater the weight of the key, and no earlier than 
 Within a key the jobs of higher priority come first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 

@@ -5,8 +5,6 @@ Progress in between has no number: it is not repeated to a client that reconnect
 who follow a job.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, Callable, Generator

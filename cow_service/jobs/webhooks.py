@@ -3,8 +3,6 @@
 Each attempt is a workflow of its own, so that retries survive this process; one that waits occupies no thread.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import hmac
@@ -12,8 +10,6 @@ import json
 import logging
 import random
 import time
-from functools import cached_property
-from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import sqlalchemy as sa
@@ -23,12 +19,10 @@ from dbos import error as dbos_error
 from cow_service.errors import StorageUnavailable, WebhookNotAllowed
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.job_table import VERSION
+from cow_service.net import Egress, NotAllowed, Unreachable
 from cow_service.observability.metrics import Metrics
 from cow_service.records import Job
 from cow_service.settings import Settings
-
-if TYPE_CHECKING:
-    from cow_service.net import Egress
 
 APPLICATION = "cow"  # as DBOS knows it
 QUEUE = "cow-webhook-receivers"  # in which every receiver has a share of its own
@@ -48,7 +42,7 @@ class Webhooks:
     """Signs and sends; DBOS keeps the attempts that are to be made."""
 
     def __init__(self, settings: Settings, metrics: Metrics, database: Database) -> None:
-        self._secret, self._metrics = settings.webhook_secret, metrics
+        self._secret, self._metrics, self._egress = settings.webhook_secret, metrics, Egress(None)
         # Unlike DBOS itself, its client can be told to raise where the database is away.
         self.client = DBOSClient(
             system_database_engine=database.engine,
@@ -58,20 +52,12 @@ class Webhooks:
             lazy=True,
         )
 
-    @cached_property
-    def _egress(self) -> Egress:
-        from cow_service.net import Egress  # noqa: PLC0415 # an HTTP client is costly to import
-
-        return Egress(None)
-
     def use(self, settings: Settings, metrics: Metrics) -> None:
         """Takes the secret from other settings, and counts elsewhere. Only tests do this."""
         self._secret, self._metrics = settings.webhook_secret, metrics
 
     def check(self, url: str) -> None:
         """Raises `WebhookNotAllowed` for a URL that would not be called."""
-        from cow_service.net import NotAllowed  # noqa: PLC0415
-
         if self._secret is None:
             raise WebhookNotAllowed("This server calls no webhooks: COW_WEBHOOK_SECRET is not set. Ask for the job.")
         try:
@@ -112,8 +98,6 @@ class Webhooks:
 
     def send(self, job: Job, url: str, attempt: int) -> float | None:
         """Makes one attempt; returns the seconds until the next one, or None where none follows."""
-        from cow_service.net import NotAllowed, Unreachable  # noqa: PLC0415
-
         assert self._secret is not None
         event = {"type": f"job.{job.status}", "timestamp": job.finished_at, "data": job.model_dump(mode="json")}
         body = json.dumps(event, separators=(",", ":")).encode()

@@ -5,8 +5,6 @@ process ends, another process makes the next one. A call of a webhook is kept by
 it again.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading
@@ -300,7 +298,8 @@ class Dispatcher(BackgroundThread):
         self._handed.put((job, image))
         self._woken.set()
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Starts what was handed over, and what waits in the queues."""
         while not self._stop.is_set():
             self._woken.clear()
             look, self._look = self._look, False

@@ -3,8 +3,6 @@
 Requests go to standard output, everything else on standard error.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import re

@@ -1,11 +1,10 @@
 """What the service counts, for Prometheus. Each instance has a registry of its own: none knows of another."""
 
-from __future__ import annotations
-
 import logging
 import sys
 from collections import Counter as Counts
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 
 import prometheus_client as prometheus
 from prometheus_client.core import GaugeMetricFamily
@@ -56,34 +55,24 @@ class Metrics:
         self.queue_unserved: QueueUnserved = dict
         self.workers: ListWorkers = tuple
         self._registry = registry = prometheus.CollectorRegistry()
-        self._requests = prometheus.Counter(
-            "cow_http_requests", "Requests answered.", ("method", "route", "status"), registry=registry
-        )
-        self._request_seconds = prometheus.Histogram(
+        counter = partial(prometheus.Counter, registry=registry)
+        histogram = partial(prometheus.Histogram, registry=registry)
+        self._requests = counter("cow_http_requests", "Requests answered.", ("method", "route", "status"))
+        self._request_seconds = histogram(
             "cow_http_request_seconds",
             "From a request's head to the last byte of its answer, s.",
             ("route",),
             buckets=_REQUEST_BUCKETS,
-            registry=registry,
         )
-        self._stage_seconds = prometheus.Histogram(
-            "cow_stage_seconds", "Time in a stage, s.", ("stage",), buckets=_STAGE_BUCKETS, registry=registry
+        self._stage_seconds = histogram("cow_stage_seconds", "Time in a stage, s.", ("stage",), buckets=_STAGE_BUCKETS)
+        self._jobs = counter("cow_jobs", "Jobs that ended.", ("kind", "outcome"))
+        self._stage_cache = counter("cow_stage_cache", "Stages looked for among earlier results.", ("stage", "result"))
+        self._worker_ends = counter("cow_worker_ends", "Worker processes that ended, and why.", ("reason",))
+        self._webhooks = counter(
+            "cow_webhook_attempts", "Attempts to call a webhook, and what came of them.", ("outcome",)
         )
-        self._jobs = prometheus.Counter("cow_jobs", "Jobs that ended.", ("kind", "outcome"), registry=registry)
-        self._stage_cache = prometheus.Counter(
-            "cow_stage_cache", "Stages looked for among earlier results.", ("stage", "result"), registry=registry
-        )
-        self._worker_ends = prometheus.Counter(
-            "cow_worker_ends", "Worker processes that ended, and why.", ("reason",), registry=registry
-        )
-        self._webhooks = prometheus.Counter(
-            "cow_webhook_attempts",
-            "Attempts to call a webhook, and what came of them.",
-            ("outcome",),
-            registry=registry,
-        )
-        self._webhooks_given_up = prometheus.Counter(
-            "cow_webhooks_given_up", "Webhooks that were not delivered after the last attempt.", registry=registry
+        self._webhooks_given_up = counter(
+            "cow_webhooks_given_up", "Webhooks that were not delivered after the last attempt."
         )
         prometheus.ProcessCollector(registry=registry)
         registry.register(_Gauges(self))

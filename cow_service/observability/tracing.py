@@ -81,7 +81,7 @@ def span(name: str, *, parent: str | None = None, **attributes: Attribute) -> Ge
     """
     above = None if parent is None else context.remote(parent)
     if _provider is not None:
-        with _recorded(_provider, name, trace.SpanKind.INTERNAL, above, attributes):
+        with _recorded(_provider, name, trace.SpanKind.INTERNAL, above, **attributes):
             yield
     elif above is not None:
         token = attach(above)
@@ -98,7 +98,7 @@ def request_span(name: str, parent: str | None) -> Generator[None]:
     """The span of a request around the block; `parent` is the caller's traceparent."""
     above = context.remote(parent)
     if _provider is not None:
-        with _recorded(_provider, name, trace.SpanKind.SERVER, above, {}):
+        with _recorded(_provider, name, trace.SpanKind.SERVER, above):
             yield
         return
     caller = trace.get_current_span(above).get_span_context()
@@ -120,11 +120,7 @@ def describe(name: str, *, failed: bool, **attributes: Attribute) -> None:
 
 @contextmanager
 def _recorded(
-    provider: TracerProvider,
-    name: str,
-    kind: trace.SpanKind,
-    above: Context | None,
-    attributes: Mapping[str, Attribute],
+    provider: TracerProvider, name: str, kind: trace.SpanKind, above: Context | None, **attributes: Attribute
 ) -> Generator[None]:
     known = {key: value for key, value in attributes.items() if value is not None}
     tracer = provider.get_tracer("cow_service", __version__)

@@ -1,7 +1,5 @@
 """Starts a worker process: `python -m cow_service.workers FD`."""
 
-from __future__ import annotations
-
 import gc
 import sys
 

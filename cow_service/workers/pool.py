@@ -4,8 +4,6 @@ Jobs of light generators share some processes, `COW_CONCURRENCY` of them. A gene
 process of its own: no photograph's frames wait for its clips, and its weights are loaded once.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -1,7 +1,5 @@
 """A worker process as seen by the process that started it, and what the two tell each other."""
 
-from __future__ import annotations
-
 import subprocess
 import threading
 import time

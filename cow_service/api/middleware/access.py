@@ -1,7 +1,5 @@
 """Who may call: API keys, rate limits, and which web pages may drive the server."""
 
-from __future__ import annotations
-
 import hmac
 import math
 import re
@@ -100,23 +98,21 @@ class Callers:
             key = rest.strip() if scheme.lower() == "bearer" else ""
             owner = state["owner"] = self._keys.owner_of(key) if key else None
             if owner is None:
-                return self._unauthorized(scope, "a key that is none of this server's" if key else "no key")
+                # A right key passes in any case: else one bad neighbour behind an address would lock all others out.
+                if self._failures is not None and (wait := self._failures.take(address_of(scope))):
+                    return rate_limited("Too many requests without a valid key came from your address.", wait)
+                what = "a key that is none of this server's" if key else "no key"
+                return Unauthorized(
+                    f"The request has {what}. Send the header `Authorization: Bearer <key>` with a key that the "
+                    "server's operator gave you.",
+                    headers={"WWW-Authenticate": "Bearer"},
+                )
         if self._requests is None:
             return None
         whose = "your address" if owner is None else "this key"
         wait = self._requests.take(f"address {address_of(scope)}" if owner is None else f"key {owner}")
         detail = f"The server takes {self._requests.per_minute} requests a minute with {whose}."
         return rate_limited(detail, wait) if wait else None
-
-    def _unauthorized(self, scope: Scope, what: str) -> CowError:
-        # A right key passes in any case: else one bad neighbour behind the same address would lock all others out.
-        if self._failures is not None and (wait := self._failures.take(address_of(scope))):
-            return rate_limited("Too many requests without a valid key came from your address.", wait)
-        return Unauthorized(
-            f"The request has {what}. Send the header `Authorization: Bearer <key>` with a key that the server's "
-            "operator gave you.",
-            headers={"WWW-Authenticate": "Bearer"},
-        )
 
 
 def rate_limited(detail: str, wait: float) -> RateLimited:

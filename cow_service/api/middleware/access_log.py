@@ -3,8 +3,6 @@
 It also turns exceptions of the inner layers into problems, so that every caller gets one.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import secrets
@@ -82,7 +80,12 @@ class AccessLog:
 
     def _record(self, scope: Scope, status: int, seconds: float) -> None:
         method = scope["method"] if scope["method"] in METHODS else "other"
-        route, path = self._route(scope), _shown(scope)
+        route, path = getattr(scope.get("route"), "path", None), _shown(scope)
+        if not isinstance(route, str):  # the one that would have been taken: of those there are only so many
+            if self._templates is None:
+                self._templates = [(compile_path(template)[0], template) for template in self._paths()]
+            fitting = (template for regex, template in self._templates if regex.match(scope["path"]))
+            route = next(fitting, UNMATCHED)
         owner = scope.get("state", {}).get("owner")
         self.metrics.request(method, route, status, seconds)
         tracing.describe(
@@ -99,15 +102,6 @@ class AccessLog:
         milliseconds = round(seconds * 1000, 1)
         fields = {"method": method, "path": path, "status": status, "milliseconds": milliseconds, "owner": owner}
         access.info("%s %s %d %.1f ms", method, path, status, milliseconds, extra=fields)
-
-    def _route(self, scope: Scope) -> str:
-        """The template of the route that was or would have been taken: of those there are only so many."""
-        path = getattr(scope.get("route"), "path", None)
-        if isinstance(path, str):
-            return path
-        if self._templates is None:
-            self._templates = [(compile_path(template)[0], template) for template in self._paths()]
-        return next((template for regex, template in self._templates if regex.match(scope["path"])), UNMATCHED)
 
 
 def _shown(scope: Scope) -> str:

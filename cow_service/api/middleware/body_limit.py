@@ -1,7 +1,5 @@
 """Refuses a body that is too large, as soon as that is known, also without a Content-Length, too slow, or too much."""
 
-from __future__ import annotations
-
 import asyncio
 
 from starlette.requests import Request

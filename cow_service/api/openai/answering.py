@@ -1,7 +1,5 @@
 """Chats with a model without an MLLM: the last user message becomes an `AnswerRequest`, and its answer the reply."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import AsyncGenerator, Iterator
 from contextlib import aclosing

@@ -1,11 +1,9 @@
 """A chat as it arrived. It goes on unchanged in meaning; here is what COW needs to know of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Self, cast
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -50,7 +48,7 @@ class Chat:
     cow: dict[str, Any]  # COW's own options
 
     @classmethod
-    def parse(cls, fields: dict[str, Any]) -> Chat:
+    def parse(cls, fields: dict[str, Any]) -> Self:
         """The chat of a JSON object. Raises `InvalidRequest`."""
         model, cow = fields.get("model"), fields.get(EXTENSION)
         if not isinstance(model, str):

@@ -4,8 +4,6 @@ With an MLLM, what can be imagined is added to the chat, the MLLM is asked once,
 Without one, the chat is a job as of `POST /answer`, and its result becomes the reply.
 """
 
-from __future__ import annotations
-
 import base64
 import time
 from collections.abc import AsyncGenerator
@@ -52,6 +50,39 @@ PASSED_OVER = (
     errors.InvalidRequest, errors.CannotGround, errors.CannotReadDirection, errors.MllmBadReply, errors.ImageTooLarge,
     errors.ImageUnreadable, errors.ImageTypeUnsupported, errors.ImageUrlNotAllowed, errors.ImageUrlUnreachable,
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WhatIf:
+    """A simulation that a chat asks for."""
+
+    request: SimulateRequest
+    message: int  # place of the message whose question it is: frames are added to it
+    image: ImagePart
+    given: frozenset[str]  # fields of `cow` in the request
+
+    def explain(self, error: errors.CowError) -> ChatImagination:
+        """Why nothing was imagined, where the chat goes on without. Raises what the caller is to hear instead."""
+        own = {"/image": self.image.url_pointer, "/question": f"/messages/{self.message}/content"}
+        located = locate_in_chat(error, own)
+        given = {f"/{EXTENSION}/{name}" for name in self.given}
+        is_own = any("/".join(field.pointer.split("/")[:3]) in given for field in located.errors)
+        if is_own or not isinstance(error, PASSED_OVER):
+            raise located from error
+        return _nothing_imagined(error.code, error.detail, Usage.model_validate(error.usage or {}))
+
+
+@dataclass(frozen=True)
+class EnrichedChat:
+    """A chat that is ready to be sent: its messages, with frames or without, and what COW says of it."""
+
+    chat: Chat
+    messages: list[Any]
+    cow: ChatImagination
+
+    def extension(self, *warnings: str) -> dict[str, Any]:
+        """`cow` of the reply."""
+        return self.cow.model_copy(update={"warnings": (*self.cow.warnings, *warnings)}).model_dump(mode="json")
 
 
 class Completer:
@@ -198,26 +229,6 @@ def preferences_without_key(request: Request) -> jobs.Preferences:
     return jobs.Preferences(fresh=prefer.fresh)
 
 
-@dataclass(frozen=True)
-class WhatIf:
-    """A simulation that a chat asks for."""
-
-    request: SimulateRequest
-    message: int  # place of the message whose question it is: frames are added to it
-    image: ImagePart
-    given: frozenset[str]  # fields of `cow` in the request
-
-    def explain(self, error: errors.CowError) -> ChatImagination:
-        """Why nothing was imagined, where the chat goes on without. Raises what the caller is to hear instead."""
-        own = {"/image": self.image.url_pointer, "/question": f"/messages/{self.message}/content"}
-        located = locate_in_chat(error, own)
-        given = {f"/{EXTENSION}/{name}" for name in self.given}
-        is_own = any("/".join(field.pointer.split("/")[:3]) in given for field in located.errors)
-        if is_own or not isinstance(error, PASSED_OVER):
-            raise located from error
-        return _nothing_imagined(error.code, error.detail, Usage.model_validate(error.usage or {}))
-
-
 def find_what_if(chat: Chat, answerer: Answerer) -> WhatIf | ChatImagination:
     """What the chat asks to be imagined, or why nothing is. Raises `InvalidRequest` for unusable fields of `cow`."""
     if answerer.imagine == "never":
@@ -259,19 +270,6 @@ def _nothing_imagined(
     return ChatImagination(
         imagined=False, reason=reason, detail=detail, usage=used, usage_total=used, warnings=warnings
     )
-
-
-@dataclass(frozen=True)
-class EnrichedChat:
-    """A chat that is ready to be sent: its messages, with frames or without, and what COW says of it."""
-
-    chat: Chat
-    messages: list[Any]
-    cow: ChatImagination
-
-    def extension(self, *warnings: str) -> dict[str, Any]:
-        """`cow` of the reply."""
-        return self.cow.model_copy(update={"warnings": (*self.cow.warnings, *warnings)}).model_dump(mode="json")
 
 
 def add_frames(chat: Chat, what_if: WhatIf, result: str, artifacts: ArtifactStore) -> EnrichedChat:

@@ -1,7 +1,5 @@
 """Sends chats on to the OpenAI-compatible server behind a model, and its replies back: each once, and as it is."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

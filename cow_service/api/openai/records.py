@@ -3,8 +3,6 @@
 Replies of an MLLM go on as they came: of those, these records say only what COW adds.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -70,14 +68,6 @@ class ChatCompletion(Record):
     cow: Answer = Field(description="The whole answer, as `POST /answer` returns it.")
 
 
-class MllmCompletion(BaseModel):
-    """What `POST /v1/chat/completions` returns of an MLLM: the reply as it came, and `cow`."""
-
-    model_config = ConfigDict(extra="allow")
-
-    cow: ChatImagination
-
-
 class ChatImagination(Record):
     """What COW did with a chat before the MLLM was asked: `cow` of the reply of an MLLM."""
 
@@ -95,6 +85,14 @@ class ChatImagination(Record):
     usage_total: Usage = Field(default=Usage(), description="What imagining would have cost without reuse.")
     reused: tuple[str, ...] = Field(default=(), description="Stages of the simulation that were found again.")
     warnings: tuple[str, ...] = ()
+
+
+class MllmCompletion(BaseModel):
+    """What `POST /v1/chat/completions` returns of an MLLM: the reply as it came, and `cow`."""
+
+    model_config = ConfigDict(extra="allow")
+
+    cow: ChatImagination
 
 
 class ResponseReply(BaseModel):

@@ -1,7 +1,5 @@
 """OpenAI's responses: the chat that asks the same, and its reply as a response. What needs state is refused by name."""
 
-from __future__ import annotations
-
 import time
 import uuid
 from collections.abc import AsyncGenerator, Iterator
@@ -199,6 +197,31 @@ def as_response(streamed: Streamed, request: dict[str, Any], model: str) -> Stre
     return replace(streamed, events=events())
 
 
+@dataclass
+class _Item:
+    """An item of the output that is being written."""
+
+    kind: str  # message, reasoning or function_call
+    id: str
+    index: int  # in the output
+    text: str = ""  # of a function call, its arguments
+    refusal: str = ""
+    call: dict[str, Any] = field(default_factory=dict[str, Any])
+    logprobs: list[Any] = field(default_factory=list[Any])
+
+    def as_output(self, status: str = "completed") -> dict[str, Any]:
+        """The item as it stands in the output."""
+        head = {"id": self.id, "type": self.kind}
+        if self.kind == "reasoning":
+            return head | {"summary": [], "content": [{"type": "reasoning_text", "text": self.text}]}
+        if self.kind == "function_call":
+            return head | {"status": status, **self.call, "arguments": self.text}
+        part: dict[str, Any] = {"type": "refusal", "refusal": self.refusal}
+        if not self.refusal:
+            part = {"type": "output_text", "text": self.text, "annotations": [], "logprobs": self.logprobs}
+        return head | {"role": "assistant", "status": status, "content": [part]}
+
+
 class ResponseEvents:
     """Writes the events of one response, each with its number. `response` is the response so far."""
 
@@ -310,31 +333,6 @@ class ResponseEvents:
     def _event(self, kind: str, **others: Any) -> bytes:
         self._number += 1
         return event_of({"type": kind, "sequence_number": self._number, **others}, kind)
-
-
-@dataclass
-class _Item:
-    """An item of the output that is being written."""
-
-    kind: str  # message, reasoning or function_call
-    id: str
-    index: int  # in the output
-    text: str = ""  # of a function call, its arguments
-    refusal: str = ""
-    call: dict[str, Any] = field(default_factory=dict[str, Any])
-    logprobs: list[Any] = field(default_factory=list[Any])
-
-    def as_output(self, status: str = "completed") -> dict[str, Any]:
-        """The item as it stands in the output."""
-        head = {"id": self.id, "type": self.kind}
-        if self.kind == "reasoning":
-            return head | {"summary": [], "content": [{"type": "reasoning_text", "text": self.text}]}
-        if self.kind == "function_call":
-            return head | {"status": status, **self.call, "arguments": self.text}
-        part: dict[str, Any] = {"type": "refusal", "refusal": self.refusal}
-        if not self.refusal:
-            part = {"type": "output_text", "text": self.text, "annotations": [], "logprobs": self.logprobs}
-        return head | {"role": "assistant", "status": status, "content": [part]}
 
 
 def _new_id(prefix: str) -> str:

@@ -1,7 +1,5 @@
 """`POST /v1/chat/completions`, `POST /v1/responses`, `GET /v1/models`: COW for clients of OpenAI's API."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated, Any
 

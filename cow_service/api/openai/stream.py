@@ -1,7 +1,5 @@
 """Replies as server-sent events: OpenAI's chunks, progress while a job runs, and a failure as the last event."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator

@@ -1,7 +1,5 @@
 """`GET /artifacts/{sha256}` and `GET /jobs/{id}/download`: files."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import zipfile
@@ -106,10 +104,7 @@ async def download(
 ) -> Response:
     """All of a job that has succeeded, or its video in forms that go where no video does."""
     ending, media_type = FILES[format]
-    headers = {
-        "Content-Disposition": f'attachment; filename="cow-{id}{ending}"',
-        "X-Content-Type-Options": "nosniff",
-    }
+    headers = {"Content-Disposition": f'attachment; filename="cow-{id}{ending}"', "X-Content-Type-Options": "nosniff"}
     limiter: CapacityLimiter = request.app.state.downloads
     if format == "zip":
         path, release = await to_thread.run_sync(make_zip, engine, id, owner, limiter=limiter)

@@ -1,7 +1,5 @@
 """`GET /livez`, `GET /readyz`, `GET /models`, `GET /workers` and `GET /metrics`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from fastapi import APIRouter

@@ -1,7 +1,5 @@
 """`GET /jobs`, `GET /jobs/{id}`, its request and events, cancellation and deletion. A caller sees those of its key."""
 
-from __future__ import annotations
-
 from collections.abc import AsyncGenerator
 from typing import Annotated, Any
 
@@ -35,9 +33,7 @@ router = APIRouter(tags=["jobs"])
 
 
 @router.get(
-    "/jobs",
-    summary="Jobs, newest first",
-    responses=documented(errors.InvalidRequest, errors.StorageUnavailable),
+    "/jobs", summary="Jobs, newest first", responses=documented(errors.InvalidRequest, errors.StorageUnavailable)
 )
 def jobs(engine: Engine, owner: Owner, filters: Annotated[JobFilters, Query()]) -> JobPage:
     """Without their results. Jobs that come or go between two pages are neither shown twice nor hide others."""
@@ -72,10 +68,7 @@ def cancel(engine: Engine, owner: Owner, id: JobId) -> Response:
 
 
 @router.delete(
-    "/jobs/{id}",
-    summary="Delete a job and what only it holds",
-    status_code=204,
-    responses=documented(*GONE),
+    "/jobs/{id}", summary="Delete a job and what only it holds", status_code=204, responses=documented(*GONE)
 )
 def delete(engine: Engine, owner: Owner, id: JobId) -> None:
     """Ends it first where it has not ended. Its artifacts go unless another job holds them."""

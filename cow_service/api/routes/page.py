@@ -1,7 +1,5 @@
 """`GET /`, the page for people, and `GET /docs`, Swagger UI, with their files. They are no part of the contract."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import io
@@ -48,9 +46,7 @@ POLICY = (
 )
 # Swagger UI draws its signs as `data:` pictures, and shows a picture that it got as `blob:`. It sets styles by script,
 # which needs no `unsafe-inline`.
-DOCS_HEADERS = HEADERS | {
-    "Content-Security-Policy": POLICY + "img-src 'self' data: blob:; connect-src 'self'",
-}
+DOCS_HEADERS = HEADERS | {"Content-Security-Policy": POLICY + "img-src 'self' data: blob:; connect-src 'self'"}
 
 router = APIRouter(include_in_schema=False)
 

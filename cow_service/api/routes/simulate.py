@@ -1,7 +1,5 @@
 """`POST /simulate` and `POST /answer`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
