@@ -23,17 +23,7 @@ from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulatio
 from cow_service.registry import Registry
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, PlaceRequest, SimulateRequest
 from cow_service.settings import Settings, SettingsError
-from cow_service.stages.run import (
-    Backends,
-    Progress,
-    Run,
-    Step,
-    check_request,
-    compute_directly,
-    ignore_progress,
-    now,
-    priority_of,
-)
+from cow_service.stages import run as runs
 from cow_service.vision.scene import SeenImages
 from cow_service.weights.manifests import find_manifest, load_manifests
 from cow_service.weights.repositories import ready
@@ -81,13 +71,16 @@ class Service:
         return self.artifacts.put(data, image.media_type), image
 
     def simulate(
-        self, request: SimulateRequest, progress: Progress = ignore_progress, image: DecodedImage | None = None
+        self,
+        request: SimulateRequest,
+        progress: runs.Progress = runs.ignore_progress,
+        image: DecodedImage | None = None,
     ) -> Simulation:
         """One simulation, start to end. Raises any `CowError` of its stages. Arguments as for `prepare`."""
         return simulate(self.prepare(request, progress, image))
 
     def answer(
-        self, request: AnswerRequest, progress: Progress = ignore_progress, image: DecodedImage | None = None
+        self, request: AnswerRequest, progress: runs.Progress = runs.ignore_progress, image: DecodedImage | None = None
     ) -> Answer:
         """One answer, start to end. Raises any `CowError` that leaves no answer. Arguments as for `prepare`."""
         return answer(self.prepare(request, progress, image))
@@ -95,14 +88,14 @@ class Service:
     def prepare(
         self,
         request: Request,
-        progress: Progress = ignore_progress,
+        progress: runs.Progress = runs.ignore_progress,
         image: DecodedImage | None = None,
-        step: Step = compute_directly,
+        step: runs.Step = runs.compute_directly,
         retry_policy: RetryPolicy = try_once,
         run_id: str | None = None,
         created_at: str | None = None,
         turn: int = 0,
-    ) -> Run[Request]:
+    ) -> runs.Run[Request]:
         """A run of the request, with its backends and its image, decoded here unless `image` is given.
 
         Runs compute by `turn`, then first in, first out by `created_at` (RFC 3339, by default now).
@@ -111,7 +104,7 @@ class Service:
         raises.
         """
         reader, generator = self._names_of(request)
-        backends = Backends(
+        backends = runs.Backends(
             reader_name=reader,
             reader=partial(self._reader, reader),
             words=lambda: cast(WordReader, self.readers.get(WORD_READER)),
@@ -121,11 +114,11 @@ class Service:
             device=partial(self._device, generator),
         )
         request = self.keep_masks(request)
-        created_at = created_at or now()
+        created_at = created_at or runs.now()
         # Also with an image at hand: a run begins in its turn, and its job counts as queued until then.
-        with self.cpu.held(priority_of(turn, created_at), partial(progress, None, 0.0)):
+        with self.cpu.held(runs.priority_of(turn, created_at), partial(progress, None, 0.0)):
             image = image or self.image_of(request.image)[1]
-        return Run(
+        return runs.Run(
             request, image, backends, progress, step, retry_policy, run_id or str(uuid.uuid4()), created_at, turn
         )
 
@@ -157,7 +150,7 @@ class Service:
         elif self.generators.is_made(name) or name == self.settings.generator:
             limits = self._generator(name)
         if limits is not None:
-            check_request(limits, request)
+            runs.check_request(limits, request)
         return reader, name
 
     def models(self) -> Models:

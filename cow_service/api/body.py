@@ -18,14 +18,7 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
 from cow_service.api.problems import invalid
-from cow_service.errors import (
-    BodyTypeUnsupported,
-    FieldError,
-    InvalidRequest,
-    MalformedBody,
-    pointer_part,
-    shortened,
-)
+from cow_service.errors import BodyTypeUnsupported, FieldError, InvalidRequest, MalformedBody, pointer_part, shortened
 from cow_service.media.images import DecodedImage
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service

@@ -14,14 +14,7 @@ from http import HTTPStatus
 
 from dbos import DBOS
 
-from cow_service.errors import (
-    ArtifactNotFound,
-    CowError,
-    IdempotencyKeyReused,
-    JobNotFound,
-    QueueFull,
-    ShuttingDown,
-)
+from cow_service.errors import ArtifactNotFound, CowError, IdempotencyKeyReused, JobNotFound, QueueFull, ShuttingDown
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.computing import Computer, EngineParts, InProcess
 from cow_service.jobs.database import Database, database_errors

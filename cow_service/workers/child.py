@@ -30,21 +30,8 @@ from cow_service.observability.metrics import gpu_memory
 from cow_service.requests import Stage
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.workers.process import (
-    Cancel,
-    Failed,
-    FromWorker,
-    Heartbeat,
-    HoldKey,
-    KeyHeld,
-    Loaded,
-    LookedFor,
-    Progressed,
-    ReleaseKey,
-    Start,
-    Succeeded,
-    ToWorker,
-)
+from cow_service.workers import process
+from cow_service.workers.process import FromWorker, ToWorker
 
 HEARTBEAT_SECONDS = 1.0
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for a key checks whether it was canceled
@@ -56,12 +43,12 @@ log = logging.getLogger("cow_service")
 class _Job:
     """One job at work here."""
 
-    def __init__(self, start: Start, send: Callable[[FromWorker], None]) -> None:
+    def __init__(self, start: process.Start, send: Callable[[FromWorker], None]) -> None:
         self.job, self._image, self._send = start.job, start.image, send
         self.canceled, self.key_held = threading.Event(), threading.Event()
         self._told: tuple[Stage | None, float] = (None, 0.0)
 
-    def compute(self, service: Service, database: Database) -> Succeeded | Failed:
+    def compute(self, service: Service, database: Database) -> process.Succeeded | process.Failed:
         """Its end, to be sent."""
         job_id, spec = self.job.id, self.job.spec
         work = Work(
@@ -69,19 +56,19 @@ class _Job:
             image=self._image,
             progress=self._progress,
             check=self._check,
-            looked_for=lambda stage, found: self._send(LookedFor(job_id, stage, found)),
+            looked_for=lambda stage, found: self._send(process.LookedFor(job_id, stage, found)),
         )
         try:
             with (
                 context.bound(request=spec.request_id, job=job_id),
                 tracing.span("compute", parent=spec.traceparent, job_id=job_id),
             ):
-                return Succeeded(job_id, compute(work, service, database, self._hold_key))
+                return process.Succeeded(job_id, compute(work, service, database, self._hold_key))
         except CowError as error:
-            return Failed(job_id, error_as_json(error))
+            return process.Failed(job_id, error_as_json(error))
         except Exception:
             log.exception("job %s failed", job_id)
-            return Failed(job_id, error_as_json(unforeseen()))
+            return process.Failed(job_id, error_as_json(unforeseen()))
 
     def _check(self) -> None:
         if self.canceled.is_set():
@@ -91,18 +78,18 @@ class _Job:
         self._check()
         if stage != self._told[0] or done >= min(1.0, self._told[1] + MIN_PROGRESS):
             self._told = stage, done
-            self._send(Progressed(self.job.id, stage, done))
+            self._send(process.Progressed(self.job.id, stage, done))
 
     @contextmanager
     def _hold_key(self, key: str, check_canceled: Callable[[], None]) -> Generator[None]:
         self.key_held.clear()
-        self._send(HoldKey(self.job.id, key))
+        self._send(process.HoldKey(self.job.id, key))
         try:
             while not self.key_held.wait(CANCEL_POLL_SECONDS):
                 check_canceled()
             yield
         finally:
-            self._send(ReleaseKey(self.job.id, key))
+            self._send(process.ReleaseKey(self.job.id, key))
 
 
 class WorkerProcess:
@@ -122,12 +109,12 @@ class WorkerProcess:
         threading.Thread(target=self._load, name="load", daemon=True).start()
         while True:
             match self._pipe.recv():
-                case Start() as start:
+                case process.Start() as start:
                     self._jobs[start.job.id] = _Job(start, self._send)
                     self._threads.submit(self._work, start.job.id)
-                case Cancel(job_id) if job_id in self._jobs:
+                case process.Cancel(job_id) if job_id in self._jobs:
                     self._jobs[job_id].canceled.set()
-                case KeyHeld(job_id) if job_id in self._jobs:
+                case process.KeyHeld(job_id) if job_id in self._jobs:
                     self._jobs[job_id].key_held.set()
                 case None:
                     return
@@ -139,9 +126,9 @@ class WorkerProcess:
             self._pipe.send(message)
 
     def _beat(self) -> None:
-        process = psutil.Process()
+        this = psutil.Process()
         while True:
-            self._send(Heartbeat(process.memory_info().rss, gpu_memory()))
+            self._send(process.Heartbeat(this.memory_info().rss, gpu_memory()))
             time.sleep(HEARTBEAT_SECONDS)
 
     def _load(self) -> None:
@@ -155,7 +142,7 @@ class WorkerProcess:
         except Exception:
             log.exception("the default backends could not be loaded")
             failure = error_as_json(unforeseen())
-        self._send(Loaded(failure))
+        self._send(process.Loaded(failure))
 
     def _work(self, job_id: str) -> None:
         end = self._jobs[job_id].compute(self._service, self._database)
