@@ -62,20 +62,9 @@ def check_queues(settings: Settings) -> None:
 class Queued(Protocol):
     """An open job, as far as its turn is concerned."""
 
-    @property
-    def owner(self) -> str | None:
-        """Whose it is."""
-        ...
-
-    @property
-    def turn(self) -> int:
-        """The lower comes first."""
-        ...
-
-    @property
-    def priority(self) -> Priority:
-        """Among the jobs of its owner."""
-        ...
+    owner: str | None
+    turn: int  # the lower comes first
+    priority: Priority  # among the jobs of its owner
 
 
 def step_of(weight: float) -> int:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from opentelemetry import trace
-from opentelemetry.context import Context, attach, detach
+from opentelemetry.context import Context
 
 from cow_service import __version__
 from cow_service.observability import logging as context
@@ -84,11 +84,8 @@ def span(name: str, *, parent: str | None = None, **attributes: Attribute) -> Ge
         with _recorded(_provider, name, trace.SpanKind.INTERNAL, above, **attributes):
             yield
     elif above is not None:
-        token = attach(above)
-        try:
+        with trace.use_span(trace.get_current_span(above)):
             yield
-        finally:
-            detach(token)
     else:
         yield
 

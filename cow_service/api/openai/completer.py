@@ -17,7 +17,7 @@ from fastapi import Request, Response
 from pydantic import ValidationError
 
 from cow_service import errors
-from cow_service.api import submission as jobs
+from cow_service.api import submission as submitting
 from cow_service.api.body import read_object
 from cow_service.api.openai import records, stream
 from cow_service.api.openai.answering import answer_events, completion_of, parse_chat
@@ -88,7 +88,7 @@ class EnrichedChat:
 class Completer:
     """Completes chats."""
 
-    def __init__(self, submitter: jobs.Submitter) -> None:
+    def __init__(self, submitter: submitting.Submitter) -> None:
         self._submitter = submitter
         self.service = submitter.engine.service
         self._forwarder = Forwarder(self.service.settings)
@@ -124,9 +124,9 @@ class Completer:
         what_if = find_what_if(chat, answerer)
         if isinstance(what_if, ChatImagination):
             return await self._forward(request, EnrichedChat(chat, chat.messages, what_if), reader)
-        owner = jobs.owner_of(request)
+        owner = submitting.owner_of(request)
         submitter.engine.check_capacity(owner)
-        submission = jobs.Submission("simulate", owner, prefer, new_job_id(owner, None))
+        submission = submitting.Submission("simulate", owner, prefer, new_job_id(owner, None))
         try:
             if chat.stream:
                 created_at = await submitter.submit(submission, what_if.request, None)
@@ -164,7 +164,7 @@ class Completer:
             raise locate_in_chat(error, parsed.pointers) from error
 
     def _stream(
-        self, submission: jobs.Submission, created_at: str | None, chat: Chat, what_if: WhatIf, reader: ChatReader
+        self, submission: submitting.Submission, created_at: str | None, chat: Chat, what_if: WhatIf, reader: ChatReader
     ) -> stream.Streamed:
         """Progress while the simulation runs, then the reply's own events."""
         stack = AsyncExitStack()
@@ -191,7 +191,7 @@ class Completer:
     async def _forward(self, request: Request, enriched: EnrichedChat, reader: ChatReader) -> Whole | stream.Streamed:
         """The reply of the MLLM. It is given up where the caller goes away before it has begun."""
         async with AsyncExitStack() as stack:
-            reply = await jobs.unless_disconnected(request, self._ask(enriched, reader, stack))
+            reply = await submitting.unless_disconnected(request, self._ask(enriched, reader, stack))
             refused = isinstance(reply, Whole) and not reply.succeeded
             if enriched.chat.stream and not refused:
                 return stream.Streamed(_events_of(reply, enriched), close=stack.pop_all().aclose)
@@ -218,15 +218,15 @@ class Completer:
         return replace(reply, body=reply.body | {EXTENSION: enriched.extension(*warnings)})
 
 
-def preferences_without_key(request: Request) -> jobs.Preferences:
+def preferences_without_key(request: Request) -> submitting.Preferences:
     """What counts of the caller's preferences. Raises `InvalidRequest` for an idempotency key."""
-    prefer = jobs.preferences_of(request.headers)
+    prefer = submitting.preferences_of(request.headers)
     if prefer.key is not None:
         raise errors.InvalidRequest(
             "The header `Idempotency-Key` cannot be kept here: a chat with an MLLM is not a stored job, and the same "
             "key would not bring the same reply. Leave it out; with /simulate and /answer it counts."
         )
-    return jobs.Preferences(fresh=prefer.fresh)
+    return submitting.Preferences(fresh=prefer.fresh)
 
 
 def find_what_if(chat: Chat, answerer: Answerer) -> WhatIf | ChatImagination:
