@@ -4,12 +4,6 @@ The order of `accelerate` follows how the parts enclose each other: weights, att
 that skips blocks, memory, and last, in `ranks`, context parallelism around the cache. A block compiled together with
 its cache hooks breaks its graph (first-block) or is not compiled at all (mag); a cache around context parallelism would
 compare a whole tensor with a shard.
-
-Private parts of libraries, for which there is no public way:
-- torch `_set_lru_cache`: which of several compiled versions of a block is tried first;
-- diffusers `_reset_stateful_cache` and `_cache_config`: forget the last clip without removing and adding all hooks,
-  which would change their order;
-- cache-dit `_is_cached`, `_context_names` and `_context_manager`: the same for its cache.
 """
 
 import os
@@ -174,7 +168,7 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2) -
         return
     from diffusers.hooks.mag_cache import MagCacheConfig, nearest_interp  # noqa: PLC0415
 
-    transformer._reset_stateful_cache()
+    transformer._reset_stateful_cache()  # removed and added anew, the hooks would be in another order
     config = transformer._cache_config
     if isinstance(config, MagCacheConfig):  # the hooks of all blocks share this one object
         ratios = config.measured  # pyright: ignore[reportAttributeAccessIssue] - of `_enable_cache`

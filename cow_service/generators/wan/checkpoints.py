@@ -7,8 +7,6 @@ with the model's before a single weight is read. Safetensors only: a pickle can 
 A LoRA is merged into the weights, so that it costs nothing per step. Distilled LoRAs hold more than pairs of low-rank
 matrices: full differences of norms, biases and modulation. diffusers' `load_lora_weights` silently drops those, and
 layers that the model lacks with a warning only; here either every tensor of the file is added or the file is refused.
-
-Private part of diffusers: `_keep_in_fp32_modules`, the layers of a model that must stay in float32.
 """
 
 import json
@@ -70,7 +68,7 @@ def load_transformer(
         raise CheckpointInvalid(f"The configuration does not make a Wan transformer: {error}.") from error
     sources = _match_names(entries, model.state_dict(), original)
     # The weights are read one at a time and file after file, straight to their device.
-    precise = tuple(model._keep_in_fp32_modules or ())  # pyright: ignore[reportPrivateUsage]
+    precise = tuple(model._keep_in_fp32_modules or ())  # pyright: ignore[reportPrivateUsage] - they stay in float32
     state: dict[str, Tensor] = {}
     for file in files:
         here = [(name, source) for name, source in sources.items() if entries[source].file == file]

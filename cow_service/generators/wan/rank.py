@@ -77,15 +77,13 @@ def main(descriptor: int) -> None:
     """Works on the pipe of a file descriptor until it ends."""
     leave_decisions_to_the_parent()
     pipe: Connection[FromRank, ToRank] = Connection(descriptor)
+    failed: CowError = unforeseen()  # also where it was told what it cannot do
     try:
         work(pipe)
     except CowError as error:
         failed = error
     except Exception:
         log.exception("a rank failed")
-        failed = unforeseen()
-    else:
-        failed = unforeseen()  # it was told what it cannot do
     try:
         pipe.send(Failed(failed.code, failed.detail))
     finally:

@@ -6,8 +6,6 @@ parallelism the ranks of a half, or all, split the tokens of each pass in every 
 
 `RankGroup` is rank 0's side, in the process of the generator: it starts the other ranks (`rank`), watches them and
 sends messages over a pipe to each. `Sharing` is what every rank does within a clip.
-
-Private part of torch: `_abort_process_group`, the only call that ends a wait for another rank, also in subgroups.
 """
 
 from __future__ import annotations
@@ -308,7 +306,8 @@ class Sharing:
         """Ends whatever waits for another rank, from any thread. The ranks cannot share a clip any more."""
         with self._leaving:
             if distributed.is_initialized():
-                distributed_c10d._abort_process_group()  # pyright: ignore[reportPrivateUsage] - of all subgroups, too
+                # The only call that ends a wait for another rank, also in subgroups.
+                distributed_c10d._abort_process_group()  # pyright: ignore[reportPrivateUsage]
 
     def _use_device(self) -> None:
         """Of this thread: diffusers makes some tensors on the current device."""
