@@ -181,9 +181,8 @@ def contact_sheet(frames: Sequence[Pixels], fps: float) -> bytes:
     """A PNG with frames from all over the clip, in rows from left to right."""
     wanted = min(len(frames), SHEET_COLUMNS * SHEET_ROWS)
     chosen = np.linspace(0, len(frames) - 1, wanted).round().astype(int)
-    return encode_png(
-        tiled([fit_within(frames[index], SHEET_SIDE) for index in chosen], SHEET_COLUMNS, SHEET_GAP, WHITE)
-    )
+    shown = [fit_within(frames[index], SHEET_SIDE) for index in chosen]
+    return encode_png(tiled(shown, SHEET_COLUMNS, SHEET_GAP, WHITE))
 
 
 FORMATS: dict[str, tuple[str, Callable[[Sequence[Pixels], float], bytes]]] = {

@@ -194,9 +194,8 @@ def read_tracks(path: Path, visibility: Path | None = None) -> Tracks:
 
 
 def _ati_array(path: Path) -> Floats32:
-    data: Any = None
     if path.suffix == ".npz":
-        data = path.read_bytes()
+        data: Any = path.read_bytes()
     else:
         torch = _import_torch()
         try:
