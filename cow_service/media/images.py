@@ -89,15 +89,11 @@ _SNIFFED_BYTES = 1024
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """The input image as pixels, upright, and the record that names it.
+    """The input image, upright, and the record that names it."""
 
-    `pixels` is [H, W, 3] RGB, C-contiguous and not to be written to, W and H as in `info`; `media_type` is that of the
-    bytes as sent.
-    """
-
-    pixels: NDArray[np.uint8]
+    pixels: NDArray[np.uint8]  # [H, W, 3] RGB, C-contiguous and not to be written to
     info: ImageInfo
-    media_type: str
+    media_type: str  # of the bytes as sent
 
 
 def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT) -> DecodedImage:
@@ -186,11 +182,7 @@ def _encoded(extension: str, pixels: NDArray[np.uint8], options: list[int]) -> b
 
 
 def fit_within(pixels: NDArray[np.uint8], max_side: int | None) -> NDArray[np.uint8]:
-    """Scale [H, W, 3] or [H, W] down so that its longer side is at most `max_side` px; never up.
-
-    The other side is rounded, at least 1 px. None, and pixels that fit already, are returned as they are. Raises
-    `ValueError` if `max_side` is under 1.
-    """
+    """Scale [H, W, 3] or [H, W] down, never up, to `max_side` px at most; None: no limit. Raises `ValueError` for 0."""
     if max_side is None:
         return pixels
     if max_side < 1:
