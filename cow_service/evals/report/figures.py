@@ -1,5 +1,6 @@
 """The figures of a report: colours that the colour-blind can tell apart, one marker per arm, axes without ornament."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -67,19 +68,17 @@ class ArmStyle:
 
     colour: str
     marker: str
-    line: str
-    face: str  # the baseline is hollow
+    hollow: bool  # as the baseline is
 
     def marked(self, size: float = 7.0) -> dict[str, Any]:
         """Options of matplotlib that draw its marker."""
-        hollow = self.face == GROUND
         return {
             "linestyle": "none",
             "marker": self.marker,
             "markersize": size,
-            "markerfacecolor": self.face,
-            "markeredgecolor": self.colour if hollow else INK,
-            "markeredgewidth": 1.4 if hollow else 0.7,
+            "markerfacecolor": GROUND if self.hollow else self.colour,
+            "markeredgecolor": self.colour if self.hollow else INK,
+            "markeredgewidth": 1.4 if self.hollow else 0.7,
             "zorder": 3,
         }
 
@@ -87,16 +86,13 @@ class ArmStyle:
 def arm_styles(summaries: Sequence[ArmSummary]) -> dict[str, ArmStyle]:
     """Of every arm, by its name in the report."""
     found: dict[str, ArmStyle] = {}
-    others = baselines = 0
+    drawn: Counter[bool] = Counter()  # baselines, and other arms
     for each in summaries:
-        if each.arm == BASELINE:
-            marker = ROUND_FIRST[baselines % len(ROUND_FIRST)]
-            found[each.name] = ArmStyle(DIM, marker, LINES[baselines % len(LINES)], GROUND)
-            baselines += 1
-        else:
-            colour = COLOURS[others % len(COLOURS)]
-            found[each.name] = ArmStyle(colour, MARKERS[others % len(MARKERS)], LINES[others % len(LINES)], colour)
-            others += 1
+        hollow = each.arm == BASELINE
+        number, markers = drawn[hollow], ROUND_FIRST if hollow else MARKERS
+        colour = DIM if hollow else COLOURS[number % len(COLOURS)]
+        found[each.name] = ArmStyle(colour, markers[number % len(markers)], hollow)
+        drawn[hollow] += 1
     return found
 
 
@@ -153,10 +149,18 @@ def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
     figure = Figure(figsize=(GAINS_WIDTH, GAIN_ROW * len(rows) + 1.1), layout="constrained")
     axes = figure.add_subplot()
     for place, (_, style, gain) in enumerate(rows):
-        if style is not None and gain is not None:
-            _draw_gain(axes, -place, style, gain)
-        else:
+        if style is None or gain is None:
             axes.axhspan(-place - 0.5, -place + 0.5, color=LINE, alpha=0.45, linewidth=0, zorder=0)
+            continue
+        interval = "one scene: no interval"
+        if gain.scenes > 1:
+            ends = [100 * gain.low, 100 * gain.high]
+            axes.plot(ends, [-place] * 2, "|-", color=style.colour, linewidth=2.2, markersize=7, zorder=2)
+            interval = f"{points(gain.low)} to {points(gain.high)}"
+        axes.plot([100 * gain.gain], [-place], **style.marked())
+        text: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 8.5}
+        axes.text(GAIN_AT, -place, points(gain.gain), weight="bold", **text)
+        axes.text(INTERVAL_AT, -place, interval, **text)
     axes.axvline(0, color=INK, linewidth=1, zorder=1)
     axes.set_ylim(-len(rows) + 0.4, 0.7)
     edge = max(5.0, *(100 * abs(end) for _, _, gain in rows if gain for end in (gain.low, gain.high)))
@@ -193,27 +197,11 @@ def _gain_rows(summaries: Sequence[ArmSummary]) -> list[tuple[str, ArmStyle | No
     return rows
 
 
-def _draw_gain(axes: Axes, height: float, style: ArmStyle, gain: Gain) -> None:
-    interval = "one scene: no interval"
-    if gain.scenes > 1:
-        ends = [100 * gain.low, 100 * gain.high]
-        axes.plot(ends, [height] * 2, "|-", color=style.colour, linewidth=2.2, markersize=7, zorder=2)
-        interval = f"{points(gain.low)} to {points(gain.high)}"
-    axes.plot([100 * gain.gain], [height], **style.marked())
-    text: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 8.5}
-    axes.text(GAIN_AT, height, points(gain.gain), weight="bold", **text)
-    axes.text(INTERVAL_AT, height, interval, **text)
-
-
 # Rates: how many questions each arm answers rightly, by task, and by the levels of each task
 
 
-@dataclass(frozen=True)
-class RateGroup:
-    """Points that stand together: what they are of, and the rates of the arms that have any."""
-
-    name: str
-    rates: dict[str, Rates]
+# Points that stand together: the rates of the arms that have any, by what they are of and by arm.
+Groups = dict[str, dict[str, Rates]]
 
 
 def draw_rates(summaries: Sequence[ArmSummary]) -> Figure | None:
@@ -233,35 +221,34 @@ def draw_rates(summaries: Sequence[ArmSummary]) -> Figure | None:
     return figure
 
 
-def _rate_panels(summaries: Sequence[ArmSummary]) -> list[tuple[str, list[RateGroup]]]:
+def _rate_panels(summaries: Sequence[ArmSummary]) -> list[tuple[str, Groups]]:
     """Titles and groups: by task, then each task that has several levels."""
     cells = [(each.name, cell) for each in summaries for cell in each.cells]
 
-    def group(name: str, task: str, level: str | None) -> RateGroup:
-        return RateGroup(name, {arm: cell.rates for arm, cell in cells if (cell.task, cell.level) == (task, level)})
+    def of(task: str, level: str | None) -> dict[str, Rates]:
+        return {arm: cell.rates for arm, cell in cells if (cell.task, cell.level) == (task, level)}
 
     tasks = [task for task in TASKS if any(cell.task == task for _, cell in cells)]
-    by_task = [group(task, task, None) for task in tasks]
-    if len(tasks) > 1:
-        by_task.insert(0, RateGroup("all", {each.name: each.rates for each in summaries}))
+    by_task: Groups = {"all": {each.name: each.rates for each in summaries}} if len(tasks) > 1 else {}
+    by_task |= {task: of(task, None) for task in tasks}
     several = any(each.rates.tpr.sd is not None for each in summaries)
     whiskers = "mean and SD over repeats" if several else "one repeat, so no SD"
     panels = [(f"Right answers by task (TPR): {whiskers}", by_task)]
     for task in tasks:
         levels = sorted({cell.level for _, cell in cells if cell.task == task and cell.level})
         if len(levels) > 1:
-            panels.append((f"{task.capitalize()} by level", [group(level, task, level) for level in levels]))
+            panels.append((f"{task.capitalize()} by level", {level: of(task, level) for level in levels}))
     return panels
 
 
-def _draw_rate_panel(axes: Axes, groups: Sequence[RateGroup], styles: dict[str, ArmStyle], space: float) -> None:
+def _draw_rate_panel(axes: Axes, groups: Groups, styles: dict[str, ArmStyle], space: float) -> None:
     """`space`: inches across that a group has."""
     step = 1 / (len(styles) + 1)
-    for middle, group in enumerate(groups):
+    for middle, rates in enumerate(groups.values()):
         for place, (name, style) in enumerate(styles.items(), 1):
-            if name not in group.rates:
+            if name not in rates:
                 continue
-            tpr, x = group.rates[name].tpr, middle - 0.5 + step * place
+            tpr, x = rates[name].tpr, middle - 0.5 + step * place
             _draw_right_answers(axes, x, tpr, style, 6.5, linewidth=1.6, capsize=2.5)
             if step * space >= LABELLED:
                 # Above the whisker and the marker, whichever is higher.
@@ -271,11 +258,9 @@ def _draw_rate_panel(axes: Axes, groups: Sequence[RateGroup], styles: dict[str, 
                 label.set(ha="center", bbox={"facecolor": GROUND, "linewidth": 0, "pad": 0.4})
         if middle:
             axes.axvline(middle - 0.5, color=LINE, linewidth=1)
-    counts = [max(each.questions for each in group.rates.values()) for group in groups]
+    counts = {name: max(each.questions for each in rates.values()) for name, rates in groups.items()}
     axes.set_xlim(-0.5, len(groups) - 0.5)
-    axes.set_xticks(
-        range(len(groups)), [f"{group.name}\nn = {count}" for group, count in zip(groups, counts, strict=True)]
-    )
+    axes.set_xticks(range(len(groups)), [f"{name}\nn = {count}" for name, count in counts.items()])
     axes.tick_params(axis="x", length=0)
     _percent_axis(axes, 0, 118)
     axes.set_yticks(range(0, 101, 25))
@@ -301,10 +286,28 @@ def draw_calibration(summaries: Sequence[ArmSummary]) -> Figure | None:
     axes = figure.add_subplot()
     (diagonal,) = axes.plot([0, 100], [0, 100], color=DIM, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
     entries = [(diagonal, "as told (perfect calibration)")]
+    counted = len(curves) <= COUNTED  # the counts of the bins stand beside the markers
     for place, (arms, found) in enumerate(curves):
         base = sum(each.count * each.happened for each in found.bins) / found.count
         scores = f"Brier score {found.brier:.3f}; base rate {100 * base:.0f}%, always told: {found.base_brier:.3f}"
-        line = _draw_curve(axes, found, place, counted=len(curves) <= COUNTED)
+        colour, marker = COLOURS[place % len(COLOURS)], ROUND_FIRST[place % len(ROUND_FIRST)]
+        stroke = LINES[place % len(LINES)]
+        told = [100 * each.told for each in found.bins]
+        happened = [100 * each.happened for each in found.bins]
+        fullest = max(each.count for each in found.bins)
+        areas = [max(SMALLEST, LARGEST * each.count / fullest) for each in found.bins]
+        axes.plot(told, happened, color=colour, linestyle=stroke, linewidth=1.6, zorder=2)
+        dots: dict[str, Any] = {"marker": marker, "facecolor": colour, "edgecolor": INK, "linewidth": 0.8}
+        axes.scatter(told, happened, s=areas, zorder=3, alpha=0.75, **dots)
+        for x, y, area, each in zip(told, happened, areas, found.bins, strict=True) if counted else ():
+            # The first curve's counts stand below to the right, the second's above to the left: a curve that rises
+            # runs through neither.
+            side = -1 if place else 1
+            offset = side * (0.36 * area**0.5 + 1.5)
+            label = axes.annotate(f"{each.count}", (x, y), (offset, -offset), textcoords="offset points", fontsize=7.5)
+            label.set(va="top" if side > 0 else "bottom", ha="left" if side > 0 else "right")
+        edge: dict[str, Any] = {"markersize": 7, "markeredgecolor": INK, "markeredgewidth": 0.7}
+        line = Line2D([], [], color=colour, linestyle=stroke, marker=marker, **edge)
         entries.append((line, f"{short(', '.join(arms), 70)}\n{scores}; n = {found.count}"))
     axes.set(xlim=(-6, 108), ylim=(-10, 106), aspect="equal")
     axes.grid()
@@ -315,90 +318,51 @@ def draw_calibration(summaries: Sequence[ArmSummary]) -> Figure | None:
     return figure
 
 
-def _draw_curve(axes: Axes, found: Calibration, place: int, counted: bool) -> Line2D:
-    """A curve, and its line for the legend. `counted`: with the counts of its bins beside the markers."""
-    colour, line = COLOURS[place % len(COLOURS)], LINES[place % len(LINES)]
-    marker = ROUND_FIRST[place % len(ROUND_FIRST)]
-    told = [100 * each.told for each in found.bins]
-    happened = [100 * each.happened for each in found.bins]
-    fullest = max(each.count for each in found.bins)
-    areas = [max(SMALLEST, LARGEST * each.count / fullest) for each in found.bins]
-    axes.plot(told, happened, color=colour, linestyle=line, linewidth=1.6, zorder=2)
-    drawn: dict[str, Any] = {"marker": marker, "facecolor": colour, "edgecolor": INK, "alpha": 0.75, "linewidth": 0.8}
-    axes.scatter(told, happened, s=areas, zorder=3, **drawn)
-    for x, y, area, each in zip(told, happened, areas, found.bins, strict=True) if counted else ():
-        # The first curve's counts stand below to the right, the second's above to the left: a curve that rises
-        # runs through neither.
-        side = -1 if place else 1
-        offset = side * (0.36 * area**0.5 + 1.5)
-        label = axes.annotate(f"{each.count}", (x, y), (offset, -offset), textcoords="offset points", fontsize=7.5)
-        label.set(va="top" if side > 0 else "bottom", ha="left" if side > 0 else "right")
-    edge: dict[str, Any] = {"markersize": 7, "markeredgecolor": INK, "markeredgewidth": 0.7}
-    return Line2D([], [], color=colour, linestyle=line, marker=marker, **edge)
-
-
 # Cost: what right answers cost in seconds, tokens and money per question
 
 
-@dataclass(frozen=True)
-class Measure:
-    """One kind of cost of all replies; None where it is not known."""
-
-    axis: str
-    title: str
-    of: Callable[[Cost], float | None]
-
-
-MEASURES = (
-    Measure("Seconds per question", "time", lambda cost: cost.seconds),
-    Measure(
-        "Tokens per question (input and output)", "tokens", lambda cost: float(cost.input_tokens + cost.output_tokens)
-    ),
-    Measure("Money per question (currency of the price table)", "money", lambda cost: cost.money),
-)
+MEASURES: dict[str, tuple[str, Callable[[Cost], float | None]]] = {  # by title: axis, and a sum over all replies
+    "time": ("Seconds per question", lambda cost: cost.seconds),
+    "tokens": ("Tokens per question (input and output)", lambda cost: float(cost.input_tokens + cost.output_tokens)),
+    "money": ("Money per question (currency of the price table)", lambda cost: cost.money),
+}
 
 
 def draw_cost(summaries: Sequence[ArmSummary]) -> Figure | None:
     """Right answers against their cost; None where nothing is known to have cost anything."""
-    shown: list[tuple[Measure, list[tuple[ArmSummary, float]]]] = []
-    for measure in MEASURES:
-        known = [(each, each.cost.replies, measure.of(each.cost)) for each in summaries]
-        values = [(each, value / max(replies, 1)) for each, replies, value in known if value is not None]
-        if any(value > 0 for _, value in values):
-            shown.append((measure, values))
+    shown: dict[str, list[tuple[ArmSummary, float]]] = {}
+    for title, (_, sum_of) in MEASURES.items():
+        known = [(each, sum_of(each.cost)) for each in summaries]
+        means = [(each, value / max(each.cost.replies, 1)) for each, value in known if value is not None]
+        if any(mean > 0 for _, mean in means):
+            shown[title] = means
     if not shown:
         return None
     figure = Figure(figsize=(COST_WIDTH, COST_PANEL * len(shown) + 0.6), layout="constrained")
     grid = figure.subplots(len(shown), squeeze=False)
     styles = arm_styles(summaries)
     _add_arm_legend(figure, styles, COST_WIDTH)
-    for axes, (measure, found) in zip(grid[:, 0], shown, strict=True):
-        _draw_cost_panel(axes, measure, found, styles)
+    for axes, (title, means) in zip(grid[:, 0], shown.items(), strict=True):
+        for each, mean in means:
+            _draw_right_answers(axes, mean, each.rates.tpr, styles[each.name], 8, linewidth=1.2, capsize=2)
+        cheapest, dearest = min(mean for _, mean in means), max(mean for _, mean in means)
+        if cheapest > 0 and dearest / cheapest > RANGE_FOR_LOG:
+            axes.set_xscale("log")
+            axes.set_xlim(cheapest / 2, dearest * 2)
+        else:
+            axes.set_xlim(0, 1.15 * dearest)
+        # Tens and units as they are written: no powers, and no offset in the corner.
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.6g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel(MEASURES[title][0])
+        spreads = [each.rates.tpr for each, _ in means]
+        whiskers = " (whiskers: SD over repeats)" if any(tpr.sd is not None for tpr in spreads) else ""
+        axes.set_title(f"Right answers against {title}{whiskers}")
+        lowest = min(100 * (tpr.mean - (tpr.sd or 0)) for tpr in spreads)
+        highest = max(100 * (tpr.mean + (tpr.sd or 0)) for tpr in spreads)
+        _percent_axis(axes, max(-3, lowest - 12), min(103, highest + 12))
+        axes.grid(visible=True)
     return figure
-
-
-def _draw_cost_panel(
-    axes: Axes, measure: Measure, found: Sequence[tuple[ArmSummary, float]], styles: Mapping[str, ArmStyle]
-) -> None:
-    for each, value in found:
-        _draw_right_answers(axes, value, each.rates.tpr, styles[each.name], 8, linewidth=1.2, capsize=2)
-    values = [value for _, value in found]
-    if min(values) > 0 and max(values) / min(values) > RANGE_FOR_LOG:
-        axes.set_xscale("log")
-        axes.set_xlim(min(values) / 2, max(values) * 2)
-    else:
-        axes.set_xlim(0, 1.15 * max(values))
-    # Tens and units as they are written: no powers, and no offset in the corner.
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.6g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel(measure.axis)
-    spreads = [each.rates.tpr for each, _ in found]
-    whiskers = " (whiskers: SD over repeats)" if any(tpr.sd is not None for tpr in spreads) else ""
-    axes.set_title(f"Right answers against {measure.title}{whiskers}")
-    lowest = min(100 * (tpr.mean - (tpr.sd or 0)) for tpr in spreads)
-    highest = max(100 * (tpr.mean + (tpr.sd or 0)) for tpr in spreads)
-    _percent_axis(axes, max(-3, lowest - 12), min(103, highest + 12))
-    axes.grid(visible=True)
 
 
 DRAWINGS = {"gains": draw_gains, "rates": draw_rates, "calibration": draw_calibration, "cost": draw_cost}
