@@ -46,11 +46,6 @@ def question_text(item: Item, order: tuple[int, ...] | None = None) -> str:
     return item.question[0] + "".join(option + part for option, part in zip(between, item.question[1:], strict=True))
 
 
-def letters(item: Item) -> tuple[str, ...]:
-    """The letters that stand in the question, in their order."""
-    return tuple(option.letter for option in item.options)
-
-
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 Wording = tuple[tuple[str, ...], tuple[AnswerOption, ...]]
 

@@ -151,8 +151,19 @@ class Progress:
     @contextmanager
     def shown(self) -> Generator[None]:
         """Shows the progress meanwhile: redrawn in a terminal, else a line now and then."""
+
+        def table() -> Table:
+            found = Table(box=None, pad_edge=False, show_footer=True)
+            done, total = (sum(getattr(count, name) for count in self._counts.values()) for name in ("done", "total"))
+            footers = ("", f"{done} of {total}", *self._pace())
+            for name, footer in zip(("arm", "asked", "right", "failed"), footers, strict=True):
+                found.add_column(name, footer=footer, justify="left" if name == "arm" else "right")
+            for arm, count in self._counts.items():
+                found.add_row(arm, f"{count.done} of {count.total}", count.share_right, str(count.failed or ""))
+            return found
+
         if self._console.is_terminal:
-            with Live(get_renderable=self._table, console=self._console, refresh_per_second=REDRAWN):
+            with Live(get_renderable=table, console=self._console, refresh_per_second=REDRAWN):
                 yield
         else:
             yield
@@ -169,16 +180,6 @@ class Progress:
         rate = self._done_here / max(time.monotonic() - self._begun, 1e-9)
         left = str(timedelta(seconds=round(self.left / rate))) if rate else "?"
         return f"{rate:.1f}/s", f"{left} left"
-
-    def _table(self) -> Table:
-        table = Table(box=None, pad_edge=False, show_footer=True)
-        done, total = (sum(getattr(count, name) for count in self._counts.values()) for name in ("done", "total"))
-        footers = ("", f"{done} of {total}", *self._pace())
-        for name, footer in zip(("arm", "asked", "right", "failed"), footers, strict=True):
-            table.add_column(name, footer=footer, justify="left" if name == "arm" else "right")
-        for arm, count in self._counts.items():
-            table.add_row(arm, f"{count.done} of {count.total}", count.share_right, str(count.failed or ""))
-        return table
 
     def _print_line(self) -> None:
         parts: list[str] = []

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from cow_service.evals.items import LETTERS, REAL, Item, Pictures
+from cow_service.evals.items import LETTERS, REAL, Pictures
 from cow_service.evals.loaders.rows import Collected, FileFault, Row, RowFault, collect
 
 _AT_ONCE = 64  # rows: a row may hold a picture of a megabyte
@@ -242,7 +242,21 @@ def load_causalspatial(folder: Path, subsets: Sequence[str], pictures: Pictures)
     shared = Counter(subset for (subset, _), count in ids.items() for _ in range(count) if count > 1)
     told = "rows share their id with others; items are told apart by subset, shard and row."
     notes = [f"{subset}: {count} {told}" for subset, count in shared.items()]
-    found.notes[:0] = [*notes, *_without_abstain(found.items, abstaining)]
+
+    # Which rows have no option that abstains, though the column `not_sure` names one; and where that is the truth.
+    wrong = [item for item in found.items if item.id in abstaining and abstaining[item.id] != item.abstain]
+    for subset in dict.fromkeys(item.id.partition("/")[0] for item in wrong):
+        of_subset = [item for item in wrong if item.id.startswith(f"{subset}/")]
+        none = [item for item in of_subset if item.abstain is None]
+        right = sum(abstaining[item.id] == item.answer for item in none)
+        if none:
+            notes.append(
+                f"{subset}: {len(none)} rows have no option that abstains, though `not_sure` names one; in {right} of "
+                "them that option is the right answer. It counts as an answer like any other."
+            )
+        if others := len(of_subset) - len(none):
+            notes.append(f"{subset}: in {others} rows another option abstains than `not_sure` says.")
+    found.notes[:0] = notes
     return found
 
 
@@ -285,21 +299,3 @@ def _published_row(folder: Path, subset: str, unique: str, place: str, fields: d
         level=REAL if real or level is None else f"L{level[1]}",
         oracle=oracle_frames(folder / TRUTH / subset / source) if (folder / TRUTH).is_dir() else (),
     )
-
-
-def _without_abstain(items: Sequence[Item], abstaining: dict[str, str]) -> list[str]:
-    """Which rows have no option that abstains, though the column `not_sure` names one; and where that is the truth."""
-    wrong = [item for item in items if item.id in abstaining and abstaining[item.id] != item.abstain]
-    notes: list[str] = []
-    for subset in dict.fromkeys(item.id.partition("/")[0] for item in wrong):
-        of_subset = [item for item in wrong if item.id.startswith(f"{subset}/")]
-        none = [item for item in of_subset if item.abstain is None]
-        right = sum(abstaining[item.id] == item.answer for item in none)
-        if none:
-            notes.append(
-                f"{subset}: {len(none)} rows have no option that abstains, though `not_sure` names one; in {right} of "
-                "them that option is the right answer. It counts as an answer like any other."
-            )
-        if others := len(of_subset) - len(none):
-            notes.append(f"{subset}: in {others} rows another option abstains than `not_sure` says.")
-    return notes

@@ -47,30 +47,28 @@ def _write(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary], out: Path) 
     plots = write_plots(out / "plots", summaries)
     differs = {f"Differences from the paper: {about.lower()}": told for about, told in tables.DIFFERENCES.items()}
     write_page(out, runs, summaries, plots, [(heading, "\n".join(told)) for heading, told in differs.items()])
+
+    # What was asked, and what was found in the data.
+    asked: list[str] = []
+    for run in runs:
+        info = run.info
+        asked.append(
+            f"{info.mllm}, asked by {info.ask}: {len(run.items)} questions of {info.data}, arms "
+            f"{', '.join(info.arms)}, {info.repeats} repeats, seed {info.seed}."
+        )
+        failures = sorted({each.failure for each in run.observations if each.failure is not None})
+        asked += [f"- {told}" for told in info.notes]
+        asked += [f"- left out: {fault}" for fault in info.faults]
+        asked += [f"- failed: {' '.join(failure.split())}" for failure in failures]
     parts = [f"## {table.title}\n\n{tables.markdown(table)}" for table in known]
     parts += [f"## {heading}\n\n" + "\n".join(f"- {each}" for each in told) for heading, told in differs.items()]
-    (out / "report.md").write_text("\n\n".join(["# Evaluation", _asked(runs), *parts]) + "\n", "utf-8")
+    (out / "report.md").write_text("\n\n".join(["# Evaluation", "\n".join(asked), *parts]) + "\n", "utf-8")
 
     # What was asked, with which versions, prompts and seeds, and the digest of every file of the report.
     files = sorted(path for path in out.rglob("*") if path.is_file() and path.name != "manifest.json")
     digests = {path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
     manifest = {"runs": [run.info.model_dump(mode="json") for run in runs], "files": digests}
     (out / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def _asked(runs: Sequence[EvalRun]) -> str:
-    """What was asked, and what was found in the data."""
-    lines: list[str] = []
-    for run in runs:
-        info = run.info
-        lines.append(
-            f"{info.mllm}, asked by {info.ask}: {len(run.items)} questions of {info.data}, arms "
-            f"{', '.join(info.arms)}, {info.repeats} repeats, seed {info.seed}."
-        )
-        lines += [f"- {told}" for told in (*info.notes, *(f"left out: {fault}" for fault in info.faults))]
-        failures = sorted({each.failure for each in run.observations if each.failure is not None})
-        lines += [f"- failed: {' '.join(failure.split())}" for failure in failures]
-    return "\n".join(lines)
 
 
 def write_plots(folder: Path, summaries: Sequence[ArmSummary]) -> tuple[Path, ...]:

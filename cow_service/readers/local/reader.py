@@ -115,37 +115,6 @@ def _from_folder(
     folder: Path, manifest: Manifest, options: LocalOptions, places: str | dict[str, str]
 ) -> tuple[transformers.PreTrainedModel, transformers.ProcessorMixin]:
     """The model and processor of a checkpoint. Opens safetensors only: a pickle can run code."""
-    _check(folder, manifest)
-    own: Any = {"local_files_only": True, "trust_remote_code": False}
-    config: transformers.PreTrainedConfig = transformers.AutoConfig.from_pretrained(folder, **own)
-    if type(config) in PROCESSOR_MAPPING:
-        kind: Any = PROCESSOR_MAPPING[type(config)]
-        # PIL's image processors everywhere: with torchvision's the same image would give other numbers where that is
-        # installed.
-        processor = still(kind).from_pretrained(folder, backend="pil", **own)
-    else:
-        processor = transformers.AutoProcessor.from_pretrained(folder, **own)
-    dtype: Any = options.dtype if options.dtype == "auto" else getattr(torch, options.dtype)
-    loaded: Any = transformers.AutoModelForImageTextToText.from_pretrained(
-        folder,
-        dtype=dtype,
-        device_map=places,
-        attn_implementation=options.attn_implementation,
-        use_safetensors=True,
-        output_loading_info=True,
-        **own,
-    )
-    model, found = loaded
-    # transformers only warns of these, and fills what is missing with random numbers.
-    for kind, what in (("missing_keys", "lacks"), ("unexpected_keys", "has, beyond its model,")):
-        if names := sorted(found[kind]):
-            raise CheckpointInvalid(
-                f"The checkpoint '{folder.name}' {what} {listed(names, MAX_LISTED)}. Download it again."
-            )
-    return model, processor
-
-
-def _check(folder: Path, manifest: Manifest) -> None:
     try:
         kind = str(json.loads((folder / "config.json").read_text(encoding="utf-8"))["model_type"])
         files = sorted(file.name for file in folder.iterdir())
@@ -162,6 +131,34 @@ def _check(folder: Path, manifest: Manifest) -> None:
             f"'{folder.name}' is of the type '{kind}', and '{manifest.name}' of the family '{manifest.family}', which "
             f"writes places in its own way. Name it under a manifest of its family in COW_CHECKPOINTS."
         )
+
+    as_it_is: Any = {"local_files_only": True, "trust_remote_code": False}
+    config: transformers.PreTrainedConfig = transformers.AutoConfig.from_pretrained(folder, **as_it_is)
+    if type(config) in PROCESSOR_MAPPING:
+        processor_class: Any = PROCESSOR_MAPPING[type(config)]
+        # PIL's image processors everywhere: with torchvision's the same image would give other numbers where that is
+        # installed.
+        processor = still(processor_class).from_pretrained(folder, backend="pil", **as_it_is)
+    else:
+        processor = transformers.AutoProcessor.from_pretrained(folder, **as_it_is)
+    dtype: Any = options.dtype if options.dtype == "auto" else getattr(torch, options.dtype)
+    loaded: Any = transformers.AutoModelForImageTextToText.from_pretrained(
+        folder,
+        dtype=dtype,
+        device_map=places,
+        attn_implementation=options.attn_implementation,
+        use_safetensors=True,
+        output_loading_info=True,
+        **as_it_is,
+    )
+    model, found = loaded
+    # transformers only warns of these, and fills what is missing with random numbers.
+    for kind, what in (("missing_keys", "lacks"), ("unexpected_keys", "has, beyond its model,")):
+        if names := sorted(found[kind]):
+            raise CheckpointInvalid(
+                f"The checkpoint '{folder.name}' {what} {listed(names, MAX_LISTED)}. Download it again."
+            )
+    return model, processor
 
 
 @contextmanager

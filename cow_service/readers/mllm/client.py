@@ -292,6 +292,11 @@ class RetryingModel(WrapperModel):
             output = OutputObjectDefinition(self._schema, "reply")
             parameters = replace(parameters, output_mode="native", output_object=output)
 
+        def is_transient(error: BaseException) -> bool:
+            if isinstance(error, errors.ModelHTTPError) and error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
+                return error.status_code in _RETRIED_STATUS
+            return isinstance(error, errors.ModelAPIError) and not isinstance(error, _NEVER_RETRIED)
+
         def is_over(state: RetryCallState) -> bool:
             """Whether the budget ends before the next attempt, or the address has long accepted no connection."""
             error = state.outcome.exception() if state.outcome else None
@@ -299,7 +304,16 @@ class RetryingModel(WrapperModel):
             unreachable = refused and (state.seconds_since_start or 0.0) > CONNECT_SECONDS
             return unreachable or stop_before_delay(self._budget)(state)
 
-        retrying = AsyncRetrying(retry=retry_if_exception(_is_transient), wait=_backoff, stop=is_over, reraise=True)
+        def seconds_to_wait(state: RetryCallState) -> float:
+            """Those that the server asked for, else exponential backoff, with jitter."""
+            error = state.outcome.exception() if state.outcome else None
+            retry_after = error.retry_after if isinstance(error, errors.ModelAPIError) else None
+            if retry_after is not None:
+                return retry_after + random.uniform(0, MIN_BACKOFF)  # many callers were told the same
+            return wait_random_exponential(MIN_BACKOFF, MAX_BACKOFF)(state)
+
+        retry = retry_if_exception(is_transient)
+        retrying = AsyncRetrying(retry=retry, wait=seconds_to_wait, stop=is_over, reraise=True)
         return await retrying(self._attempt, messages, model_settings, parameters)
 
     async def _attempt(
@@ -335,21 +349,6 @@ def reason_of(error: errors.ModelAPIError) -> str:
     return "its reply could not be read; check that COW_MLLM_BASE_URL is that of an OpenAI-compatible server"
 
 
-def _is_transient(error: BaseException) -> bool:
-    if isinstance(error, errors.ModelHTTPError) and error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
-        return error.status_code in _RETRIED_STATUS
-    return isinstance(error, errors.ModelAPIError) and not isinstance(error, _NEVER_RETRIED)
-
-
-def _backoff(state: RetryCallState) -> float:
-    """Seconds until the next attempt: those that the server asked for, else exponential backoff, with jitter."""
-    error = state.outcome.exception() if state.outcome else None
-    retry_after = error.retry_after if isinstance(error, errors.ModelAPIError) else None
-    if retry_after is not None:
-        return retry_after + random.uniform(0, MIN_BACKOFF)  # many callers were told the same
-    return wait_random_exponential(MIN_BACKOFF, MAX_BACKOFF)(state)
-
-
 CLOSE_SECONDS = 5.0  # that closing waits for connections
 
 
@@ -374,15 +373,16 @@ class EventLoopThread:
         if self.closed:
             return
         self.closed = True
-        concurrent.futures.wait([self.submit(self._end())], CLOSE_SECONDS)
+
+        async def end() -> None:
+            running = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in running:
+                task.cancel()
+            await asyncio.gather(*running, return_exceptions=True)
+            await self._model.__aexit__(None, None, None)
+
+        concurrent.futures.wait([self.submit(end())], CLOSE_SECONDS)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(CLOSE_SECONDS)
         if not self._thread.is_alive():
             self._loop.close()
-
-    async def _end(self) -> None:
-        running = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in running:
-            task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
-        await self._model.__aexit__(None, None, None)
