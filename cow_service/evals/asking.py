@@ -9,10 +9,10 @@ import hashlib
 import random
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import permutations
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from inspect_ai import model as inspect_model
 
@@ -149,12 +149,8 @@ class CaseReplies:
     messages: tuple[Any, ...] = field(default=(), compare=False)  # as they were sent last, for the log
 
 
-class Asker(Protocol):
-    """A way of asking."""
-
-    async def __call__(self, case: Case) -> CaseReplies:
-        """Asks. Raises the `CowError` for which there is no reply."""
-        ...
+# A way of asking. Raises the `CowError` for which there is no reply.
+Asker = Callable[[Case], Awaitable[CaseReplies]]
 
 
 def observation_of(case: Case, asked: CaseReplies) -> Observation:

@@ -6,8 +6,10 @@
 import atexit
 import os
 import secrets
+import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import rich
@@ -23,7 +25,7 @@ from cow_service.evals import asking, plan, runs
 from cow_service.evals.imagination import Arm, check_arms
 from cow_service.evals.items import Ask, Item, Observation, Pictures, RunInfo, question_text
 from cow_service.evals.loaders import CAUSALSPATIAL, load
-from cow_service.evals.session import Progress, active_session, own_folder, session
+from cow_service.evals.session import Progress, active_session, session
 from cow_service.readers.prompts import load_prompt
 
 MAX_RETRIES = 6  # of a call of the multimodal LLM, about three minutes: then the question has failed
@@ -50,8 +52,9 @@ def causalspatial(
     if shared is None:  # the session of the first task of the process is that of all
         stack = ExitStack()
         atexit.register(stack.close)
-        options = plan.request_options(reader, generator)
-        shared = stack.enter_context(session(own_folder(), url, options, *[secrets.token_hex(8)] * 2))
+        options, key = plan.request_options(reader, generator), secrets.token_hex(8)
+        folder = Path(tempfile.mkdtemp(prefix="cow-eval-"))  # of pictures and a server; left to the system to clean
+        shared = stack.enter_context(session(folder, url, options, key, key))
     items = shared.items  # loaded and checked before, whatever `data` says
     if items is None:
         named = subsets.split(",") if isinstance(subsets, str) else subsets

@@ -1,7 +1,6 @@
 """What every task of an evaluation shares: the server that it asks, where its pictures are kept, and its progress."""
 
 import asyncio
-import tempfile
 import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -95,11 +94,6 @@ def _server(folder: Path, settings: Mapping[str, Any]) -> Generator[str]:
             stack.callback(pool.close)
             pool.start()  # it computes in processes of its own: replies are read, and kept, as they come
         yield stack.enter_context(serving(service, pool))
-
-
-def own_folder() -> Path:
-    """A folder for pictures and a server of tasks that Inspect's own command runs; left to the system to clean."""
-    return Path(tempfile.mkdtemp(prefix="cow-eval-"))
 
 
 @dataclass

@@ -110,22 +110,9 @@ def _digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-class _Interned:
-    """Values, each once, and the place of each."""
-
-    def __init__(self) -> None:
-        self.values: list[Any] = []
-        self._places: dict[Any, int] = {}
-
-    def place(self, value: Any) -> int:
-        """Of a value, which is added where it is new."""
-        if value not in self._places:
-            self._places[value] = len(self.values)
-            self.values.append(value)
-        return self._places[value]
-
-    def place_or_none(self, value: Any) -> int | None:
-        return None if value is None else self.place(value)
+def _place(known: dict[Any, int], value: Any) -> int | None:
+    """The place of a value among those that are known, where it is added if it is new; None for None."""
+    return None if value is None else known.setdefault(value, len(known))
 
 
 @dataclass(frozen=True)
@@ -183,7 +170,7 @@ def page_data(
     runs: Sequence[EvalRun], arms: Sequence[PageArm], links: _PictureLinks
 ) -> tuple[dict[str, Any], list[list[str]]]:
     """What the page needs at once, and the texts of the replies in blocks of items."""
-    data, pictures, shown, reasons, replies = (_Interned() for _ in range(5))
+    data, pictures, shown, reasons, replies = (dict[Any, int]() for _ in range(5))
 
     def packed_observation(each: Observation) -> list[Any]:
         """The order is that of `readObservation` in page/data.js."""
@@ -192,11 +179,11 @@ def page_data(
             "".join(each.options),
             each.read,
             each.read_as_paper,
-            replies.place_or_none(each.reply),
-            shown.place(tuple(map(pictures.place, each.frames))),
-            pictures.place_or_none(each.overlay),
-            reasons.place_or_none(each.refusal),
-            reasons.place_or_none(each.failure),
+            _place(replies, each.reply),
+            _place(shown, tuple(_place(pictures, frame) for frame in each.frames)),
+            _place(pictures, each.overlay),
+            _place(reasons, each.refusal),
+            _place(reasons, each.failure),
             None if each.probability is None else round(each.probability, 4),
             each.happens,
             round(each.seconds, 2),
@@ -216,8 +203,8 @@ def page_data(
             [[each.letter, each.text] for each in item.options],
             item.answer,
             item.abstain,
-            pictures.place(item.image),
-            [pictures.place(each) for each in item.oracle],
+            _place(pictures, item.image),
+            [_place(pictures, each) for each in item.oracle],
             [[packed_observation(each) for each in of_arm] for of_arm in seen],
         ]
 
@@ -225,31 +212,31 @@ def page_data(
     seen: dict[tuple[int, str, int], list[Observation]] = defaultdict(list)
     places = {(each.run, each.arm): place for place, each in enumerate(arms)}
     for number, run in enumerate(runs):
-        of_data = data.place(run.info.data_digest)
+        of_data = data.setdefault(run.info.data_digest, len(data))
         for item in run.items.values():
             asked.setdefault((of_data, item.id), item)
         for each in run.observations:
             if (number, each.arm) in places:
                 seen[of_data, each.item, places[number, each.arm]].append(each)
     items: list[list[Any]] = []
-    blocks: list[list[str]] = []
+    blocks: list[dict[Any, int]] = []
     for place, (key, item) in enumerate(asked.items()):
         if place % ITEMS_PER_BLOCK == 0:
-            replies = _Interned()
-            blocks.append(replies.values)
+            replies = dict[Any, int]()
+            blocks.append(replies)
         of_arms = [sorted(seen.get((*key, arm), ()), key=lambda each: each.repeat) for arm in range(len(arms))]
         items.append(packed_item(item, key[0], of_arms))
     names = {each.data_digest: each.data for each in (run.info for run in reversed(runs))}
     core = {
         "perBlock": ITEMS_PER_BLOCK,
-        "data": [names[digest] for digest in data.values],
+        "data": [names[digest] for digest in data],
         "arms": [[each.name, each.against] for each in arms],
-        "shown": shown.values,
-        "reasons": reasons.values,
-        "pictures": [links.address(each) for each in pictures.values],
+        "shown": list(shown),
+        "reasons": list(reasons),
+        "pictures": [links.address(each) for each in pictures],
         "items": items,
     }
-    return core, blocks
+    return core, [list(block) for block in blocks]
 
 
 def script_json(value: Any) -> str:
