@@ -46,7 +46,20 @@ class Row:
 
 def item_of(row: Row, pictures: Pictures) -> Item:
     """The item of a row; its pictures are kept. Raises `RowFault`."""
-    parts, options = _wording(row)
+    if not row.question or not row.question.strip():
+        raise RowFault("`question` is empty")
+    if row.options is None:
+        wording = items.listed_wording(row.question)
+        if wording is None:
+            raise RowFault("the question lists no options, such as (A) Yes, (B) No, and the row has none either")
+    else:
+        texts = [str(text).strip() for text in row.options]
+        if len(texts) < 2 or not all(texts) or len({text.lower() for text in texts}) < len(texts):
+            raise RowFault(f"`options` must be two or more different texts, got {texts}")
+        if len(texts) > len(items.LETTERS):
+            raise RowFault(f"`options` are at most {len(items.LETTERS)}, got {len(texts)}")
+        wording = items.appended_wording(row.question.rstrip(), texts)
+    parts, options = wording
     image = _picture(row.image, "image", pictures)
     abstain = not_sure_option(options)
     try:
@@ -75,23 +88,6 @@ def task_of(name: str | None) -> Task:
         if word in _TASKS:
             return _TASKS[word]
     return "other"
-
-
-def _wording(row: Row) -> items.Wording:
-    """The question around its options. Raises `RowFault` where it has none, or they are no options."""
-    if not row.question or not row.question.strip():
-        raise RowFault("`question` is empty")
-    if row.options is None:
-        listed = items.listed_wording(row.question)
-        if listed is None:
-            raise RowFault("the question lists no options, such as (A) Yes, (B) No, and the row has none either")
-        return listed
-    texts = [str(text).strip() for text in row.options]
-    if len(texts) < 2 or not all(texts) or len({text.lower() for text in texts}) < len(texts):
-        raise RowFault(f"`options` must be two or more different texts, got {texts}")
-    if len(texts) > len(items.LETTERS):
-        raise RowFault(f"`options` are at most {len(items.LETTERS)}, got {len(texts)}")
-    return items.appended_wording(row.question.rstrip(), texts)
 
 
 def _answer(given: str | None, options: Sequence[AnswerOption]) -> str:

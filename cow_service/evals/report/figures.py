@@ -143,9 +143,24 @@ def _percent_axis(axes: Axes, low: float, high: float) -> None:
 
 def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
     """What every arm gains over the image alone; None where no arm has a gain."""
-    rows = _gain_rows(summaries)
-    if not rows:
+    styles = arm_styles(summaries)
+    groups = {"All questions": [(each.name, each.gain) for each in summaries if each.gain is not None]}
+    for task in TASKS:
+        own = [(each.name, found.gain) for each in summaries for found in each.gains if found.task == task]
+        groups[task.capitalize()] = own
+    kept = [(heading, group) for heading, group in groups.items() if group]
+    if not kept:
         return None
+
+    # Rows of the plot: headings of groups, and below each the gains of its arms.
+    rows: list[tuple[str, ArmStyle | None, Gain | None]] = []
+    # With one task, its group says the same as all questions.
+    for heading, group in kept[1:] if len(kept) == 2 else kept:
+        questions = max(gain.questions for _, gain in group)
+        scenes = max(gain.scenes for _, gain in group)
+        rows.append((f"{heading} ({questions} questions, {scenes} scene{'s' if scenes > 1 else ''})", None, None))
+        rows += [(short(name), styles[name], gain) for name, gain in group]
+
     figure = Figure(figsize=(GAINS_WIDTH, GAIN_ROW * len(rows) + 1.1), layout="constrained")
     axes = figure.add_subplot()
     for place, (_, style, gain) in enumerate(rows):
@@ -174,27 +189,9 @@ def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
     axes.set_xlabel(f"Gain in right answers over “{BASELINE}” (percentage points)")
     title = f"Gain of each arm over the image alone (arm “{BASELINE}”)"
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, weight="bold")
-    heading: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "fontsize": 8.5, "color": DIM}
-    axes.text(GAIN_AT, 0.9, "gain, 95% interval", va="bottom", **heading)
+    dim: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "fontsize": 8.5, "color": DIM}
+    axes.text(GAIN_AT, 0.9, "gain, 95% interval", va="bottom", **dim)
     return figure
-
-
-def _gain_rows(summaries: Sequence[ArmSummary]) -> list[tuple[str, ArmStyle | None, Gain | None]]:
-    """The lines of the plot: headings of groups, and below each the gains of its arms."""
-    styles = arm_styles(summaries)
-    groups = {"All questions": [(each.name, each.gain) for each in summaries if each.gain is not None]}
-    for task in TASKS:
-        own = [(each.name, found.gain) for each in summaries for found in each.gains if found.task == task]
-        groups[task.capitalize()] = own
-    kept = [(heading, group) for heading, group in groups.items() if group]
-    rows: list[tuple[str, ArmStyle | None, Gain | None]] = []
-    # With one task, its group says the same as all questions.
-    for heading, group in kept[1:] if len(kept) == 2 else kept:
-        questions = max(gain.questions for _, gain in group)
-        scenes = max(gain.scenes for _, gain in group)
-        rows.append((f"{heading} ({questions} questions, {scenes} scene{'s' if scenes > 1 else ''})", None, None))
-        rows += [(short(name), styles[name], gain) for name, gain in group]
-    return rows
 
 
 # Rates: how many questions each arm answers rightly, by task, and by the levels of each task

@@ -16,6 +16,7 @@ from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, EncodedImage
 from cow_service.readers.mllm.identify import MAX_OTHERS
 from cow_service.readers.mllm.replies import Reply, ReplyError
+from cow_service.records import BBox, LocatedObject, ObjectPrior, Point, Vector
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
 
@@ -27,7 +28,7 @@ MAX_LABEL = 80  # characters
 STRAIGHT = 60.0  # degrees from the image's vertical, within which a line can also lead towards or away
 STEEP = 60.0  # degrees out of the image plane, from which a motion leads straight towards or away
 LEAST_SPAN = 4.0  # px: measuring less is guessing
-DOWN: dict[str, records.Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}
+DOWN: dict[str, Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}
 _SIDES = {side: side for side in DOWN} | {"down": "bottom", "below": "bottom", "up": "top", "above": "top"}
 _LABEL_KEYS = ("label", "object", "name", "class")
 _DIRECTION_KEYS = ("direction", "motion_direction", "line", "vector")
@@ -52,14 +53,14 @@ _POINT_TAG = re.compile(
 _CORNER_PAIRS = re.compile(rf"{_PAIR}\s*(?:,|-|–|→|to|and|through)?\s*{_PAIR}")
 _FOUR = re.compile(r"[(\[]?\s*" + r"\s*,\s*".join([f"({NUMBER})"] * 4) + r"\s*[)\]]?")
 _COORDINATES = WithJsonSchema({replies.COORDINATES: 4})  # nullable
-Ends = tuple[records.Point, records.Point]  # of a line, px of the upright image
+Ends = tuple[Point, Point]  # of a line, px of the upright image
 
 
 class SeenObject(Reply):
     """An object at its place, and what may be estimated of it. Places are in px of the upright image."""
 
     label: Annotated[str, BeforeValidator(lambda said: replies.text_of(said)[:MAX_LABEL]), Field(max_length=MAX_LABEL)]
-    bbox: Annotated[records.BBox | None, _COORDINATES]
+    bbox: Annotated[BBox | None, _COORDINATES]
     size: estimates.Size = None  # m
     stands_on: estimates.Support = None
     height_above: estimates.Height = None  # m
@@ -67,21 +68,21 @@ class SeenObject(Reply):
 
     @field_validator("bbox", mode="before")
     @classmethod
-    def _read_bbox(cls, written: object, info: ValidationInfo) -> records.BBox | None:
+    def _read_bbox(cls, written: object, info: ValidationInfo) -> BBox | None:
         return None if replies.is_none(written) else estimates.context_of(info).frame.bbox(written)
 
     @property
-    def prior(self) -> records.ObjectPrior | None:
+    def prior(self) -> ObjectPrior | None:
         """The estimates with widths; null where there are none."""
         size, height = self.size, self.height_above
         width = 0.0 if height is None else max(estimates.HEIGHT_DEVIATION * height, estimates.MIN_HEIGHT_DEVIATION)
-        prior = records.ObjectPrior(
+        prior = ObjectPrior(
             shape=self.shape,
             size=None if size is None else records.Estimate(value=size, deviation=estimates.SIZE_DEVIATION * size),
             stands_on=self.stands_on,
             height=None if height is None else records.Estimate(value=height, deviation=width),
         )
-        return None if prior == records.ObjectPrior() else prior
+        return None if prior == ObjectPrior() else prior
 
 
 class Surroundings(Reply):
@@ -131,12 +132,12 @@ class Located:
     A reply may give a point instead of a box. `label` is what the reply calls it.
     """
 
-    bbox: records.BBox | None = None
-    point: records.Point | None = None
+    bbox: BBox | None = None
+    point: Point | None = None
     label: str = ""
     clipped: bool = False  # the box reached over the image's edge
-    others: tuple[records.LocatedObject, ...] = ()
-    prior: records.ObjectPrior | None = None
+    others: tuple[LocatedObject, ...] = ()
+    prior: ObjectPrior | None = None
     line: Line | None = None
     warnings: tuple[str, ...] = ()  # of optional fields and other boxes that were left out
 
@@ -155,7 +156,7 @@ def locate_call(
     question: str,
     image: EncodedImage,
     name: str,
-    bbox: records.BBox | None,
+    bbox: BBox | None,
     others: Sequence[str],
     wants_direction: bool,
     reasoning_length: int,
@@ -217,7 +218,7 @@ def read_located(
         return SeenObject.model_validate({**found.fields, "label": found.label, "bbox": found.box}, context=context)
 
     mover = seen(wanted, place)
-    objects: list[records.LocatedObject] = []
+    objects: list[LocatedObject] = []
     for name, role, other in named:
         try:
             found = seen(name, other)
@@ -229,7 +230,7 @@ def read_located(
         if role == "obstacle" and coordinates.covers_image(frame.width, frame.height, found.bbox):
             warnings.append(f"The reader's box of '{name}' was left out: it covers nearly the whole image.")
             continue
-        objects.append(records.LocatedObject(object=name, bbox=found.bbox, role=role, prior=found.prior, source="mllm"))
+        objects.append(LocatedObject(object=name, bbox=found.bbox, role=role, prior=found.prior, source="mllm"))
     return Located(
         bbox=mover.bbox,
         point=frame.point(place.point) if mover.bbox is None else None,
@@ -242,14 +243,12 @@ def read_located(
     )
 
 
-def separate_objects(
-    mover: records.BBox, others: Sequence[records.LocatedObject]
-) -> tuple[tuple[records.LocatedObject, ...], tuple[str, ...]]:
+def separate_objects(mover: BBox, others: Sequence[LocatedObject]) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
     """The others without those that have the box of the mover or of one before them, and with few obstacles.
 
     A target that goes is told of in a warning.
     """
-    kept: list[records.LocatedObject] = []
+    kept: list[LocatedObject] = []
     warnings: list[str] = []
     for other in others:
         boxes = [mover, *(each.bbox for each in kept)]
@@ -409,7 +408,7 @@ class Scale(Reply):
     reference: Annotated[str | None, BeforeValidator(replies.name_of)]
     metres: Annotated[float | None, WithJsonSchema(replies.nullable(replies.number(*estimates.SIZES)))]
     ends: Annotated[Ends | None, _COORDINATES]
-    down: Annotated[records.Vector, WithJsonSchema(replies.nullable(replies.one_of(*DOWN)))]
+    down: Annotated[Vector, WithJsonSchema(replies.nullable(replies.one_of(*DOWN)))]
 
     @field_validator("metres", mode="before")
     @classmethod
@@ -432,7 +431,7 @@ class Scale(Reply):
 
     @field_validator("down", mode="before")
     @classmethod
-    def _read_down(cls, written: object) -> records.Vector:
+    def _read_down(cls, written: object) -> Vector:
         said = replies.text_of(written).lower().removesuffix(" side")
         side = "bottom" if replies.is_none(written) else _SIDES.get(said)
         if side is None:

@@ -11,6 +11,7 @@ from cow_service import __version__, records
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
 from cow_service.readers import base
+from cow_service.readers.base import GroundingReading, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.client import MllmClient, PromptCall
@@ -22,6 +23,7 @@ from cow_service.readers.mllm.locate import Located, Scale, locate_call, scale_c
 from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
+from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.settings import Settings
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import SAME_OBJECT_IOU
@@ -82,7 +84,7 @@ class MllmReader:
         """The reply to a chat of OpenAI's protocol, through pydantic-ai. Raises `InvalidRequest`, `MllmUnavailable`."""
         return await self._client.chat(body)
 
-    def ground(self, given: base.ReaderInput) -> base.GroundingReading:
+    def ground(self, given: ReaderInput) -> GroundingReading:
         """Two calls: what moves, in words; then where it is and, in the same call, which way it moves.
 
         Raises `ObjectNotFound`, `MllmBadReply`, `MllmUnavailable`.
@@ -99,10 +101,10 @@ class MllmReader:
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
             warnings = box_warnings(given.scene, bbox, identified.object, located.clipped)
         others, doubles = separate_objects(bbox, located.others)
-        mover = records.LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
+        mover = LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
         known = {name_words(each.object): each for each in (mover, *others)}
 
-        def changed(name: str) -> records.LocatedObject:
+        def changed(name: str) -> LocatedObject:
             found = known.get(name_words(name))
             if found is None:
                 raise ObjectNotFound(
@@ -123,7 +125,7 @@ class MllmReader:
         if located.label and set(name_words(located.label)).isdisjoint(name_words(identified.object)):
             mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
             warnings = (*warnings, mismatch)
-        return base.GroundingReading(
+        return GroundingReading(
             object=identified.object,
             bbox=bbox,
             point=located.point,
@@ -135,9 +137,7 @@ class MllmReader:
             asked=identified.asked,
         )
 
-    def read_motion(
-        self, given: base.ReaderInput, grounding: records.Grounding, hints: base.MotionHints | None
-    ) -> base.MotionReading:
+    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
         """No call with hints, else two.
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
@@ -158,9 +158,7 @@ class MllmReader:
                 raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found. {GIVE_DIRECTION}")
             others.append(base.OtherMotionReading(place, hint.kind, hint.direction, hint.depth))
         kind = hints.kind or DEFAULT_KIND
-        reading = base.MotionReading(
-            kind, None, "text", sentence=hints.sentence, warnings=warnings, others=tuple(others)
-        )
+        reading = MotionReading(kind, None, "text", sentence=hints.sentence, warnings=warnings, others=tuple(others))
         if kind in records.FALLING_KINDS:
             reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
             if hints.scale_error:
@@ -170,9 +168,9 @@ class MllmReader:
 
     def answer(
         self,
-        given: base.ReaderInput,
+        given: ReaderInput,
         options: Sequence[records.AnswerOption],
-        grounding: records.Grounding | None,
+        grounding: Grounding | None,
         imagined: base.Imagined | None,
         votes: int,
     ) -> tuple[base.AnswerReading, ...]:
@@ -187,20 +185,15 @@ class MllmReader:
             raise next(each for each in results if isinstance(each, CowError))
         return readings
 
-    def _identify(self, given: base.ReaderInput) -> tuple[EncodedImage, Identified | None]:
+    def _identify(self, given: ReaderInput) -> tuple[EncodedImage, Identified | None]:
         """The image as it is sent, and what is asked of it."""
         with given.cpu():
             image = encode(given.scene.image, self._model.family)
         return image, self._client.complete(identify_call(given.question, image, self._reasoning), given)
 
     def _locate(
-        self,
-        given: base.ReaderInput,
-        image: EncodedImage,
-        identified: Identified | None,
-        name: str,
-        bbox: records.BBox | None,
-    ) -> tuple[Located | None, base.MotionHints]:
+        self, given: ReaderInput, image: EncodedImage, identified: Identified | None, name: str, bbox: BBox | None
+    ) -> tuple[Located | None, MotionHints]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
         None where the place was not asked for, or the object not seen. Raises `MllmBadReply`, `MllmUnavailable`.
@@ -232,15 +225,11 @@ class MllmReader:
             hints |= {"metres_per_pixel": scaled.metres_per_pixel, "down": scaled.down}
         elif isinstance(scaled, CowError):
             hints["scale_error"] = scaled.code
-        return located, base.MotionHints(**hints)
+        return located, MotionHints(**hints)
 
     def _directed(
-        self,
-        given: base.ReaderInput,
-        grounding: records.Grounding,
-        reading: base.MotionReading,
-        hints: base.MotionHints,
-    ) -> base.MotionReading:
+        self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints
+    ) -> MotionReading:
         """The reading with its direction, checked against the drawn arrow where one is the cue."""
         if hints.ends is None and hints.camera is None:
             raise CannotReadDirection(
@@ -274,7 +263,7 @@ def create(settings: Settings) -> MllmReader:
     return MllmReader("mllm", MllmClient(configure(settings), settings), settings.mllm_base_url or "")
 
 
-def follow_arrow(scene: Scene, bbox: records.BBox, reading: base.MotionReading) -> base.MotionReading:
+def follow_arrow(scene: Scene, bbox: BBox, reading: MotionReading) -> MotionReading:
     """The reading, with the direction of the arrow drawn at the object where the two are at odds.
 
     `along_arrow` says whether the object moves with it; where the reader does not say, only the arrow's axis counts.
@@ -299,7 +288,7 @@ def follow_arrow(scene: Scene, bbox: records.BBox, reading: base.MotionReading) 
     return replace(reading, direction=drawn, along_arrow=along, sentence=None, warnings=warnings)
 
 
-def box_warnings(scene: Scene, bbox: records.BBox, name: str, clipped: bool) -> tuple[str, ...]:
+def box_warnings(scene: Scene, bbox: BBox, name: str, clipped: bool) -> tuple[str, ...]:
     """What speaks against a box that was given for an object of this name; empty where nothing does.
 
     `clipped`: the box reached over the image's edge.
