@@ -155,6 +155,7 @@ class CoordinateFrame:
 
     def _pairs(self, written: object, count: int, what: str) -> list[tuple[float, float]]:
         """(x, y) pairs in the family's units."""
+        # The two points of an object such as {"start": ..., "end": ...}; anything else as it is.
         fields = fields_of(written) if count == 2 else {}
         ends = next(([fields[a], fields[b]] for a, b in _CORNERS if a in fields and b in fields), written)
         named = _by_name(ends, count)
