@@ -43,7 +43,7 @@ from cow_service.client import AsyncClient, Client, CowError, Event, Simulation,
 from cow_service.client.display import simulation_html
 from cow_service.client.options import AnswerOptions, SimulateOptions
 from cow_service.client.progress import reporting
-from cow_service.client.request import Upload, image_input
+from cow_service.client.request import image_input
 from cow_service.records import Job
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, ObjectRequest, SimulateRequest
 
@@ -134,8 +134,8 @@ def test_images_of_every_kind(address: str, tmp_path: Path) -> None:
 def test_pixels_of_pil_images_are_kept(mode: str) -> None:
     given = picture(mode)
     sent = image_input(given)
-    assert isinstance(sent, Upload)
-    with Image.open(io.BytesIO(sent.data)) as came:
+    assert isinstance(sent, bytes)
+    with Image.open(io.BytesIO(sent)) as came:
         assert came.format == "PNG"
         assert came.size == given.size
         if mode.startswith("I;16"):

@@ -25,8 +25,8 @@ from rich.console import Console
 from servers import data_url
 from typer.testing import CliRunner
 
-from cow_service.cli.batch import _print_summary
-from cow_service.cli.console import _answer_table
+from cow_service.cli.batch import print_summary
+from cow_service.cli.console import answer_table
 from cow_service.cli.main import app as cli
 from cow_service.client.display import answer_html
 from cow_service.errors import MllmUnavailable
@@ -254,14 +254,14 @@ def test_what_the_gate_saw_and_what_it_cost_is_shown_everywhere(
     assert f"Before looking: {words}." in answer_text(found, "")
     reused = found.model_copy(update={"usage_total": found.usage + COST})
     console = Console(width=200)
-    console.print(_answer_table(reused))
+    console.print(answer_table(reused))
     printed = capsys.readouterr().out
     assert words in printed
     assert "3 calls, 300 tokens in, 30 out; without reuse 4 calls, 400 tokens in, 40 out" in printed
     lines = [{"id": str(n), "status": "succeeded", "result": each.model_dump(mode="json")}
              for n, each in enumerate((found, reused))]  # fmt: skip
     (tmp_path / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert _print_summary(tmp_path) == 0
+    assert print_summary(tmp_path) == 0
     said = "asked of the MLLM: 6 calls, 600 tokens in, 60 out; without reuse 7 calls, 700 tokens in, 70 out"
     assert said in capsys.readouterr().out
 

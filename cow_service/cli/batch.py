@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from cow_service.cli.options import object_in, printable
+from cow_service.cli.options import EXISTING, Url, argument, object_in, open_client, option, printable
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
@@ -29,35 +29,25 @@ RESUME_HINT = "The same command goes on with the batch."
 def batch(
     questions: Annotated[
         Path,
-        typer.Argument(
-            metavar="QUESTIONS",
-            help='JSON Lines: {"image": FILE or URL, "question": TEXT}, maybe "id", "meta", and fields of the request.',
-            exists=True,
-            dir_okay=False,
+        argument(
+            'JSON Lines: {"image": FILE or URL, "question": TEXT}, maybe "id", "meta", and fields of the request.',
+            "QUESTIONS",
             readable=True,
+            **EXISTING,
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for results.jsonl; a batch in it is gone on with.")],
-    kind: Annotated[
-        Literal["answer", "simulate"], typer.Option(help="Whether to answer, or only to simulate.")
-    ] = "answer",
+    out: Annotated[Path, option("Folder for results.jsonl; a batch in it is gone on with.", "--out", "-o")],
+    kind: Annotated[Literal["answer", "simulate"], option("Whether to answer, or only to simulate.")] = "answer",
     request: Annotated[
-        str | None,
-        typer.Option(metavar="JSON", help='Fields for questions that lack them: {"votes": 5}.', show_default="none"),
+        str | None, option('Fields for questions that lack them: {"votes": 5}.', metavar="JSON", shown="none")
     ] = None,
-    concurrency: Annotated[int, typer.Option(min=1, help="Questions at the same time.")] = 8,
-    timeout: Annotated[
-        float | None, typer.Option(min=0.001, help="Longest wait for one question, s.", show_default="none")
-    ] = None,
-    save: Annotated[bool, typer.Option("--save", help="Keep the pictures of each in OUT/items.")] = False,
-    fresh: Annotated[
-        bool, typer.Option("--fresh", help="Draw everything afresh: take no results of earlier requests.")
-    ] = False,
-    minimal: Annotated[bool, typer.Option("--minimal", help="Leave out the long lists of trajectories.")] = False,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Ask those again that failed.")] = False,
-    url: Annotated[
-        str | None, typer.Option(help="The server.", show_default="COW_BASE_URL, http://127.0.0.1:8000")
-    ] = None,
+    concurrency: Annotated[int, option("Questions at the same time.", min=1)] = 8,
+    timeout: Annotated[float | None, option("Longest wait for one question, s.", min=0.001, shown="none")] = None,
+    save: Annotated[bool, option("Keep the pictures of each in OUT/items.", "--save")] = False,
+    fresh: Annotated[bool, option("Draw everything afresh: take no results of earlier requests.", "--fresh")] = False,
+    minimal: Annotated[bool, option("Leave out the long lists of trajectories.", "--minimal")] = False,
+    retry_failed: Annotated[bool, option("Ask those again that failed.", "--retry-failed")] = False,
+    url: Url = None,
 ) -> None:
     """Ask a server many questions, and resume where it stopped.
 
@@ -65,29 +55,15 @@ def batch(
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
     """
-    from cow_service.client import Client  # noqa: PLC0415
+    given = locals()
     from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
+    from cow_service.client.options import BatchSettings  # noqa: PLC0415
 
     asked = _read(questions, object_in(request or "{}", "--request"), kind)
+    settings: dict[str, Any] = {name: given[name] for name in BatchSettings.__annotations__.keys() & given.keys()}
     try:
-        client = Client(url)
-    except ValueError as error:
-        raise InvalidRequest(f"{error}.") from error
-    try:
-        with client:
-            for result in client.map(
-                asked,
-                kind=kind,
-                only_new=True,
-                progress=True,
-                out=out,
-                concurrency=concurrency,
-                timeout=timeout,
-                save=save,
-                fresh=fresh,
-                minimal=minimal,
-                retry_failed=retry_failed,
-            ):
+        with open_client(url) as client:
+            for result in client.map(asked, kind=kind, only_new=True, progress=True, **settings):
                 if result.unsaved is not None:
                     typer.echo(printable(f"{result.id}: not saved: {result.unsaved.detail}"), err=True)
     except KeyboardInterrupt:
@@ -103,40 +79,44 @@ def batch(
     except TRANSIENT as error:
         error.detail += f" {RESUME_HINT}"
         raise
-    raise typer.Exit(_print_summary(out))
+    raise typer.Exit(print_summary(out))
 
 
 def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]:
-    """The questions of a file; images are looked for beside it.
+    """The questions of a file; images are looked for beside it. Prints which of them are missing.
 
     Raises `InvalidRequest` for whatever the server would refuse, before it is asked anything.
     """
+    from pydantic import ValidationError  # noqa: PLC0415
+
+    from cow_service import requests  # noqa: PLC0415
     from cow_service.client.batches import questions  # noqa: PLC0415
 
+    model = requests.AnswerRequest if kind == "answer" else requests.SimulateRequest
     items: list[dict[str, Any]] = []
     faults: list[str] = []
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
-        if line.strip():
-            try:
-                item = object_in(line, "it")
-                (question,) = questions([item], defaults, path.parent)
-                _check(question, kind)
-                items.append(item)
-            except InvalidRequest as error:
-                fields = [f"`{field.pointer.rpartition('/')[2]}` {field.detail}." for field in error.errors]
-                faults.append(f"{path.name}, line {number}: {' '.join(fields) or error.detail}")
+        if not line.strip():
+            continue
+        try:
+            item = object_in(line, "it")
+            (question,) = questions([item], defaults, path.parent)
+            image = dict(question.image) if isinstance(question.image, Mapping) else "data:"
+            model.model_validate({**question.options, "image": image, "question": question.question})
+            items.append(item)
+        except ValidationError as error:
+            wrong = requests.field_errors(error.errors())[0]
+            faults.append(f"{path.name}, line {number}: {wrong.pointer}: {wrong.detail}.")
+        except InvalidRequest as error:
+            fields = [f"`{field.pointer.rpartition('/')[2]}` {field.detail}." for field in error.errors]
+            faults.append(f"{path.name}, line {number}: {' '.join(fields) or error.detail}")
     if faults:
         more = f"\n... and {len(faults) - MAX_FAULTS_SHOWN} more" if len(faults) > MAX_FAULTS_SHOWN else ""
         raise InvalidRequest("\n".join(faults[:MAX_FAULTS_SHOWN]) + more)
     if not items:
         raise InvalidRequest(f"{path.name} holds no questions: give one JSON object a line.")
     asked = list(questions(items, defaults, path.parent))
-    _check_images(asked, path)
-    return asked
-
-
-def _check_images(asked: list[Question], path: Path) -> None:
-    """Prints which files are missing: their questions will fail. Raises `InvalidRequest` where all are."""
+    # The questions of files that are missing will fail; where all are, nothing is asked.
     files = [question.image for question in asked if isinstance(question.image, Path)]
     missing = [file for file in files if not file.is_file()]
     if files and len(missing) == len(files):
@@ -149,24 +129,10 @@ def _check_images(asked: list[Question], path: Path) -> None:
         names = ", ".join(file.name for file in missing[:MAX_FAILURES_SHOWN])
         warning = f"{len(missing)} of {len(files)} images {verb} not there: {names}"
         typer.echo(printable(warning + (", ..." if len(missing) > MAX_FAILURES_SHOWN else "")), err=True)
+    return asked
 
 
-def _check(question: Question, kind: JobKind) -> None:
-    from pydantic import ValidationError  # noqa: PLC0415
-
-    from cow_service.requests import AnswerRequest, SimulateRequest  # noqa: PLC0415
-    from cow_service.requests.values import field_errors  # noqa: PLC0415
-
-    model = AnswerRequest if kind == "answer" else SimulateRequest
-    image = dict(question.image) if isinstance(question.image, Mapping) else "data:"
-    try:
-        model.model_validate({**question.options, "image": image, "question": question.question})
-    except ValidationError as error:
-        wrong = field_errors(error.errors())[0]
-        raise InvalidRequest(f"{wrong.pointer}: {wrong.detail}.") from error
-
-
-def _print_summary(out: Path) -> int:
+def print_summary(out: Path) -> int:
     """Prints what the folder holds of the batch; returns the exit code."""
     from cow_service.client.display import asked_words  # noqa: PLC0415
     from cow_service.records import Usage  # noqa: PLC0415

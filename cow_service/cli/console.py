@@ -5,11 +5,11 @@ from __future__ import annotations
 import platform
 import shutil
 import sys
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from rich.console import Console
@@ -17,106 +17,69 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
-from cow_service import __version__
+from cow_service import __version__, records
 from cow_service.cli.options import HINTS, FolderNotWritable, read_file
-from cow_service.client.display import (
-    asked_words,
-    contacts_words,
-    encounters_words,
-    gate_words,
-    outcome_words,
-    readiness_words,
-)
+from cow_service.client import display
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.jobs.processes import describe_unserved, remedy, unserved_jobs
-from cow_service.media.images import DecodedImage
-from cow_service.records import (
-    DIRECTED_KINDS,
-    Answer,
-    BackendInfo,
-    Models,
-    Simulation,
-    Unserved,
-    Verdict,
-    artifacts_of,
-    documents_of,
-)
+from cow_service.records import Answer, Simulation, Unserved, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.requests.values import field_errors
 from cow_service.service import Service
 
-Body = TypeVar("Body", bound=SimulateRequest)
 
-
-def run_simulation(
+def run_request(
     service: Service,
+    model: type[SimulateRequest],
     image: Path,
     body: dict[str, Any],
-    out: Path,
+    out: Path | None,
     formats: Sequence[str] = (),
     *,
-    as_json: bool,
-) -> Simulation:
-    """Simulates with progress of each stage, writes the results into a folder, and prints a summary.
+    as_json: bool = False,
+) -> Simulation | None:
+    """Simulates or answers, shows the progress of each stage, prints a summary, and writes the results into a folder.
 
-    `formats` are names of `video.FORMATS`. Raises `InvalidRequest` where one is wanted and no video.
+    Returns the simulation. `formats` are names of `video.FORMATS`. Raises `InvalidRequest` that names the fields, and
+    where one of the formats is wanted and no video.
     """
     if formats and not body["video"]:
         raise InvalidRequest("--format makes its file of the video: leave --no-video out.")
-    console = console_for(as_json)
-    make_folder(out)
-    request, decoded = read_request(service, image, body, SimulateRequest)
-    with stages_shown(console) as show:
-        simulation = service.simulate(request, show, decoded)
-    written = [*save(service, simulation, out), *_save_formats(out, formats)]
-    if as_json:
-        print(simulation.model_dump_json(indent=2))
-        return simulation
-    print_stages(console, simulation)
-    print_warnings(console, simulation.warnings)
-    console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
-    return simulation
-
-
-def run_answer(service: Service, image: Path, body: dict[str, Any], out: Path | None, *, as_json: bool) -> None:
-    """Answers with progress of each stage, and prints a summary; writes the results where a folder is given."""
-    console = console_for(as_json)
+    # With JSON a silent one: standard output is for a program.
+    console = Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)
     if out is not None:
-        make_folder(out)
-    request, decoded = read_request(service, image, body, AnswerRequest)
-    with stages_shown(console) as show:
-        answer = service.answer(request, show, decoded)
-    written = [] if out is None else save(service, answer, out)
-    if as_json:
-        print(answer.model_dump_json(indent=2))
-        return
-    if answer.simulation is not None:
-        print_stages(console, answer.simulation)
-    console.print(_answer_table(answer))
-    if answer.reasoning:
-        console.print(f"[dim]reasoning[/]: {escape(answer.reasoning)}")
-    simulated = () if answer.simulation is None else answer.simulation.warnings
-    print_warnings(console, (*simulated, *answer.warnings))
-    if answer.simulation_problem is not None and (hint := HINTS.get(answer.simulation_problem.code)):
-        console.print(hint)
-    if out is not None:
-        console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
-
-
-def console_for(as_json: bool) -> Console:
-    """A console on standard output; with JSON a silent one, since that output is for a program."""
-    return Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)
-
-
-def read_request(service: Service, image: Path, body: dict[str, Any], model: type[Body]) -> tuple[Body, DecodedImage]:
-    """The validated request, and its image, which is stored. Raises `InvalidRequest` that names the fields."""
+        with writable(out):  # before the work, so that its results are not lost
+            out.mkdir(parents=True, exist_ok=True)
     artifact, decoded = service.keep_image(read_file(image))
     try:
-        return model.model_validate({"image": {"artifact": artifact.sha256}, **body}), decoded
+        request = model.model_validate({"image": {"artifact": artifact.sha256}, **body})
     except ValidationError as error:
         fields = field_errors(error.errors())
         faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
         raise InvalidRequest(f"{faults}.", errors=fields) from error
+    with stages_shown(console) as show:
+        answered = service.answer(request, show, decoded) if isinstance(request, AnswerRequest) else None
+        simulation = service.simulate(request, show, decoded) if answered is None else answered.simulation
+    result = answered or simulation
+    assert result is not None
+    written = [] if out is None else save(service, result, out, formats)
+    if as_json:
+        print(result.model_dump_json(indent=2))
+    if simulation is not None:
+        print_stages(console, simulation)
+    if answered is not None:
+        console.print(answer_table(answered))
+        if answered.reasoning:
+            console.print(f"[dim]reasoning[/]: {escape(answered.reasoning)}")
+    own = () if answered is None else answered.warnings
+    for warning in (*(() if simulation is None else simulation.warnings), *own):
+        console.print(f"[yellow]warning[/]: {escape(warning)}")
+    problem = None if answered is None else answered.simulation_problem
+    if problem is not None and (hint := HINTS.get(problem.code)):
+        console.print(hint)
+    if written:
+        console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
+    return simulation
 
 
 @contextmanager
@@ -145,57 +108,38 @@ def print_stages(console: Console, simulation: Simulation) -> None:
     way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"
     if motion.depth:
         way += " and towards the camera" if motion.depth < 0 else " and away from the camera"
-    speed = f", {motion.speed:.0f} px/s" if motion.kind in DIRECTED_KINDS else ""
+    speed = f", {motion.speed:.0f} px/s" if motion.kind in records.DIRECTED_KINDS else ""
     video = f", {simulation.video.num_frames}-frame video" if simulation.video else ""
     lines = {
         "grounding": f"{grounding.object} at ({x:.0f}, {y:.0f}), from {grounding.source}",
         "motion": f"{motion.kind}{way}{speed}, from {motion.cue}",
-        "trajectory": f"{encounters_words(trajectory)}, law {trajectory.law}",
+        "trajectory": f"{display.encounters_words(trajectory)}, law {trajectory.law}",
         "generation": f"{len(simulation.frames)} frames{video}, by {simulation.generator.name}",
     }
     for stage, line in lines.items():
         console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {escape(line)}")
-    if contacts := contacts_words(trajectory):
+    if contacts := display.contacts_words(trajectory):
         console.print(f"[dim]contacts[/]: {escape(contacts)}")
-    if trajectory.outcome is not None and (outcome := outcome_words(trajectory.outcome)):
+    if trajectory.outcome is not None and (outcome := display.outcome_words(trajectory.outcome)):
         console.print(f"[dim]outcome[/]: {escape(outcome)}")
 
 
-def print_warnings(console: Console, warnings: Iterable[str]) -> None:
-    """Prints a line for each warning."""
-    for warning in warnings:
-        console.print(f"[yellow]warning[/]: {escape(warning)}")
-
-
-def make_folder(out: Path) -> None:
-    """Creates the folder for the results: before the work, so that its results are not lost."""
-    with writable(out):
-        out.mkdir(parents=True, exist_ok=True)
-
-
-def save(service: Service, result: Simulation | Answer, out: Path) -> list[str]:
-    """Writes frames, video, overlay and the result as JSON into a folder; returns their names."""
-    artifacts, documents = artifacts_of(result), documents_of(result)
+def save(service: Service, result: Simulation | Answer, out: Path, formats: Sequence[str]) -> list[str]:
+    """Writes frames, video, overlay, the result as JSON and the clip in other formats; returns the names of files."""
+    artifacts, documents, made = records.artifacts_of(result), records.documents_of(result), dict[str, Any]()
     with writable(out):
         for name, sha256 in artifacts.items():
             (out / name).write_bytes(service.artifacts.read(sha256))
         for name, text in documents.items():
             (out / name).write_text(text, encoding="utf-8")
-    return [*artifacts, *documents]
+        if formats:
+            from cow_service.media import video  # noqa: PLC0415 # FFmpeg's bindings take long to import
 
-
-def _save_formats(out: Path, formats: Sequence[str]) -> list[str]:
-    """Writes the clip of a folder in other forms; returns their names."""
-    if not formats:
-        return []
-    from cow_service.media.video import FORMATS, frames_of  # noqa: PLC0415 # FFmpeg's bindings take long to import
-
-    frames, fps = frames_of((out / "video.mp4").read_bytes())
-    made = dict(FORMATS[each] for each in formats)
-    with writable(out):
-        for name, make in made.items():
-            (out / name).write_bytes(make(frames, fps))
-    return list(made)
+            frames, fps = video.frames_of((out / records.VIDEO_FILE).read_bytes())
+            made = dict(video.FORMATS[each] for each in formats)
+            for name, make in made.items():
+                (out / name).write_bytes(make(frames, fps))
+    return [*artifacts, *documents, *made]
 
 
 @contextmanager
@@ -208,7 +152,7 @@ def writable(out: Path) -> Generator[None]:
         raise FolderNotWritable(detail) from error
 
 
-def print_models(models: Models, *, as_json: bool) -> None:
+def print_models(models: records.Models, *, as_json: bool) -> None:
     """Prints a table of backends, or their JSON."""
     if as_json:
         print(models.model_dump_json(indent=2))
@@ -216,7 +160,7 @@ def print_models(models: Models, *, as_json: bool) -> None:
     table = Table("role", "name", "ready", "what it is", box=None, pad_edge=False)
     for role, backends in (("reader", models.readers), ("generator", models.generators)):
         for backend in backends:
-            words = escape(readiness_words(backend))
+            words = escape(display.readiness_words(backend))
             ready = words if backend.ready is None else f"[{'green' if backend.ready else 'yellow'}]{words}[/]"
             table.add_row(role, backend.name + (" (default)" if backend.default else ""), ready, backend.summary)
     console = Console()
@@ -224,19 +168,25 @@ def print_models(models: Models, *, as_json: bool) -> None:
     console.print(f"\nCOW_MLLM takes one of these, or provider:model: {', '.join(models.mllms)}", highlight=False)
 
 
-def _answer_table(answer: Answer) -> Table:
+def answer_table(answer: Answer) -> Table:
+    """What was answered, and what it rests on and cost."""
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(style="bold")
     table.add_column()
     table.add_row("answer", _verdict(answer))
     if sum(answer.votes.values()) > 1:
-        table.add_row("votes", _votes(answer))
+        table.add_row("votes", escape(display.votes_words(answer)))
     if answer.baseline is not None:
-        table.add_row("without frames", f"{_verdict(answer.baseline)}, votes {_votes(answer.baseline)}")
+        table.add_row(
+            "without frames", f"{_verdict(answer.baseline)}, votes {escape(display.votes_words(answer.baseline))}"
+        )
     if answer.gate is not None:
-        table.add_row("before looking", escape(gate_words(answer.gate)))
+        table.add_row("before looking", escape(display.gate_words(answer.gate)))
     usage, total = answer.usage, answer.usage_total
-    table.add_row("tokens", asked_words(usage) + ("" if usage == total else f"; without reuse {asked_words(total)}"))
+    table.add_row(
+        "tokens",
+        display.asked_words(usage) + ("" if usage == total else f"; without reuse {display.asked_words(total)}"),
+    )
     table.add_row("time", f"{sum(answer.timings.values()):.2f} s")
     model = answer.reader.model
     table.add_row("reader", escape(answer.reader.name if model is None else f"{answer.reader.name} ({model})"))
@@ -248,10 +198,6 @@ def _verdict(verdict: Verdict) -> str:
         return "[yellow]not sure[/]"
     text = verdict.answer if verdict.option is None else f"({verdict.answer}) {verdict.option}"
     return f"[yellow]{escape(text)}[/]" if verdict.not_sure else f"[green]{escape(text)}[/]"
-
-
-def _votes(verdict: Verdict) -> str:
-    return ", ".join(f"{escape(name)}: {count}" for name, count in verdict.votes.items())
 
 
 # `cow doctor`
@@ -282,7 +228,7 @@ class Report(BaseModel):
     data_folder: str
     free_disk_gb: float | None
     problem: str | None
-    backends: list[BackendInfo]
+    backends: list[records.BackendInfo]
     unserved: list[Unserved]  # jobs that wait, and that no process takes
     jobs_problem: str | None  # why the job database could not be read
 
@@ -293,20 +239,21 @@ class Report(BaseModel):
 
 
 def examine(service: Service) -> Report:
-    """Inspects this installation and its job database. Imports no model library, and writes only an empty file, which
-    it removes."""
-    problem = None
+    """Inspects this installation and its job database.
+
+    Imports no model library, and writes only an empty file, which it removes.
+    """
+    problem = jobs_problem = None
+    unserved: tuple[Unserved, ...] = ()
     try:
         service.check()
     except CowError as error:
         problem = f"{error.code}: {error.detail}"
-    models = service.models()
-    unserved: tuple[Unserved, ...] = ()
-    jobs_problem = None
     try:
         unserved = unserved_jobs(service.settings)
     except CowError as error:
         jobs_problem = f"{error.code}: {error.detail}"
+    models = service.models()
     installed = {distribution.name.lower(): distribution.version for distribution in distributions()}
     folder = service.settings.data_dir
     while not folder.exists() and folder != folder.parent:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
-from cow_service.cli.options import printable
+from cow_service.cli.options import Texts, argument, option, printable
 from cow_service.errors import CowError
 
 INSTALL = 'pip install "cow-service[evals]"'
@@ -41,10 +41,9 @@ app = typer.Typer(
     help="Measure whether imagination helps: cow eval DATA asks, cow eval report RUNS compares.",
 )
 
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; one in it is gone on with.")]
+Out = Annotated[Path, option("Folder of the run; one in it is gone on with.", "--out", "-o")]
 Prices = Annotated[
-    Path | None,
-    typer.Option(help="YAML or JSON: {MODEL: {input: 1.25, output: 10}}, per million tokens.", show_default="none"),
+    Path | None, option("YAML or JSON: {MODEL: {input: 1.25, output: 10}}, per million tokens.", shown="none")
 ]
 
 
@@ -52,57 +51,49 @@ Prices = Annotated[
 def run(
     data: Annotated[
         str,
-        typer.Argument(
-            help="A folder in CausalSpatial's layout, a folder of scenes, a file (JSONL, CSV, TSV, Parquet), or the "
-            "name of a data set of the Hugging Face hub, such as Mwxinnn/CausalSpatial."
+        argument(
+            "A folder in CausalSpatial's layout, a folder of scenes, a file (JSONL, CSV, TSV, Parquet), or the "
+            "name of a data set of the Hugging Face hub, such as Mwxinnn/CausalSpatial.",
+            None,
         ),
     ],
     out: Out,
     mllm: Annotated[
-        str | None,
-        typer.Option(help="The multimodal LLM, as Inspect names it: openai/gpt-5.", show_default="the embedded reader"),
+        str | None, option("The multimodal LLM, as Inspect names it: openai/gpt-5.", shown="the embedded reader")
     ] = None,
     arm: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="never, always, auto, best-of-K, placebo-still, placebo-direction, encounters, frames-only, oracle; "
+        Texts,
+        option(
+            "never, always, auto, best-of-K, placebo-still, placebo-direction, encounters, frames-only, oracle; "
             "may be repeated, or several with commas.",
-            show_default="never,always",
+            shown="never,always",
         ),
     ] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="How often each question is asked in each arm.")] = 1,
+    repeats: Annotated[int, option("How often each question is asked in each arm.", min=1)] = 1,
     ask: Annotated[
         Literal["prompt", "answer"] | None,
-        typer.Option(
-            help="prompt: the paper's prompt, with frames of /simulate; answer: the service's own /answer.",
-            show_default="prompt with --mllm, else answer",
+        option(
+            "prompt: the paper's prompt, with frames of /simulate; answer: the service's own /answer.",
+            shown="prompt with --mllm, else answer",
         ),
     ] = None,
-    subset: Annotated[
-        list[str] | None, typer.Option(help="Of CausalSpatial's layout only these; may be repeated.")
-    ] = None,
-    limit: Annotated[
-        int | None, typer.Option(min=1, help="Only the first so many questions.", show_default="all")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of the order in which options are shown.")] = 0,
+    subset: Annotated[Texts, option("Of CausalSpatial's layout only these; may be repeated.")] = None,
+    limit: Annotated[int | None, option("Only the first so many questions.", min=1, shown="all")] = None,
+    seed: Annotated[int, option("Of the order in which options are shown.")] = 0,
     reader: Annotated[
-        str | None, typer.Option(help="Who grounds and reads motion for the imagination.", show_default="the server's")
+        str | None, option("Who grounds and reads motion for the imagination.", shown="the server's")
     ] = None,
-    generator: Annotated[str | None, typer.Option(help="Who makes its frames.", show_default="the server's")] = None,
-    url: Annotated[
-        str | None, typer.Option(help="The COW server.", show_default="one is started in this process")
-    ] = None,
-    base_url: Annotated[
-        str | None, typer.Option(help="Where the multimodal LLM is served.", show_default="the provider's")
-    ] = None,
-    temperature: Annotated[float | None, typer.Option(help="Of its replies.", show_default="the provider's")] = None,
-    max_tokens: Annotated[int | None, typer.Option(min=1, help="Of a reply.", show_default="8192")] = None,
-    concurrency: Annotated[int, typer.Option(min=1, help="Questions at the same time, in each arm.")] = 8,
+    generator: Annotated[str | None, option("Who makes its frames.", shown="the server's")] = None,
+    url: Annotated[str | None, option("The COW server.", shown="one is started in this process")] = None,
+    base_url: Annotated[str | None, option("Where the multimodal LLM is served.", shown="the provider's")] = None,
+    temperature: Annotated[float | None, option("Of its replies.", shown="the provider's")] = None,
+    max_tokens: Annotated[int | None, option("Of a reply.", min=1, shown="8192")] = None,
+    concurrency: Annotated[int, option("Questions at the same time, in each arm.", min=1)] = 8,
     skip_faulty: Annotated[
-        bool, typer.Option("--skip-faulty", help="Leave out rows that cannot be asked, and columns that mean nothing.")
+        bool, option("Leave out rows that cannot be asked, and columns that mean nothing.", "--skip-faulty")
     ] = False,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Ask those again that failed.")] = False,
-    log_images: Annotated[bool, typer.Option(help="Keep pictures in Inspect's logs, for inspect view.")] = True,
+    retry_failed: Annotated[bool, option("Ask those again that failed.", "--retry-failed")] = False,
+    log_images: Annotated[bool, option("Keep pictures in Inspect's logs, for inspect view.")] = True,
     prices: Prices = None,
 ) -> None:
     """Ask every question in every arm, and report. `cow eval report RUNS` compares runs.
@@ -130,21 +121,19 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED) from None
     _report([done], out / REPORT, priced)
     failed = sum(each.failure is not None for each in done.observations)
+    unasked = len(done.items) * len(done.info.arms) * done.info.repeats - len(done.observations)
     if failed:
         typer.echo(f"{failed} questions failed; the report says why. --retry-failed asks them again.", err=True)
-        raise typer.Exit(EXIT_SOME_FAILED)
-    unasked = len(done.items) * len(done.info.arms) * done.info.repeats - len(done.observations)
-    if unasked:
+    elif unasked:
         typer.echo(f"{unasked} questions were not asked. The same command goes on with it.", err=True)
+    if failed or unasked:
         raise typer.Exit(EXIT_SOME_FAILED)
 
 
 @app.command()
 def report(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUNS", help="Folders that `cow eval --out` wrote.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the report.", show_default="RUN/report")
-    ] = None,
+    runs: Annotated[list[Path], argument("Folders that `cow eval --out` wrote.", "RUNS")],
+    out: Annotated[Path | None, option("Folder for the report.", "--out", "-o", shown="RUN/report")] = None,
     prices: Prices = None,
 ) -> None:
     """Compare runs: tables, plots and a page that opens without a server."""

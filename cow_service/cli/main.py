@@ -11,7 +11,7 @@ import typer
 
 from cow_service import __version__
 from cow_service.cli import batch, eval, models, options, server
-from cow_service.cli.options import Commands, with_request_options
+from cow_service.cli.options import AsJson, Commands, Texts, Url, option, with_request_options
 from cow_service.cli.server import open_service
 
 app = typer.Typer(
@@ -32,9 +32,7 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def main(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
-    ] = False,
+    version: Annotated[bool, option("Show the version.", "--version", callback=_version, is_eager=True)] = False,
 ) -> None:
     """Look before you answer: imagine the future of an image."""
 
@@ -44,16 +42,14 @@ def main(
 def simulate(
     image: options.Image,
     question: options.Question,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the results.", show_default="./<image>-cow")
-    ] = None,
-    video: Annotated[bool, typer.Option(help="Make the mp4.")] = True,
+    out: Annotated[Path | None, option("Folder for the results.", "--out", "-o", shown="./<image>-cow")] = None,
+    video: Annotated[bool, option("Make the mp4.")] = True,
     formats: Annotated[
         list[options.Format] | None,
-        typer.Option("--format", help="Also an animated gif or webp, or a contact sheet; may be repeated."),
+        option("Also an animated gif or webp, or a contact sheet; may be repeated.", "--format"),
     ] = None,
-    open_it: Annotated[bool, typer.Option("--open", help="Open the video, or the overlay, when it is done.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the simulation as JSON, and nothing else.")] = False,
+    open_it: Annotated[bool, option("Open the video, or the overlay, when it is done.", "--open")] = False,
+    as_json: Annotated[bool, option("Print the simulation as JSON, and nothing else.", "--json")] = False,
     *,
     request: dict[str, Any],
 ) -> None:
@@ -61,28 +57,30 @@ def simulate(
 
     They go into a folder, with simulation.json.
     """
-    from cow_service.cli.console import run_simulation  # noqa: PLC0415
+    from cow_service.cli.console import run_request  # noqa: PLC0415
+    from cow_service.requests import SimulateRequest  # noqa: PLC0415
 
     body = {**request, "question": question, "video": video}
     out = out or Path(f"{image.stem}-cow")
     with open_service() as service:
-        simulation = run_simulation(service, image, body, out, tuple(formats or ()), as_json=as_json)
-    if open_it:
+        simulation = run_request(service, SimulateRequest, image, body, out, formats or (), as_json=as_json)
+    if open_it and simulation is not None:
         typer.launch(str(out / ("video.mp4" if video else simulation.overlay_name)))
 
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("cow-demo"),
-    open_it: Annotated[bool, typer.Option("--open", help="Open the video when it is done.")] = False,
+    out: Annotated[Path, option("Folder for the results.", "--out", "-o")] = Path("cow-demo"),
+    open_it: Annotated[bool, option("Open the video when it is done.", "--open")] = False,
 ) -> None:
     """Imagine the future of an example: a ball is pushed towards a mug."""
-    from cow_service.cli.console import run_simulation  # noqa: PLC0415
+    from cow_service.cli.console import run_request  # noqa: PLC0415
+    from cow_service.requests import SimulateRequest  # noqa: PLC0415
     from cow_service.weights.manifests import EXAMPLES  # noqa: PLC0415
 
     question = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
     with open_service() as service, as_file(EXAMPLES["ball-and-mug"].file("image")) as image:
-        run_simulation(service, image, {"question": question, "frames": {"policy": "events"}}, out, as_json=False)
+        run_request(service, SimulateRequest, image, {"question": question, "frames": {"policy": "events"}}, out)
     if open_it:
         typer.launch(str(out / "video.mp4"))
 
@@ -93,28 +91,28 @@ def answer(
     image: options.Image,
     question: options.Question,
     choice: Annotated[
-        list[str] | None,
-        typer.Option(
+        Texts,
+        option(
+            "An answer to choose from, in order A, B, C...; may be repeated.",
             metavar="TEXT",
-            help="An answer to choose from, in order A, B, C...; may be repeated.",
-            show_default="those in the question",
+            shown="those in the question",
         ),
     ] = None,
     imagine: Annotated[
         Literal["always", "auto", "never"],
-        typer.Option(help="Simulate first; auto: only where answers from the image alone disagree or are not sure."),
+        option("Simulate first; auto: only where answers from the image alone disagree or are not sure."),
     ] = "always",
-    no_imagine: Annotated[bool, typer.Option("--no-imagine", help="The same as --imagine never.")] = False,
-    imagine_votes: Annotated[int, typer.Option(help="Of --imagine auto: votes before anything is imagined.")] = 3,
+    no_imagine: Annotated[bool, option("The same as --imagine never.", "--no-imagine")] = False,
+    imagine_votes: Annotated[int, option("Of --imagine auto: votes before anything is imagined.")] = 3,
     imagine_threshold: Annotated[
-        float, typer.Option(help="Of --imagine auto: share of them that agrees, for nothing to be imagined.")
+        float, option("Of --imagine auto: share of them that agrees, for nothing to be imagined.")
     ] = 1.0,
-    votes: Annotated[int, typer.Option(help="How often to ask; the most frequent answer is taken.")] = 1,
-    baseline: Annotated[bool, typer.Option("--baseline", help="Answer without frames, too, for comparison.")] = False,
+    votes: Annotated[int, option("How often to ask; the most frequent answer is taken.")] = 1,
+    baseline: Annotated[bool, option("Answer without frames, too, for comparison.", "--baseline")] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the simulation and answer.json.", show_default="none")
+        Path | None, option("Folder for the simulation and answer.json.", "--out", "-o", shown="none")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as JSON, and nothing else.")] = False,
+    as_json: Annotated[bool, option("Print the answer as JSON, and nothing else.", "--json")] = False,
     *,
     request: dict[str, Any],
 ) -> None:
@@ -122,7 +120,8 @@ def answer(
 
     Shows the answer, the votes, the baseline, tokens and time.
     """
-    from cow_service.cli.console import run_answer  # noqa: PLC0415
+    from cow_service.cli.console import run_request  # noqa: PLC0415
+    from cow_service.requests import AnswerRequest  # noqa: PLC0415
 
     body = {
         **request,
@@ -136,11 +135,11 @@ def answer(
         "video": out is not None,
     }
     with open_service() as service:
-        run_answer(service, image, body, out, as_json=as_json)
+        run_request(service, AnswerRequest, image, body, out, as_json=as_json)
 
 
 @app.command()
-def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+def doctor(as_json: AsJson = False) -> None:
     """Show what is installed, and what each backend lacks.
 
     Names the command that installs it.
@@ -168,10 +167,8 @@ def openapi() -> None:
 
 @app.command()
 def top(
-    url: Annotated[
-        str | None, typer.Option(help="The server.", show_default="COW_BASE_URL, http://127.0.0.1:8000")
-    ] = None,
-    once: Annotated[bool, typer.Option("--once", help="Print one picture, and end.")] = False,
+    url: Url = None,
+    once: Annotated[bool, option("Print one picture, and end.", "--once")] = False,
 ) -> None:
     """Show processes, workers and queues of a server, until Ctrl-C.
 

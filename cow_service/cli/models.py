@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from cow_service.cli.options import EXISTING, AsJson, Texts, argument, option
 from cow_service.errors import InvalidRequest
 
 if TYPE_CHECKING:
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(rich_markup_mode=None, help="List readers and generators; pull and check weights.")
 
-Name = Annotated[str, typer.Argument(metavar="NAME", help="As `cow models` lists it.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Name = Annotated[str, argument("As `cow models` lists it.", "NAME")]
 
 
 @app.callback(invoke_without_command=True)
@@ -43,11 +43,11 @@ def models(context: typer.Context, as_json: AsJson = False) -> None:
 def pull(
     name: Name,
     revision: Annotated[
-        list[str] | None,
-        typer.Option(
+        Texts,
+        option(
+            "Branch, tag or commit, of all parts or of one; may be repeated.",
             metavar="[PART=]REV",
-            help="Branch, tag or commit, of all parts or of one; may be repeated.",
-            show_default="what was pulled before, else the newest",
+            shown="what was pulled before, else the newest",
         ),
     ] = None,
 ) -> None:
@@ -218,10 +218,8 @@ ANCHOR_MAX_MOVE_PX = 1.0  # a track that never moves further from its start is a
 
 @tracks.command(name="export")
 def export_tracks(
-    simulation: Annotated[
-        Path, typer.Argument(metavar="SIMULATION", help="A simulation.json.", exists=True, dir_okay=False)
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="tracks.pth or .npz for ATI, tracks.npy for Wan-Move.")],
+    simulation: Annotated[Path, argument("A simulation.json.", "SIMULATION", **EXISTING)],
+    out: Annotated[Path, option("tracks.pth or .npz for ATI, tracks.npy for Wan-Move.", "--out", "-o")],
 ) -> None:
     """Write a simulation's tracks, in pixels of its input image: of what moves, the mover's first, then the anchors."""
     from pydantic import ValidationError  # noqa: PLC0415
@@ -245,17 +243,12 @@ def export_tracks(
 
 @tracks.command(name="import")
 def import_tracks(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help=".pth, .npz or .npy.", exists=True, dir_okay=False)],
+    file: Annotated[Path, argument(".pth, .npz or .npy.", "FILE", **EXISTING)],
     visibility: Annotated[
-        Path | None,
-        typer.Option(
-            help="Wan-Move's other file.", exists=True, dir_okay=False, show_default="FILE's name with -visibility"
-        ),
+        Path | None, option("Wan-Move's other file.", **EXISTING, shown="FILE's name with -visibility")
     ] = None,
-    fps: Annotated[float, typer.Option(help="Frames per second of the clip.")] = 16,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Where to write it.", show_default="standard output")
-    ] = None,
+    fps: Annotated[float, option("Frames per second of the clip.")] = 16,
+    out: Annotated[Path | None, option("Where to write it.", "--out", "-o", shown="standard output")] = None,
 ) -> None:
     """Turn a track file into the `trajectory` of a request, for `cow simulate --trajectory` or `POST /simulate`.
 

@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from enum import StrEnum
 from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 from typer.core import TyperGroup
 
 from cow_service.errors import CowError, InvalidRequest
+
+if TYPE_CHECKING:
+    from cow_service.client import Client
 
 _GIVE_PLACE = (
     "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME) for what moves, --other NAME=X0,Y0,X1,Y1 for the rest."
@@ -57,7 +61,11 @@ class Commands(TyperGroup):
                 typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
             raise typer.Exit(1) from error
         except typer.BadParameter as error:
-            error.message = _own_words(error)
+            from pydantic import ValidationError  # noqa: PLC0415 - its import would slow down --help
+
+            if isinstance(error.__cause__, ValidationError):  # without what typer puts before it ("Value error, ")
+                raised = error.__cause__.errors()[0].get("ctx", {}).get("error")
+                error.message = str(raised) if isinstance(raised, ValueError) else error.message
             raise
         except Exception as error:
             from cow_service.settings import SettingsError  # noqa: PLC0415 - its import would slow down --help
@@ -68,19 +76,33 @@ class Commands(TyperGroup):
             raise typer.Exit(2) from error
 
 
-def _own_words(error: typer.BadParameter) -> str:
-    """What is wrong with an option, without what the validator of typer puts before it ("Value error, ")."""
-    from pydantic import ValidationError  # noqa: PLC0415 - its import would slow down --help
-
-    if not isinstance(error.__cause__, ValidationError):
-        return error.message
-    raised = error.__cause__.errors()[0].get("ctx", {}).get("error")
-    return str(raised) if isinstance(raised, ValueError) else error.message
-
-
 def printable(text: str) -> str:
     """The text without characters that control a terminal: control codes, escapes, marks of writing direction."""
     return "".join(character if character.isprintable() or character == "\n" else "\ufffd" for character in text)
+
+
+def option(help: str, *names: str, shown: str | None = None, **more: Any) -> Any:
+    """The declaration of an option; `shown` is what the help calls its default, where that has no value of its own."""
+    return typer.Option(*names, help=help, show_default=shown or True, **more)
+
+
+def argument(help: str, name: str | None, **more: Any) -> Any:
+    """The declaration of an argument."""
+    return typer.Argument(metavar=name, help=help, **more)
+
+
+EXISTING: dict[str, Any] = {"exists": True, "dir_okay": False}  # of a path: a file that is there
+Image = Annotated[Path, argument("PNG, JPEG or WebP.", "IMAGE", readable=True, **EXISTING)]
+Question = Annotated[
+    str, argument('For example "If the red ball moves to the left, will it hit the vase?"', "QUESTION")
+]
+Url = Annotated[str | None, option("The server.", shown="COW_BASE_URL, http://127.0.0.1:8000")]
+AsJson = Annotated[bool, option("Print JSON.", "--json")]
+Texts = list[str] | None
+Policy = Literal["initial", "uniform", "events"]
+Kind = Literal["linear", "projectile", "fall", "static"]
+Law = Literal["contact", "ballistic"]
+Until = Literal["contact"]
 
 
 class Format(StrEnum):
@@ -89,19 +111,6 @@ class Format(StrEnum):
     GIF = "gif"
     WEBP = "webp"
     SHEET = "sheet"
-
-
-Policy = Literal["initial", "uniform", "events"]
-Kind = Literal["linear", "projectile", "fall", "static"]
-Law = Literal["contact", "ballistic"]
-Until = Literal["contact"]
-Image = Annotated[
-    Path, typer.Argument(metavar="IMAGE", help="PNG, JPEG or WebP.", exists=True, dir_okay=False, readable=True)
-]
-Question = Annotated[
-    str,
-    typer.Argument(metavar="QUESTION", help='For example "If the red ball moves to the left, will it hit the vase?"'),
-]
 
 
 # Where an option stands in the request. Typer needs their declarations below before pydantic could be imported: a test
@@ -126,84 +135,74 @@ _SAME_NAME = ("ensemble", "reader", "generator", "num_frames", "fps", "seed")
 
 
 def request_body(
-    point: Annotated[str | None, typer.Option(help="X,Y of a point on the object that moves, px.")] = None,
-    box: Annotated[str | None, typer.Option(help="X0,Y0,X1,Y1 of the object that moves, px.")] = None,
+    point: Annotated[str | None, option("X,Y of a point on the object that moves, px.")] = None,
+    box: Annotated[str | None, option("X0,Y0,X1,Y1 of the object that moves, px.")] = None,
     name: Annotated[
-        str | None, typer.Option("--object", help="What the object is called, with --point, --box or --trajectory.")
+        str | None, option("What the object is called, with --point, --box or --trajectory.", "--object")
     ] = None,
-    direction: Annotated[str | None, typer.Option(help="DX,DY of the motion, px, x right, y down.")] = None,
+    direction: Annotated[str | None, option("DX,DY of the motion, px, x right, y down.")] = None,
     kind: Annotated[
-        Kind | None,
-        typer.Option(help="Kind of motion, with --direction (or alone for fall and static).", show_default="linear"),
+        Kind | None, option("Kind of motion, with --direction (or alone for fall and static).", shown="linear")
     ] = None,
-    speed: Annotated[float | None, typer.Option(help="px/s.", show_default="0.26 widths/s")] = None,
-    distance: Annotated[float | None, typer.Option(help="px, after which it is stopped.")] = None,
-    duration: Annotated[float | None, typer.Option(help="Seconds, after which it is stopped.")] = None,
-    until: Annotated[Until | None, typer.Option(help="contact: stopped where it first meets something.")] = None,
-    remove: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Taken away before the motion; may be repeated.")
-    ] = None,
+    speed: Annotated[float | None, option("px/s.", shown="0.26 widths/s")] = None,
+    distance: Annotated[float | None, option("px, after which it is stopped.")] = None,
+    duration: Annotated[float | None, option("Seconds, after which it is stopped.")] = None,
+    until: Annotated[Until | None, option("contact: stopped where it first meets something.")] = None,
+    remove: Annotated[Texts, option("Taken away before the motion; may be repeated.", metavar="NAME")] = None,
     place: Annotated[
-        list[str] | None,
-        typer.Option(metavar="THING RELATION THING", help='Such as "apple into bowl"; may be repeated.'),
+        Texts, option('Such as "apple into bowl"; may be repeated.', metavar="THING RELATION THING")
     ] = None,
     law: Annotated[
-        Law | None,
-        typer.Option(help="contact: floor, bounces, pushes; ballistic: through everything.", show_default="contact"),
+        Law | None, option("contact: floor, bounces, pushes; ballistic: through everything.", shown="contact")
     ] = None,
     other: Annotated[
-        list[str] | None,
-        typer.Option(
+        Texts,
+        option(
+            'Another object and its box (or X,Y of a point on it), such as "red mug=10,20,90,140"; may be repeated.',
             metavar="NAME=X0,Y0,X1,Y1",
-            help='Another object and its box (or X,Y of a point on it), such as "red mug=10,20,90,140"; '
-            "may be repeated.",
         ),
     ] = None,
-    ensemble: Annotated[int, typer.Option(help="How many worlds the probabilities are counted in; 0: none.")] = 50,
+    ensemble: Annotated[int, option("How many worlds the probabilities are counted in; 0: none.")] = 50,
     trajectory: Annotated[
         Path | None,
-        typer.Option(
-            help="JSON with the `trajectory` of a request, as `cow tracks import` makes it.",
-            exists=True,
-            dir_okay=False,
-        ),
+        option("JSON with the `trajectory` of a request, as `cow tracks import` makes it.", **EXISTING),
     ] = None,
     fields: Annotated[
         str | None,
-        typer.Option(
-            "--request",
-            metavar="JSON",
-            help='Other fields of the request: {"camera": {"pitch": 25}}.',
-            show_default="none",
-        ),
+        option('Other fields of the request: {"camera": {"pitch": 25}}.', "--request", metavar="JSON", shown="none"),
     ] = None,
-    reader: Annotated[str | None, typer.Option(help="Who looks at the image.", show_default="COW_READER")] = None,
-    generator: Annotated[str | None, typer.Option(help="Who makes the frames.", show_default="COW_GENERATOR")] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="An option of the generator, such as steps=20; may be repeated."),
+    reader: Annotated[str | None, option("Who looks at the image.", shown="COW_READER")] = None,
+    generator: Annotated[str | None, option("Who makes the frames.", shown="COW_GENERATOR")] = None,
+    own: Annotated[
+        Texts,
+        option("An option of the generator, such as steps=20; may be repeated.", "--option", metavar="NAME=VALUE"),
     ] = None,
-    num_frames: Annotated[int, typer.Option(help="Frames of the clip.")] = 81,
-    fps: Annotated[float, typer.Option(help="Frames per second.")] = 16,
-    seed: Annotated[
-        int | None, typer.Option(help="For what draws random numbers.", show_default="0, and none for an MLLM")
-    ] = None,
-    frames: Annotated[Policy, typer.Option(help="Which frames to keep as pictures.")] = "events",
-    count: Annotated[int, typer.Option(help="How many of them.")] = 3,
-    max_side: Annotated[int, typer.Option(help="Their longest side, px; 0 for the clip's own size.")] = 512,
+    num_frames: Annotated[int, option("Frames of the clip.")] = 81,
+    fps: Annotated[float, option("Frames per second.")] = 16,
+    seed: Annotated[int | None, option("For what draws random numbers.", shown="0, and none for an MLLM")] = None,
+    frames: Annotated[Policy, option("Which frames to keep as pictures.")] = "events",
+    count: Annotated[int, option("How many of them.")] = 3,
+    max_side: Annotated[int, option("Their longest side, px; 0 for the clip's own size.")] = 512,
 ) -> dict[str, Any]:
     """The fields of the request that both commands have. Raises `InvalidRequest` naming the option that is wrong."""
     given = locals()
-    body: dict[str, Any] = {option: given[option] for option in _SAME_NAME}
-    body["generator_options"] = dict(map(_name_and_value, option or []))
+    body: dict[str, Any] = {name: given[name] for name in _SAME_NAME}
+    body["generator_options"] = {}
+    for text in own or []:
+        own_name, equals, own_value = text.partition("=")
+        if not own_name or not equals:
+            raise InvalidRequest(f"--option takes NAME=VALUE, such as steps=20; got '{text}'.")
+        body["generator_options"][own_name] = own_value
+        with suppress(ValueError):  # a value that is no JSON is text
+            body["generator_options"][own_name] = json.loads(own_value)
     body["objects"] = [_other_object(text) for text in other or []]
     removed = ({"kind": "remove", "object": thing} for thing in remove or [])
     body["interventions"] = [*removed, *map(_placement, place or [])]
-    numbers = {each: _numbers(f"--{each}", given[each], size) for each, size in _NUMBERS.items() if given[each]}
     for option_name, path in FIELDS.items():
-        value = numbers.get(option_name, given[option_name])
-        if value is not None:
+        if (value := given[option_name]) is not None:
             record, _, field = path.partition("/")
+            if option_name in _NUMBERS:
+                value = _numbers(f"--{option_name}", value, _NUMBERS[option_name])
             body.setdefault(record, {})[field] = value
     body["frames"]["max_side"] = max_side or None
     if trajectory is not None:
@@ -230,6 +229,16 @@ def with_request_options(command: Callable[..., None]) -> Callable[..., None]:
     keyword_only = [parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in (*own, *shared.values())]
     cast("Any", with_options).__signature__ = signature(command).replace(parameters=keyword_only)
     return with_options
+
+
+def open_client(url: str | None, **named: Any) -> Client:
+    """A client of the SDK. Raises `InvalidRequest` for what is no address."""
+    from cow_service.client import Client  # noqa: PLC0415
+
+    try:
+        return Client(url, **named)
+    except ValueError as error:
+        raise InvalidRequest(f"{error}.") from error
 
 
 def read_file(path: Path) -> bytes:
@@ -288,14 +297,3 @@ def _other_object(text: str) -> dict[str, object]:
     is_point = place.count(",") == 1
     field, count = ("point", 2) if is_point else ("bbox", 4)
     return {"object": name.strip(), field: _numbers("--other NAME=", place, count)}
-
-
-def _name_and_value(given: str) -> tuple[str, object]:
-    """An option of the generator; a value that is no JSON is text."""
-    name, equals, text = given.partition("=")
-    if not name or not equals:
-        raise InvalidRequest(f"--option takes NAME=VALUE, such as steps=20; got '{given}'.")
-    try:
-        return name, json.loads(text)
-    except ValueError:
-        return name, text

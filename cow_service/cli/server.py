@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from cow_service.cli.options import Texts, argument, option
 from cow_service.errors import CowError, InvalidRequest
 
 if TYPE_CHECKING:
@@ -28,13 +29,11 @@ keys = typer.Typer(rich_markup_mode=None, help="Create API keys.", no_args_is_he
 
 
 def serve(
-    host: Annotated[str | None, typer.Option(help="Address to listen on.", show_default="COW_HOST, 127.0.0.1")] = None,
-    port: Annotated[
-        int | None, typer.Option(help="Port to listen on; 0 takes a free one.", show_default="COW_PORT, 8000")
-    ] = None,
+    host: Annotated[str | None, option("Address to listen on.", shown="COW_HOST, 127.0.0.1")] = None,
+    port: Annotated[int | None, option("Port to listen on; 0 takes a free one.", shown="COW_PORT, 8000")] = None,
     role: Annotated[
         Literal["all", "api"] | None,
-        typer.Option(help="api: take requests only, and leave the jobs to `cow worker`.", show_default="COW_ROLE, all"),
+        option("api: take requests only, and leave the jobs to `cow worker`.", shown="COW_ROLE, all"),
     ] = None,
 ) -> None:
     """Start the server."""
@@ -56,8 +55,7 @@ def serve(
 
 def worker(
     queues: Annotated[
-        str | None,
-        typer.Option(help="Queues to take jobs from: light, and ati or another name.", show_default="COW_QUEUES, all"),
+        str | None, option("Queues to take jobs from: light, and ati or another name.", shown="COW_QUEUES, all")
     ] = None,
 ) -> None:
     """Compute the jobs of servers on the same job database."""
@@ -94,23 +92,21 @@ class McpNotInstalled(CowError):
 def mcp(
     transport: Annotated[
         Literal["stdio", "http"],
-        typer.Option(help="stdio: with the program that starts this one; http: at --host and --port, /mcp."),
+        option("stdio: with the program that starts this one; http: at --host and --port, /mcp."),
     ] = "stdio",
-    host: Annotated[str, typer.Option(help="Address to listen on, with --transport http.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to listen on; 0 takes a free one.", min=0, max=65535)] = 8001,
+    host: Annotated[str, option("Address to listen on, with --transport http.")] = "127.0.0.1",
+    port: Annotated[int, option("Port to listen on; 0 takes a free one.", min=0, max=65535)] = 8001,
     url: Annotated[
         str | None,
-        typer.Option(
-            help="COW server that does the work; its key is COW_API_KEY, or that of the caller over HTTP.",
+        option(
+            "COW server that does the work; its key is COW_API_KEY, or that of the caller over HTTP.",
             envvar="COW_BASE_URL",
-            show_default="none: this process does it",
+            shown="none: this process does it",
         ),
     ] = None,
     allow_host: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME", help="Another name by which it may be asked, such as that of a proxy; may be repeated."
-        ),
+        Texts,
+        option("Another name by which it may be asked, such as that of a proxy; may be repeated.", metavar="NAME"),
     ] = None,
 ) -> None:
     """Serve `simulate` and `answer` as tools over MCP.
@@ -157,7 +153,7 @@ def _keys() -> None:
 
 @keys.command()
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Whose key it is; logs and limits go by it.")],
+    name: Annotated[str, argument("Whose key it is; logs and limits go by it.", "NAME")],
 ) -> None:
     """Create a key for NAME, and print the setting with which the server accepts it. Nothing is stored."""
     from cow_service.api.middleware.access import hash_of, new_key  # noqa: PLC0415

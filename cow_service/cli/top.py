@@ -12,9 +12,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from cow_service.cli.options import printable
-from cow_service.client import Client
-from cow_service.errors import CowError, InvalidRequest
+from cow_service.cli.options import open_client, printable
+from cow_service.errors import CowError
 from cow_service.records import ProcessInfo, WorkerInfo, Workers
 
 REFRESH_SECONDS = 1.0
@@ -27,11 +26,7 @@ ID_LENGTH = 8  # characters that are shown of a job's id
 def show_processes(url: str | None, *, once: bool) -> None:
     """Shows a new picture each second, or one; one that cannot be had leaves the last one, and says why."""
     console = Console()
-    try:
-        client = Client(url, timeout=TIMEOUT_SECONDS, retries=0)
-    except ValueError as error:
-        raise InvalidRequest(f"{error}.") from error
-    with client:
+    with open_client(url, timeout=TIMEOUT_SECONDS, retries=0) as client:
         shown = picture(client.workers(), client.base_url)
         if once or not console.is_terminal:
             console.print(shown)

@@ -65,15 +65,15 @@ class BatchResult(Generic[R_co]):
 
     def line(self) -> dict[str, Any]:
         """Its line of `results.jsonl`."""
-        head = {"status": self.status, "seconds": round(self.seconds, 3)}
-        if self.error is not None:
-            problem = {"code": self.error.code, **self.error.as_problem()}
-            job = {"job_id": self.error.job_id} if isinstance(self.error, WaitTimeout) else {}
-            return {**head, "problem": {**problem, "request_id": self.error.request_id, **job}}
-        assert self.result is not None
+        line: dict[str, Any] = {"status": self.status, "seconds": round(self.seconds, 3)}
+        if (error := self.error) is not None:
+            problem = {"code": error.code, **error.as_problem(), "request_id": error.request_id}
+            line["problem"] = problem | ({"job_id": error.job_id} if isinstance(error, WaitTimeout) else {})
         if self.unsaved is not None:
-            head["unsaved"] = self.unsaved.detail
-        return {**head, "result": self.result.model_dump(mode="json")}
+            line["unsaved"] = self.unsaved.detail
+        if self.result is not None:
+            line["result"] = self.result.model_dump(mode="json")
+        return line
 
 
 class OutageTimer:

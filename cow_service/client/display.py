@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cow_service import records
 from cow_service.records import (
@@ -21,7 +21,6 @@ from cow_service.records import (
     Trajectory,
     Usage,
     Verdict,
-    Video,
 )
 from cow_service.records.world import BAND_PERCENTILES
 
@@ -46,6 +45,11 @@ def readiness_words(backend: BackendInfo) -> str:
     if backend.ready is None:
         return "unknown"
     return "yes" if backend.ready else f"needs {', '.join(backend.missing) or 'its weights'}"
+
+
+def votes_words(verdict: Verdict) -> str:
+    """How often each was answered."""
+    return ", ".join(f"{answer}: {count}" for answer, count in verdict.votes.items())
 
 
 def gate_words(gate: Gate) -> str:
@@ -99,31 +103,21 @@ def body_name(body: int | None, trajectory: Trajectory) -> str:
 
 def outcome_words(outcome: Outcome) -> str:
     """What the question asks, as the world answers it, and how sure that is."""
-    parts = [outcome.facts.rstrip(".")] if outcome.facts else []
-    value = _value(outcome)
-    if value:
-        parts.append(value)
-    if not outcome.sure:
-        parts.append("not sure")
-    if outcome.depends_on:
-        parts.append(f"it depends on {' and '.join(outcome.depends_on)}")
-    elif outcome.robust and outcome.sure:
-        parts.append("robust")
-    return "; ".join(parts)
-
-
-def _value(outcome: Outcome) -> str:
-    sure = "" if outcome.probability is None else f", {worlds(outcome.probability)}"
-    if outcome.asked.form == "which-first":
-        return f"first: {outcome.first or 'none'}{sure}"
-    if outcome.asked.form == "how-many":
-        return "" if outcome.count is None else f"count: {outcome.count}{sure}"
-    if outcome.asked.form == "when" and outcome.time is not None:
+    form, value = outcome.asked.form, ""
+    share = "" if outcome.probability is None else f", {worlds(outcome.probability)}"
+    if form == "which-first":
+        value = f"first: {outcome.first or 'none'}{share}"
+    elif form == "how-many":
+        value = "" if outcome.count is None else f"count: {outcome.count}{share}"
+    elif form == "when" and outcome.time is not None:
         band = "" if outcome.time_band is None else f" ({outcome.time_band[0]:.1f} to {outcome.time_band[1]:.1f} s)"
-        return f"after {outcome.time:.1f} s{band}{sure}"
-    if outcome.probability is None or outcome.asked.form in ("where", "what-happens"):  # the facts are the answer
-        return ""
-    return f"what is asked happens in {worlds(outcome.probability)}"
+        value = f"after {outcome.time:.1f} s{band}{share}"
+    elif form not in ("where", "what-happens") and outcome.probability is not None:  # of these the facts are the answer
+        value = f"what is asked happens in {worlds(outcome.probability)}"
+    doubt = f"it depends on {' and '.join(outcome.depends_on)}" if outcome.depends_on else ""
+    robust = "robust" if outcome.robust and outcome.sure and not doubt else ""
+    parts = outcome.facts.rstrip("."), value, "" if outcome.sure else "not sure", doubt, robust
+    return "; ".join(filter(None, parts))
 
 
 GetBytes = Callable[[str], bytes | None]  # the bytes of an artifact by its digest, where they are available
@@ -133,7 +127,6 @@ ROW_HEIGHT_PX, PICTURES_PER_ROW, GAP_PX = 240, 4, 6  # of the filmstrip
 # Inherited colours, dimmed by opacity: notebooks are light or dark. Long words of callers and models break.
 TEXT_STYLE = "font:14px/1.45 system-ui,sans-serif;max-width:72em;overflow-wrap:anywhere"
 DIM_STYLE = "opacity:.7"
-_PICTURE = "max-width:100%;border-radius:4px;display:block"
 _PLACEHOLDER = f"border:1px dashed;border-radius:4px;display:grid;place-items:center;{DIM_STYLE}"
 _LONG_TEXT = "white-space:pre-wrap;max-height:14em;overflow:auto;margin:4px 0"
 
@@ -168,27 +161,26 @@ def describe_answer(answer: Verdict) -> str:
 
 def simulation_html(simulation: Simulation, get: GetBytes) -> str:
     """Overlay, video, the frames side by side, and what was found, as HTML that needs nothing from the network."""
-    return _block(escape(simulation.question), _body(simulation, get))
+    return _block(simulation.question, _found(simulation, get))
 
 
 def answer_html(answer: Answer, get: GetBytes) -> str:
     """The answer, then the simulation that it was reasoned on."""
-    parts = [f'<div style="font-size:16px;font-weight:600;{_LONG_TEXT}">{escape(describe_answer(answer))}</div>']
+    body = _line(describe_answer(answer), f"font-size:16px;font-weight:600;{_LONG_TEXT}")
     if answer.reasoning:
-        parts.append(f'<div style="{_LONG_TEXT}">{escape(answer.reasoning)}</div>')
+        body += _line(answer.reasoning, _LONG_TEXT)
     if sum(answer.votes.values()) > 1:
         votes = ", ".join(f"{name} {count}" for name, count in answer.votes.items())
-        parts.append(f'<div style="{DIM_STYLE}">votes: {escape(votes)}</div>')
+        body += _line(f"votes: {votes}", DIM_STYLE)
     if answer.gate is not None:
-        parts.append(f'<div style="{DIM_STYLE}">before looking: {escape(gate_words(answer.gate))}</div>')
+        body += _line(f"before looking: {gate_words(answer.gate)}", DIM_STYLE)
     if answer.baseline is not None:
-        parts.append(f'<div style="{DIM_STYLE}">without frames: {escape(describe_answer(answer.baseline))}</div>')
+        body += _line(f"without frames: {describe_answer(answer.baseline)}", DIM_STYLE)
+    shown: tuple[str, ...] = ()
     if answer.simulation is not None:
-        parts.append(_body(answer.simulation, get))
-        own = [warning for warning in answer.warnings if warning not in answer.simulation.warnings]
-    else:
-        own = list(answer.warnings)
-    return _block(escape(answer.question), "".join(parts) + _warnings(own))
+        body += _found(answer.simulation, get)
+        shown = answer.simulation.warnings
+    return _block(answer.question, body + _notes(warning for warning in answer.warnings if warning not in shown))
 
 
 def filmstrip_png(simulation: Simulation, get: GetBytes) -> bytes | None:
@@ -213,76 +205,61 @@ def filmstrip_png(simulation: Simulation, get: GetBytes) -> bytes | None:
     return buffer.getvalue()
 
 
-def _block(heading: str, body: str) -> str:
-    return f'<div style="{TEXT_STYLE}"><div style="{DIM_STYLE};{_LONG_TEXT}">{heading}</div>{body}</div>'
-
-
-def _body(simulation: Simulation, get: GetBytes) -> str:
-    image = simulation.image
-    trajectory = simulation.trajectory
-    found = "; ".join(filter(None, ("what was found", band_words(trajectory))))
-    large = [_picture(get(simulation.overlay.sha256), image.width / image.height, LARGE_PX, found)]
-    if simulation.video is not None:
-        large.append(_video(get(simulation.video.sha256), simulation.video))
-    frames = [
-        _picture(get(frame.sha256), frame.width / frame.height, SMALL_PX, f"frame {frame.index}, {frame.time:.2f} s")
+def _found(simulation: Simulation, get: GetBytes) -> str:
+    """Pictures, and what was found."""
+    image, trajectory, video = simulation.image, simulation.trajectory, simulation.video
+    caption = "; ".join(filter(None, ("what was found", band_words(trajectory))))
+    large = _figure(get(simulation.overlay.sha256), image.width / image.height, LARGE_PX, caption)
+    if video is not None:
+        data, instead = get(video.sha256), "video not downloaded"
+        if data is not None and len(data) > MAX_VIDEO_BYTES:
+            size = f"{len(data) / 1024**2:.1f} MB"
+            data, instead = None, f"The video has {size}, too much to be shown here: save(folder) writes it."
+        caption = f"video, {video.num_frames / video.fps:.1f} s"
+        large += _figure(data, video.width / video.height, LARGE_PX, caption, instead)
+    frames = "".join(
+        _figure(get(frame.sha256), frame.width / frame.height, SMALL_PX, f"frame {frame.index}, {frame.time:.2f} s")
         for frame in simulation.frames
-    ]
-    shown = _row(large) + _row(frames)
-    said = simulation.motion.sentence
-    if simulation.encounters_known:
-        said += f" It {encounters_words(trajectory)}."
-    lines = [said]
+    )
+    row = f"display:flex;flex-wrap:wrap;gap:10px {GAP_PX}px;margin:8px 0"
+    met = f" It {encounters_words(trajectory)}." if simulation.encounters_known else ""
+    lines = [simulation.motion.sentence + met]
     if contacts := contacts_words(trajectory):
         lines.append(f"Contacts: {contacts}.")
     if trajectory.outcome is not None and (outcome := outcome_words(trajectory.outcome)):
         lines.append(f"Outcome: {outcome}.")
     if trajectory.moving_until is not None:
         lines.append(f"Nothing moves in the image from {trajectory.moving_until:.1f} s on.")
-    return shown + "".join(f"<div>{escape(text)}</div>" for text in lines) + _warnings(simulation.warnings)
+    pictures = "".join(f'<div style="{row}">{figures}</div>' for figures in (large, frames))
+    return pictures + "".join(f"<div>{escape(line)}</div>" for line in lines) + _notes(simulation.warnings)
 
 
-def _row(figures: Sequence[str]) -> str:
-    return f'<div style="display:flex;flex-wrap:wrap;gap:10px {GAP_PX}px;margin:8px 0">{"".join(figures)}</div>'
-
-
-def _picture(data: bytes | None, ratio: float, height: int, caption: str) -> str:
+def _figure(data: bytes | None, ratio: float, height: int, caption: str, instead: str = "not downloaded") -> str:
+    """A picture or a video, or a text instead, with words below it that are no wider."""
+    words, style = escape(caption), f"max-height:{height}px;max-width:100%;border-radius:4px;display:block"
     if data is None:
-        return _figure(_placeholder("not downloaded", ratio, height), ratio, height, caption)
-    media_type = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
-    source = f"data:{media_type};base64,{base64.b64encode(data).decode()}"
-    style = f"max-height:{height}px;{_PICTURE}"
-    return _figure(f'<img src="{source}" alt="{escape(caption)}" style="{style}">', ratio, height, caption)
-
-
-def _video(data: bytes | None, video: Video) -> str:
-    """The clip as a player; where it is not there, or too large for the file of a notebook, what to do instead."""
-    ratio, caption = video.width / video.height, f"video, {video.num_frames / video.fps:.1f} s"
-    if data is None:
-        inner = _placeholder("video not downloaded", ratio, LARGE_PX)
-    elif len(data) > MAX_VIDEO_BYTES:
-        note = f"The video has {len(data) / 1024**2:.1f} MB, too much to be shown here: save(folder) writes it."
-        inner = _placeholder(note, ratio, LARGE_PX)
+        size = f"height:{height - 2}px;max-width:100%;aspect-ratio:{ratio:.3f}"
+        inner = _line(instead, f"{size};{_PLACEHOLDER}")
     else:
-        source = f"data:video/mp4;base64,{base64.b64encode(data).decode()}"
-        style = f"max-height:{LARGE_PX}px;{_PICTURE}"
-        inner = f'<video controls loop muted playsinline aria-label="{caption}" src="{source}" style="{style}"></video>'
-    return _figure(inner, ratio, LARGE_PX, caption)
-
-
-def _placeholder(text: str, ratio: float, height: int) -> str:
-    size = f"height:{height - 2}px;max-width:100%;aspect-ratio:{ratio:.3f}"
-    return f'<div style="{size};{_PLACEHOLDER}">{escape(text)}</div>'
-
-
-def _figure(inner: str, ratio: float, height: int, caption: str) -> str:
-    """A picture or a video, with words below it that are no wider."""
-    said = f'<figcaption style="{DIM_STYLE}">{escape(caption)}</figcaption>'
+        is_video = data[4:8] == b"ftyp"
+        media_type = "video/mp4" if is_video else "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
+        source = f'src="data:{media_type};base64,{base64.b64encode(data).decode()}" style="{style}"'
+        video = f'<video controls loop muted playsinline aria-label="{words}" {source}></video>'
+        inner = video if is_video else f'<img alt="{words}" {source}>'
+    said = f'<figcaption style="{DIM_STYLE}">{words}</figcaption>'
     return f'<figure style="margin:0;max-width:{max(ratio * height, height):.0f}px">{inner}{said}</figure>'
 
 
-def _warnings(warnings: Sequence[Any]) -> str:
-    return "".join(f'<div style="{DIM_STYLE}">Note: {escape(str(warning))}</div>' for warning in warnings)
+def _line(text: str, style: str) -> str:
+    return f'<div style="{style}">{escape(text)}</div>'
+
+
+def _notes(warnings: Iterable[str]) -> str:
+    return "".join(_line(f"Note: {warning}", DIM_STYLE) for warning in warnings)
+
+
+def _block(heading: str, body: str) -> str:
+    return f'<div style="{TEXT_STYLE}">{_line(heading, f"{DIM_STYLE};{_LONG_TEXT}")}{body}</div>'
 
 
 HEADINGS = ("role", "name", "ready", "licence", "weights", "to make it ready")
@@ -299,8 +276,8 @@ class Models(records.Models):
 
     def __repr__(self) -> str:
         rows = [
-            (role, _name(backend), one_line("; ".join((readiness_words(backend), *_commands(backend)))))
-            for role, backend in self._backends()
+            (role, name, one_line("; ".join((readiness_words(backend), *commands))))
+            for role, name, commands, backend in self._backends()
         ]
         widths = [max((len(row[column]) for row in rows), default=0) for column in (0, 1)]
         return "\n".join(f"{role:<{widths[0]}}  {name:<{widths[1]}}  {said}" for role, name, said in rows)
@@ -310,29 +287,23 @@ class Models(records.Models):
     def _repr_html_(self) -> str:
         head = "".join(f'<th style="{_CELL}">{heading}</th>' for heading in HEADINGS)
         rows = ""
-        for role, backend in self._backends():
-            name = f'<b>{escape(_name(backend))}</b><div style="{DIM_STYLE}">{escape(backend.summary)}</div>'
-            commands = "".join(f"<div><code>{escape(command)}</code></div>" for command in _commands(backend))
+        for role, name, commands, backend in self._backends():
+            what = f"<b>{escape(name)}</b>{_line(backend.summary, DIM_STYLE)}"
+            code = "".join(f"<div><code>{escape(command)}</code></div>" for command in commands)
             words = escape(readiness_words(backend)), escape(backend.licence or ""), escape(backend.weights or "none")
-            cells = "".join(f'<td style="{_CELL}">{cell}</td>' for cell in (role, name, *words, commands))
+            cells = "".join(f'<td style="{_CELL}">{cell}</td>' for cell in (role, what, *words, code))
             rows += f"<tr>{cells}</tr>"
         table = f'<table style="border-collapse:collapse"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
         table = f'<div style="overflow-x:auto">{table}</div>'
         named = escape(", ".join(self.mllms)) or "none"
         return f'<div style="{TEXT_STYLE}">{table}<div style="{DIM_STYLE}">COW_MLLM may name: {named}</div></div>'
 
-    def _backends(self) -> list[tuple[str, BackendInfo]]:
-        readers = [("reader", backend) for backend in self.readers]
-        return readers + [("generator", backend) for backend in self.generators]
-
-
-def _name(backend: BackendInfo) -> str:
-    return one_line(backend.name) + (" (default)" if backend.default else "")
-
-
-def _commands(backend: BackendInfo) -> tuple[str, ...]:
-    """The commands that bring what is missing."""
-    return tuple(filter(None, (backend.install, backend.pull)))
+    def _backends(self) -> Iterator[tuple[str, str, tuple[str, ...], BackendInfo]]:
+        """Role, name and the commands that bring what is missing, of each."""
+        for role, backends in (("reader", self.readers), ("generator", self.generators)):
+            for backend in backends:
+                name = one_line(backend.name) + (" (default)" if backend.default else "")
+                yield role, name, tuple(filter(None, (backend.install, backend.pull))), backend
 
 
 class SimulationView(Simulation):

@@ -17,13 +17,14 @@ import os
 import re
 import secrets
 import threading
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any, BinaryIO, Self, TypeAlias
 
-from cow_service.client.request import ImageLike, Reference, image_input, is_url, request_fields, to_json
+from cow_service.client.request import ImageLike, image_input, is_url, request_fields, to_json
 from cow_service.errors import CowError, FieldError, InvalidRequest
 from cow_service.records import JobKind
 
@@ -39,7 +40,8 @@ _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 class Question:
     """One question of a batch. `meta` is whatever should stand beside its outcome, such as the true answer.
 
-    `named` is what tells its image from others; by default its path, its URL, or the digest of its bytes.
+    `named` is what tells its image from others; by default its path, its URL, or the digest of its bytes. No file is
+    read for it.
     """
 
     id: str
@@ -52,7 +54,15 @@ class Question:
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of what is asked; of an image in a file its path counts, not its bytes."""
-        named = _named(self.image) if self.named is None else self.named
+        image, named = self.image, self.named
+        if named is None:
+            if isinstance(image, Path) or (isinstance(image, str) and not image.lower().startswith("data:")):
+                named = str(image)
+            elif isinstance(image, Mapping):
+                named = dict(image)
+            else:
+                sent = image_input(image)
+                named = hashlib.sha256(sent).hexdigest() if isinstance(sent, bytes) else sent
         asked = {**self.options, "image": named, "question": self.question}
         return hashlib.sha256(to_json(dict(sorted(asked.items())))).hexdigest()
 
@@ -71,13 +81,11 @@ def questions(
     `InvalidRequest` for an item without image or question, for what no JSON can hold, and for an id that comes twice.
     """
     defaults = defaults or {}
-    wrong = sorted(_OWN_FIELDS & defaults.keys())
-    if wrong:
-        raise InvalidRequest(
-            f"Each question has its own {' and '.join(f'`{name}`' for name in wrong)}: give none for all."
-        )
+    if wrong := sorted(_OWN_FIELDS & defaults.keys()):
+        names = " and ".join(f"`{name}`" for name in wrong)
+        raise InvalidRequest(f"Each question has its own {names}: give none for all.")
     seen: set[str] = set()
-    same: dict[str, int] = {}
+    same: Counter[str] = Counter()
     for place, item in enumerate(items, 1):
         question = _read_item(item, place, defaults, folder)
         try:
@@ -86,55 +94,43 @@ def questions(
         except CowError as error:
             raise InvalidRequest(f"Question {place}: {error.detail}", errors=error.errors) from error
         if question.id == "":
-            made = _checked(question, place).fingerprint[:16]
-            times = same[made] = same.get(made, 0) + 1
-            question = replace(question, id=made if times == 1 else f"{made}-{times}")
+            made = question.fingerprint[:16]
+            same[made] += 1
+            question = replace(question, id=made if same[made] == 1 else f"{made}-{same[made]}")
         if question.id in seen:
             raise _invalid(place, "id", f"'{question.id}' stands before; give each its own")
         seen.add(question.id)
-        yield _checked(question, place)
+        yield question
 
 
 def _read_item(item: Any, place: int, defaults: Mapping[str, Any], folder: Path | None) -> Question:
-    """A question without an id where it has none of its own. Raises `InvalidRequest` for what is no `QuestionLike`."""
+    """A question, without an id where it has none of its own. Raises `InvalidRequest` for what is no `QuestionLike`."""
     if isinstance(item, Question):
-        return replace(item, options={**defaults, **item.options}) if defaults else item
-    if not isinstance(item, Mapping) and not (isinstance(item, tuple | list) and len(item) == 2):
-        raise InvalidRequest(f"Question {place} is a {type(item).__name__}: give a mapping, or image and question.")
-    given: dict[str, Any] = dict(item) if isinstance(item, Mapping) else {"image": item[0], "question": item[1]}
-    for name in ("image", "question"):
-        if given.get(name) is None:
-            raise _invalid(place, name, "is missing")
-    if not isinstance(given["question"], str):
-        raise _invalid(place, "question", f"must be a text, got {type(given['question']).__name__}")
-    own = given.pop("id", None)
-    if own is not None and not 0 < len(str(own)) <= MAX_ID_CHARACTERS:
-        raise _invalid(place, "id", f"has {len(str(own))} characters; give 1 to {MAX_ID_CHARACTERS}")
-    image, question, meta = given.pop("image"), given.pop("question"), given.pop("meta", None)
-    named = None
-    if folder is not None and isinstance(image, str) and not is_url(image):
-        image, named = folder / image, image  # the same question, from wherever the folder is looked at
-    return Question("" if own is None else str(own), image, question, {**defaults, **given}, meta, named)
-
-
-def _checked(question: Question, place: int) -> Question:
-    """The question, all of which JSON can hold: checked before it is asked, not after it was paid for."""
-    for name, value in (("id", question.id), ("question", question.question), ("meta", question.meta)):
+        question = replace(item, options={**defaults, **item.options}) if defaults else item
+    else:
+        if not isinstance(item, Mapping) and not (isinstance(item, tuple | list) and len(item) == 2):
+            raise InvalidRequest(f"Question {place} is a {type(item).__name__}: give a mapping, or image and question.")
+        given: dict[str, Any] = dict(item) if isinstance(item, Mapping) else {"image": item[0], "question": item[1]}
+        for name in ("image", "question"):
+            if given.get(name) is None:
+                raise _invalid(place, name, "is missing")
+        if not isinstance(given["question"], str):
+            raise _invalid(place, "question", f"must be a text, got {type(given['question']).__name__}")
+        own = given.pop("id", None)
+        if own is not None and not 0 < len(str(own)) <= MAX_ID_CHARACTERS:
+            raise _invalid(place, "id", f"has {len(str(own))} characters; give 1 to {MAX_ID_CHARACTERS}")
+        image, text, meta = given.pop("image"), given.pop("question"), given.pop("meta", None)
+        named = None
+        if folder is not None and isinstance(image, str) and not is_url(image):
+            image, named = folder / image, image  # the same question, from wherever the folder is looked at
+        question = Question("" if own is None else str(own), image, text, {**defaults, **given}, meta, named)
+    # JSON has no objects of other libraries, and no half of a surrogate pair: found before it is asked and paid for.
+    for name in ("id", "question", "meta"):
         try:
-            to_json(value)
-        except (TypeError, ValueError) as error:  # numbers and objects that JSON has not; halves of surrogate pairs
+            to_json(getattr(question, name))
+        except (TypeError, ValueError) as error:
             raise _invalid(place, name, f"cannot be written as JSON: {error}") from error
     return question
-
-
-def _named(image: ImageLike) -> Any:
-    """What tells an image from others without its file being read."""
-    if isinstance(image, Path) or (isinstance(image, str) and not image.lower().startswith("data:")):
-        return str(image)
-    if isinstance(image, Mapping):
-        return dict(image)
-    sent = image_input(image)
-    return sent.json if isinstance(sent, Reference) else hashlib.sha256(sent.data).hexdigest()
 
 
 def _invalid(place: int, name: str, detail: str) -> InvalidRequest:
@@ -169,8 +165,9 @@ class Journal:
             ) from error
         try:
             self._secret = self._begin(kind)
-            _cut(self.results)
-            _cut(self._retried)
+            for path in (self.results, self._retried):  # cuts off a last line that was not written to its end
+                with contextlib.suppress(FileNotFoundError), path.open("r+b") as file:
+                    file.truncate(sum(len(line) for line in file if line.endswith(b"\n")))
             self._attempts = {line["id"]: line["attempt"] for line in _lines(self._retried)}
             if retry_failed:
                 self._set_failures_aside()
@@ -239,72 +236,62 @@ class Journal:
         return _lines(self.results)
 
     def _begin(self, kind: JobKind) -> str:
+        """The secret of the batch, which is made where the folder is new."""
         path = self.folder / "batch.json"
-        with contextlib.suppress(FileNotFoundError):
-            try:
-                known = json.loads(path.read_bytes())
-                version, known_kind, secret = known["version"], known["kind"], str(known["secret"])
-            except (KeyError, TypeError, ValueError) as error:
-                raise InvalidRequest(f"'{path}' is not that of a batch: use another folder.") from error
-            if version != VERSION or known_kind != kind:
-                raise InvalidRequest(
-                    f"'{self.folder}' is the folder of a batch of kind '{known_kind}' (version {version}): "
-                    "use another folder."
-                )
-            return secret
-        secret = secrets.token_hex(16)
-        beside = path.with_name(path.name + ".new")
-        with beside.open("wb") as file:
-            file.write(json.dumps({"version": VERSION, "kind": kind, "secret": secret}, indent=2).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
+        if not path.exists():
+            made = {"version": VERSION, "kind": kind, "secret": secrets.token_hex(16)}
+            beside = path.with_name(path.name + ".new")
+            with beside.open("wb") as file:
+                file.write(json.dumps(made, indent=2).encode() + b"\n")
+                _flush(file)
+            beside.replace(path)
+        try:
+            known = json.loads(path.read_bytes())
+            version, known_kind, secret = known["version"], known["kind"], str(known["secret"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise InvalidRequest(f"'{path}' is not that of a batch: use another folder.") from error
+        if version != VERSION or known_kind != kind:
+            raise InvalidRequest(
+                f"'{self.folder}' is the folder of a batch of kind '{known_kind}' (version {version}): "
+                "use another folder."
+            )
         return secret
 
     def _set_failures_aside(self) -> None:
         """Moves failures to `retried.jsonl`. Killed in between, they stand in both, and are moved at the next start."""
+        failed = [line for line in _lines(self.results) if line["status"] == "failed"]
+        if not failed:
+            return
+        with self._retried.open("ab") as retried:
+            for line in failed:
+                self._attempts[line["id"]] = line["attempt"] + 1
+                retried.write(to_json({**line, "attempt": line["attempt"] + 1}) + b"\n")
+            _flush(retried)
         beside = self.results.with_name(self.results.name + ".new")
-        failed = 0
-        with contextlib.suppress(FileNotFoundError):
-            with self.results.open("rb") as lines, beside.open("wb") as kept, self._retried.open("ab") as retried:
-                for number, text in enumerate(lines, 1):
-                    line = _line(self.results, number, text)
-                    if line["status"] != "failed":
-                        kept.write(text)
-                        continue
-                    failed += 1
-                    self._attempts[line["id"]] = line["attempt"] + 1
-                    retried.write(to_json({**line, "attempt": line["attempt"] + 1}) + b"\n")
-                for file in (retried, kept):
-                    file.flush()
-                    os.fsync(file.fileno())
-            if failed:
-                beside.replace(self.results)
-            else:
-                beside.unlink()
+        with self.results.open("rb") as texts, beside.open("wb") as kept:
+            lines = zip(texts, _lines(self.results), strict=True)
+            kept.writelines(text for text, line in lines if line["status"] != "failed")
+            _flush(kept)
+        beside.replace(self.results)
 
 
-def _cut(path: Path) -> None:
-    """Cuts off a last line that was not written to its end."""
-    with contextlib.suppress(FileNotFoundError), path.open("r+b") as file:
-        file.truncate(sum(len(line) for line in file if line.endswith(b"\n")))
+def _flush(file: BinaryIO) -> None:
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The lines that were written whole. Raises `InvalidRequest` for one that is none of a batch."""
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
-        for number, line in enumerate(file, 1):
-            if not line.endswith(b"\n"):
+        for number, text in enumerate(file, 1):
+            if not text.endswith(b"\n"):
                 return
-            yield _line(path, number, line)
-
-
-def _line(path: Path, number: int, text: bytes) -> dict[str, Any]:
-    try:
-        line = json.loads(text)
-        if not {"id", "status", "attempt", "fingerprint"} <= line.keys():
-            raise ValueError
-    except (ValueError, AttributeError) as error:
-        raise InvalidRequest(
-            f"'{path}' is damaged in line {number}: take that line out; its question is then asked again."
-        ) from error
-    return line
+            try:
+                line = json.loads(text)
+                if not {"id", "status", "attempt", "fingerprint"} <= line.keys():
+                    raise ValueError
+            except (ValueError, AttributeError) as error:
+                raise InvalidRequest(
+                    f"'{path}' is damaged in line {number}: take that line out; its question is then asked again."
+                ) from error
+            yield line

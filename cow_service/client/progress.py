@@ -129,8 +129,13 @@ def progress_shown(state: BatchProgress, progress: bool) -> Generator[Callable[[
     if not progress:
         yield lambda: None
     elif sys.stderr.isatty():
-        with _batch_bar(state) as update:
-            yield update
+        from rich.console import Console  # noqa: PLC0415
+        from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
+
+        columns = (BarColumn(bar_width=30), TextColumn("{task.description}"))
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(str(state), total=state.total)
+            yield lambda: bar.update(task, completed=state.done, description=str(state))
     else:
         printed, note = time.monotonic(), state.note
 
@@ -141,19 +146,3 @@ def progress_shown(state: BatchProgress, progress: bool) -> Generator[Callable[[
                 print(state, file=sys.stderr, flush=True)
 
         yield print_now_and_then
-
-
-@contextmanager
-def _batch_bar(state: BatchProgress) -> Generator[Callable[[], None]]:
-    from rich.console import Console  # noqa: PLC0415
-    from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
-
-    columns = (BarColumn(bar_width=30), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(str(state), total=state.total)
-
-        def update() -> None:
-            bar.update(task, completed=state.done, description=str(state))
-
-        update()
-        yield update

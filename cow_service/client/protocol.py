@@ -20,15 +20,7 @@ from httpx_sse import ServerSentEvent
 from pydantic import BaseModel, ValidationError
 
 from cow_service import __version__
-from cow_service.client.errors import (
-    BadResponse,
-    Canceled,
-    code_of,
-    error_from,
-    error_of,
-    unreachable,
-    with_request_id,
-)
+from cow_service.client import errors
 from cow_service.records import Job
 
 R = TypeVar("R", bound=BaseModel)
@@ -61,9 +53,7 @@ class Endpoint:
     @property
     def stream_timeout(self) -> httpx.Timeout:
         """Timeouts of a stream of events, in which the server may be silent for longer."""
-        return httpx.Timeout(
-            connect=self.timeout.connect, read=STREAM_TIMEOUT_SECONDS, write=self.timeout.write, pool=self.timeout.pool
-        )
+        return httpx.Timeout(**{**self.timeout.as_dict(), "read": STREAM_TIMEOUT_SECONDS})
 
     def limited(self, seconds: float | None) -> httpx.Timeout:
         """Timeouts of a request, none of them longer than so many seconds."""
@@ -111,25 +101,21 @@ _BROKEN_CONNECTION = (httpx.NetworkError, httpx.TimeoutException, httpx.RemotePr
 def pause_before_retry(outcome: httpx.Response | httpx.HTTPError, attempts: int) -> float | None:
     """Seconds to wait after so many attempts; None where another would have the same outcome."""
     if isinstance(outcome, httpx.HTTPError):
-        return _backoff(attempts) if isinstance(outcome, _BROKEN_CONNECTION) else None
-    code = code_of(outcome)
-    if code not in RETRYABLE_CODES if code is not None else outcome.status_code not in RETRYABLE_STATUS:
-        return None
-    retry_after = _retry_after(outcome.headers.get("retry-after"))
-    if retry_after is None:
-        return _backoff(attempts)
-    return min(retry_after, MAX_RETRY_AFTER_SECONDS) + random.uniform(0, 0.25)
-
-
-def _backoff(attempts: int) -> float:
+        if not isinstance(outcome, _BROKEN_CONNECTION):
+            return None
+    else:
+        code = errors.code_of(outcome)
+        if code not in RETRYABLE_CODES if code is not None else outcome.status_code not in RETRYABLE_STATUS:
+            return None
+        retry_after = _retry_after(outcome.headers.get("retry-after", ""))
+        if retry_after is not None:
+            return min(retry_after, MAX_RETRY_AFTER_SECONDS) + random.uniform(0, 0.25)
     pause = min(FIRST_BACKOFF_SECONDS * BACKOFF_GROWTH ** (attempts - 1), MAX_BACKOFF_SECONDS)
     return pause * random.uniform(0.75, 1.25)
 
 
-def _retry_after(header: str | None) -> float | None:
+def _retry_after(header: str) -> float | None:
     """The header `Retry-After`, a number or a date (RFC 9110), as seconds from now."""
-    if header is None:
-        return None
     if header.isascii() and header.isdecimal():
         return float(header)
     try:
@@ -198,17 +184,18 @@ class EventCursor:
         Raises the error for which no other is made.
         """
         self._attempts += 1
-        if isinstance(outcome, httpx.Response) and outcome.status_code == NO_CONTENT:
-            self.ended = True
-            return 0.0
-        if isinstance(outcome, httpx.Response) and is_event_stream(outcome):
-            outcome = httpx.RemoteProtocolError("the stream ended before the job", request=outcome.request)
+        if isinstance(outcome, httpx.Response):
+            if outcome.status_code == NO_CONTENT:
+                self.ended = True
+                return 0.0
+            if is_event_stream(outcome):
+                outcome = httpx.RemoteProtocolError("the stream ended before the job", request=outcome.request)
         pause = pause_before_retry(outcome, self._attempts) if self._attempts <= self._retries else None
         if pause is not None:
             return pause
         if isinstance(outcome, httpx.Response):
-            raise error_of(outcome)
-        raise unreachable(outcome) from outcome
+            raise errors.error_of(outcome)
+        raise errors.unreachable(outcome) from outcome
 
 
 def is_event_stream(response: httpx.Response) -> bool:
@@ -224,7 +211,7 @@ def read(model: type[R], body: Any) -> R:
     except ValidationError as error:
         wrong = error.errors()[0]
         place = ".".join(str(part) for part in wrong["loc"])
-        raise BadResponse(
+        raise errors.BadResponse(
             f"The response is no {model.__name__} that this version reads ({place}: {wrong['msg']}): are server and "
             "SDK of the same version?"
         ) from error
@@ -237,7 +224,7 @@ def object_in(response: httpx.Response) -> dict[str, Any]:
     except ValueError:
         body = None
     if not isinstance(body, dict):
-        raise error_of(response)
+        raise errors.error_of(response)
     return body
 
 
@@ -251,9 +238,10 @@ def result_in(response: httpx.Response, job: Job) -> Any:
     body = object_in(response)
     if job.status == "succeeded":
         return body.get("result") or {}
-    canceled = job.status == "canceled"
-    error = Canceled(f"The job {job.id} was canceled.") if canceled else error_from(body.get("problem") or {})
-    raise with_request_id(error, response)
+    error: errors.CowError = errors.Canceled(f"The job {job.id} was canceled.")
+    if job.status == "failed":
+        error = errors.error_from(body.get("problem") or {})
+    raise errors.with_request_id(error, response)
 
 
 def deadline(timeout: float | None) -> float:

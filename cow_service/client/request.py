@@ -76,52 +76,37 @@ def is_url(text: str) -> bool:
     return text[:8].lower().startswith(URLS)
 
 
-@dataclass(frozen=True)
-class Upload:
-    """An image to be sent as a file. It holds the bytes themselves, so that every attempt sends the same."""
-
-    data: bytes
-
-
-@dataclass(frozen=True)
-class Reference:
-    """An image that the request names: a URL, a data URL or an artifact."""
-
-    json: str | dict[str, str]
-
-
-def image_input(image: ImageLike) -> Upload | Reference:
-    """How an image is sent.
+def image_input(image: ImageLike) -> bytes | str | dict[str, str]:
+    """How an image is sent: as a file with these bytes, or named in the request: a URL, a data URL, an artifact.
 
     Raises `OSError` where a file cannot be read, and `InvalidRequest` for anything that is no image.
     """
+    sent: bytes | str | dict[str, str] | None = None
     if isinstance(image, str) and is_url(image):
-        return Reference(image if image[:5].lower() == "data:" else {"url": image})
-    if isinstance(image, str | os.PathLike):
-        return Upload(Path(image).read_bytes())
-    if isinstance(image, bytes | bytearray | memoryview):
-        return Upload(bytes(image))
-    if isinstance(image, Mapping | Record) and (reference := _reference(image)) is not None:
-        return reference
+        sent = image if image[:5].lower() == "data:" else {"url": image}
+    elif isinstance(image, str | os.PathLike):
+        sent = Path(image).read_bytes()
+    elif isinstance(image, bytes | bytearray | memoryview):
+        sent = bytes(image)
+    elif isinstance(image, Mapping):
+        sent = dict(image)
+    elif isinstance(image, Artifact | Frame | ImageInfo):
+        sent = {"artifact": image.sha256}
+    elif isinstance(image, Record):
+        from cow_service.requests import ImageArtifact, ImageUrl  # noqa: PLC0415 - most calls do not need it
+
+        sent = image.model_dump() if type(image) in (ImageArtifact, ImageUrl) else None
     # Neither library is loaded for this: whoever has such an image has loaded it.
-    if hasattr(image, "__array_interface__") and hasattr(image, "dtype"):
-        return Upload(encoded_array(cast("NDArray[np.uint8]", image)))
-    if hasattr(image, "save") and hasattr(image, "mode"):
-        return Upload(encoded_picture(cast("Image.Image", image)))
-    raise _wrong(
-        f"got {type(image).__name__}; give a path, bytes, a PIL image, an array (height, width, 3) of uint8, a URL, or "
-        "an artifact"
-    )
-
-
-def _reference(image: Mapping[str, str] | Record) -> Reference | None:
-    from cow_service.requests import ImageArtifact, ImageUrl  # noqa: PLC0415 - not needed to import the SDK
-
-    if isinstance(image, Mapping):
-        return Reference(dict(image))
-    if isinstance(image, Artifact | Frame | ImageInfo):
-        return Reference({"artifact": image.sha256})
-    return Reference(image.model_dump()) if isinstance(image, ImageArtifact | ImageUrl) else None
+    elif hasattr(image, "__array_interface__") and hasattr(image, "dtype"):
+        sent = encoded_array(cast("NDArray[np.uint8]", image))
+    elif hasattr(image, "save") and hasattr(image, "mode"):
+        sent = encoded_picture(cast("Image.Image", image))
+    if sent is None:
+        raise _wrong(
+            f"got {type(image).__name__}; give a path, bytes, a PIL image, an array (height, width, 3) of uint8, a "
+            "URL, or an artifact"
+        )
+    return sent
 
 
 def encoded_array(array: NDArray[np.uint8]) -> bytes:
@@ -193,8 +178,9 @@ def _with_mask(place: Any) -> Any:
     if getattr(getattr(mask, "dtype", None), "kind", "") == "b":
         mask = mask.astype("uint8") * 255
     sent = image_input(mask)
-    json = f"data:image/png;base64,{base64.b64encode(sent.data).decode()}" if isinstance(sent, Upload) else sent.json
-    return {**plain(place), "mask": json}
+    if isinstance(sent, bytes):
+        sent = f"data:image/png;base64,{base64.b64encode(sent).decode()}"
+    return {**plain(place), "mask": sent}
 
 
 MINIMAL = "return=minimal"  # the preference of RFC 7240
@@ -242,24 +228,19 @@ def job_request(
     sent = image_input(image)
     fields = request_fields(options)
     try:
-        if isinstance(sent, Reference):
-            content = to_json({**fields, "image": sent.json, "question": question})
-            media_type = "application/json"
+        if isinstance(sent, bytes):
+            boundary = hashlib.sha256(sent).hexdigest()[:32]  # the same in every attempt, and nothing the image holds
+            form = httpx.Request(
+                "POST",
+                "http://form",
+                files={"image": ("image", sent, "application/octet-stream")},
+                data={"question": question, "request": to_json(fields).decode()},
+                headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
+            )
+            content, media_type = form.read(), form.headers["content-type"]
         else:
-            content, media_type = _multipart(sent.data, question, fields)
+            content, media_type = to_json({**fields, "image": sent, "question": question}), "application/json"
     except UnicodeEncodeError as error:
         detail = f"holds half of a surrogate pair ({error.object[error.start]!r}), which is no text"
         raise InvalidRequest(f"The request {detail}.", errors=(FieldError("", detail),)) from error
     return JobRequest(kind, content, media_type, key or secrets.token_urlsafe(18), fresh, minimal)
-
-
-def _multipart(image: bytes, question: str, fields: Mapping[str, Any]) -> tuple[bytes, str]:
-    boundary = hashlib.sha256(image).hexdigest()[:32]  # the same in every attempt, and nothing the image holds
-    form = httpx.Request(
-        "POST",
-        "http://form",
-        files={"image": ("image", image, "application/octet-stream")},
-        data={"question": question, "request": to_json(fields).decode()},
-        headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
-    )
-    return form.read(), form.headers["content-type"]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from cow_service.records import (
     DIRECTED_KINDS,
@@ -21,7 +22,6 @@ from cow_service.records import (
     ObjectPrior,
     ObjectRole,
     PlaceRelation,
-    Point,
     Record,
     Shape,
     Until,
@@ -125,6 +125,15 @@ MAX_TRACKS = 1024
 MAX_TRACK_POINTS = 262_144  # of all tracks together
 MAX_STEPS = 16
 _OF_A_LINE = ("distance", "duration", "until", "steps")
+
+
+def _has_length(direction: Vector) -> Vector:
+    if not 1e-9 < math.hypot(*direction) < 1e12:
+        raise ValueError(f"[dx, dy] must have a length, got {list(direction)}")
+    return direction
+
+
+Direction = Annotated[tuple[Finite, Finite], AfterValidator(_has_length)]
 Length = Annotated[Finite, Field(gt=0, le=1_000_000)]
 Seconds = Annotated[Finite, Field(gt=0, le=3600)]
 Speed = Annotated[Finite, Field(ge=0, le=100_000)]
@@ -133,15 +142,10 @@ Speed = Annotated[Finite, Field(ge=0, le=100_000)]
 class MotionStepRequest(Record):
     """A further leg of a motion, after the one before has ended."""
 
-    direction: tuple[Finite, Finite] = Field(description="[dx, dy] in the image, any length but zero.")
+    direction: Direction = Field(description="[dx, dy] in the image, any length but zero.")
     depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
     distance: Length | None = Field(default=None, description="px at the depth of the first frame.")
     duration: Seconds | None = Field(default=None, description="s.")
-
-    @field_validator("direction")
-    @classmethod
-    def _has_length(cls, direction: Vector) -> Vector:
-        return _checked(direction)
 
 
 class OtherMotionRequest(Record):
@@ -151,7 +155,7 @@ class OtherMotionRequest(Record):
     kind: Literal["linear", "projectile", "fall"] | None = Field(
         default=None, description="By default linear; a fall takes no `direction`."
     )
-    direction: tuple[Finite, Finite] | None = Field(default=None, description="[dx, dy] in the image.")
+    direction: Direction | None = Field(default=None, description="[dx, dy] in the image.")
     depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
     speed: Speed | None = Field(default=None, description="px/s; by default as for the mover.")
 
@@ -160,24 +164,12 @@ class OtherMotionRequest(Record):
         """The kind of motion."""
         return self.kind or "linear"
 
-    @field_validator("direction")
-    @classmethod
-    def _has_length(cls, direction: Vector | None) -> Vector | None:
-        return None if direction is None else _checked(direction)
-
     @model_validator(mode="after")
     def _goes_somewhere(self) -> OtherMotionRequest:
         if (self.direction is None) != (self.stated_kind == "fall"):
             needs = "takes no" if self.kind == "fall" else "needs a"
             raise ValueError(f"a {self.stated_kind} motion {needs} `direction`")
         return self
-
-
-def _checked(direction: Vector) -> Vector:
-    """A direction that has a length."""
-    if not 1e-9 < math.hypot(*direction) < 1e12:
-        raise ValueError(f"[dx, dy] must have a length, got {list(direction)}")
-    return direction
 
 
 class MotionRequest(Record):
@@ -192,7 +184,7 @@ class MotionRequest(Record):
         default="contact",
         description="contact: it bounces, pushes, rolls, comes to rest; ballistic: straight through everything.",
     )
-    direction: tuple[Finite, Finite] | None = Field(
+    direction: Direction | None = Field(
         default=None,
         description="[dx, dy] in the image, x right, y down, any length but zero: [-1, 0] is to the left. By default "
         "read from the question and from arrows drawn in the image; not needed for a fall or a static object.",
@@ -244,11 +236,6 @@ class MotionRequest(Record):
             raise ValueError(f"a {kind} motion takes no `{lengths[0]}`: it ends by what it meets")
         return self
 
-    @field_validator("direction")
-    @classmethod
-    def _has_length(cls, direction: Vector | None) -> Vector | None:
-        return None if direction is None else _checked(direction)
-
 
 class TrajectoryRequest(Record):
     """Skips stage 3: where the object's centre is, at `fps`. After the last point it stays there."""
@@ -275,22 +262,14 @@ class TrajectoryRequest(Record):
         description="Points that stay where they are. By default spread over the image.",
     )
 
-    @field_validator("points", "anchors")
+    @field_validator("points", "anchors", "tracks")
     @classmethod
-    def _near_the_image(cls, points: tuple[Point, ...] | None) -> tuple[Point, ...] | None:
-        far = next((point for point in points or () if max(abs(point[0]), abs(point[1])) > 1e6), None)
-        if far is not None:
-            raise ValueError(f"points lie at most 1,000,000 px from the image, got {list(far)}")
-        return points
-
-    @field_validator("tracks")
-    @classmethod
-    def _tracks_near_the_image(
-        cls, tracks: tuple[tuple[Point, ...], ...] | None
-    ) -> tuple[tuple[Point, ...], ...] | None:
-        for track in tracks or ():
-            cls._near_the_image(track)
-        return tracks
+    def _near_the_image(cls, given: Any, info: ValidationInfo) -> Any:
+        paths: Any = given or () if info.field_name == "tracks" else (given or (),)
+        for x, y in itertools.chain.from_iterable(paths):
+            if max(abs(x), abs(y)) > 1e6:
+                raise ValueError(f"points lie at most 1,000,000 px from the image, got {[x, y]}")
+        return given
 
     @model_validator(mode="after")
     def _same_length(self) -> TrajectoryRequest:
@@ -302,9 +281,8 @@ class TrajectoryRequest(Record):
             raise ValueError(f"a track has {wrong} points where `points` has {wanted}")
         if len(self.tracks or ()) * wanted > MAX_TRACK_POINTS:
             raise ValueError(f"`tracks` holds more than {MAX_TRACK_POINTS} points")
-        if self.tracks_visible is not None and [len(t) for t in self.tracks_visible] != [wanted] * len(
-            self.tracks or ()
-        ):
+        lengths = [wanted] * len(self.tracks or ())
+        if self.tracks_visible is not None and [len(track) for track in self.tracks_visible] != lengths:
             raise ValueError("`tracks_visible` must have an entry for every point of every track")
         return self
 
