@@ -74,8 +74,7 @@ def pull(
     for each in downloads:
         folder = folder_of(weights_dir, each.lock.repository)
         console.print(f"{each.lock.repository} at {each.lock.revision[:12]} is in {folder}")
-    for line in _fetched_kernels(manifest):
-        console.print(line)
+    _fetch_kernels(manifest, console)
 
 
 @app.command()
@@ -104,12 +103,12 @@ def check(name: Name, as_json: AsJson = False) -> None:
         raise typer.Exit(1)
 
 
-def _fetched_kernels(manifest: Manifest) -> list[str]:
-    """What became of the attention kernels that a video model may use on this machine's GPU; each has a line."""
+def _fetch_kernels(manifest: Manifest, console: Console) -> None:
+    """Fetches the attention kernels that a video model may use on this machine's GPU; prints what became of each."""
     from importlib.util import find_spec  # noqa: PLC0415
 
     if not manifest.architecture or manifest.missing_modules() or find_spec("kernels") is None:
-        return []
+        return
     from cow_service.errors import GeneratorUnavailable  # noqa: PLC0415
     from cow_service.generators.wan.attention import fetch_kernels  # noqa: PLC0415
     from cow_service.generators.wan.profiles import profile_of  # noqa: PLC0415
@@ -118,10 +117,9 @@ def _fetched_kernels(manifest: Manifest) -> list[str]:
 
     device = choose_device(load_settings().device, GeneratorUnavailable)
     fetched = fetch_kernels((profile_of(manifest, name).acceleration for name in manifest.profiles), device)
-    return [
-        f"Attention kernel {name}: {'fetched' if problem is None else f'not fetched, and not needed ({problem})'}"
-        for name, problem in fetched.items()
-    ]
+    for name, problem in fetched.items():
+        outcome = "fetched" if problem is None else f"not fetched, and not needed ({problem})"
+        console.print(f"Attention kernel {name}: {outcome}")
 
 
 def _weights_dir() -> Path:

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from cow_service.cli.options import open_client, printable
 from cow_service.errors import CowError
-from cow_service.records import ProcessInfo, WorkerInfo, Workers
+from cow_service.records import WorkerInfo, Workers
 
 REFRESH_SECONDS = 1.0
 TIMEOUT_SECONDS = 5.0  # that the server may say nothing
@@ -47,58 +47,42 @@ def show_processes(url: str | None, *, once: bool) -> None:
 
 def picture(found: Workers, url: str) -> RenderableType:
     """Everything that a server reports, and what needs somebody."""
-    faults: list[Text] = []
-    for one in found.unserved:
-        what = f"workflow version {one.workflow_version}" if one.reason == "version" else f"queue {one.queue}"
-        jobs = f"{_number(one.jobs, 'job')} of {printable(what)}"
-        faults.append(Text(f"{jobs}: no process takes them (see `cow doctor`)", style="red"))
-    parts = _head(found, url), *faults, Text(), _queues(found), Text(), _processes(found.processes)
-    return Group(*parts)
-
-
-def with_fault(shown: RenderableType, fault: str, age: float) -> RenderableType:
-    """The last picture, `age` seconds old, and why there is no newer one."""
-    return Group(Text(printable(fault), style="red"), Text(f"As it was {_duration(age)} ago:", style="yellow"), shown)
-
-
-def _head(found: Workers, url: str) -> Text:
     workers = [worker for process in found.processes for worker in process.workers]
-    text = Text(printable(url), style="bold")
     counts = (
         _number(len(found.processes), "process", "processes"),
         f"{_number(len(workers), 'worker')} ({sum(bool(worker.jobs) for worker in workers)} busy)",
         f"{sum(queue.queued for queue in found.queues)} queued",
         datetime.now().astimezone().strftime("%H:%M:%S"),
     )
-    return text.append("  " + ", ".join(counts), style="not bold")
-
-
-def _queues(found: Workers) -> Table:
-    table = _table("queue", right=("queued", "running", "capacity", "oldest", "jobs/min"))
+    parts: list[RenderableType] = [
+        Text(printable(url), style="bold").append("  " + ", ".join(counts), style="not bold")
+    ]
+    for one in found.unserved:
+        what = f"workflow version {one.workflow_version}" if one.reason == "version" else f"queue {one.queue}"
+        jobs = f"{_number(one.jobs, 'job')} of {printable(what)}"
+        parts.append(Text(f"{jobs}: no process takes them (see `cow doctor`)", style="red"))
+    queues = _table("queue", right=("queued", "running", "capacity", "oldest", "jobs/min"))
     for queue in found.queues:
         idle = not queue.queued and not queue.running
-        table.add_row(
+        queues.add_row(
             Text(printable(queue.name)),
-            str(queue.queued),
-            str(queue.running),
-            str(queue.capacity),
+            *(str(number) for number in (queue.queued, queue.running, queue.capacity)),
             "-" if queue.oldest_seconds is None else _duration(queue.oldest_seconds),
             f"{queue.jobs_per_minute:.1f}",
             style="dim" if idle else "red" if not queue.capacity else "",
         )
-    return table
-
-
-def _processes(processes: Iterable[ProcessInfo]) -> RenderableType:
-    parts: list[RenderableType] = []
-    for process in processes:
+    parts += [Text(), queues, Text()]
+    for process in found.processes:
         takes = ", ".join(map(printable, process.queues)) or "nothing"
         head = Text(f"{ROLES[process.role]} on {printable(process.host)}", style="bold")
         head.append(f"  pid {process.pid}, COW {printable(process.version)}, takes {takes}", style="not bold dim")
-        parts.append(head)
-        if process.workers:
-            parts.append(_workers(process.workers))
+        parts += [head, _workers(process.workers)] if process.workers else [head]
     return Group(*parts)
+
+
+def with_fault(shown: RenderableType, fault: str, age: float) -> RenderableType:
+    """The last picture, `age` seconds old, and why there is no newer one."""
+    return Group(Text(printable(fault), style="red"), Text(f"As it was {_duration(age)} ago:", style="yellow"), shown)
 
 
 def _workers(workers: Iterable[WorkerInfo]) -> Table:

@@ -9,20 +9,6 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from cow_service import records
-from cow_service.records import (
-    MEETINGS,
-    Answer,
-    BackendInfo,
-    Contact,
-    Encounter,
-    Gate,
-    Outcome,
-    Simulation,
-    Trajectory,
-    Usage,
-    Verdict,
-)
-from cow_service.records.world import BAND_PERCENTILES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,36 +19,36 @@ if TYPE_CHECKING:
 MAX_CONTACTS = 6  # that are named
 
 
-def asked_words(usage: Usage) -> str:
+def asked_words(usage: records.Usage) -> str:
     """What a multimodal LLM was asked."""
     if not usage.calls:
         return "none"
     return f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out"
 
 
-def readiness_words(backend: BackendInfo) -> str:
+def readiness_words(backend: records.BackendInfo) -> str:
     """Whether a reader or generator can be used, and what is missing where it cannot."""
     if backend.ready is None:
         return "unknown"
     return "yes" if backend.ready else f"needs {', '.join(backend.missing) or 'its weights'}"
 
 
-def votes_words(verdict: Verdict) -> str:
+def votes_words(verdict: records.Verdict) -> str:
     """How often each was answered."""
     return ", ".join(f"{answer}: {count}" for answer, count in verdict.votes.items())
 
 
-def gate_words(gate: Gate) -> str:
+def gate_words(gate: records.Gate) -> str:
     """What was answered before looking, and what came of it."""
     votes = ", ".join(f"{name} {count}" for name, count in gate.votes.items()) or "no vote"
     return f"{votes} of {gate.asked}; {gate.reason}: {'imagined' if gate.imagined else 'not imagined'}"
 
 
-def band_words(trajectory: Trajectory) -> str:
+def band_words(trajectory: records.Trajectory) -> str:
     """What the band of an overlay says; empty where it has none."""
     if trajectory.law != "contact" or not trajectory.ensemble:
         return ""
-    low, high = BAND_PERCENTILES
+    low, high = records.BAND_PERCENTILES
     return f"band: where {high - low}% of {trajectory.ensemble} worlds have it, across and down apart"
 
 
@@ -71,37 +57,29 @@ def worlds(probability: float) -> str:
     return f"{probability:.0%} of the worlds"
 
 
-def encounter_words(encounter: Encounter, fps: float) -> str:
+def encounter_words(encounter: records.Encounter, fps: float) -> str:
     """What the mover does with the other object, when, and in how many worlds."""
     sure = "" if encounter.probability is None else f" ({worlds(encounter.probability)})"
-    return f"{MEETINGS[encounter.kind]} {encounter.object} at {encounter.first_frame / fps:.1f} s{sure}"
+    return f"{records.MEETINGS[encounter.kind]} {encounter.object} at {encounter.first_frame / fps:.1f} s{sure}"
 
 
-def encounters_words(trajectory: Trajectory) -> str:
+def encounters_words(trajectory: records.Trajectory) -> str:
     """All that the mover encounters."""
     met = [encounter_words(encounter, trajectory.fps) for encounter in trajectory.encounters]
     return ", ".join(met) or ("meets nothing" if trajectory.encounters_known else "encounters were not computed")
 
 
-def first_contacts(trajectory: Trajectory) -> tuple[Contact, ...]:
-    """The first contacts after the start: a thing that comes to rest touches the floor many times."""
-    return tuple(contact for contact in trajectory.contacts if contact.time > 0)[:MAX_CONTACTS]
+def contacts_words(trajectory: records.Trajectory, between: str = ", ", digits: int = 1) -> str:
+    """Which two begin to touch, and when; empty where none do.
+
+    Only the first few after the start: a thing that comes to rest touches the floor many times.
+    """
+    names: dict[int | None, str] = {None: "the floor", **{i: body.object for i, body in enumerate(trajectory.bodies)}}
+    first = [contact for contact in trajectory.contacts if contact.time > 0][:MAX_CONTACTS]
+    return between.join(f"{names[each.a]} and {names[each.b]} at {each.time:.{digits}f} s" for each in first)
 
 
-def contacts_words(trajectory: Trajectory) -> str:
-    """Which two begin to touch, and when; empty where none do."""
-    return ", ".join(
-        f"{body_name(contact.a, trajectory)} and {body_name(contact.b, trajectory)} at {contact.time:.1f} s"
-        for contact in first_contacts(trajectory)
-    )
-
-
-def body_name(body: int | None, trajectory: Trajectory) -> str:
-    """What the body with that index is called; null is the floor."""
-    return "the floor" if body is None else trajectory.bodies[body].object
-
-
-def outcome_words(outcome: Outcome) -> str:
+def outcome_words(outcome: records.Outcome) -> str:
     """What the question asks, as the world answers it, and how sure that is."""
     form, value = outcome.asked.form, ""
     share = "" if outcome.probability is None else f", {worlds(outcome.probability)}"
@@ -152,19 +130,19 @@ def one_line(text: str, most: int = 120) -> str:
     return line if len(line) <= most else f"{line[: most - 1]}…"
 
 
-def describe_answer(answer: Verdict) -> str:
+def describe_answer(answer: records.Verdict) -> str:
     """What was answered, in words."""
     if answer.answer is None:
         return "not sure"
     return answer.answer if answer.option is None else f"{answer.answer}: {answer.option}"
 
 
-def simulation_html(simulation: Simulation, get: GetBytes) -> str:
+def simulation_html(simulation: records.Simulation, get: GetBytes) -> str:
     """Overlay, video, the frames side by side, and what was found, as HTML that needs nothing from the network."""
     return _block(simulation.question, _found(simulation, get))
 
 
-def answer_html(answer: Answer, get: GetBytes) -> str:
+def answer_html(answer: records.Answer, get: GetBytes) -> str:
     """The answer, then the simulation that it was reasoned on."""
     body = _line(describe_answer(answer), f"font-size:16px;font-weight:600;{_LONG_TEXT}")
     if answer.reasoning:
@@ -183,7 +161,7 @@ def answer_html(answer: Answer, get: GetBytes) -> str:
     return _block(answer.question, body + _notes(warning for warning in answer.warnings if warning not in shown))
 
 
-def filmstrip_png(simulation: Simulation, get: GetBytes) -> bytes | None:
+def filmstrip_png(simulation: records.Simulation, get: GetBytes) -> bytes | None:
     """Overlay and frames, a few in a row, as PNG; None where none of them has been downloaded."""
     names = [simulation.overlay.sha256, *(frame.sha256 for frame in simulation.frames)]
     pictures = [picture_of(data) for data in map(get, names) if data is not None]
@@ -205,7 +183,7 @@ def filmstrip_png(simulation: Simulation, get: GetBytes) -> bytes | None:
     return buffer.getvalue()
 
 
-def _found(simulation: Simulation, get: GetBytes) -> str:
+def _found(simulation: records.Simulation, get: GetBytes) -> str:
     """Pictures, and what was found."""
     image, trajectory, video = simulation.image, simulation.trajectory, simulation.video
     caption = "; ".join(filter(None, ("what was found", band_words(trajectory))))
@@ -298,7 +276,7 @@ class Models(records.Models):
         named = escape(", ".join(self.mllms)) or "none"
         return f'<div style="{TEXT_STYLE}">{table}<div style="{DIM_STYLE}">COW_MLLM may name: {named}</div></div>'
 
-    def _backends(self) -> Iterator[tuple[str, str, tuple[str, ...], BackendInfo]]:
+    def _backends(self) -> Iterator[tuple[str, str, tuple[str, ...], records.BackendInfo]]:
         """Role, name and the commands that bring what is missing, of each."""
         for role, backends in (("reader", self.readers), ("generator", self.generators)):
             for backend in backends:
@@ -306,7 +284,7 @@ class Models(records.Models):
                 yield role, name, tuple(filter(None, (backend.install, backend.pull))), backend
 
 
-class SimulationView(Simulation):
+class SimulationView(records.Simulation):
     """A simulation as a notebook and a terminal show it."""
 
     def picture_bytes(self, sha256: str) -> bytes | None:
@@ -326,7 +304,7 @@ class SimulationView(Simulation):
         return filmstrip_png(self, self.picture_bytes)
 
 
-class AnswerView(Answer):
+class AnswerView(records.Answer):
     """An answer as a notebook and a terminal show it."""
 
     simulation: SimulationView | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: nobody assigns it

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
@@ -55,23 +56,18 @@ def input_schema(tool: ToolName, image: str) -> dict[str, Any]:
     for name, path in NESTED.items():
         record, _, field = path.partition("/")
         properties[name] = fields[record]["properties"][field]
-    properties |= {
-        "remove": {
-            "type": "array",
-            "items": {"type": "string"},
-            "description": "Things that are taken away before anything moves, in words.",
-        },
-        "place": {
-            "type": "array",
-            "items": _record_of(intervention, _OF_PLACE),
-            "description": "Things that are put somewhere: before anything else moves, or as all that happens.",
-        },
+    properties["remove"] = {
+        "type": "array",
+        "items": {"type": "string"},
+        "description": "Things that are taken away before anything moves, in words.",
+    }
+    properties["place"] = {
+        "type": "array",
+        "items": _record_of(intervention, _OF_PLACE),
+        "description": "Things that are put somewhere: before anything else moves, or as all that happens.",
     }
     properties |= {name: field for name, field in fields.items() if name not in _LEFT_OUT | _LEFT_OUT_OF[tool]}
-    properties["objects"] = {
-        **properties["objects"],
-        "items": _record_of(fields["objects"]["items"]["properties"], _OF_OBJECTS),
-    }
+    properties["objects"] |= {"items": _record_of(fields["objects"]["items"]["properties"], _OF_OBJECTS)}
     properties["image"] = {"type": "string", "description": image}
     for name, default in DEFAULTS[tool].items():
         properties[name] = {**properties[name], "default": default}
@@ -85,28 +81,24 @@ def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, An
     Raises `InvalidRequest` for an unknown argument, and where `image` or `question` is missing.
     """
     known = input_schema(tool, "")["properties"]
-    faults = [
-        FieldError(f"/{name}", f"there is no such argument; there are: {', '.join(known)}")
-        for name in arguments
-        if name not in known
-    ]
-    faults += [
-        FieldError(f"/{name}", "is needed, as text")
-        for name in ("image", "question")
-        if not isinstance(arguments.get(name), str)
-    ]
+    others = f"there is no such argument; there are: {', '.join(known)}"
+    faults = [FieldError(f"/{name}", others) for name in arguments if name not in known]
+    missing = [name for name in ("image", "question") if not isinstance(arguments.get(name), str)]
+    faults += [FieldError(f"/{name}", "is needed, as text") for name in missing]
     if faults:
         raise InvalidRequest("The arguments of the tool are not valid.", errors=tuple(faults))
     request: dict[str, Any] = {}
     given = DEFAULTS[tool] | {name: value for name, value in arguments.items() if value is not None}
     for name, argument in given.items():
-        value = argument if known[name].get("type") == "string" else _parsed(argument)
+        value = argument
+        if isinstance(argument, str) and known[name].get("type") != "string":
+            with suppress(ValueError):  # some clients write lists and numbers as JSON in a string
+                value = json.loads(argument)
         if name in ("remove", "place"):
             things = value if isinstance(value, list) else [value]
             changes = [{"object": thing} if name == "remove" else thing for thing in things]
-            request.setdefault("interventions", []).extend(
-                {"kind": name, **change} if isinstance(change, Mapping) else change for change in changes
-            )
+            changes = [{"kind": name, **change} if isinstance(change, Mapping) else change for change in changes]
+            request.setdefault("interventions", []).extend(changes)
         elif name in NESTED:
             record, _, field = NESTED[name].partition("/")
             request.setdefault(record, {})[field] = value
@@ -149,14 +141,6 @@ def _record_of(properties: Mapping[str, Any], names: tuple[str, ...]) -> dict[st
     return {"type": "object", "properties": {name: properties[name] for name in names}, "required": list(names)}
 
 
-def _parsed(value: Any) -> Any:
-    """Some clients write lists and numbers as JSON in a string."""
-    try:
-        return json.loads(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
-
-
 ARTIFACTS = "cow://artifacts/"
 _KEPT = (
     "the 64-digit sha256 of the `image` in an earlier result, which asks about the same image again without sending it"
@@ -191,16 +175,7 @@ def image_of(text: str, *, paths: bool) -> ImageLike:
         )
     if scheme not in (None, "file://"):
         raise _wrong(f"{_shown(text)} cannot be opened: give a path, a data URL, an http(s) URL or a digest")
-    return _read_image(Path(url2pathname(urlsplit(text).path)) if scheme else Path(text))
-
-
-def digest_of(text: str) -> str | None:
-    """The SHA-256 that a text names, as such or as a resource; None where it names none."""
-    found = _DIGEST.fullmatch(text)
-    return found and found[1].lower()
-
-
-def _read_image(path: Path) -> bytes:
+    path = Path(url2pathname(urlsplit(text).path)) if scheme else Path(text)
     try:
         path = path.expanduser().absolute()
         if not path.is_file():  # devices and pipes may never end
@@ -210,12 +185,18 @@ def _read_image(path: Path) -> bytes:
             if media_type_of(head) not in ("image/png", "image/jpeg", "image/webp"):
                 raise _wrong(f"{_shown(str(path))} is no PNG, JPEG or WebP")
             rest = file.read(MAX_FILE_BYTES)
-            if len(head) + len(rest) > MAX_FILE_BYTES:
-                raise _wrong(f"{_shown(str(path))} is larger than {MAX_FILE_BYTES // 1_000_000} MB")
-            return head + rest
     except (OSError, RuntimeError, ValueError) as error:  # no home folder; NUL in the name
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise _wrong(f"{_shown(str(path))} cannot be read: {why or type(error).__name__}") from error
+    if len(head) + len(rest) > MAX_FILE_BYTES:
+        raise _wrong(f"{_shown(str(path))} is larger than {MAX_FILE_BYTES // 1_000_000} MB")
+    return head + rest
+
+
+def digest_of(text: str) -> str | None:
+    """The SHA-256 that a text names, as such or as a resource; None where it names none."""
+    found = _DIGEST.fullmatch(text)
+    return found and found[1].lower()
 
 
 def _shown(text: str) -> str:

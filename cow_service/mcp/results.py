@@ -11,8 +11,7 @@ from anyio import to_thread
 from mcp_types import CallToolResult, ImageContent, TextContent
 from PIL import Image
 
-from cow_service.client import AsyncClient
-from cow_service.client.display import MAX_CONTACTS, body_name, first_contacts, gate_words, outcome_words, worlds
+from cow_service.client import AsyncClient, display
 from cow_service.mcp.arguments import ARTIFACTS, ToolName, inlined
 from cow_service.records import MEETINGS, Answer, Body, Simulation, Verdict
 
@@ -69,7 +68,7 @@ async def tool_result(result: Simulation | Answer, client: AsyncClient, base_url
     if simulation is not None:
         # A thing that comes to rest touches the floor many times.
         contacts = shown["trajectory"]["contacts"]
-        shown["trajectory"]["contacts"] = [each for each in contacts if each["time"] > 0][:MAX_CONTACTS]
+        shown["trajectory"]["contacts"] = [each for each in contacts if each["time"] > 0][: display.MAX_CONTACTS]
     if simulation is not None and simulation.video is not None:
         sha256, url = simulation.video.sha256, simulation.video.url
         video = shown["video"]["url"] = ARTIFACTS + sha256 if base_url is None else base_url + url
@@ -82,8 +81,7 @@ async def tool_result(result: Simulation | Answer, client: AsyncClient, base_url
 
 def simulation_text(simulation: Simulation, video: str) -> str:
     """What moves, how, what it meets when; which picture is which; what to mind. `video` is where the clip is."""
-    lines = [*_simulation_lines(simulation, video), *_warning_lines(simulation.warnings)]
-    return "\n".join([*lines, _image_hint(simulation.image.sha256)])
+    return _text(_simulation_lines(simulation, video), simulation.warnings, simulation.image.sha256)
 
 
 def answer_text(answer: Answer, video: str) -> str:
@@ -92,19 +90,24 @@ def answer_text(answer: Answer, video: str) -> str:
     if answer.reasoning:
         lines.append(f"Reasoning: {answer.reasoning}")
     if sum(answer.votes.values()) > 1:
-        lines.append(f"Votes: {_votes(answer)}.")
+        lines.append(f"Votes: {display.votes_words(answer)}.")
     if answer.gate is not None:
-        lines.append(f"Before looking: {gate_words(answer.gate)}.")
-    if answer.baseline is not None:
-        votes = f"; votes {_votes(answer.baseline)}" if sum(answer.baseline.votes.values()) > 1 else ""
-        lines.append(f"Without imagined frames: {_verdict(answer.baseline)}{votes}.")
-    warnings = list(answer.warnings)
+        lines.append(f"Before looking: {display.gate_words(answer.gate)}.")
+    if (baseline := answer.baseline) is not None:
+        votes = f"; votes {display.votes_words(baseline)}" if sum(baseline.votes.values()) > 1 else ""
+        lines.append(f"Without imagined frames: {_verdict(baseline)}{votes}.")
+    warnings = answer.warnings
     if answer.simulation is not None:
         lines += ["", "Imagined:", *_simulation_lines(answer.simulation, video)]
         warnings += answer.simulation.warnings
     else:
         lines.append("Nothing was imagined: the answer is from the image alone.")
-    return "\n".join([*lines, *_warning_lines(warnings), _image_hint(answer.image.sha256)])
+    return _text(lines, warnings, answer.image.sha256)
+
+
+def _text(lines: Iterable[str], warnings: Iterable[str], image: str) -> str:
+    notes = (f"Note: {warning}" for warning in dict.fromkeys(warnings))
+    return "\n".join([*lines, *notes, f'To ask about this image again, give image="{image}".'])
 
 
 def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
@@ -119,10 +122,9 @@ def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
         f"It is the {simulation.grounding.object} at [{box}] in the image of {image.width} x {image.height} px; "
         f"{motion.kind}, {way}law {trajectory.law}."
     )
-    encounters = sorted(trajectory.encounters, key=lambda encounter: encounter.first_frame)
     meetings: list[str] = []
-    for each in encounters:
-        sure = "" if each.probability is None else f", {worlds(each.probability)}"
+    for each in sorted(trajectory.encounters, key=lambda encounter: encounter.first_frame):
+        sure = "" if each.probability is None else f", {display.worlds(each.probability)}"
         when = f"from {each.first_frame / trajectory.fps:.2f} s (frame {each.first_frame}{sure})"
         meetings.append(f"{MEETINGS[each.kind]} {each.object} {when}")
     if meetings:
@@ -131,13 +133,9 @@ def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
         yield "It meets nothing on its way, as far as the image tells."
     else:
         yield "What it meets was not computed."
-    if contacts := first_contacts(trajectory):
-        touches = (
-            f"{body_name(contact.a, trajectory)} and {body_name(contact.b, trajectory)} at {contact.time:.2f} s"
-            for contact in contacts
-        )
-        yield f"Contacts: {'; '.join(touches)}."
-    if trajectory.outcome is not None and (summary := outcome_words(trajectory.outcome)):
+    if contacts := display.contacts_words(trajectory, "; ", digits=2):
+        yield f"Contacts: {contacts}."
+    if trajectory.outcome is not None and (summary := display.outcome_words(trajectory.outcome)):
         yield f"Outcome (a hypothesis of the simulated world): {summary}."
     if trajectory.moving_until is not None:
         yield f"Nothing moves in the image from {trajectory.moving_until:.2f} s on."
@@ -154,18 +152,6 @@ def _verdict(verdict: Verdict) -> str:
     if verdict.answer is None:
         return "not sure"
     return verdict.answer if verdict.option is None else f"{verdict.answer} ({verdict.option})"
-
-
-def _votes(verdict: Verdict) -> str:
-    return ", ".join(f"{answer}: {count}" for answer, count in verdict.votes.items())
-
-
-def _warning_lines(warnings: Iterable[str]) -> Iterable[str]:
-    return (f"Note: {warning}" for warning in dict.fromkeys(warnings))
-
-
-def _image_hint(sha256: str) -> str:
-    return f'To ask about this image again, give image="{sha256}".'
 
 
 # Pictures

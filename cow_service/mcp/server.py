@@ -17,7 +17,6 @@ from typing import Any, TypeAlias
 
 import anyio
 import mcp_types as types
-from anyio.streams.memory import MemoryObjectReceiveStream
 from mcp.server.context import ServerRequestContext
 from mcp.server.lowlevel import Server
 from mcp.shared.exceptions import MCPError
@@ -26,17 +25,8 @@ from cow_service import __version__
 from cow_service.client import AsyncAnswer, AsyncClient, AsyncSimulation, CowError, ImageLike
 from cow_service.client.progress import describe
 from cow_service.errors import InternalError
-from cow_service.mcp.arguments import (
-    ARTIFACTS,
-    HELP_WITH_PATHS,
-    HELP_WITHOUT_PATHS,
-    ToolName,
-    digest_of,
-    error_text,
-    image_of,
-    input_schema,
-    request_fields,
-)
+from cow_service.mcp import arguments
+from cow_service.mcp.arguments import ToolName
 from cow_service.mcp.results import output_schema, tool_result
 from cow_service.media.artifacts import media_type_of
 from cow_service.records import Job
@@ -128,12 +118,13 @@ def create_server(connect: Connect, lifespan: Lifespan, *, paths: bool, links: b
 class _Tools:
     def __init__(self, connect: Connect, *, paths: bool, links: bool) -> None:
         self._connect, self._paths, self._links = connect, paths, links
+        image = arguments.HELP_WITH_PATHS if paths else arguments.HELP_WITHOUT_PATHS
         self._listed = [
             types.Tool(
                 name=name,
                 title=TITLES[name],
                 description=description,
-                input_schema=input_schema(name, HELP_WITH_PATHS if paths else HELP_WITHOUT_PATHS),
+                input_schema=arguments.input_schema(name, image),
                 output_schema=output_schema(name),
                 annotations=types.ToolAnnotations(title=TITLES[name], **HINTS),
             )
@@ -155,8 +146,8 @@ class _Tools:
             await context.session.report_progress(done, 1.0, stage)
 
         try:
-            fields = request_fields(tool, params.arguments or {})
-            image = await anyio.to_thread.run_sync(partial(image_of, fields.pop("image"), paths=self._paths))
+            fields = arguments.request_fields(tool, params.arguments or {})
+            image = await anyio.to_thread.run_sync(partial(arguments.image_of, fields.pop("image"), paths=self._paths))
             async with self._connect(_caller(context)) as client:
                 result = await result_of(client, tool, image, fields, report)
                 return await tool_result(result, client, client.base_url if self._links else None)
@@ -166,14 +157,14 @@ class _Tools:
         except Exception:
             log.exception("%s failed", tool)
             failure = InternalError("The tool met an error that it did not foresee; its log has the trace.")
-        return types.CallToolResult(content=[types.TextContent(text=error_text(failure))], is_error=True)
+        return types.CallToolResult(content=[types.TextContent(text=arguments.error_text(failure))], is_error=True)
 
     async def resources(self, *_: Any) -> types.ListResourcesResult:
         return types.ListResourcesResult(resources=[])
 
     async def templates(self, *_: Any) -> types.ListResourceTemplatesResult:
         artifact = types.ResourceTemplate(
-            uri_template=ARTIFACTS + "{sha256}",
+            uri_template=arguments.ARTIFACTS + "{sha256}",
             name="artifact",
             title="Pictures and videos of results",
             description="The bytes of a picture or video, by the SHA-256 that a result names it with.",
@@ -184,7 +175,7 @@ class _Tools:
         self, context: ServerRequestContext[Any], params: types.ReadResourceRequestParams
     ) -> types.ReadResourceResult:
         uri = str(params.uri)
-        sha256 = digest_of(uri)
+        sha256 = arguments.digest_of(uri)
         if sha256 is None:
             raise MCPError(code=types.INVALID_PARAMS, message=f"There is no resource {uri[:200]!r}.")
         try:
@@ -192,7 +183,7 @@ class _Tools:
                 data = await client.artifact(sha256)
         except CowError as error:
             code = types.INVALID_PARAMS if error.code == "artifact-not-found" else types.INTERNAL_ERROR
-            raise MCPError(code=code, message=error_text(error)) from error
+            raise MCPError(code=code, message=arguments.error_text(error)) from error
         blob = base64.b64encode(data).decode()
         media_type = media_type_of(data) or "application/octet-stream"
         return types.ReadResourceResult(contents=[types.BlobResourceContents(uri=uri, mime_type=media_type, blob=blob)])
@@ -217,8 +208,18 @@ async def result_of(
     call = client.simulate if tool == "simulate" else client.answer
     result: AsyncSimulation | AsyncAnswer | CowError | None = None
     updates, updated = anyio.create_memory_object_stream[Job](math.inf)
+
+    async def report_all() -> None:
+        done, stage = -MIN_STEP, ""
+        with updated:
+            async for job in updated:
+                now = describe(job)
+                if job.progress > done or now != stage:
+                    done, stage = max(job.progress, done + MIN_STEP), now
+                    await report(done, stage)
+
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(_report_all, updated, report)
+        tasks.start_soon(report_all)
         with updates:
             try:
                 result = await call(image, progress=updates.send_nowait, **fields)
@@ -228,13 +229,3 @@ async def result_of(
         raise result
     assert result is not None
     return result
-
-
-async def _report_all(jobs: MemoryObjectReceiveStream[Job], report: Report) -> None:
-    done, stage = -MIN_STEP, ""
-    with jobs:
-        async for job in jobs:
-            now = describe(job)
-            if job.progress > done or now != stage:
-                done, stage = max(job.progress, done + MIN_STEP), now
-                await report(done, stage)
