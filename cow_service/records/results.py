@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import BaseModel, Field
 
-from cow_service.records.world import Artifact, Grounding, ImageInfo, Motion, Record, Sha256, Share, Trajectory
+from cow_service.records.world import Artifact, Grounding, ImageInfo, Motion, Record, Sha256, Trajectory
 
 FramePolicy = Literal["initial", "uniform", "events"]
 
@@ -14,12 +14,12 @@ FramePolicy = Literal["initial", "uniform", "events"]
 class Frame(Record):
     """One picture of the clip."""
 
-    index: NonNegativeInt = Field(description="Which frame of the clip.")
-    time: NonNegativeFloat = Field(description="Seconds.")
+    index: int = Field(ge=0, description="Which frame of the clip.")
+    time: float = Field(ge=0, description="Seconds.")
     url: str
     sha256: Sha256
-    width: PositiveInt = Field(description="Pixels.")
-    height: PositiveInt = Field(description="Pixels.")
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
 
 
 class Video(Record):
@@ -27,10 +27,10 @@ class Video(Record):
 
     url: str
     sha256: Sha256
-    fps: PositiveFloat
-    num_frames: PositiveInt
-    width: PositiveInt = Field(description="Pixels.")
-    height: PositiveInt = Field(description="Pixels.")
+    fps: float = Field(gt=0)
+    num_frames: int = Field(gt=0)
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
 
 
 class ReaderInfo(Record):
@@ -48,9 +48,9 @@ class ReaderInfo(Record):
 class Usage(Record):
     """What the multimodal LLM was asked, re-asks and failed tries that it counted included."""
 
-    calls: NonNegativeInt = 0
-    input_tokens: NonNegativeInt = 0
-    output_tokens: NonNegativeInt = 0
+    calls: int = Field(default=0, ge=0)
+    input_tokens: int = Field(default=0, ge=0)
+    output_tokens: int = Field(default=0, ge=0)
 
     def __add__(self, other: Usage) -> Usage:
         return Usage(
@@ -203,8 +203,8 @@ class Gate(Record):
     asked: int = Field(
         ge=1, description="Votes asked for; 1 where the reader gives the same answer however often it is asked."
     )
-    agreement: Share = Field(description="Share of the votes asked for that the leading answer has.")
-    threshold: PositiveFloat = Field(le=1, description="`imagine_threshold` of the request.")
+    agreement: float = Field(ge=0, le=1, description="Share of the votes asked for that the leading answer has.")
+    threshold: float = Field(gt=0, le=1, description="`imagine_threshold` of the request.")
     imagined: bool = Field(
         description="Whether imagining followed; where that failed, `simulation_problem` says why, and the leading "
         "answer is taken."
@@ -295,7 +295,7 @@ class Job(Record):
     kind: JobKind
     status: JobStatus
     stage: str | None = Field(default=None, description="The stage that it is in, or was in when it ended.")
-    progress: Share = Field(description="Share of the work that is done, all stages together.")
+    progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
     question: str | None = Field(
         default=None,
         description="The request's; in lists at most 200 characters of it, the last of them `…` where it is longer. "
@@ -306,12 +306,13 @@ class Job(Record):
     )
     created_at: str = Field(description="RFC 3339, UTC.")
     finished_at: str | None = Field(default=None, description="RFC 3339, UTC.")
-    position: NonNegativeInt | None = Field(
+    position: int | None = Field(
         default=None,
+        ge=0,
         description="Jobs that are taken before it, while it is queued and asked for by its id; null otherwise.",
     )
-    expected_wait: NonNegativeFloat | None = Field(
-        default=None, description="Seconds until it is taken, at the rate of the last minutes; null if not known."
+    expected_wait: float | None = Field(
+        default=None, ge=0, description="Seconds until it is taken, at the rate of the last minutes; null if not known."
     )
     generator: str = Field(description="Who makes its frames.")
     result: Simulation | Answer | None = Field(default=None, description="Of a succeeded job, but not in lists.")
@@ -342,9 +343,9 @@ class GpuMemory(Record):
     """Memory of one GPU."""
 
     device: str = Field(description="Such as cuda:0.")
-    allocated_mb: NonNegativeFloat = Field(description="In use by the process, MB.")
-    reserved_mb: NonNegativeFloat = Field(description="Held by the process, MB.")
-    total_mb: NonNegativeFloat = Field(description="Of the device, MB.")
+    allocated_mb: float = Field(ge=0, description="In use by the process, MB.")
+    reserved_mb: float = Field(ge=0, description="Held by the process, MB.")
+    total_mb: float = Field(ge=0, description="Of the device, MB.")
 
 
 class WorkerJob(Record):
@@ -353,8 +354,8 @@ class WorkerJob(Record):
     id: str | None = Field(default=None, description="Null where the server has keys.")
     kind: JobKind
     stage: str | None = None
-    progress: Share = Field(description="Share of the work that is done, all stages together.")
-    seconds: NonNegativeFloat = Field(description="Since it began to be computed.")
+    progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
+    seconds: float = Field(ge=0, description="Since it began to be computed.")
 
 
 class WorkerInfo(Record):
@@ -363,8 +364,8 @@ class WorkerInfo(Record):
     name: str = Field(description="Its queue and a number.")
     queue: str | None = Field(description="Whose jobs it computes; null: of all queues.")
     pid: int
-    memory_mb: NonNegativeFloat = Field(description="Resident memory, MB (10^6 bytes).")
-    jobs_done: NonNegativeInt
+    memory_mb: float = Field(ge=0, description="Resident memory, MB (10^6 bytes).")
+    jobs_done: int = Field(ge=0)
     jobs: tuple[WorkerJob, ...] = Field(default=(), description="At hand; several where jobs wait for an MLLM.")
     gpus: tuple[GpuMemory, ...] = Field(default=(), description="That it uses.")
 
@@ -389,13 +390,11 @@ class QueueInfo(Record):
     """One queue."""
 
     name: str
-    queued: NonNegativeInt = Field(description="Jobs that wait.")
-    running: NonNegativeInt = Field(description="Jobs that are computed.")
-    capacity: NonNegativeInt = Field(description="Jobs that all processes together take at the same time.")
-    oldest_seconds: NonNegativeFloat | None = Field(
-        default=None, description="How long the oldest of `queued` has waited."
-    )
-    jobs_per_minute: NonNegativeFloat = Field(description="That ended, over the last five minutes.")
+    queued: int = Field(ge=0, description="Jobs that wait.")
+    running: int = Field(ge=0, description="Jobs that are computed.")
+    capacity: int = Field(ge=0, description="Jobs that all processes together take at the same time.")
+    oldest_seconds: float | None = Field(default=None, ge=0, description="How long the oldest of `queued` has waited.")
+    jobs_per_minute: float = Field(ge=0, description="That ended, over the last five minutes.")
 
 
 class Unserved(Record):
@@ -403,7 +402,7 @@ class Unserved(Record):
 
     queue: str
     workflow_version: str
-    jobs: PositiveInt
+    jobs: int = Field(gt=0)
     reason: Literal["version", "queue"] = Field(
         description="No process has their workflow version, or none of those that have it serves their queue."
     )

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Point = tuple[float, float]
 BBox = tuple[float, float, float, float]
@@ -21,7 +12,6 @@ Vector = tuple[float, float]
 Position = tuple[float, float, float]
 State = tuple[float, float, float, float, float, float]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-Share = Annotated[float, Field(ge=0, le=1)]  # of a whole, or a probability
 
 
 class Record(BaseModel):
@@ -37,14 +27,14 @@ class Artifact(Record):
     sha256: Sha256
     url: str = Field(description="Path of the bytes on the server that made them.")
     media_type: str
-    size: NonNegativeInt = Field(description="Bytes.")
+    size: int = Field(ge=0, description="Bytes.")
 
 
 class ImageInfo(Record):
     """The input image, upright. `sha256` is that of the bytes as they were sent."""
 
-    width: PositiveInt = Field(description="Pixels.")
-    height: PositiveInt = Field(description="Pixels.")
+    width: int = Field(gt=0, description="Pixels.")
+    height: int = Field(gt=0, description="Pixels.")
     sha256: Sha256
 
 
@@ -87,8 +77,8 @@ class Asked(Record):
     )
     every: bool = Field(default=False, description="It counts only where it happens with each of `among`.")
     partly: bool = Field(default=False, description="Of `covers` and `covered`: it counts where any part is hidden.")
-    within: PositiveFloat | None = Field(
-        default=None, description="How long it may take to happen, s; null: as long as the clip."
+    within: float | None = Field(
+        default=None, gt=0, description="How long it may take to happen, s; null: as long as the clip."
     )
 
 
@@ -96,7 +86,7 @@ class Estimate(Record):
     """A value that somebody estimated: a prior, never taken as truth."""
 
     value: float
-    deviation: NonNegativeFloat = Field(description="One standard deviation, in the unit of the value.")
+    deviation: float = Field(ge=0, description="One standard deviation, in the unit of the value.")
 
 
 class ObjectPrior(Record):
@@ -159,7 +149,7 @@ class Grounding(Record):
 class MetresPerPixel(Record):
     """The scale of the scene at the object, and where it came from."""
 
-    value: PositiveFloat = Field(description="Metres per pixel at the object's depth.")
+    value: float = Field(gt=0, description="Metres per pixel at the object's depth.")
     source: Literal["default", "reference", "request"]
     note: str = Field(default="", description="What it was taken from, in words.")
 
@@ -169,8 +159,8 @@ class MotionStep(Record):
 
     direction: Vector = Field(description="Unit vector in the image, px.")
     depth: float = Field(default=0.0, ge=-1, le=1, description="As `Motion.depth`.")
-    distance: PositiveFloat | None = Field(default=None, description="px at the depth of the first frame.")
-    duration: PositiveFloat | None = Field(default=None, description="s.")
+    distance: float | None = Field(default=None, gt=0, description="px at the depth of the first frame.")
+    duration: float | None = Field(default=None, gt=0, description="s.")
 
 
 class AlsoMoving(Record):
@@ -180,7 +170,7 @@ class AlsoMoving(Record):
     kind: MotionKind
     direction: Vector | None = Field(default=None, description="As `Motion.direction`.")
     depth: float = Field(default=0.0, ge=-1, le=1, description="As `Motion.depth`.")
-    speed: NonNegativeFloat = Field(description="px/s at the depth of the first frame.")
+    speed: float = Field(ge=0, description="px/s at the depth of the first frame.")
     speed_deviation: float = Field(default=0.0, ge=0, le=3, description="As `Motion.speed_deviation`.")
 
 
@@ -205,14 +195,14 @@ class Motion(Record):
     )
     cue: Cue
     along_arrow: bool | None = Field(default=None, description="Along or against it, where the cue is an arrow.")
-    speed: NonNegativeFloat = Field(description="px/s at the depth of the first frame.")
+    speed: float = Field(ge=0, description="px/s at the depth of the first frame.")
     speed_deviation: float = Field(
         default=0.0, ge=0, le=3, description="One standard deviation of the speed's natural logarithm."
     )
-    distance: PositiveFloat | None = Field(
-        default=None, description="px at the depth of the first frame, after which the object is stopped."
+    distance: float | None = Field(
+        default=None, gt=0, description="px at the depth of the first frame, after which the object is stopped."
     )
-    duration: PositiveFloat | None = Field(default=None, description="s, after which the object is stopped.")
+    duration: float | None = Field(default=None, gt=0, description="s, after which the object is stopped.")
     until: Until | None = Field(
         default=None, description="contact: stopped where it first meets something; null: it goes on by itself."
     )
@@ -243,19 +233,19 @@ CameraSource = Literal["shadow", "edges", "request", "prior"]
 class CameraDeviations(Record):
     """One standard deviation of each value of a camera, in its unit."""
 
-    focal: NonNegativeFloat = Field(description="px.")
-    pitch: NonNegativeFloat = Field(description="Degrees.")
-    roll: NonNegativeFloat = Field(description="Degrees.")
-    height: NonNegativeFloat = Field(description="m.")
+    focal: float = Field(ge=0, description="px.")
+    pitch: float = Field(ge=0, description="Degrees.")
+    roll: float = Field(ge=0, description="Degrees.")
+    height: float = Field(ge=0, description="m.")
 
 
 class CameraEstimate(Record):
     """The pinhole camera that took the image, as it was estimated. Its centre is the origin of all positions."""
 
-    focal: PositiveFloat = Field(description="px.")
+    focal: float = Field(gt=0, description="px.")
     pitch: float = Field(description="Degrees that it looks down on the floor.")
     roll: float = Field(default=0.0, description="Degrees that the vertical leans to the left in the image.")
-    height: PositiveFloat = Field(description="m above the floor.")
+    height: float = Field(gt=0, description="m above the floor.")
     source: CameraSource = Field(description="What it was estimated from beside the priors.")
     deviations: CameraDeviations
 
@@ -275,7 +265,7 @@ class Body(Record):
         "somewhere before the motion.",
     )
     source: Literal["embedded", "mllm", "request"] = Field(description="Who says that it is there.")
-    confidence: Share = Field(description="How sure it is that this is one separate thing.")
+    confidence: float = Field(ge=0, le=1, description="How sure it is that this is one separate thing.")
 
 
 _MINIMAL = "; not in minimal results"  # `Prefer: return=minimal`
@@ -284,7 +274,7 @@ _MINIMAL = "; not in minimal results"  # `Prefer: return=minimal`
 class Path(Record):
     """What one body does, per frame of the clip."""
 
-    body: NonNegativeInt = Field(default=0, description="Which of `Trajectory.bodies`.")
+    body: int = Field(default=0, ge=0, description="Which of `Trajectory.bodies`.")
     states: tuple[State, ...] = Field(
         default=(), description=f"[x, y, z, vx, vy, vz] per frame: the 6-D state of the body{_MINIMAL}."
     )
@@ -308,11 +298,9 @@ class Path(Record):
         description="Of the mover alone: the point in other worlds of the ensemble, at most 8 of them, each [x, y] per "
         f"frame, px, to 0.1 px; empty where `band` is{_MINIMAL}.",
     )
-    moved_at: NonNegativeFloat | None = Field(
-        default=None, description="Seconds until it is set in motion; null: never."
-    )
-    tipped_at: NonNegativeFloat | None = Field(
-        default=None, description="Seconds until its upright axis leans by more than 45 degrees; null: never."
+    moved_at: float | None = Field(default=None, ge=0, description="Seconds until it is set in motion; null: never.")
+    tipped_at: float | None = Field(
+        default=None, ge=0, description="Seconds until its upright axis leans by more than 45 degrees; null: never."
     )
     tracks: tuple[tuple[Point, ...], ...] = Field(
         default=(), description=f"Several points inside the body's mask, each [x, y] per frame, px{_MINIMAL}."
@@ -325,12 +313,12 @@ class Path(Record):
 class Contact(Record):
     """Two bodies begin to touch, or a body meets the floor, in the likeliest world."""
 
-    a: NonNegativeInt = Field(description="Which of `Trajectory.bodies`.")
+    a: int = Field(ge=0, description="Which of `Trajectory.bodies`.")
     b: int | None = Field(description="Which of `Trajectory.bodies`; null for the floor.")
-    time: NonNegativeFloat = Field(description="Seconds.")
+    time: float = Field(ge=0, description="Seconds.")
     point: Point = Field(description="[x, y], px.")
-    impulse: NonNegativeFloat = Field(
-        description="Change of velocity of `a`, m/s: 0 where nothing is exchanged, as under the ballistic law."
+    impulse: float = Field(
+        ge=0, description="Change of velocity of `a`, m/s: 0 where nothing is exchanged, as under the ballistic law."
     )
 
 
@@ -339,15 +327,15 @@ class Encounter(Record):
 
     object: str
     bbox: BBox = Field(description="[x0, y0, x1, y1], px, of the other object at the first frame.")
-    body: NonNegativeInt | None = Field(default=None, description="Which of `Trajectory.bodies`.")
-    subject: NonNegativeInt = Field(default=0, description="Which of `Trajectory.bodies` meets it; 0: the mover.")
+    body: int | None = Field(default=None, ge=0, description="Which of `Trajectory.bodies`.")
+    subject: int = Field(default=0, ge=0, description="Which of `Trajectory.bodies` meets it; 0: the mover.")
     kind: EncounterKind
-    first_frame: NonNegativeInt = Field(description="The first clip frame of the encounter, in the likeliest world.")
-    share: Share | None = Field(
-        default=None, description="Of an occlusion: the largest share of what is hidden that is covered."
+    first_frame: int = Field(ge=0, description="The first clip frame of the encounter, in the likeliest world.")
+    share: float | None = Field(
+        default=None, ge=0, le=1, description="Of an occlusion: the largest share of what is hidden that is covered."
     )
-    probability: Share | None = Field(
-        default=None, description="Share of the ensemble's worlds in which it happens; null without one."
+    probability: float | None = Field(
+        default=None, ge=0, le=1, description="Share of the ensemble's worlds in which it happens; null without one."
     )
 
 
@@ -359,8 +347,10 @@ class Outcome(Record):
         default=None, description="The object whose encounter is asked about, where that is not the mover."
     )
     object: str | None = Field(default=None, description="The object asked about, where it was found.")
-    probability: Share | None = Field(
+    probability: float | None = Field(
         default=None,
+        ge=0,
+        le=1,
         description="That what is asked happens, negation included; of `which-first`, `when` and `how-many`: of the "
         "value below. Null where nothing tells.",
     )
@@ -385,29 +375,31 @@ class Placement(Record):
     probabilities: dict[PlacementResult, float] = Field(
         default_factory=dict, description="Share of the ensemble's worlds with each result; empty without an ensemble."
     )
-    fits: Share | None = Field(
+    fits: float | None = Field(
         default=None,
+        ge=0,
+        le=1,
         description="Probability that it ends as it was meant to: inside and not held up at the rim, on top, or beside "
         "without overlapping.",
     )
     clearance: float | None = Field(
         default=None, description="Width of the opening less that of the object, as a share of the opening."
     )
-    above_rim: Share | None = Field(
-        default=None, description="Share of the object's height that is higher than the rim."
+    above_rim: float | None = Field(
+        default=None, ge=0, le=1, description="Share of the object's height that is higher than the rim."
     )
 
 
 class PlacedBefore(Placement):
     """What becomes of an object that is put somewhere before the motion."""
 
-    body: NonNegativeInt = Field(description="Which of `Trajectory.bodies`: there is its new place.")
+    body: int = Field(ge=0, description="Which of `Trajectory.bodies`: there is its new place.")
     place: str = Field(description="Where it is put, in words.")
     by_heading: bool = Field(
         default=False, description="In front of or behind the mover by the way that it goes, not as the camera sees it."
     )
-    visible: Share = Field(
-        description="Share of it that is seen there at the first frame: 0 behind others or off the image."
+    visible: float = Field(
+        ge=0, le=1, description="Share of it that is seen there at the first frame: 0 behind others or off the image."
     )
 
 
@@ -429,7 +421,7 @@ class Trajectory(Record):
     """
 
     law: Law = "ballistic"
-    fps: PositiveFloat = Field(description="Frames per second of the clip.")
+    fps: float = Field(gt=0, description="Frames per second of the clip.")
     units: TrajectoryUnits = TrajectoryUnits()
     camera: CameraEstimate | None = Field(default=None, description="Null where nothing was estimated.")
     bodies: tuple[Body, ...] = ()
@@ -440,15 +432,15 @@ class Trajectory(Record):
         description="Metres that a shadow lies to the right of what casts it, and away from the camera, per metre of "
         "height above the floor; null where no shadow in the air tells.",
     )
-    moving_until: NonNegativeFloat | None = Field(
-        default=None, description="Seconds from which nothing moves any more, or the mover has left the image."
+    moving_until: float | None = Field(
+        default=None, ge=0, description="Seconds from which nothing moves any more, or the mover has left the image."
     )
     anchors: tuple[Point, ...] = Field(description="Static points that hold the camera still, px.")
     encounters: tuple[Encounter, ...] = ()
     encounters_known: bool = Field(
         default=True, description="False where the surroundings could not be told apart: then nothing is listed."
     )
-    ensemble: NonNegativeInt = Field(default=0, description="How many worlds the probabilities are counted in.")
+    ensemble: int = Field(default=0, ge=0, description="How many worlds the probabilities are counted in.")
     outcome: Outcome | None = Field(
         default=None, description="Null where the question asks for nothing that the world can tell."
     )
