@@ -30,7 +30,7 @@ lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-unasync: $(VENV)/.test ## write the blocking client from the async one
+unasync: $(VENV)/.test ## write the classes of the blocking client from the async ones
 	$(BIN)/python tests/sync_twins.py
 
 openapi: $(VENV)/.base ## write openapi.yaml from the app

@@ -1,7 +1,5 @@
 """What `simulate`, `answer`, `models` and `doctor` show: progress, results in a folder, tables."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import sys
@@ -57,26 +55,30 @@ def run_request(
         fields = field_errors(error.errors())
         faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
         raise InvalidRequest(f"{faults}.", errors=fields) from error
+    result: Simulation | Answer
     with stages_shown(console) as show:
-        answered = service.answer(request, show, decoded) if isinstance(request, AnswerRequest) else None
-        simulation = service.simulate(request, show, decoded) if answered is None else answered.simulation
-    result = answered or simulation
-    assert result is not None
+        if isinstance(request, AnswerRequest):
+            result = service.answer(request, show, decoded)
+        else:
+            result = service.simulate(request, show, decoded)
     written = [] if out is None else save(service, result, out, formats)
     if as_json:
         print(result.model_dump_json(indent=2))
+    simulation = result.simulation if isinstance(result, Answer) else result
+    warnings: list[str] = []
     if simulation is not None:
         print_stages(console, simulation)
-    if answered is not None:
-        console.print(answer_table(answered))
-        if answered.reasoning:
-            console.print(f"[dim]reasoning[/]: {escape(answered.reasoning)}")
-    own = () if answered is None else answered.warnings
-    for warning in (*(() if simulation is None else simulation.warnings), *own):
+        warnings += simulation.warnings
+    if isinstance(result, Answer):
+        console.print(answer_table(result))
+        if result.reasoning:
+            console.print(f"[dim]reasoning[/]: {escape(result.reasoning)}")
+        warnings += result.warnings
+    for warning in warnings:
         console.print(f"[yellow]warning[/]: {escape(warning)}")
-    problem = None if answered is None else answered.simulation_problem
-    if problem is not None and (hint := HINTS.get(problem.code)):
-        console.print(hint)
+    problem = result.simulation_problem if isinstance(result, Answer) else None
+    if problem is not None and problem.code in HINTS:
+        console.print(HINTS[problem.code])
     if written:
         console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
     return simulation

@@ -1,7 +1,5 @@
 """`cow eval`: does imagination help a multimodal LLM, by how much, and at what cost."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """The command line. Heavy imports stand inside the commands, so that `cow --help` is quick."""
 
-from __future__ import annotations
-
 import sys
 from importlib.resources import as_file
 from pathlib import Path
@@ -166,10 +164,7 @@ def openapi() -> None:
 
 
 @app.command()
-def top(
-    url: Url = None,
-    once: Annotated[bool, option("Print one picture, and end.", "--once")] = False,
-) -> None:
+def top(url: Url = None, once: Annotated[bool, option("Print one picture, and end.", "--once")] = False) -> None:
     """Show processes, workers and queues of a server, until Ctrl-C.
 
     Where standard output is no terminal, one picture is printed.

@@ -164,8 +164,7 @@ def request_body(
     ] = None,
     ensemble: Annotated[int, option("How many worlds the probabilities are counted in; 0: none.")] = 50,
     trajectory: Annotated[
-        Path | None,
-        option("JSON with the `trajectory` of a request, as `cow tracks import` makes it.", **EXISTING),
+        Path | None, option("JSON with the `trajectory` of a request, as `cow tracks import` makes it.", **EXISTING)
     ] = None,
     fields: Annotated[
         str | None,

@@ -152,9 +152,7 @@ def _keys() -> None:
 
 
 @keys.command()
-def new(
-    name: Annotated[str, argument("Whose key it is; logs and limits go by it.", "NAME")],
-) -> None:
+def new(name: Annotated[str, argument("Whose key it is; logs and limits go by it.", "NAME")]) -> None:
     """Create a key for NAME, and print the setting with which the server accepts it. Nothing is stored."""
     from cow_service.api.middleware.access import hash_of, new_key  # noqa: PLC0415
     from cow_service.settings import KEY_NAME, load_settings  # noqa: PLC0415

@@ -1,7 +1,5 @@
 """What `cow top` shows: the processes on a server's job database, once a second."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from datetime import datetime

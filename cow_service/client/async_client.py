@@ -162,11 +162,7 @@ class AsyncClient:
 
     @overload
     def map(
-        self,
-        questions: Iterable[QuestionLike],
-        *,
-        kind: Literal["simulate"],
-        **options: Unpack[SimulateBatchOptions],
+        self, questions: Iterable[QuestionLike], *, kind: Literal["simulate"], **options: Unpack[SimulateBatchOptions]
     ) -> AsyncGenerator[BatchResult[AsyncSimulation]]: ...
 
     def map(

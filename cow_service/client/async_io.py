@@ -1,7 +1,5 @@
 """How `AsyncClient` waits: on the event loop. `sync_io.py` has the same names for `Client`, which waits in threads."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager

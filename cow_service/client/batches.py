@@ -1,7 +1,5 @@
 """Batches: what becomes of each question, and which errors are about the question and which about the server."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
@@ -11,28 +9,26 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Generic, Literal, Self, TypeVar
 
-from cow_service import errors as problems
 from cow_service import records
-from cow_service.client.errors import BadResponse, ServerUnreachable, WaitTimeout, error_from
+from cow_service.client import errors
 from cow_service.client.journal import Journal, Question, QuestionLike, questions
 from cow_service.client.options import CONCURRENCY
 from cow_service.client.progress import BatchProgress, progress_shown
 from cow_service.client.request import JobRequest, job_request
-from cow_service.errors import CowError
 from cow_service.records import JobKind
 
 MAX_OUTAGE_SECONDS = 300.0  # without any response, after which a batch ends; it can be resumed
 RETRY_SECONDS = 2.0  # before a question is sent again that the server could not accept
 # Every other question would meet these, too.
-_FATAL = (problems.Unauthorized, problems.OriginNotAllowed, problems.MethodNotAllowed, problems.NotFound)
+_FATAL = (errors.Unauthorized, errors.OriginNotAllowed, errors.MethodNotAllowed, errors.NotFound)
 TRANSIENT = (
-    ServerUnreachable,
-    problems.ShuttingDown,
-    problems.QueueFull,
-    problems.RateLimited,
-    problems.NotReady,
-    problems.StorageUnavailable,
-    problems.BodyTooSlow,
+    errors.ServerUnreachable,
+    errors.ShuttingDown,
+    errors.QueueFull,
+    errors.RateLimited,
+    errors.NotReady,
+    errors.StorageUnavailable,
+    errors.BodyTooSlow,
 )
 
 R_co = TypeVar("R_co", bound=records.Simulation | records.Answer, covariant=True)
@@ -44,9 +40,9 @@ class BatchResult(Generic[R_co]):
 
     question: Question
     result: R_co | None
-    error: CowError | None
+    error: errors.CowError | None
     seconds: float
-    unsaved: CowError | None = None  # why its pictures were not saved, where they were not
+    unsaved: errors.CowError | None = None  # why its pictures were not saved, where they were not
 
     @property
     def id(self) -> str:
@@ -68,7 +64,7 @@ class BatchResult(Generic[R_co]):
         line: dict[str, Any] = {"status": self.status, "seconds": round(self.seconds, 3)}
         if (error := self.error) is not None:
             problem = {"code": error.code, **error.as_problem(), "request_id": error.request_id}
-            line["problem"] = problem | ({"job_id": error.job_id} if isinstance(error, WaitTimeout) else {})
+            line["problem"] = problem | ({"job_id": error.job_id} if isinstance(error, errors.WaitTimeout) else {})
         if self.unsaved is not None:
             line["unsaved"] = self.unsaved.detail
         if self.result is not None:
@@ -80,7 +76,7 @@ class OutageTimer:
     """How long a batch waits for a server that accepts nothing. One for all questions; thread-safe."""
 
     def __init__(
-        self, seconds: float = MAX_OUTAGE_SECONDS, on_change: Callable[[CowError | None], None] | None = None
+        self, seconds: float = MAX_OUTAGE_SECONDS, on_change: Callable[[errors.CowError | None], None] | None = None
     ) -> None:
         """`on_change` is called with what the batch waits for, and with None when that is over."""
         self._seconds = seconds
@@ -96,19 +92,19 @@ class OutageTimer:
             if self._on_change is not None:
                 self._on_change(None)
 
-    def pause_after(self, error: CowError) -> float | None:
+    def pause_after(self, error: errors.CowError) -> float | None:
         """Seconds before the question is sent again; None where the error is about the question.
 
         Raises an error that all questions would meet, or that has lasted for too long.
         """
-        proxy = isinstance(error, BadResponse)
+        proxy = isinstance(error, errors.BadResponse)
         if isinstance(error, _FATAL) or (proxy and 300 <= error.status < 500):
             raise error
         if not (isinstance(error, TRANSIENT) or (proxy and error.status >= 500)):
             self.reset()
             return None
         with self._lock:
-            missing = isinstance(error, ServerUnreachable) and not self._ever_answered
+            missing = isinstance(error, errors.ServerUnreachable) and not self._ever_answered
             if missing or time.monotonic() - self._last_response > self._seconds:
                 raise error
             if self._on_change is not None:
@@ -185,7 +181,7 @@ class Batch:
         try:
             request = job_request(self._kind, question.image, question.question, question.options, None, fresh, minimal)
         except OSError as error:
-            raise problems.ImageUnreadable(f"'{question.image}' cannot be read: {error.strerror or error}.") from error
+            raise errors.ImageUnreadable(f"'{question.image}' cannot be read: {error.strerror or error}.") from error
         if self.journal is None:
             return request
         return replace(request, key=self.journal.key(question, request.content, fresh=fresh))
@@ -197,7 +193,7 @@ class Batch:
         return self.journal.folder / "items" / question.folder
 
     def keep(
-        self, question: Question, result: R_co | None, failed: CowError | None, seconds: float
+        self, question: Question, result: R_co | None, failed: errors.CowError | None, seconds: float
     ) -> BatchResult[R_co]:
         """The result of a question, which is written down; where only its pictures could not be saved, it stands."""
         self.outage.reset()
@@ -221,13 +217,13 @@ class Batch:
             if line["status"] == "succeeded":
                 yield BatchResult(question, read(self._kind, line["result"]), None, line["seconds"])
                 continue
-            error = error_from(line["problem"])
+            error = errors.error_from(line["problem"])
             error.request_id = line["problem"].get("request_id")
-            if isinstance(error, WaitTimeout):
+            if isinstance(error, errors.WaitTimeout):
                 error.job_id = line["problem"].get("job_id", "")
             yield BatchResult(question, None, error, line["seconds"])
 
-    def _show_outage(self, error: CowError | None) -> None:
+    def _show_outage(self, error: errors.CowError | None) -> None:
         note = "" if error is None else f"waiting for the server ({error.code})"
         if note != self._progress.note:
             self._progress.note = note

@@ -20,12 +20,10 @@ import httpx
 from pydantic import BaseModel
 
 from cow_service import records
-from cow_service.client import protocol
-from cow_service.client.errors import BadResponse, ServerUnreachable, WaitTimeout, error_of, unreachable
+from cow_service.client import errors, protocol
 from cow_service.client.progress import ProgressLike, reporting
 from cow_service.client.protocol import Event, EventCursor, job_in, job_path, object_in, read
 from cow_service.client.request import MINIMAL, JobRequest, job_request, plain
-from cow_service.errors import CowError
 
 if TYPE_CHECKING:
     from cow_service.client.async_io import AsyncIO
@@ -78,11 +76,11 @@ class Connection:
                 break
             await self.io.sleep(pause)
         if isinstance(outcome, httpx.HTTPError):
-            raise unreachable(outcome, self.endpoint.base_url) from outcome
+            raise errors.unreachable(outcome, self.endpoint.base_url) from outcome
         # A second DELETE finds nothing where the first succeeded and its response was lost.
         was_deleted = method == "DELETE" and attempt > 1 and outcome.status_code == protocol.NOT_FOUND
         if not outcome.is_success and not was_deleted:
-            raise error_of(outcome)
+            raise errors.error_of(outcome)
         return outcome
 
     async def _attempt(self, method: str, url: str, **arguments: Any) -> httpx.Response | httpx.HTTPError:
@@ -91,14 +89,14 @@ class Connection:
         Retries would only delay the message that no server is there.
         """
         if self.io.http.is_closed:
-            raise ServerUnreachable("The client is closed. Call `load()` or `save()` on results before that.")
+            raise errors.ServerUnreachable("The client is closed. Call `load()` or `save()` on results before that.")
         try:
             response = await self.io.request(method, url, **arguments)
         except httpx.HTTPError as error:
             if isinstance(error, httpx.ConnectError):
                 self._refused += 1
                 if not self._ever_answered and self._refused >= protocol.MAX_FIRST_ATTEMPTS:
-                    raise unreachable(error, self.endpoint.base_url) from error
+                    raise errors.unreachable(error, self.endpoint.base_url) from error
             return error
         self._ever_answered = True
         return response
@@ -112,7 +110,9 @@ class Connection:
         # A redirect leads to another host where the server keeps artifacts in an object store; it gets no API key.
         response = await self.exchange("GET", f"/artifacts/{quote(sha256, safe='')}", follow_redirects=True)
         if hashlib.sha256(response.content).hexdigest() != sha256:
-            raise BadResponse(f"The artifact {sha256} came damaged ({len(response.content)} bytes): get it again.")
+            raise errors.BadResponse(
+                f"The artifact {sha256} came damaged ({len(response.content)} bytes): get it again."
+            )
         return response.content
 
     # Jobs
@@ -166,7 +166,7 @@ class Connection:
                 return self.result(request.kind, object_in(response))
             job_id = job_in(response).id
             return await self.poll(job_id, timeout, until, on_update, request.minimal)
-        except (CowError, GeneratorExit):
+        except (errors.CowError, GeneratorExit):
             raise
         except BaseException:
             if cancel_abandoned:
@@ -195,7 +195,7 @@ class Connection:
                 return self.result(job.kind, protocol.result_in(response, job))
             rest = min(pause, until - time.monotonic())
             if rest <= 0:
-                raise WaitTimeout.of(job_id, timeout or 0)
+                raise errors.WaitTimeout.of(job_id, timeout or 0)
             await self.io.sleep(rest)
             pause = min(pause * protocol.POLL_GROWTH, protocol.MAX_POLL_SECONDS)
 
@@ -257,7 +257,7 @@ class Connection:
         began, timeout = time.monotonic(), batch.options.timeout
         while True:
             result: Any = None
-            failed: CowError | None = None
+            failed: errors.CowError | None = None
             try:
                 request = await self.io.call_blocking(partial(batch.request, question))  # reads and encodes pictures
                 result = await self.complete(
@@ -269,10 +269,10 @@ class Connection:
                 )
                 if (folder := batch.folder_of(question)) is not None:
                     await result.files.save(folder, result)
-            except CowError as error:
+            except errors.CowError as error:
                 failed = error
-                if isinstance(error, WaitTimeout):
-                    with suppress(CowError):
+                if isinstance(error, errors.WaitTimeout):
+                    with suppress(errors.CowError):
                         await self.cancel(error.job_id)
             pause = None if failed is None else batch.outage.pause_after(failed)
             if pause is None:

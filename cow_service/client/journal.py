@@ -8,8 +8,6 @@ A line is written at once and whole. A line that a kill cut short is removed at 
 sent again under the same key, and the server, which has kept the job, returns its result.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

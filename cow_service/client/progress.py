@@ -1,7 +1,5 @@
 """Progress of a job and of a batch, on the terminal or in a notebook: with rich, tqdm, or a function of one's own."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Generator

@@ -1,7 +1,5 @@
 """What both clients do without I/O: addresses and headers, when to retry, what events and responses mean."""
 
-from __future__ import annotations
-
 import email.utils
 import json
 import math

@@ -162,11 +162,7 @@ class Client:
 
     @overload
     def map(
-        self,
-        questions: Iterable[QuestionLike],
-        *,
-        kind: Literal["simulate"],
-        **options: Unpack[SimulateBatchOptions],
+        self, questions: Iterable[QuestionLike], *, kind: Literal["simulate"], **options: Unpack[SimulateBatchOptions]
     ) -> Generator[BatchResult[Simulation]]: ...
 
     def map(

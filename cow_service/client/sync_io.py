@@ -3,8 +3,6 @@
 What is `async` here never waits for an event loop.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Generator, Iterable, Iterator

@@ -3,8 +3,6 @@
 Names, types and descriptions are those of `SimulateRequest` and `AnswerRequest`; the server checks the values.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

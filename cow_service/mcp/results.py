@@ -1,7 +1,5 @@
 """What a tool returns: the service's record as data without its long lists, the same as text, and pictures."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Iterable, Sequence

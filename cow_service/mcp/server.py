@@ -4,8 +4,6 @@ The low-level server of the library takes arguments as they come: its high-level
 know, and reports wrong ones in pydantic's words.
 """
 
-from __future__ import annotations
-
 import base64
 import logging
 import math

@@ -1,7 +1,5 @@
 """What fields of a request are made of: strict numbers, text that can be kept, points, images."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
