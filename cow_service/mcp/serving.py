@@ -8,7 +8,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -186,21 +186,20 @@ def run_stdio(backend: Backend) -> None:
     """Serves the program that started this process, until it closes standard input or sends a signal."""
     server = create_server(backend.connect, backend.lifespan, paths=True, links=backend.links)
 
+    async def exit_on_signal() -> None:
+        with anyio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
+            async for number in signals:
+                await backend.close()
+                os._exit(128 + number)  # the thread that reads standard input cannot be woken, and would be waited for
+
     async def serve() -> None:
         async with stdio_server() as (read, write), anyio.create_task_group() as tasks:
             if sys.platform != "win32":
-                tasks.start_soon(_exit_on_signal, backend.close)
+                tasks.start_soon(exit_on_signal)
             await server.run(read, write, server.create_initialization_options())
             tasks.cancel_scope.cancel()
 
     anyio.run(serve)
-
-
-async def _exit_on_signal(close: Callable[[], Awaitable[None]]) -> None:
-    with anyio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
-        async for number in signals:
-            await close()
-            os._exit(128 + number)  # the thread that reads standard input cannot be woken, and would be waited for
 
 
 def run_http(backend: Backend, settings: Settings, *, names: Sequence[str] = ()) -> None:

@@ -60,11 +60,6 @@ class Usage(Record):
         )
 
 
-def _usage_of(fields: dict[str, Any]) -> Usage:
-    """The usage of a result of a version that had no total."""
-    return fields.get("usage", Usage())
-
-
 class GeneratorInfo(Record):
     """Who made the frames, and what would have to be the same to make them again."""
 
@@ -103,7 +98,7 @@ class Result(Record):
         default=Usage(), description="What this request cost, everything together, but not stages that are `reused`."
     )
     usage_total: Usage = Field(
-        default_factory=_usage_of,
+        default_factory=lambda fields: fields.get("usage", Usage()),
         description="What it would have cost without reuse; of results of earlier versions, what it cost.",
     )
     timings: dict[str, float] = Field(description="Seconds per stage.")
