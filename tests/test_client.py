@@ -510,6 +510,20 @@ def test_a_notebook_shows_what_is_left_when_the_server_has_gone(
     assert len(seen) == 1  # a server that is gone is not asked for every picture
 
 
+def test_the_blocking_client_works_where_an_event_loop_runs(address: str) -> None:
+    """As in a notebook: its coroutines never wait for that loop."""
+
+    async def cell() -> None:
+        with Client(address) as client:
+            handle = client.submit(IMAGE, QUESTION, **SMALL)
+            assert next(iter(handle.events())).name == "queued"  # and the rest is left where it is
+            assert [event.name for event in handle.events()][-1] == "succeeded"
+            results = client.map([(IMAGE, QUESTION)], kind="simulate", **SMALL)
+            assert [result.succeeded for result in results] == [True]
+
+    asyncio.run(cell())
+
+
 # --- handles ---
 
 
