@@ -28,7 +28,7 @@ from cow_service.service import Service
 
 def run_request(
     service: Service,
-    model: type[SimulateRequest],
+    kind: records.JobKind,
     image: Path,
     body: dict[str, Any],
     out: Path | None,
@@ -49,6 +49,7 @@ def run_request(
         with writable(out):  # before the work, so that its results are not lost
             out.mkdir(parents=True, exist_ok=True)
     artifact, decoded = service.keep_image(read_file(image))
+    model = AnswerRequest if kind == "answer" else SimulateRequest
     try:
         request = model.model_validate({"image": {"artifact": artifact.sha256}, **body})
     except ValidationError as error:

@@ -51,8 +51,7 @@ def run(
         str,
         argument(
             "A folder in CausalSpatial's layout, a folder of scenes, a file (JSONL, CSV, TSV, Parquet), or the "
-            "name of a data set of the Hugging Face hub, such as Mwxinnn/CausalSpatial.",
-            None,
+            "name of a data set of the Hugging Face hub, such as Mwxinnn/CausalSpatial."
         ),
     ],
     out: Out,

@@ -56,12 +56,11 @@ def simulate(
     They go into a folder, with simulation.json.
     """
     from cow_service.cli.console import run_request  # noqa: PLC0415
-    from cow_service.requests import SimulateRequest  # noqa: PLC0415
 
     body = {**request, "question": question, "video": video}
     out = out or Path(f"{image.stem}-cow")
     with open_service() as service:
-        simulation = run_request(service, SimulateRequest, image, body, out, formats or (), as_json=as_json)
+        simulation = run_request(service, "simulate", image, body, out, formats or (), as_json=as_json)
     if open_it and simulation is not None:
         typer.launch(str(out / ("video.mp4" if video else simulation.overlay_name)))
 
@@ -73,12 +72,11 @@ def demo(
 ) -> None:
     """Imagine the future of an example: a ball is pushed towards a mug."""
     from cow_service.cli.console import run_request  # noqa: PLC0415
-    from cow_service.requests import SimulateRequest  # noqa: PLC0415
     from cow_service.weights.manifests import EXAMPLES  # noqa: PLC0415
 
     question = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
     with open_service() as service, as_file(EXAMPLES["ball-and-mug"].file("image")) as image:
-        run_request(service, SimulateRequest, image, {"question": question, "frames": {"policy": "events"}}, out)
+        run_request(service, "simulate", image, {"question": question, "frames": {"policy": "events"}}, out)
     if open_it:
         typer.launch(str(out / "video.mp4"))
 
@@ -119,7 +117,6 @@ def answer(
     Shows the answer, the votes, the baseline, tokens and time.
     """
     from cow_service.cli.console import run_request  # noqa: PLC0415
-    from cow_service.requests import AnswerRequest  # noqa: PLC0415
 
     body = {
         **request,
@@ -133,7 +130,7 @@ def answer(
         "video": out is not None,
     }
     with open_service() as service:
-        run_request(service, AnswerRequest, image, body, out, as_json=as_json)
+        run_request(service, "answer", image, body, out, as_json=as_json)
 
 
 @app.command()

@@ -86,7 +86,7 @@ def option(help: str, *names: str, shown: str | None = None, **more: Any) -> Any
     return typer.Option(*names, help=help, show_default=shown or True, **more)
 
 
-def argument(help: str, name: str | None, **more: Any) -> Any:
+def argument(help: str, name: str | None = None, **more: Any) -> Any:
     """The declaration of an argument."""
     return typer.Argument(metavar=name, help=help, **more)
 
