@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import BOX_SIDES, Meeting, RigidShape, WorldRun, hollow_of, run_worlds
+from cow_service.physics.engine import BOX_SIDES, RigidShape, WorldRun, hollow_of, run_worlds
 from cow_service.records import PlacementResult, PlaceRelation
 from cow_service.vision.openings import SeenOpening
 from cow_service.vision.types import Floats, Mask
@@ -103,13 +103,33 @@ def carry(
     released = [_released(goal, bodies, row) for bodies, row in zip(shapes, draws, strict=True)]
     settled = run_worlds(released, to_run, fps, every, turns_wanted=True)
     found = [classify(goal, *each) for each in zip(released, settled, shapes, strict=True)]
+    share = (np.arange(0, carried, every) / carried)[:, None]
+    share, step = share * share * (3 - 2 * share), every / fps  # it sets out and arrives at rest
+    shown, last = min(len(share), rows), (rows - 1) * step + 1e-9
+
+    def after_way(values: Floats, still: Floats) -> Floats:
+        """Values [B, F, D] with those of the way before them."""
+        return np.concatenate([np.repeat(still[:, None], len(share), axis=1), values], axis=1)[:, :rows]
+
     runs: list[WorldRun] = []
     for bodies, then, run in zip(shapes, released, settled, strict=True):
         body = then[goal.body]
+        # A Bezier curve up, over and down that leaves and arrives upright and passes over what it is carried over.
+        start, end = np.array(bodies[goal.body].position), np.array(body.position)
         top = max(then[i].position[1] + then[i].half_height for i in goal.targets)
-        over = top + body.half_height + CLEARANCE * body.half_width
-        way = _arc(np.array(bodies[goal.body].position), np.array(body.position), over, carried, every)
-        runs.append(_with_way(run, way, carried / fps, rows, every / fps))
+        over = top + body.half_height + CLEARANCE * body.half_width - (start[1] + end[1]) / 2
+        rise = max(over, LEAST_RISE * math.hypot(end[0] - start[0], end[2] - start[2]), 1e-6) * 4 / 3
+        high, rest = np.array([0.0, rise, 0.0]), 1 - share
+        way = (
+            rest**3 * start + 3 * rest**2 * share * (start + high) + 3 * rest * share**2 * (end + high) + share**3 * end
+        )
+        positions = after_way(run.positions, run.positions[:, 0])
+        velocities = after_way(run.velocities, np.zeros_like(run.velocities[:, 0]))
+        positions[goal.body, :shown] = way[:shown]
+        velocities[goal.body, :shown] = np.gradient(way, step, axis=0)[:shown] if len(way) > 1 else 0.0
+        meetings = [replace(each, time=carried / fps + each.time) for each in run.meetings]
+        turns = after_way(run.turns, run.turns[:, 0])
+        runs.append(WorldRun(positions, velocities, turns, [m for m in meetings if m.time <= last], run.moved))
     begun = tuple((before[0], *then[1:]) for before, then in zip(shapes, released, strict=True))
     results, clearance, above = zip(*found, strict=True)
     return begun, tuple(runs), Placements(goal.meant, results, np.array(clearance), np.array(above), carried / fps)
@@ -229,37 +249,6 @@ def _reach(body: RigidShape, right: float, ahead: float) -> float:
     cosine, sine = math.cos(body.yaw), math.sin(body.yaw)
     along, across = cosine * right - sine * ahead, sine * right + cosine * ahead
     return abs(along) * body.half_width + abs(across) * body.half_depth
-
-
-def _arc(start: Floats, end: Floats, over: float, frames: int, every: int) -> Floats:
-    """Positions [R, 3] of every `every`-th frame from one point [3] to another: up, over, and down.
-
-    A Bezier curve that leaves and arrives upright and rises `over` a height (m) in its middle.
-    """
-    way = math.hypot(end[0] - start[0], end[2] - start[2])
-    rise = max(over - (start[1] + end[1]) / 2, LEAST_RISE * way, 1e-6) * 4 / 3
-    high = np.array([0.0, rise, 0.0])
-    t = (np.arange(0, frames, every) / frames)[:, None]
-    t = t * t * (3 - 2 * t)  # it sets out and arrives at rest
-    return (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * (start + high) + 3 * (1 - t) * t**2 * (end + high) + t**3 * end
-
-
-def _with_way(run: WorldRun, way: Floats, start: float, rows: int, step: float) -> WorldRun:
-    """A run from the moment of release (s), with the way there [R, 3] before it, and `rows` recorded frames in all."""
-
-    def after(values: Floats, still: Floats) -> Floats:
-        lead = np.repeat(still[:, None], len(way), axis=1)
-        return np.concatenate([lead, values], axis=1)[:, :rows]
-
-    positions = after(run.positions, run.positions[:, 0])
-    velocities = after(run.velocities, np.zeros_like(run.velocities[:, 0]))
-    shown = min(len(way), rows)
-    positions[0, :shown] = way[:shown]
-    velocities[0, :shown] = np.gradient(way, step, axis=0)[:shown] if len(way) > 1 else 0.0
-    meetings = [Meeting(start + each.time, each.a, each.b, each.impulse) for each in run.meetings]
-    last = (rows - 1) * step + 1e-9
-    turns = after(run.turns, run.turns[:, 0])
-    return WorldRun(positions, velocities, turns, [each for each in meetings if each.time <= last], run.moved)
 
 
 def classify(

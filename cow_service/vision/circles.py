@@ -77,19 +77,61 @@ class Edges:
     def of(image: Image) -> Edges | None:
         """The edges of an RGB image [H, W, 3]; None where it is too cluttered, or plain."""
         small = scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2])))
-        points, normals = _edges(small)
-        if not 20 <= len(points) <= MAX_EDGES:
+        dx, dy, total = lab_gradients(lab_of(small))
+        strong = total > max(EDGE[0], EDGE[1] * float(np.median(total[::2, ::2])))
+        strong[:2] = strong[-2:] = False
+        strong[:, :2] = strong[:, -2:] = False
+        rows, columns = np.nonzero(strong)
+        gx, gy = dx[rows, columns], dy[rows, columns]
+        each, channel = np.arange(len(rows)), (gx * gx + gy * gy).argmax(axis=1)
+        normals = np.stack([gx[each, channel], gy[each, channel]], axis=1).astype(np.float64)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+        points = np.stack([columns, rows], axis=1).astype(np.float64)
+        # Where the gradient is strongest across the edge: at the vertex of a parabola.
+        here = total[rows, columns].astype(np.float64)
+        ahead, behind = (_at(total, points + side * normals) for side in (1, -1))
+        peak = (here >= ahead) & (here > behind)
+        if not 20 <= np.count_nonzero(peak) <= MAX_EDGES:
             return None
-        height, width = small.shape[:2]
-        return Edges(points, normals, (height, width), (image.shape[1] / width, image.shape[0] / height))
+        here, ahead, behind, points, normals = (values[peak] for values in (here, ahead, behind, points, normals))
+        bend = np.maximum(2 * here - ahead - behind, 1e-6)
+        points += np.clip(0.5 * (ahead - behind) / bend, -0.5, 0.5)[:, None] * normals
+        down, (height, width) = np.argsort(points[:, 1], kind="stable"), small.shape[:2]
+        stretch = image.shape[1] / width, image.shape[0] / height
+        return Edges(points[down], normals[down], (height, width), stretch)
 
     def circles(self) -> tuple[Circle, ...]:
         """The circles that stand out, those with most edges on them first."""
+        most = max(LEAST_RADIUS, min(MOST_RADIUS, min(self.shape) / 2))
+        radii = LEAST_RADIUS * RADIUS_STEP ** np.arange(int(np.log(most / LEAST_RADIUS) / np.log(RADIUS_STEP)) + 1)
+        rows, columns = self.shape[0] // CELL + 1, self.shape[1] // CELL + 1
+        scores = np.zeros((len(radii), rows, columns), np.float32)
+        x, y = (np.concatenate([values, values]).astype(np.float32) / CELL + 0.5 for values in self.points.T)
+        nx, ny = (np.concatenate([values, -values]).astype(np.float32) / CELL for values in self.normals.T)
+        for i, radius in enumerate(radii.astype(np.float32)):
+            column, row = np.floor(x + radius * nx).astype(np.int32), np.floor(y + radius * ny).astype(np.int32)
+            inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+            index = (row * columns + column)[inside]
+            votes = np.bincount(index, minlength=rows * columns).reshape(rows, columns).astype(np.float32)
+            # Chance votes grow with the circumference as true ones do: weighed by its root, long arcs of large circles
+            # come before whole circles of a few pixels.
+            gathered = np.asarray(cv2.boxFilter(votes, -1, (3, 3), normalize=False), np.float32)
+            gathered[gathered < LEAST_VOTES * 2 * np.pi * radius] = 0
+            scores[i] = gathered / np.sqrt(2 * np.pi * radius)
         found: list[Circle] = []
-        for x, y, radius in _voted(self.points, self.normals, self.shape):
-            circle = self._fitted(x, y, radius)
+        best, tried = scores.max(axis=0), 0
+        while tried < MAX_CIRCLES:
+            row, column = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
+            if best[row, column] <= 0:
+                break
+            i, tried = int(scores[:, row, column].argmax()), tried + 1
+            circle = self._fitted(float(column * CELL), float(row * CELL), float(radii[i]))
             if circle is not None and not any(circle.is_same(other) for other in found):
                 found.append(circle)
+            reach = max(1, round(0.2 * float(radii[i]) / CELL))
+            near = slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
+            scores[max(0, i - 3) : i + 4, *near] = 0
+            best[near] = scores[:, *near].max(axis=0)
         return tuple(sorted(found, key=lambda circle: -circle.support))
 
     def within(self, box: BBox) -> Edges:
@@ -166,30 +208,6 @@ class Edges:
         return first + np.nonzero((columns > left - reach) & (columns < right + reach))[0]
 
 
-def _edges(small: Image) -> tuple[Floats, Floats]:
-    """Points [N, 2] (px) where the gradient is strongest across the edge, and its unit vectors [N, 2]."""
-    dx, dy, total = lab_gradients(lab_of(small))
-    strong = total > max(EDGE[0], EDGE[1] * float(np.median(total[::2, ::2])))
-    strong[:2] = strong[-2:] = False
-    strong[:, :2] = strong[:, -2:] = False
-    rows, columns = np.nonzero(strong)
-    gx, gy = dx[rows, columns], dy[rows, columns]
-    channel = (gx * gx + gy * gy).argmax(axis=1)
-    each = np.arange(len(rows))
-    normals = np.stack([gx[each, channel], gy[each, channel]], axis=1).astype(np.float64)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-    points = np.stack([columns, rows], axis=1).astype(np.float64)
-    here = total[rows, columns].astype(np.float64)
-    ahead, behind = (_at(total, points + side * normals) for side in (1, -1))
-    peak = (here >= ahead) & (here > behind)
-    here, ahead, behind, points, normals = (values[peak] for values in (here, ahead, behind, points, normals))
-    bend = np.maximum(2 * here - ahead - behind, 1e-6)
-    shift = np.clip(0.5 * (ahead - behind) / bend, -0.5, 0.5)  # the vertex of a parabola
-    points += shift[:, None] * normals
-    down = np.argsort(points[:, 1], kind="stable")
-    return points[down], normals[down]
-
-
 def _at(values: Floats32, points: Floats) -> Floats:
     """Values [N] between the pixels of [h, w]."""
     x, y = points[:, 0], points[:, 1]
@@ -197,39 +215,6 @@ def _at(values: Floats32, points: Floats) -> Floats:
     u, v = x - column, y - row
     top = (1 - u) * values[row, column] + u * values[row, column + 1]
     return (1 - v) * top + v * ((1 - u) * values[row + 1, column] + u * values[row + 1, column + 1])
-
-
-def _voted(points: Floats, normals: Floats, shape: tuple[int, int]) -> list[tuple[float, float, float]]:
-    """Centres and radii (px) with most votes for their size, the most first."""
-    most = max(LEAST_RADIUS, min(MOST_RADIUS, min(shape) / 2))
-    radii = LEAST_RADIUS * RADIUS_STEP ** np.arange(int(np.log(most / LEAST_RADIUS) / np.log(RADIUS_STEP)) + 1)
-    rows, columns = shape[0] // CELL + 1, shape[1] // CELL + 1
-    scores = np.zeros((len(radii), rows, columns), np.float32)
-    x, y = (np.concatenate([values, values]).astype(np.float32) / CELL + 0.5 for values in points.T)
-    nx, ny = (np.concatenate([values, -values]).astype(np.float32) / CELL for values in normals.T)
-    for i, radius in enumerate(radii.astype(np.float32)):
-        column, row = np.floor(x + radius * nx).astype(np.int32), np.floor(y + radius * ny).astype(np.int32)
-        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-        index = (row * columns + column)[inside]
-        votes = np.bincount(index, minlength=rows * columns).reshape(rows, columns).astype(np.float32)
-        # Chance votes grow with the circumference as true ones do: weighed by its root, long arcs of large circles
-        # come before whole circles of a few pixels.
-        gathered = np.asarray(cv2.boxFilter(votes, -1, (3, 3), normalize=False), np.float32)
-        gathered[gathered < LEAST_VOTES * 2 * np.pi * radius] = 0
-        scores[i] = gathered / np.sqrt(2 * np.pi * radius)
-    found: list[tuple[float, float, float]] = []
-    best = scores.max(axis=0)
-    while len(found) < MAX_CIRCLES:
-        y, x = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
-        if best[y, x] <= 0:
-            break
-        i = int(scores[:, y, x].argmax())
-        found.append((float(x * CELL), float(y * CELL), float(radii[i])))
-        reach = max(1, round(0.2 * float(radii[i]) / CELL))
-        near = slice(max(0, y - reach), y + reach + 1), slice(max(0, x - reach), x + reach + 1)
-        scores[max(0, i - 3) : i + 4, *near] = 0
-        best[near] = scores[:, *near].max(axis=0)
-    return found
 
 
 def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:
