@@ -186,18 +186,35 @@ def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, in
 
     None where no likely camera and light would make that shadow of a ball in the air.
     """
-    model = _ShadowModel.of(ball, size, start.roll)
+    radius, middle = (ball[2] - ball[0] + ball[3] - ball[1]) / 4, np.array(size) / 2
+    across = (np.array([ball[0] + ball[2], ball[1] + ball[3]]) / 2 - middle) / radius
     precision = np.linalg.inv(start.covariance)
     root = np.linalg.cholesky(precision).T
     seen = np.array([*shadow.centre, *shadow.spread])
+    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
 
     def residuals(parameters: Floats) -> Floats:
-        made = _features(model.shadow(parameters), model.radius)
-        measured = (made - _features(seen, model.radius)) / np.array(MEASUREMENT_SIGMA)
+        """Deviations from the shadow that such a camera, height and light make [5], and from the priors [5].
+
+        Lengths are radii of the ball: x right, y down, z ahead.
+        """
+        pitch, log_focal, log_height, sideways, away = parameters
+        focal, height = math.exp(log_focal) * size[0], math.exp(log_height)
+        right, up, ahead = axes_of(np.array([pitch]), np.array([start.roll]))[0]
+        centre = np.array([*across, focal / radius]) + height * (sideways * right + away * ahead - up)
+        slant = np.array([sideways, away])
+        # A ball's shadow has the matrix 1 + slant slant^T: as wide as the ball, drawn out along the light.
+        rim = circle @ (np.eye(2) + np.outer(slant, slant) / (1 + np.sqrt(1 + slant @ slant)))
+        points = centre + rim[:, :1] * right + rim[:, 1:] * ahead
+        image = focal * points[:, :2] / np.maximum(points[:, 2:], 1e-3) + middle
+        spread = np.cov(image.T, bias=True) / 2
+        made = np.array([*image.mean(axis=0), spread[0, 0], spread[1, 1], spread[0, 1]])
+        measured = (_features(made, radius) - _features(seen, radius)) / np.array(MEASUREMENT_SIGMA)
         return np.concatenate([measured, root @ (parameters - start.mean)])
 
     parameters = start.mean.copy()
-    drop = (shadow.centre[1] - (ball[1] + ball[3]) / 2) / model.radius / math.cos(parameters[0])
+    drop = (shadow.centre[1] - (ball[1] + ball[3]) / 2) / radius / math.cos(parameters[0])
     parameters[2] = math.log(max(drop, 1.2))
     parameters, slopes = gauss_newton(
         residuals, parameters, step=1e-5, most=0.3, least=1e-4, iterations=MAX_ITERATIONS, bounds=(LOWEST, HIGHEST)
@@ -233,40 +250,6 @@ def gauss_newton(
         if float(np.abs(move).max()) < least:
             break
     return parameters, slopes
-
-
-@dataclass(frozen=True)
-class _ShadowModel:
-    """A ball seen by a pinhole camera, lengths in radii of the ball: x right, y down, z ahead."""
-
-    across: Floats  # [2]: its centre from the middle of the image, in its radii
-    radius: float  # px
-    width: float  # px, of the image
-    middle: Floats  # [2] px
-    roll: float  # radians
-
-    @staticmethod
-    def of(bbox: BBox, size: tuple[int, int], roll: float) -> _ShadowModel:
-        radius, middle = (bbox[2] - bbox[0] + bbox[3] - bbox[1]) / 4, np.array(size) / 2
-        centre = np.array([bbox[0] + bbox[2], bbox[1] + bbox[3]]) / 2
-        return _ShadowModel((centre - middle) / radius, radius, float(size[0]), middle, roll)
-
-    def shadow(self, parameters: Floats) -> Floats:
-        """Centre [2] and spread [3] (px, px^2) of the shadow that such a camera, height and light make."""
-        pitch, log_focal, log_height, sideways, away = parameters
-        focal, height = math.exp(log_focal) * self.width, math.exp(log_height)
-        right, up, ahead = axes_of(np.array([pitch]), np.array([self.roll]))[0]
-        ball = np.array([*self.across, focal / self.radius])
-        centre = ball + height * (sideways * right + away * ahead - up)
-        slant = np.array([sideways, away])
-        # A ball's shadow has the matrix 1 + slant slant^T: as wide as the ball, drawn out along the light.
-        stretch = np.eye(2) + np.outer(slant, slant) / (1 + np.sqrt(1 + slant @ slant))
-        turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-        rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ stretch
-        points = centre + rim[:, :1] * right + rim[:, 1:] * ahead
-        image = focal * points[:, :2] / np.maximum(points[:, 2:], 1e-3) + self.middle
-        spread = np.cov(image.T, bias=True) / 2
-        return np.array([*image.mean(axis=0), spread[0, 0], spread[1, 1], spread[0, 1]])
 
 
 def _features(shadow: Floats, radius: float) -> Floats:

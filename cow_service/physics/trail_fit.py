@@ -7,8 +7,6 @@ v dt, the second ones g dt^2: so v^2 / (g R) follows, whatever the interval. Len
 ahead of the camera.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,7 +46,11 @@ def fit_throw(positions: Sequence[Position], camera: CameraFit, size: tuple[int,
     """
     if len(positions) < 3:
         return None
-    problem = _Problem.of(positions, camera, size)
+    x, y = size[0] / 2, size[1] / 2
+    seen = np.array([(p.x - x, p.y - y, p.radius) for p in positions])
+    centre = np.maximum(CENTRE_SIGMA[0], CENTRE_SIGMA[1] * seen[:, 2])
+    radius = np.maximum(RADIUS_SIGMA[0], RADIUS_SIGMA[1] * seen[:, 2])
+    problem = _Problem(seen, np.stack([centre, centre, radius], axis=1), camera, float(size[0]))
     parameters, slopes = gauss_newton(
         problem.residuals, problem.start(), step=1e-6, most=0.5, least=1e-5, iterations=MAX_ITERATIONS
     )
@@ -57,7 +59,19 @@ def fit_throw(positions: Sequence[Position], camera: CameraFit, size: tuple[int,
     if not np.isfinite(cost) or cost > MAX_COST:
         return None
     covariance = np.asarray(np.linalg.inv(slopes.T @ slopes), np.float64) * max(1.0, cost / GOOD_COST)
-    return problem.result(parameters, covariance)
+    # The deviations of the throw, by first order.
+    log_speed, angle, turn = now = problem.throw(parameters)
+    steps = 1e-5 * np.eye(len(parameters))
+    slopes = np.stack([(problem.throw(parameters + step) - now) / 1e-5 for step in steps], axis=1)
+    deviation = np.sqrt(np.maximum(np.diag(slopes @ covariance @ slopes.T), 0.0))
+    return TrailFit(
+        froude=math.exp(2 * log_speed),
+        speed_deviation=float(deviation[0]),
+        direction=(math.cos(angle), math.sin(angle)),
+        direction_deviation=math.degrees(deviation[1]),
+        turn=math.degrees(turn),
+        turn_deviation=math.degrees(deviation[2]),
+    )
 
 
 def straight_direction(positions: Sequence[Position]) -> tuple[float, float]:
@@ -85,14 +99,6 @@ class _Problem:
     sigma: Floats  # [N, 3]
     camera: CameraFit
     width: float  # px, of the image
-
-    @staticmethod
-    def of(positions: Sequence[Position], camera: CameraFit, size: tuple[int, int]) -> _Problem:
-        x, y = size[0] / 2, size[1] / 2
-        seen = np.array([(p.x - x, p.y - y, p.radius) for p in positions])
-        centre = np.maximum(CENTRE_SIGMA[0], CENTRE_SIGMA[1] * seen[:, 2])
-        radius = np.maximum(RADIUS_SIGMA[0], RADIUS_SIGMA[1] * seen[:, 2])
-        return _Problem(seen, np.stack([centre, centre, radius], axis=1), camera, float(size[0]))
 
     def start(self) -> Floats:
         """As if the ball kept its distance."""
@@ -135,18 +141,3 @@ class _Problem:
         turn = math.atan2(ahead, max(right * math.copysign(1.0, seen[0]), 1e-9))
         log_speed = math.log(max(float(velocity @ velocity), 1e-12)) / 2 - parameters[6] / 2
         return np.array([log_speed, math.atan2(seen[1], seen[0]), turn])
-
-    def result(self, parameters: Floats, covariance: Floats) -> TrailFit:
-        """The throw with its deviations, by first order."""
-        log_speed, angle, turn = now = self.throw(parameters)
-        steps = 1e-5 * np.eye(len(parameters))
-        slopes = np.stack([(self.throw(parameters + step) - now) / 1e-5 for step in steps], axis=1)
-        deviation = np.sqrt(np.maximum(np.diag(slopes @ covariance @ slopes.T), 0.0))
-        return TrailFit(
-            froude=math.exp(2 * log_speed),
-            speed_deviation=float(deviation[0]),
-            direction=(math.cos(angle), math.sin(angle)),
-            direction_deviation=math.degrees(deviation[1]),
-            turn=math.degrees(turn),
-            turn_deviation=math.degrees(deviation[2]),
-        )

@@ -62,27 +62,23 @@ def compose(layers: Layers, index: int) -> Image:
     frame = layers.background.copy()
     for shadow in layers.shadows:
         for shade in shadow.at(index, (frame.shape[1], frame.shape[0])):
+            # Where the surface is seen: the floor between still bodies, or the top of one.
+            others = [other for other in layers.still if shade.surface in (None, other.index)]
+            others = [other for other in others if _overlap(shade.window, other)]
+            if not others and shade.surface is not None:
+                continue
+            seen = np.ones(shade.dark.shape[:2], np.float32)
+            for other in others:
+                _hide(seen, shade.window, other)
+            share = three_channels(seen if shade.surface is None else 1 - seen) if others else 1.0
             window = frame[shade.window]
-            left = 1 - shade.dark * _visible_share(layers, shade.surface, shade.window)
-            window[:] = cv2.multiply(window, left, dtype=cv2.CV_8U)
+            window[:] = cv2.multiply(window, 1 - shade.dark * share, dtype=cv2.CV_8U)
     for body, sprite in _far_to_near(layers, index):
         _draw(layers, frame, body, sprite, index)
         for container in layers.containers:
             if container.moving is not None and container.sprite is not None and container.covers(body, index):
                 _draw(layers, frame, container.moving, container.sprite, index)
     return frame
-
-
-def _visible_share(layers: Layers, surface: int | None, window: Window) -> Floats32 | float:
-    """Where in a window a surface is seen, 0..1 [a, b, 3]: the floor between still bodies, or the top of one."""
-    others = [other for other in layers.still if surface in (None, other.index) and _overlap(window, other)]
-    if not others:
-        return 1.0 if surface is None else 0.0
-    rows, columns = window
-    seen = np.ones((rows.stop - rows.start, columns.stop - columns.start), np.float32)
-    for other in others:
-        _hide(seen, window, other)
-    return three_channels(seen if surface is None else 1 - seen)
 
 
 def _far_to_near(layers: Layers, index: int) -> list[tuple[MovingBody, Sprite]]:

@@ -16,7 +16,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import Ground, MovingBody, StillBody, Surface, Window, clipped
 from cow_service.generators.cutout.shade import LEAST_SHADE, Shade, cast_shade, contact_shade, strongest
 from cow_service.records import Path, Vector
-from cow_service.vision.masks import bbox_of
+from cow_service.vision.masks import bbox_of, three_channels
 from cow_service.vision.shadows import find_shadow
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
@@ -141,9 +141,24 @@ class SkyShadow:
         across = np.abs(ground.shape_on_floor(foot)).sum(axis=1) * EXTENT * radius
         centre = ground.project(foot)
         window = clipped(centre - across, centre + across, size)
-        if window is not None and foot[2] > 0:
-            dark = _sky_taken(ground, foot, window, radius, above)
-            yield ShadePatch(window, np.asarray(cv2.merge((dark, dark, dark)), np.float32), surface.body)
+        if window is None or foot[2] <= 0:
+            return
+        # The share of the sky's light that a sphere takes from the plane through `foot`, fading out at `EXTENT`.
+        rows, columns = window
+        high, wide = rows.stop - rows.start, columns.stop - columns.start
+        scale = min(1.0, CELLS / max(wide, high))
+        cells_x, cells_y = max(1, round(wide * scale)), max(1, round(high * scale))
+        xs = columns.start + (np.arange(cells_x) + 0.5) * wide / cells_x
+        ys = rows.start + (np.arange(cells_y) + 0.5) * high / cells_y
+        rays = ground.camera.rays(np.stack(np.meshgrid(xs, ys), axis=2).reshape(-1, 2) / ground.factor)
+        sink = -rays @ ground.camera.up
+        length = (ground.camera.height - ground.height(foot)) / np.where(sink > 1e-6, sink, 1.0)
+        gap = ((rays * length[:, None] - foot) ** 2).sum(axis=1)
+        taken = np.where(sink > 1e-6, above * radius**2 / (gap + above**2) ** 1.5, 0.0) ** SHARPNESS
+        edge = (above * radius**2 / ((EXTENT * radius) ** 2 + above**2) ** 1.5) ** SHARPNESS
+        cells = np.clip(SKY * (taken - edge), 0, MOST_TAKEN).reshape(cells_y, cells_x).astype(np.float32)
+        dark = np.asarray(cv2.resize(cells, (wide, high), interpolation=cv2.INTER_LINEAR), np.float32)
+        yield ShadePatch(window, three_channels(dark), surface.body)
 
 
 def cast_onto(ground: Ground, position: Floats, light: Vector, height: float) -> Floats:
@@ -165,25 +180,6 @@ def _patch(
     window = clipped(*shade.corners(matrix, to, start), size)
     if window is not None:
         yield ShadePatch(window, np.float32(strength) * shade.darkness(window, matrix, to, start), surface)
-
-
-def _sky_taken(ground: Ground, foot: Floats, window: Window, radius: float, above: float) -> Floats32:
-    """Share [a, b] of the sky's light that a sphere takes from the plane through `foot`, fading out at `EXTENT`."""
-    rows, columns = window
-    height, width = rows.stop - rows.start, columns.stop - columns.start
-    scale = min(1.0, CELLS / max(width, height))
-    cells_x, cells_y = max(1, round(width * scale)), max(1, round(height * scale))
-    xs = columns.start + (np.arange(cells_x) + 0.5) * width / cells_x
-    ys = rows.start + (np.arange(cells_y) + 0.5) * height / cells_y
-    grid = np.stack(np.meshgrid(xs, ys), axis=2).reshape(-1, 2) / ground.factor
-    rays = ground.camera.rays(grid)
-    sink = -rays @ ground.camera.up
-    length = (ground.camera.height - ground.height(foot)) / np.where(sink > 1e-6, sink, 1.0)
-    gap = ((rays * length[:, None] - foot) ** 2).sum(axis=1)
-    taken = np.where(sink > 1e-6, above * radius**2 / (gap + above**2) ** 1.5, 0.0) ** SHARPNESS
-    edge = (above * radius**2 / ((EXTENT * radius) ** 2 + above**2) ** 1.5) ** SHARPNESS
-    cells = np.clip(SKY * (taken - edge), 0, MOST_TAKEN).reshape(cells_y, cells_x).astype(np.float32)
-    return np.asarray(cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 @dataclass(frozen=True)
