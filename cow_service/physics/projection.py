@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cow_service.physics.world import Worlds
 from cow_service.records import Path
-from cow_service.vision.masks import CroppedMask, scaled_size
+from cow_service.vision.masks import CroppedMask, dilated, scaled_size
 from cow_service.vision.types import Floats, Mask
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion x, y, z, w
@@ -203,7 +203,7 @@ def spread_anchors(movable: Mask, count: int = ANCHORS) -> tuple[tuple[float, fl
     """At most `count` points (px), far from each other, off a mask [H, W] of everything that may move."""
     height, width = movable.shape
     side = 2 * max(2, int(CLEARANCE * min(height, width))) + 1
-    blocked = cv2.dilate(movable.astype(np.uint8), np.ones((side, side), np.uint8))
+    blocked = dilated(movable, side)
     step = max(height, width) / GRID
     xs = np.arange(step / 2, width, step)
     ys = np.arange(step / 2, height, step)

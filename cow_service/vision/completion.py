@@ -12,7 +12,7 @@ import numpy as np
 
 from cow_service.records import BBox
 from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, EDGE_THRESHOLDS, View
-from cow_service.vision.masks import dilated, hull, outline_of, window_of
+from cow_service.vision.masks import dilated, eroded, hull, outline_of, window_of
 from cow_service.vision.types import Floats, Floats32, Mask
 
 TRIES = 120  # circles through three points of the outline
@@ -140,7 +140,7 @@ def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
     beside = np.zeros(neck.shape, bool)
     beside[rows.stop : below.start, max(0, int(ends[0]) - width // 2) : int(ends[-1]) + width // 2] = True
     beside &= ~dilated(neck | mouth | body, 5)
-    inner = cv2.erode(neck.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    inner = eroded(neck, 5)
     if not beside.any() or not inner.any():
         return None
     return neck if np.linalg.norm(lab[inner].mean(axis=0) - lab[beside].mean(axis=0)) > NECK_STEP else None

@@ -50,19 +50,13 @@ def window_of(mask: Mask, margin: int = 0) -> tuple[slice, slice] | None:
     left, top, across, down = cv2.boundingRect(mask.view(np.uint8))
     if not across:
         return None
-    rows, columns = (
-        slice(max(0, start - margin), min(length, start + size + margin))
-        for start, size, length in ((top, down, mask.shape[0]), (left, across, mask.shape[1]))
-    )
-    return rows, columns
+    rows = slice(max(0, top - margin), min(mask.shape[0], top + down + margin))
+    return rows, slice(max(0, left - margin), min(mask.shape[1], left + across + margin))
 
 
 def bbox_of(mask: Mask) -> BBox:
     """Tight box [x0, y0, x1, y1] of a mask that is not empty; x1 and y1 lie one past the last pixel."""
-    return _bbox(*(window_of(mask) or _FIRST_PIXEL))
-
-
-def _bbox(rows: slice, columns: slice) -> BBox:
+    rows, columns = window_of(mask) or _FIRST_PIXEL
     return float(columns.start), float(rows.start), float(columns.stop), float(rows.stop)
 
 
@@ -81,9 +75,14 @@ def dilated(mask: Mask, width: int = 3, times: int = 1) -> Mask:
     return cv2.dilate(mask.astype(np.uint8), np.ones((width, width), np.uint8), iterations=times) > 0
 
 
+def eroded(mask: Mask, width: int = 3, beyond: int = 1) -> Mask:
+    """A mask [H, W] less what a square of a width (px) takes off its rim; `beyond` the border it counts as 1 or 0."""
+    return cv2.erode(mask.astype(np.uint8), np.ones((width, width), np.uint8), borderValue=beyond) > 0
+
+
 def outline_of(mask: Mask) -> Mask:
     """The pixels [H, W] of a mask that have a pixel outside it beside them."""
-    return mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    return mask & ~eroded(mask)
 
 
 def outer_contour(mask: Mask) -> NDArray[np.int32]:
@@ -125,7 +124,7 @@ class CroppedMask:
     @property
     def bbox(self) -> BBox:
         """Tight box [x0, y0, x1, y1], px; x1 and y1 lie one past the last pixel."""
-        return _bbox(self.rows, self.columns)
+        return float(self.columns.start), float(self.rows.start), float(self.columns.stop), float(self.rows.stop)
 
     @property
     def area(self) -> int:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import outer_contour, scaled
+from cow_service.vision.masks import eroded, outer_contour, scaled
 from cow_service.vision.types import Image, Mask
 
 WORKING_SIDE = 896  # px: longer images are searched at this size
@@ -152,12 +152,12 @@ def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
     """The hollow drawing of which a stroke may be the rim, and that of which it may be the inside."""
     whole = _outlined(stroke.patch)
     if np.count_nonzero(whole & ~stroke.patch) > LEAST_INSIDE * np.count_nonzero(whole):
-        inside = cv2.erode((whole & ~stroke.patch).astype(np.uint8), _SQUARE, borderValue=0) > 0
+        inside = eroded(whole & ~stroke.patch, beyond=0)
         pixels = image[stroke.surroundings(image, 0)[0]][inside].astype(np.int16)
         if len(pixels) and np.median(np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)) <= TOLERANCES[1]:
             yield Stroke(stroke.x, stroke.y, whole, stroke.colour, hollow=True)
         return
-    if cv2.erode(stroke.patch.astype(np.uint8), _SQUARE, borderValue=0).sum() <= LEAST_INSIDE * stroke.patch.sum():
+    if eroded(stroke.patch, beyond=0).sum() <= LEAST_INSIDE * stroke.patch.sum():
         return
     # The rim around a flat patch has a colour of its own, unlike the patch and what lies beyond. Compression may have
     # broken it: as a stroke of its own it is then not found.

@@ -14,7 +14,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.physics.camera import NEAREST, FloorCamera
 from cow_service.records import FALLING_KINDS, BBox, Body, Path, Shape
 from cow_service.vision.inpainting import push_pull
-from cow_service.vision.masks import hull, resized_mask, turning, window_of
+from cow_service.vision.masks import eroded, hull, resized_mask, turning, window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 TOUCHING = 0.25  # of the smaller height: how deep one body may seem to stand in the one beneath it
@@ -104,11 +104,6 @@ class Ground:
         slope = np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
         return self.factor * self.camera.focal * slope @ steps
 
-    def lower_end(self, body: int) -> float:
-        """Metres above the floor of a body's lower end, at the first frame."""
-        it = self.bodies[body]
-        return 0.0 if it.support == "floor" else self.height(np.array(it.position)) - it.size[1] / 2
-
     def surface_below(self, position: Floats, bottom: float, size: float) -> Surface:
         """The highest top of a still body, or else the floor, below a body of a size (m) with its lower end there."""
         best = Surface(0.0, None)
@@ -183,7 +178,7 @@ def cut_out(image: Image, mask: Mask, hidden: Mask | None, start: Floats, shape:
     body, colours = whole[inside], image[inside].astype(np.float32)
     alpha = soft(body)
     known = mask[inside]
-    core = cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
+    core = eroded(known)
     if not core.any():
         core = known
     own = push_pull(colours, core) if core.any() else colours
@@ -199,7 +194,7 @@ def cut_out(image: Image, mask: Mask, hidden: Mask | None, start: Floats, shape:
     shares = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
     shading = cv2.GaussianBlur(blended * weight[..., None], (0, 0), sigma) / shares[..., None]
     detail = np.asarray((blended - shading) * weight[..., None], np.float32)
-    core = cv2.erode(weight, np.ones((5, 5), np.uint8)) > 0
+    core = eroded(body, 5)
     if not core.any() or float(np.percentile(np.abs(detail[core]).max(axis=1), 80)) <= PRINTED:
         return Sprite(pixels, None, origin, start)
     turns = np.dstack([detail * alpha[..., None], np.zeros_like(alpha)]).astype(np.float32)

@@ -13,7 +13,7 @@ import numpy as np
 from cow_service.generators.cutout.bodies import Window, warping
 from cow_service.records import BBox
 from cow_service.vision.inpainting import push_pull, quadratic_terms
-from cow_service.vision.masks import window_of
+from cow_service.vision.masks import dilated, window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_SIDE = 40.0  # px: the surroundings are measured at the size at which the object's longer side is so long
@@ -209,9 +209,9 @@ def _shadow(
     share = np.asarray(cv2.GaussianBlur(np.where(known, share, own), (0, 0), 1.0), np.float32) * ~border
     lost = np.clip(1 - left, -MOST_GIVEN, MOST_SHADE).astype(np.float32) * share[..., None]
     # Where nothing is known, under the object, the shadow goes on from its rim, where it is darkest.
-    kernel = np.ones((CONTACT, CONTACT), np.uint8)
-    rim = ~known & (cv2.dilate(known.astype(np.uint8), kernel) > 0)
+    rim = ~known & dilated(known, CONTACT)
     seen = np.where(known[..., None], lost, np.float32(0))
-    seen = np.where(rim[..., None], np.asarray(cv2.dilate(seen, kernel), np.float32), seen)
+    darkest = np.asarray(cv2.dilate(seen, np.ones((CONTACT, CONTACT), np.uint8)), np.float32)
+    seen = np.where(rim[..., None], darkest, seen)
     under = push_pull(np.asarray(seen, np.float32), known | rim) * (own * ~border)[..., None]
     return np.where(known[..., None], lost, under).astype(np.float32)

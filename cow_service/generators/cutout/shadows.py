@@ -16,7 +16,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import Ground, MovingBody, StillBody, Surface, Window, clipped
 from cow_service.generators.cutout.shade import LEAST_SHADE, Shade, cast_shade, contact_shade, strongest
 from cow_service.records import Path, Vector
-from cow_service.vision.masks import bbox_of, three_channels
+from cow_service.vision.masks import bbox_of, eroded, three_channels
 from cow_service.vision.shadows import find_shadow
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
@@ -78,7 +78,8 @@ class ContactShadow:
         """On what lies beneath the thing; none once it has risen."""
         ground, body = self.ground, self.ground.bodies[self.path.body]
         first, there = (np.array(self.path.states[index][:3]) for index in (0, frame))
-        lower = ground.lower_end(self.path.body)
+        # Heights of its lower end above the floor, first and now.
+        lower = 0.0 if body.support == "floor" else ground.height(np.array(body.position)) - body.size[1] / 2
         bottom = lower + ground.height(there) - ground.height(first)
         surface = ground.surface_below(there, bottom, body.size[1])
         if surface.body == self.support:
@@ -200,10 +201,8 @@ def take_shadows(
     factor: float,
 ) -> UnshadedScene:
     """The scene [h, w, 3] without the shadows of the bodies that move, and these shadows."""
-    rim = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
     objects = np.logical_or.reduce([body.mask for body in (*moving, *still)])
-    floor, shadows = cv2.erode((~objects).astype(np.uint8), rim) > 0, list[Shadow]()
-    noisy = dict[int, Mask]()
+    floor, shadows, noisy = eroded(~objects, 2 * RIM + 1), list[Shadow](), dict[int, Mask]()
     for body in moving:
         index, points = body.path.body, np.array(body.path.points)
         if np.abs(points - points[0]).max() <= 1 and np.ptp(body.path.scale) <= 0.01:  # it stays where it is
@@ -216,7 +215,7 @@ def take_shadows(
                 image, _ = _without_shade(image, cast.shade, ~objects)
             continue
         masks = [other.mask for other in still if other.index == body.support]
-        beside = cv2.erode(masks[0].astype(np.uint8), rim) > 0 if masks else floor
+        beside = eroded(masks[0], 2 * RIM + 1) if masks else floor
         shade = None if body.airborne else contact_shade(image, body.mask, bbox_of(body.mask), beside)
         if shade is None:
             continue
