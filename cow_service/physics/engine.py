@@ -12,19 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from rapier3d import (
-    ActiveEvents,
-    ChannelEventCollector,
-    CoefficientCombineRule,
-    Collider,
-    ColliderBuilder,
-    Group,
-    InteractionGroups,
-    PhysicsWorld,
-    RigidBody,
-    RigidBodyHandle,
-    Vec3,
-)
+import rapier3d as rapier
 
 from cow_service.physics.ballistic import GRAVITY, Course
 from cow_service.physics.draws import COLUMN
@@ -181,14 +169,14 @@ class _Engine:
         self.frames = range(0, num_frames, every)
         self.substeps = max(1, math.ceil((LEAST_STEPS if self.is_alone else LEAST_STEPS_OF_MANY) / fps))
         self.scale = ENGINE_SIZE / worlds[0][0].half_width
-        self.world = PhysicsWorld(gravity=(0.0, -min(GRAVITY * self.scale, MOST_GRAVITY), 0.0))
+        self.world = rapier.PhysicsWorld(gravity=(0.0, -min(GRAVITY * self.scale, MOST_GRAVITY), 0.0))
         self.world.set_num_threads(1)
         parameters = self.world.integration_parameters
         parameters.dt = 1 / (fps * self.substeps)
         parameters.normalized_max_corrective_velocity = 1.0  # m/s: bodies that overlap part slowly
-        self.collector = ChannelEventCollector()
+        self.collector = rapier.ChannelEventCollector()
         self.world.event_handler = self.collector  # pyright: ignore[reportAttributeAccessIssue]
-        floor = Collider.halfspace((0.0, 1.0, 0.0)).friction(FLOOR_FRICTION).restitution(FLOOR_RESTITUTION)
+        floor = rapier.Collider.halfspace((0.0, 1.0, 0.0)).friction(FLOOR_FRICTION).restitution(FLOOR_RESTITUTION)
         self.world.add_collider(_combined(floor))
         self.owner: dict[int, tuple[int, int]] = {}  # world and body by the collider's index
         side = math.ceil(math.sqrt(len(worlds)))
@@ -197,7 +185,8 @@ class _Engine:
         # Each first body stands in the middle of its cell: small ones are many of their sizes away from the camera.
         self.middle = np.array([bodies[0].position for bodies in worlds]) * [self.scale, 0.0, self.scale]
         self.origin -= self.middle
-        self.groups = [Group(1 << (k % side % COLOURS * COLOURS + k // side % COLOURS)) for k in range(len(worlds))]
+        cells = [k % side % COLOURS * COLOURS + k // side % COLOURS for k in range(len(worlds))]
+        self.groups = [rapier.Group(1 << cell) for cell in cells]
         everything = [((k, i), body) for k, bodies in enumerate(worlds) for i, body in enumerate(bodies)]
         self.followers = {which: body.follows for which, body in everything if body.follows is not None}
         self.courses = {which: body.course for which, body in everything if body.course is not None}
@@ -226,10 +215,12 @@ class _Engine:
             for k in range(len(self.worlds))
         ]
 
-    def add(self, k: int, i: int, body: RigidShape) -> RigidBodyHandle:
+    def add(self, k: int, i: int, body: RigidShape) -> rapier.RigidBodyHandle:
         """Adds a body; what neither moves nor is touched costs nothing."""
         x, y, z = (np.array(body.position) * self.scale + self.origin[k]).tolist()
-        builder = RigidBody.kinematic_position_based() if body.follows is not None else RigidBody.dynamic()
+        builder = (
+            rapier.RigidBody.kinematic_position_based() if body.follows is not None else rapier.RigidBody.dynamic()
+        )
         lift = GAP if body.falls and not body.ghost else 0.0
         rotation = (0.0, body.yaw, 0.0)  # axis times angle, radians
         if body.turn is not None:
@@ -247,13 +238,13 @@ class _Engine:
                 builder = builder.angvel((z / radius, 0.0, -x / radius))
         else:
             builder = builder.sleeping(True)
-        group = InteractionGroups(self.groups[k], self.groups[k])
-        colliders: list[Collider | ColliderBuilder] = [
+        group = rapier.InteractionGroups(self.groups[k], self.groups[k])
+        colliders: list[rapier.Collider | rapier.ColliderBuilder] = [
             _combined(part.friction(0.0 if body.glides else body.friction))
             .restitution(body.restitution)
             .sensor(body.is_ghostly)
             .collision_groups(group)
-            .active_events(ActiveEvents.COLLISION_EVENTS)
+            .active_events(rapier.ActiveEvents.COLLISION_EVENTS)
             for part in _colliders(body, self.scale)
         ]
         handle = self.world.add_body(builder, colliders=colliders)
@@ -261,7 +252,7 @@ class _Engine:
             self.owner[collider.index] = k, i
         return handle
 
-    def body_of(self, handle: RigidBodyHandle) -> RigidBody:
+    def body_of(self, handle: rapier.RigidBodyHandle) -> rapier.RigidBody:
         return self.world.rigid_bodies[handle]
 
     def advance(self, frame: int) -> None:
@@ -293,10 +284,10 @@ class _Engine:
             if course.changes(time - 1.5 * step, time + step):
                 body, shape = self.body_of(self.handles[k][i]), self.worlds[k][i]
                 x, y, z = (course.mean_velocity(time, time + step) * self.scale).tolist()
-                body.linvel = Vec3(x, body.linvel.y if shape.falls else y, z)
+                body.linvel = rapier.Vec3(x, body.linvel.y if shape.falls else y, z)
                 if shape.shape == "sphere" and shape.falls:  # on the floor it rolls
                     radius = shape.half_width * self.scale
-                    body.angvel = Vec3(z / radius, 0.0, -x / radius)
+                    body.angvel = rapier.Vec3(z / radius, 0.0, -x / radius)
             if course.end <= time:
                 self.release(k, i)
 
@@ -333,7 +324,7 @@ class _Engine:
                 self.release(k, i)
                 if course is not None and course.halts:
                     for stopped in (self.body_of(self.handles[k][each]) for each in (a, b)):
-                        stopped.linvel = stopped.angvel = Vec3(0.0, 0.0, 0.0)
+                        stopped.linvel = stopped.angvel = rapier.Vec3(0.0, 0.0, 0.0)
 
     def wake(self, k: int, bodies: set[int]) -> None:
         """Has bodies recorded from now on, and what they have touched: it stands on them or leans against them."""
@@ -366,21 +357,21 @@ class _Engine:
             self.velocities[k, i, row, 1] = 0.0
 
 
-def _combined(collider: ColliderBuilder) -> ColliderBuilder:
-    rule = CoefficientCombineRule.MULTIPLY
+def _combined(collider: rapier.ColliderBuilder) -> rapier.ColliderBuilder:
+    rule = rapier.CoefficientCombineRule.MULTIPLY
     return collider.friction_combine_rule(rule).restitution_combine_rule(rule)
 
 
-def _colliders(body: RigidShape, scale: float) -> list[ColliderBuilder]:
+def _colliders(body: RigidShape, scale: float) -> list[rapier.ColliderBuilder]:
     """Of one solid piece, or a container's floor and the convex segments of the wall that stands on it."""
     width, height, hollow = body.half_width * scale, body.half_height * scale, body.hollow
     if hollow is None:
         if body.shape == "sphere":
-            solid = Collider.ball(width)
+            solid = rapier.Collider.ball(width)
         elif body.shape == "box":
-            solid = Collider.cuboid(width, height, body.half_depth * scale)
+            solid = rapier.Collider.cuboid(width, height, body.half_depth * scale)
         else:
-            solid = Collider.cylinder(height, width) if body.shape == "cylinder" else Collider.cone(height, width)
+            solid = (rapier.Collider.cylinder if body.shape == "cylinder" else rapier.Collider.cone)(height, width)
         return [solid.density(body.density)]
     half_width, half_height = body.half_width, body.half_height
     foot = hollow.bottom + half_width - hollow.opening  # m: outer radius of the floor, or half its side
@@ -394,10 +385,14 @@ def _colliders(body: RigidShape, scale: float) -> list[ColliderBuilder]:
         rings += [circle * radius + np.array([0.0, level, 0.0]) for radius in (outer, inner)]
     half, radius = (2 * half_height - hollow.depth) / 2 * scale, foot * scale
     # A flat cylinder stands on the floor as a hull of its corners does not: that sinks into it.
-    floor = Collider.cylinder(half, radius) if hollow.sides > BOX_SIDES else Collider.cuboid(radius, half, radius)
+    floor = (
+        rapier.Collider.cylinder(half, radius)
+        if hollow.sides > BOX_SIDES
+        else rapier.Collider.cuboid(radius, half, radius)
+    )
     parts = [floor.translation((0.0, half - half_height * scale, 0.0))]
     for i in range(hollow.sides):
-        parts.append(Collider.convex_hull(np.concatenate([ring[i : i + 2] for ring in rings]) * scale))
+        parts.append(rapier.Collider.convex_hull(np.concatenate([ring[i : i + 2] for ring in rings]) * scale))
     # As heavy as a solid body of its outline: things that hold others are made of heavier stuff than balls and blocks
     # of their size, and the thickness of their walls is not seen and must not decide what tips them.
     outline = 2 * half_height * (foot**2 + foot * half_width + half_width**2) / 3

@@ -1,5 +1,6 @@
 """What bodies that move meet in worlds that were run: when one first touches, hides or is hidden by each other."""
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -167,24 +168,21 @@ def encounters(
     Of two that both move, the one that was set in motion first is the subject. `partly`: also where any part is hidden.
     """
     found: list[Encounter] = []
-    for place, subject in enumerate(likeliest.order):
-        events, before = likeliest.of[subject], likeliest.order[:place]
-        for kind in KINDS:
-            times = (events.partly if partly else events.times)[kind][0]
-            for body in np.nonzero(np.isfinite(times))[0].tolist():
-                if body in before:
-                    continue
-                frame = math.ceil(times[body] * fps - 1e-6)
-                found.append(
-                    Encounter(
-                        object=bodies[body].name,
-                        bbox=bodies[body].bbox,
-                        body=body,
-                        subject=subject,
-                        kind=kind,
-                        first_frame=min(frame, num_frames - 1),
-                        share=None if kind == "touches" else float(events.shares[kind][0, body]),
-                        probability=None if ensemble is None else ensemble.of[subject].share(kind, body),
-                    )
-                )
+    for (place, subject), kind in itertools.product(enumerate(likeliest.order), KINDS):
+        events = likeliest.of[subject]
+        times = (events.partly if partly else events.times)[kind][0]
+        found += [
+            Encounter(
+                object=bodies[body].name,
+                bbox=bodies[body].bbox,
+                body=body,
+                subject=subject,
+                kind=kind,
+                first_frame=min(math.ceil(times[body] * fps - 1e-6), num_frames - 1),
+                share=None if kind == "touches" else float(events.shares[kind][0, body]),
+                probability=None if ensemble is None else ensemble.of[subject].share(kind, body),
+            )
+            for body in np.nonzero(np.isfinite(times))[0].tolist()
+            if body not in likeliest.order[:place]
+        ]
     return tuple(sorted(found, key=lambda encounter: encounter.first_frame))

@@ -176,10 +176,9 @@ def _texture(
     best: tuple[float, tuple[slice, slice]] | None = None
     for sx, sy in SHIFTS:
         y, x = inner[0].start + sy * step_y, inner[1].start + sx * step_x
-        if y < 0 or x < 0 or y + step_y > height or x + step_x > across:
-            continue
         place = slice(y, y + step_y), slice(x, x + step_x)
-        if (unusable[place][::2, ::2] & shape).any():
+        is_inside = y >= 0 and x >= 0 and y + step_y <= height and x + step_x <= across
+        if not is_inside or (unusable[place][::2, ::2] & shape).any():
             continue
         patch = image[place][::2, ::2].astype(np.float32)  # every other pixel tells enough of its unrest
         unrest = float(np.percentile(np.abs(patch - cv2.blur(patch, (half, half)))[shape], 99))

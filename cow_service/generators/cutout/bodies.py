@@ -136,6 +136,36 @@ class Sprite:
     origin: tuple[float, float]  # x, y of its top left corner at the first frame, px
     start: Floats  # [2] x, y of the body's centre at the first frame, px
 
+    @staticmethod
+    def of(image: Image, mask: Mask, hidden: Mask | None, start: Floats, shape: Shape | None) -> Sprite:
+        """The body under a mask [h, w]; its part `hidden` behind others gets the colours next to it."""
+        whole = mask if hidden is None else mask | hidden
+        inside = window_of(whole, MARGIN) or (slice(0, 1), slice(0, 1))
+        body, colours = whole[inside], image[inside].astype(np.float32)
+        alpha = soft(body)
+        known = mask[inside]
+        core = eroded(known)
+        if not core.any():
+            core = known
+        own = push_pull(colours, core) if core.any() else colours
+        rim = 0.5 * colours + 0.5 * own
+        blended = np.where(core[..., None], colours, np.where(known[..., None], rim, own))
+        pixels = np.dstack([blended * alpha[..., None], alpha]).astype(np.float32)
+        origin = float(inside[1].start), float(inside[0].start)
+        if shape != "sphere":
+            return Sprite(None, pixels, origin, start)
+        # What is printed on a ball turns with it, without its shading.
+        sigma = max(1.0, SHADING_SIGMA * float(np.sqrt(body.sum())))
+        weight = body.astype(np.float32)
+        shares = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
+        shading = cv2.GaussianBlur(blended * weight[..., None], (0, 0), sigma) / shares[..., None]
+        detail = np.asarray((blended - shading) * weight[..., None], np.float32)
+        core = eroded(body, 5)
+        if not core.any() or float(np.percentile(np.abs(detail[core]).max(axis=1), 80)) <= PRINTED:
+            return Sprite(pixels, None, origin, start)
+        turns = np.dstack([detail * alpha[..., None], np.zeros_like(alpha)]).astype(np.float32)
+        return Sprite(pixels - turns, turns, origin, start)
+
     def at(self, point: Floats, scale: float, rotation: float, size: tuple[int, int]) -> tuple[Window, Floats32] | None:
         """Its window and pixels [a, b, 4] with its centre at `point` (px); None outside a frame of `size`."""
         parts = [(part, turn) for part, turn in ((self.fixed, 0.0), (self.turning, rotation)) if part is not None]
@@ -169,36 +199,6 @@ def warping(
     first = np.array(origin) + 0.5 * step - start
     shift = to + matrix @ first - 0.5 - np.array([columns.start, rows.start])
     return np.column_stack([matrix * step, shift]), (columns.stop - columns.start, rows.stop - rows.start)
-
-
-def cut_out(image: Image, mask: Mask, hidden: Mask | None, start: Floats, shape: Shape | None) -> Sprite:
-    """The body under a mask [h, w]; its part `hidden` behind others gets the colours next to it."""
-    whole = mask if hidden is None else mask | hidden
-    inside = window_of(whole, MARGIN) or (slice(0, 1), slice(0, 1))
-    body, colours = whole[inside], image[inside].astype(np.float32)
-    alpha = soft(body)
-    known = mask[inside]
-    core = eroded(known)
-    if not core.any():
-        core = known
-    own = push_pull(colours, core) if core.any() else colours
-    rim = 0.5 * colours + 0.5 * own
-    blended = np.where(core[..., None], colours, np.where(known[..., None], rim, own))
-    pixels = np.dstack([blended * alpha[..., None], alpha]).astype(np.float32)
-    origin = float(inside[1].start), float(inside[0].start)
-    if shape != "sphere":
-        return Sprite(None, pixels, origin, start)
-    # What is printed on a ball turns with it, without its shading.
-    sigma = max(1.0, SHADING_SIGMA * float(np.sqrt(body.sum())))
-    weight = body.astype(np.float32)
-    shares = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
-    shading = cv2.GaussianBlur(blended * weight[..., None], (0, 0), sigma) / shares[..., None]
-    detail = np.asarray((blended - shading) * weight[..., None], np.float32)
-    core = eroded(body, 5)
-    if not core.any() or float(np.percentile(np.abs(detail[core]).max(axis=1), 80)) <= PRINTED:
-        return Sprite(pixels, None, origin, start)
-    turns = np.dstack([detail * alpha[..., None], np.zeros_like(alpha)]).astype(np.float32)
-    return Sprite(pixels - turns, turns, origin, start)
 
 
 def clipped(low: Floats, high: Floats, size: tuple[int, int]) -> Window | None:
@@ -301,10 +301,10 @@ def still_bodies(
     given: GeneratorInput, moving: Sequence[MovingBody], size: tuple[int, int], ground: Ground | None
 ) -> tuple[StillBody, ...]:
     """The obstacles that have no path."""
-    taken = np.logical_or.reduce([body.mask for body in moving])
+    taken, paths = np.logical_or.reduce([body.mask for body in moving]), {body.path.body for body in moving}
     found: list[StillBody] = []
     for index, obstacle in enumerate(given.obstacles, start=1):
-        if all(body.path.body != index for body in moving):
+        if index not in paths:
             extent = Extent(obstacle.bbox, False) if ground is None else ground.extent(index, obstacle.bbox)
             whole = obstacle.mask.at(size)
             found.append(StillBody(index, whole & ~taken, extent, whole))

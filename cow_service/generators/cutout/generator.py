@@ -17,7 +17,7 @@ from cow_service.physics.camera import has_passed
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
 from cow_service.vision.masks import scaled_size, three_channels
-from cow_service.vision.types import Floats, Floats32, Image
+from cow_service.vision.types import Floats32, Image
 
 
 class CutoutGenerator:
@@ -83,11 +83,9 @@ def compose(layers: Layers, index: int) -> Image:
 
 def _far_to_near(layers: Layers, index: int) -> list[tuple[MovingBody, Sprite]]:
     """The bodies before the camera at a frame, in the order in which they are drawn."""
-    there: list[tuple[MovingBody, Sprite]] = []
-    for body, sprite in zip(layers.moving, layers.sprites, strict=True):
-        depths: Floats = np.array([body.path.states[0][2], body.path.states[index][2]])
-        if not has_passed(depths, depths[0])[1]:
-            there.append((body, sprite))
+    depths = [np.array(body.path.states)[[0, index], 2] for body in layers.moving]
+    drawn = zip(layers.moving, layers.sprites, depths, strict=True)
+    there = [(body, sprite) for body, sprite, (first, now) in drawn if not has_passed(now, first)]
 
     def order(a: tuple[MovingBody, Sprite], b: tuple[MovingBody, Sprite]) -> int:
         for one, other, sign in ((a[0], b[0], 1), (b[0], a[0], -1)):
@@ -110,8 +108,7 @@ def _draw(layers: Layers, frame: Image, body: MovingBody, sprite: Sprite, index:
     for container in layers.containers:
         if container.takes(body, index):  # then its front wall alone hides the body
             hiding = [other for other in hiding if other.index != container.index]
-            if container.moving is None and container.covers(body, index):
-                hiding.append(container.front)
+            hiding += [container.front] if container.moving is None and container.covers(body, index) else []
     window, pixels = found
     for other in hiding:
         if _overlap(window, other):

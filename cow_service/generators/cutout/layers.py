@@ -9,15 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.generators.base import GeneratorInput
-from cow_service.generators.cutout.bodies import (
-    Ground,
-    MovingBody,
-    Sprite,
-    StillBody,
-    cut_out,
-    moving_bodies,
-    still_bodies,
-)
+from cow_service.generators.cutout.bodies import Ground, MovingBody, Sprite, StillBody, moving_bodies, still_bodies
 from cow_service.generators.cutout.shadows import Shadow, UnshadedScene, take_shadows
 from cow_service.media.images import fit_within
 from cow_service.vision.inpainting import fill_hole
@@ -98,7 +90,7 @@ def take_apart(given: GeneratorInput) -> Layers:
     cues = resized_mask(scene.cues, size) if clean else None
     background = without_bodies(unshaded, moving, still, eye, cues)
     sprites = tuple(
-        cut_out(
+        Sprite.of(
             image,
             body.mask,
             _hidden(body, moving, still, eye),
@@ -206,7 +198,7 @@ def _containers(
         off = np.clip((columns + 0.5 - x) / (inner * half), -1, 1)
         front_mask = mask & (rows + 0.5 > y + inner * tall * np.sqrt(1 - off**2))
         front = StillBody(index, front_mask, ground.extent(index, it.bbox))
-        sprite = None if body is None else cut_out(image, front_mask, None, ground.factor * body.start, it.shape)
+        sprite = None if body is None else Sprite.of(image, front_mask, None, ground.factor * body.start, it.shape)
         holds = results[content] in ("inside", "sticks-out")
         found.append(Container(index, content, holds, front, ground, body, sprite))
     return tuple(found)
