@@ -3,6 +3,7 @@
 They lie in the plane of the first depth unless the motion leads out of it, as the paper has it: there is no floor.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,12 +51,7 @@ class Course:
 
     def changes(self, start: float, end: float) -> bool:
         """Whether a leg ends between two times (s)."""
-        at = 0.0
-        for leg in self.legs:
-            at += leg.duration
-            if start < at < end:
-                return True
-        return False
+        return any(start < at < end for at in itertools.accumulate(leg.duration for leg in self.legs))
 
     def mean_velocity(self, start: float, end: float) -> Floats:
         """[3] m/s, between two times (s): with it, steps of any length lead to the same places."""
@@ -74,13 +70,10 @@ def course_of(motion: Motion, velocities: Sequence[Floats], speed: float, clip: 
     Legs before the last that have no length of their own share what is left of the clip's seconds.
     """
     extents = [(motion.distance, motion.duration), *((step.distance, step.duration) for step in motion.steps)]
-    seconds = [
-        min(
-            math.inf if distance is None or speed <= 0 else distance / speed,
-            math.inf if duration is None else duration,
-        )
-        for distance, duration in extents
-    ]
+    seconds: list[float] = []
+    for distance, duration in extents:
+        reached = math.inf if distance is None or speed <= 0 else distance / speed
+        seconds.append(min(reached, math.inf if duration is None else duration))
     if seconds == [math.inf] and motion.until != "contact":
         return None
     if not all(map(math.isfinite, seconds[:-1])):
@@ -146,8 +139,7 @@ def sampled(path: Floats, fps: float, times: Floats) -> Floats:
 def latest(given: TrajectoryRequest, times: Floats) -> list[int]:
     """The number of the given point that was reached last at each time."""
     # The small term keeps a frame that falls on a point from landing before it.
-    reached = np.minimum((times * given.fps + 1e-6).astype(np.int64), len(given.points) - 1)
-    return [int(point) for point in reached]
+    return np.minimum((times * given.fps + 1e-6).astype(np.int64), len(given.points) - 1).tolist()
 
 
 def _seen(camera: Camera, states: Floats) -> FreePath:
