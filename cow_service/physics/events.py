@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,15 +61,46 @@ class Events:
         return float(np.isfinite(self.times[kind])[:, body].mean())
 
 
-class _Lazily(dict[int, Events]):
+class _EventsOf(dict[int, Events]):
     """The events of each body, found when first asked for."""
 
-    def __init__(self, find: Callable[[int], Events]) -> None:
+    def __init__(
+        self, worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, paths: Sequence[SeenPaths]
+    ) -> None:
         super().__init__()
-        self._find = find
+        self.worlds, self.bodies, self.fps, self.draws, self.paths = worlds, bodies, fps, draws, paths
 
     def __missing__(self, subject: int) -> Events:
-        return self.setdefault(subject, self._find(subject))
+        enough = COVERED * np.exp(COVERED_SIGMA * self.draws[:, COLUMN["outline"]])[:, None]
+        eligible, count = np.ones(len(self.bodies), bool), len(self.bodies)
+        on, loads = self.worlds.layout.supports[subject], self.worlds.layout.loads_of(subject)
+        eligible[[0, subject, *([] if on is None else [on])]] = False
+        times: PerKind = {kind: np.full((len(self.draws), count), NEVER) for kind in KINDS}
+        partly: PerKind = {kind: np.full((len(self.draws), count), NEVER) for kind in KINDS}
+        most: PerKind = {kind: np.zeros((len(self.draws), count)) for kind in KINDS}
+        # When it first touches each other one, once it moves itself.
+        for k, (shapes, run) in enumerate(zip(self.worlds.shapes, self.worlds.runs, strict=True)):
+            since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
+            for meeting in run.meetings:
+                if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
+                    other = meeting.b if meeting.a == subject else meeting.a
+                    if other != on and other not in loads:
+                        times["touches"][k, other] = min(times["touches"][k, other], meeting.time)
+        partly["touches"] = times["touches"]
+        path, step = self.paths[subject], self.worlds.every / self.fps
+        clock = np.arange(path.depth.shape[1]) * step
+        for other in range(count):
+            if other in (subject, on) or other in loads:
+                continue
+            found = shares(self.bodies[subject].mask, path, self.bodies[other].mask, self.paths[other])
+            before = clock[None] <= times["touches"][:, other : other + 1] + step
+            for kind, values in zip(KINDS[1:], (found.covers, found.covered), strict=True):
+                seen = np.where(before, values, 0.0)
+                most[kind][:, other] = seen.max(axis=1)
+                times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)
+                partly[kind][:, other] = np.where(seen >= ANY_PART, clock[None], NEVER).min(axis=1)
+        self[subject] = Events(times, most, eligible, partly, subject)
+        return self[subject]
 
 
 @dataclass(frozen=True)
@@ -111,7 +142,7 @@ def find_world_events(
             if meeting.b is None:
                 landed[k, meeting.a] = min(landed[k, meeting.a], meeting.time)
     return WorldEvents(
-        of=_Lazily(lambda subject: _events_of(subject, worlds, bodies, fps, draws, paths)),
+        of=_EventsOf(worlds, bodies, fps, draws, paths),
         moved=_first(displaced, worlds),
         tipped=_first(leans, worlds),
         gone=_first(~np.stack(inside, axis=1), worlds),
@@ -119,40 +150,6 @@ def find_world_events(
         placed=None if worlds.placements is None else worlds.placements.times,
         order=order,
     )
-
-
-def _events_of(
-    subject: int, worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, paths: Sequence[SeenPaths]
-) -> Events:
-    enough = COVERED * np.exp(COVERED_SIGMA * draws[:, COLUMN["outline"]])[:, None]
-    eligible, count = np.ones(len(bodies), bool), len(bodies)
-    on, loads = worlds.layout.supports[subject], worlds.layout.loads_of(subject)
-    eligible[[0, subject, *([] if on is None else [on])]] = False
-    times: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
-    partly: PerKind = {kind: np.full((len(draws), count), NEVER) for kind in KINDS}
-    most: PerKind = {kind: np.zeros((len(draws), count)) for kind in KINDS}
-    # When it first touches each other one, once it moves itself.
-    for k, (shapes, run) in enumerate(zip(worlds.shapes, worlds.runs, strict=True)):
-        since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
-        for meeting in run.meetings:
-            if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
-                other = meeting.b if meeting.a == subject else meeting.a
-                if other != on and other not in loads:
-                    times["touches"][k, other] = min(times["touches"][k, other], meeting.time)
-    partly["touches"] = times["touches"]
-    path, step = paths[subject], worlds.every / fps
-    clock = np.arange(path.depth.shape[1]) * step
-    for other in range(count):
-        if other in (subject, on) or other in loads:
-            continue
-        found = shares(bodies[subject].mask, path, bodies[other].mask, paths[other])
-        before = clock[None] <= times["touches"][:, other : other + 1] + step
-        for kind, values in zip(KINDS[1:], (found.covers, found.covered), strict=True):
-            seen = np.where(before, values, 0.0)
-            most[kind][:, other] = seen.max(axis=1)
-            times[kind][:, other] = np.where(seen >= enough, clock[None], NEVER).min(axis=1)
-            partly[kind][:, other] = np.where(seen >= ANY_PART, clock[None], NEVER).min(axis=1)
-    return Events(times, most, eligible, partly, subject)
 
 
 def encounters(

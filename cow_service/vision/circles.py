@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cow_service.records import BBox, Point
 from cow_service.vision.contrast import lab_gradients
 from cow_service.vision.masks import lab_of, scaled
-from cow_service.vision.types import Floats, Floats32, Image, Mask
+from cow_service.vision.types import Floats, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
 EDGE = 1.0, 2.2  # Lab units per px, and times the median gradient; the larger counts
@@ -89,7 +89,12 @@ class Edges:
         points = np.stack([columns, rows], axis=1).astype(np.float64)
         # Where the gradient is strongest across the edge: at the vertex of a parabola.
         here = total[rows, columns].astype(np.float64)
-        ahead, behind = (_at(total, points + side * normals) for side in (1, -1))
+        x, y = np.concatenate([points + normals, points - normals]).T
+        left, top = x.astype(np.int64), y.astype(np.int64)
+        u, v = x - left, y - top
+        upper = (1 - u) * total[top, left] + u * total[top, left + 1]
+        lower = (1 - u) * total[top + 1, left] + u * total[top + 1, left + 1]
+        ahead, behind = np.split((1 - v) * upper + v * lower, 2)
         peak = (here >= ahead) & (here > behind)
         if not 20 <= np.count_nonzero(peak) <= MAX_EDGES:
             return None
@@ -206,15 +211,6 @@ class Edges:
         first, last = np.searchsorted(self.points[:, 1], (top - reach, bottom + reach))
         columns = self.points[first:last, 0]
         return first + np.nonzero((columns > left - reach) & (columns < right + reach))[0]
-
-
-def _at(values: Floats32, points: Floats) -> Floats:
-    """Values [N] between the pixels of [h, w]."""
-    x, y = points[:, 0], points[:, 1]
-    column, row = x.astype(np.int64), y.astype(np.int64)
-    u, v = x - column, y - row
-    top = (1 - u) * values[row, column] + u * values[row, column + 1]
-    return (1 - v) * top + v * ((1 - u) * values[row + 1, column] + u * values[row + 1, column + 1])
 
 
 def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:

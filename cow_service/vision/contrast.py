@@ -42,8 +42,15 @@ def view_of(small: Image) -> View:
     smooth = cv2.bilateralFilter(small, 5, 25, 5)
     lab = lab_of(np.asarray(smooth, np.uint8))
     coarse = scaled(np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.uint8), 0.25)
-    size = small.shape[1], small.shape[0]
-    around = cv2.resize(_surroundings(coarse), size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    wide = _wide_median(coarse)
+    # Strong colours, seen in a first pass, are left out: a large object would count as its own surroundings.
+    off = np.hypot(*np.moveaxis(coarse[..., 1:].astype(np.float32) - wide[..., 1:], 2, 0))
+    plain = (~dilated(off > STRONG_CHROMA_STEP)).astype(np.float32)
+    if plain.mean() >= 0.5 and not plain.all():
+        side = (min(coarse.shape[:2]),) * 2
+        filled = cv2.blur(coarse * plain[..., None], side) / np.maximum(cv2.blur(plain, side)[..., None], 1e-3)
+        wide = _wide_median(np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8))
+    around = cv2.resize(wide, small.shape[1::-1], interpolation=cv2.INTER_LINEAR).astype(np.float32)
     (lightness, a, b), (around_l, around_a, around_b) = cv2.split(lab), cv2.split(around)
     around_l = around_l / np.float32(2.55)
     gap = cv2.magnitude(a - (around_a - 128), b - (around_b - 128))
@@ -68,22 +75,8 @@ def lab_gradients(lab: Floats32) -> tuple[Floats32, Floats32, Floats32]:
     return dx, dy, np.asarray(cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3), np.float32))), np.float32)
 
 
-def _surroundings(coarse: Image) -> Image:
-    """The median over half the image around every pixel of an 8-bit Lab image [h, w, 3], strong colours left out.
-
-    What is left out is seen in a first pass; without this a large object would count as its own surroundings.
-    """
-    first = _wide_median(coarse)
-    off = np.hypot(*np.moveaxis(coarse[..., 1:].astype(np.float32) - first[..., 1:], 2, 0))
-    plain = (~dilated(off > STRONG_CHROMA_STEP)).astype(np.float32)
-    if plain.all() or plain.mean() < 0.5:
-        return first
-    side = (min(coarse.shape[:2]),) * 2
-    filled = cv2.blur(coarse * plain[..., None], side) / np.maximum(cv2.blur(plain, side)[..., None], 1e-3)
-    return _wide_median(np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8))
-
-
 def _wide_median(coarse: Image) -> Image:
+    """The median over half the image around every pixel of an 8-bit Lab image [h, w, 3]."""
     side = int(0.5 * min(coarse.shape[:2])) | 1
     pad = side // 2
     padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)

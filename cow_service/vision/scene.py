@@ -15,8 +15,8 @@ from cow_service.errors import CannotReadDirection
 from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import CroppedMask, bbox_of, dilated, iou, without_holes
-from cow_service.vision.regions import SAME_OBJECT_IOU, Region, disc_region, find_regions, region_of
+from cow_service.vision.masks import CroppedMask, bbox_of, dilated, without_holes
+from cow_service.vision.regions import Region, disc_region, find_regions, is_among, is_same_object, region_of
 from cow_service.vision.segmentation import fault_of, mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
@@ -52,7 +52,7 @@ def find_obstacles(
     near = dilated(body, 7)
     obstacles: list[Obstacle] = []
     for other in named:
-        if iou(other.bbox, mover) < SAME_OBJECT_IOU:
+        if not is_same_object(other.bbox, mover):
             region = None if other.mask is not None else region_of(regions, other.bbox)
             mask = CroppedMask.of(silhouette(other.bbox)) if region is None else region.mask
             found = region is not None and region.bbox == other.bbox  # here, not by the request or another reader
@@ -60,11 +60,11 @@ def find_obstacles(
             obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
     for region in regions:
         area = region.mask.area
-        if iou(region.bbox, mover) >= SAME_OBJECT_IOU or region.mask.shared_with(whole) > 0.5 * area:
+        if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
             continue
         if area < OWN_SHARE * body_area and region.mask.shared_with(near):
             continue
-        if any(iou(region.bbox, other.bbox) >= SAME_OBJECT_IOU for other in obstacles):
+        if is_among(region.bbox, (other.bbox for other in obstacles)):
             continue
         larger = [other.mask for other in obstacles if area < OWN_SHARE * other.mask.area]
         if region.confidence < DOUBTFUL and any(region.mask.shared_with(dilated(mask.full(), 7)) for mask in larger):
@@ -211,7 +211,7 @@ class Scene:
 
     def arrows_near(self, bbox: BBox) -> list[Arrow]:
         """Arrows that start or end close to a box and at no other object, nearest first."""
-        others = [region.bbox for region in self.regions if iou(region.bbox, bbox) < SAME_OBJECT_IOU]
+        others = [region.bbox for region in self.regions if not is_same_object(region.bbox, bbox)]
         near: list[Arrow] = []
         for arrow in self.arrows:
             (x, y), gap = arrow.tail, arrow.gap(bbox)

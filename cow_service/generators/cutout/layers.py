@@ -89,18 +89,20 @@ def take_apart(given: GeneratorInput) -> Layers:
     unshaded = take_shadows(given, image, moving, still, ground, factor)
     cues = resized_mask(scene.cues, size) if clean else None
     background = without_bodies(unshaded, moving, still, eye, cues)
-    sprites = tuple(
-        Sprite.of(
-            image,
-            body.mask,
-            _hidden(body, moving, still, eye),
-            factor * body.start,
-            None if ground is None else ground.bodies[body.path.body].shape,
-        )
-        for body in moving
-    )
+    sprites: list[Sprite] = []
+    for body in moving:
+        # What nearer bodies hide of it at the first frame: of a sphere's disc; of the hull of what is seen, else.
+        extent, window = body.extent(0), window_of(body.mask, 2) or (slice(0, 0), slice(0, 0))
+        others = [(other.mask, other.extent) for other in still]
+        others += [(other.mask, other.extent(0)) for other in moving if other is not body]
+        nearer = [mask for mask, at in others if mask[window].any() and not extent.is_in_front_of(at, eye)]
+        hidden = None
+        if nearer:
+            hidden = (hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
+        shape = None if ground is None else ground.bodies[body.path.body].shape
+        sprites.append(Sprite.of(image, body.mask, hidden, factor * body.start, shape))
     containers = () if ground is None else _containers(given, image, moving, still, ground)
-    return Layers(image, background, moving, sprites, unshaded.shadows, still, containers, eye, factor)
+    return Layers(image, background, moving, tuple(sprites), unshaded.shadows, still, containers, eye, factor)
 
 
 def without_bodies(
@@ -140,21 +142,6 @@ def without_bodies(
                 objects |= part
         image = fill_hole(image, rest, objects)
     return image
-
-
-def _hidden(body: MovingBody, moving: Sequence[MovingBody], still: Sequence[StillBody], eye: float) -> Mask | None:
-    """What nearer bodies hide of a body at the first frame: of a sphere's disc; of the hull of what is seen, else."""
-    extent = body.extent(0)
-    window = window_of(body.mask, 2)
-    others = [(other.mask, other.extent) for other in still]
-    others += [(other.mask, other.extent(0)) for other in moving if other is not body]
-    if window is None:
-        return None
-    nearer = [mask for mask, at in others if mask[window].any() and not extent.is_in_front_of(at, eye)]
-    if not nearer:
-        return None
-    hidden = (hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
-    return hidden if hidden.any() else None
 
 
 def _dilated(mask: Mask, width: int, iterations: int = 1) -> Mask:
